@@ -1,0 +1,60 @@
+# `make run` and `make test` need nothing but Python >= 3.11 with venv and pip.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
+	&& { command -v $$p; break; }; done)
+
+.PHONY: help run test lint types layers wheel bench clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo 'make run      set up, then the main job: gpebo run plant=circuit estimator=drem'
+	@echo 'make test     set up, then the tests'
+	@echo 'make lint types layers    ruff, mypy, import-linter'
+	@echo 'make wheel    dist/gpebo-*.whl'
+	@echo 'make bench    docs/benchmarks.md, measured afresh'
+	@echo 'make clean    remove .venv and what tools leave behind; outputs/ is kept'
+
+run: $(VENV)/installed
+	$(BIN)/gpebo run plant=circuit estimator=drem
+
+test: $(VENV)/installed-dev
+	$(BIN)/pytest -n auto
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check
+
+types: $(VENV)/installed-dev
+	$(BIN)/mypy
+
+layers: $(VENV)/installed-dev
+	$(BIN)/lint-imports
+
+wheel: $(VENV)/installed-dev
+	$(BIN)/python -m build --wheel --no-isolation
+
+bench: $(VENV)/installed-dev
+	$(BIN)/python -m benchmarks
+
+clean:
+	rm -rf $(VENV) build dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis \
+		.import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Tests and tools are not what `make run` needs; a user should not wait for them.
+$(VENV)/installed: pyproject.toml | $(VENV)/bin/pip
+	$(BIN)/pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/installed-dev: pyproject.toml | $(VENV)/bin/pip
+	$(BIN)/pip install --quiet --editable '.[dev]'
+	@touch $@ $(VENV)/installed
+
+$(VENV)/bin/pip:
+	@test -n '$(PYTHON)' || { \
+		echo 'no Python >= 3.11 with venv and ensurepip found; on Debian: apt install python3-venv' >&2; \
+		exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@$(BIN)/pip --version > /dev/null
