@@ -1,0 +1,28 @@
+"""What can go wrong, as values a person can read.
+
+Every error the program raises on purpose is a :class:`GpeboError`: one sentence that names the
+file, key, entry or time, and what would be accepted. The command line prints it as one line and
+returns :attr:`GpeboError.exit_code`; anything else that escapes is a bug.
+"""
+
+from __future__ import annotations
+
+
+class GpeboError(Exception):
+    """A run or a check that failed for a reason its user can act on (exit code 1)."""
+
+    exit_code = 1
+
+
+class ConfigError(GpeboError):
+    """Wrong usage or configuration: unknown key, wrong type or shape, hostile text (exit 2)."""
+
+    exit_code = 2
+
+
+class ModelError(GpeboError):
+    """The model itself cannot be used: index too high, not uniquely solvable, rank of E changes."""
+
+
+class SolverError(GpeboError):
+    """The solver cannot reach the tolerance it was asked for."""

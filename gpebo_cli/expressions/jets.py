@@ -1,0 +1,180 @@
+"""Truncated Taylor arithmetic over arrays of times (Griewank & Walther, ch. 13).
+
+A jet is the list of normalised Taylor coefficients ``a[k] = a^(k)(t) / k!`` of a function at N
+times. Entries are arrays of shape (N,), or plain floats where they are equal at all times; a
+list shorter than asked for ends in zeros, so a constant is ``[c]`` and time is ``[t, 1.0]``.
+Every operation computes coefficients 0 to ``order`` and may be given longer arguments. For
+``order = 0`` each is one NumPy call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_MULTIPLIED_POWER = 1024  # larger integer exponents take the recurrence, which needs a != 0
+
+Coefficient = NDArray[np.float64] | float
+Jet = list[Coefficient]
+
+
+def convolve(a: Jet, b: Jet, k: int, first: int = 0) -> Coefficient:
+    """``sum(a[j] * b[k - j])`` over ``first <= j <= k``, where both exist."""
+    total: Coefficient | None = None
+    for j in range(max(first, k - len(b) + 1), min(k, len(a) - 1) + 1):
+        term = a[j] * b[k - j]
+        total = term if total is None else total + term
+    return 0.0 if total is None else total
+
+
+def weighted(a: Jet, order: int) -> Jet:
+    """``k a[k]``: the coefficients of t a'(t), which every recurrence below is written in."""
+    return [0.0, *(k * a[k] for k in range(1, min(order, len(a) - 1) + 1))]
+
+
+def add(a: Jet, b: Jet, order: int) -> Jet:
+    """a + b."""
+    common = min(order + 1, len(a), len(b))
+    longer = a if len(a) > len(b) else b
+    return [*(a[k] + b[k] for k in range(common)), *longer[common : order + 1]]
+
+
+def negative(a: Jet, order: int) -> Jet:
+    """-a."""
+    return [-c for c in a[: order + 1]]
+
+
+def subtract(a: Jet, b: Jet, order: int) -> Jet:
+    """a - b."""
+    common = min(order + 1, len(a), len(b))
+    rest = a[common : order + 1] if len(a) > len(b) else negative(b[common:], order - common)
+    return [*(a[k] - b[k] for k in range(common)), *rest]
+
+
+def multiply(a: Jet, b: Jet, order: int) -> Jet:
+    """a b."""
+    if len(a) == 1:
+        return [a[0] * c for c in b[: order + 1]]
+    if len(b) == 1:
+        return [c * b[0] for c in a[: order + 1]]
+    return [convolve(a, b, k) for k in range(min(order, len(a) + len(b) - 2) + 1)]
+
+
+def divide(a: Jet, b: Jet, order: int) -> Jet:
+    """q = a / b, from q b = a."""
+    if len(b) == 1:
+        # A float of NumPy's divides by zero as arrays do: by raising a flag.
+        divisor = b[0] if isinstance(b[0], np.ndarray) else np.float64(b[0])
+        return [c / divisor for c in a[: order + 1]]
+    q: Jet = [np.divide(a[0], b[0])]
+    for k in range(1, order + 1):
+        rest = (a[k] if k < len(a) else 0.0) - convolve(b, q, k, first=1)
+        q.append(np.divide(rest, b[0]))
+    return q
+
+
+def derivative(a: Jet, order: int) -> Jet:
+    """a'; needs a to order + 1."""
+    return [k * a[k] for k in range(1, min(order + 1, len(a) - 1) + 1)] or [0.0]
+
+
+def integer_power(a: Jet, exponent: int, order: int) -> Jet:
+    """a ** n for n >= 1 by repeated squaring: valid at zeros of a, unlike the recurrence."""
+    if exponent == 1:
+        return a[: order + 1]
+    even = integer_power(multiply(a, a, order), exponent // 2, order)
+    return multiply(even, a, order) if exponent % 2 else even
+
+
+def power(a: Jet, exponent: float, order: int) -> Jet:
+    """p = a ** r, r constant: by multiplication for modest integers, else from a p' = r a' p."""
+    if exponent.is_integer() and abs(exponent) <= MAX_MULTIPLIED_POWER:
+        result = integer_power(a, abs(int(exponent)), order)
+        return result if exponent > 0 else divide([1.0], result, order)
+    p: Jet = [np.sqrt(a[0]) if exponent == 0.5 else np.power(a[0], exponent)]
+    if len(a) == 1:
+        return p
+    for k in range(1, order + 1):
+        total: Coefficient = 0.0
+        for j in range(1, min(k, len(a) - 1) + 1):
+            total = total + (j * exponent - (k - j)) * (a[j] * p[k - j])
+        p.append(np.divide(total, k * a[0]))
+    return p
+
+
+def exp(a: Jet, order: int) -> Jet:
+    """e = exp(a), from e' = a' e."""
+    e: Jet = [np.exp(a[0])]
+    if len(a) == 1:
+        return e
+    w = weighted(a, order)
+    for k in range(1, order + 1):
+        e.append(convolve(w, e, k, first=1) / k)
+    return e
+
+
+def log(a: Jet, order: int) -> Jet:
+    """g = log(a), from a g' = a'."""
+    g: Jet = [np.log(a[0])]
+    if len(a) == 1:
+        return g
+    w = weighted(a, order)
+    v: Jet = [0.0]  # k g[k]
+    for k in range(1, order + 1):
+        rest = (w[k] if k < len(w) else 0.0) - convolve(v, a, k, first=1)
+        v.append(np.divide(rest, a[0]))
+        g.append(v[k] / k)
+    return g
+
+
+def sine_and_cosine(a: Jet, order: int, hyperbolic: bool = False) -> tuple[Jet, Jet]:
+    """(sin, cos) or (sinh, cosh) of a together: each one's derivative is the other's value."""
+    s: Jet = [np.sinh(a[0]) if hyperbolic else np.sin(a[0])]
+    c: Jet = [np.cosh(a[0]) if hyperbolic else np.cos(a[0])]
+    if len(a) == 1:
+        return s, c
+    w = weighted(a, order)
+    for k in range(1, order + 1):
+        s_k = convolve(w, c, k, first=1) / k
+        c_k = convolve(w, s, k, first=1) / k
+        s.append(s_k)
+        c.append(c_k if hyperbolic else -c_k)
+    return s, c
+
+
+def tangent(a: Jet, order: int, hyperbolic: bool = False) -> Jet:
+    """y = tan(a), from y' = (1 + y²) a', or y = tanh(a), from y' = (1 - y²) a'."""
+    y: Jet = [np.tanh(a[0]) if hyperbolic else np.tan(a[0])]
+    if len(a) == 1:
+        return y
+    w = weighted(a, order)
+    slope: Jet = []  # 1 ± y²
+    for k in range(1, order + 1):
+        square = convolve(y, y, k - 1)
+        signed = -square if hyperbolic else square
+        slope.append(signed + 1.0 if k == 1 else signed)
+        y.append(convolve(w, slope, k, first=1) / k)
+    return y
+
+
+def tanh(a: Jet, order: int) -> Jet:
+    """tanh(a)."""
+    return tangent(a, order, hyperbolic=True)
+
+
+UNARY: dict[str, Callable[[Jet, int], Jet]] = {
+    "negative": negative,
+    "derivative": derivative,
+    "exp": exp,
+    "log": log,
+    "tan": tangent,
+    "tanh": tanh,
+}
+BINARY: dict[str, Callable[[Jet, Jet, int], Jet]] = {
+    "add": add,
+    "subtract": subtract,
+    "multiply": multiply,
+    "divide": divide,
+}

@@ -1,0 +1,225 @@
+"""Functions of time as small immutable trees, built by constructors that fold what they can.
+
+A node may be used in many places: together the nodes of a plant form a graph that grows only with
+the length of its text. Nothing is ever differentiated symbolically (repeated derivatives of a
+product grow exponentially); ``d`` is one more node, resolved by Taylor arithmetic.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+MAX_DERIVATIVES = 16  # nested d(.); each raises the Taylor order of everything inside it by one
+
+
+class FoldError(ValueError):
+    """An expression that has no value for any t, or that the language excludes; one clause."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Node:
+    """One operation. Compared by identity; equal work is found when a tape is recorded.
+
+    ``value`` is the number itself, the exponent of ``power`` or the instant of ``step``.
+    ``affine`` is (c, s) where the node is c + s t. ``derivatives`` is how deep d(.) is nested
+    inside. ``smooth`` is how often the node may be differentiated before it jumps: 0 for
+    something that jumps itself, 1 for something with a kink.
+    """
+
+    operation: str
+    arguments: tuple[Node, ...] = ()
+    value: float = 0.0
+    affine: tuple[float, float] | None = None
+    derivatives: int = 0
+    smooth: float = math.inf
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the node is one number for all t."""
+        return self.operation == "number"
+
+
+TIME = Node("t", affine=(0.0, 1.0))
+
+
+def number(value: float) -> Node:
+    """A finite constant. Raises FoldError for nan and infinity."""
+    if not math.isfinite(value):
+        raise FoldError("a number in it is not finite")
+    value += 0.0  # -0.0 becomes 0.0, so that equal constants are one constant
+    return Node("number", value=value, affine=(value, 0.0))
+
+
+ONE = number(1.0)
+
+
+def _node(
+    operation: str,
+    *arguments: Node,
+    value: float = 0.0,
+    affine: tuple[float, float] | None = None,
+    smooth: float = math.inf,
+) -> Node:
+    if affine is not None:
+        if not (math.isfinite(affine[0]) and math.isfinite(affine[1])):
+            affine = None
+        elif affine[1] == 0.0:  # t - t + 3: affine expressions are defined for every t
+            return number(affine[0])
+    return Node(
+        operation,
+        arguments,
+        value,
+        affine,
+        max((argument.derivatives for argument in arguments), default=0),
+        min((smooth, *(argument.smooth for argument in arguments))),
+    )
+
+
+def _fold(function: Callable[..., float], *values: float) -> Node:
+    try:
+        result = function(*values)
+    except ZeroDivisionError:
+        raise FoldError("it divides by zero") from None
+    except OverflowError:
+        raise FoldError("a number in it is too large") from None
+    except ValueError:
+        raise FoldError("a function in it is undefined at its argument") from None
+    if isinstance(result, complex):
+        raise FoldError("it takes a fractional power of a negative number")
+    if not math.isfinite(result):
+        raise FoldError("a number in it is too large")
+    return number(result)
+
+
+def add(a: Node, b: Node) -> Node:
+    """a + b."""
+    if a.is_number and b.is_number:
+        return _fold(lambda x, y: x + y, a.value, b.value)
+    if a.is_number and a.value == 0.0:
+        return b
+    if b.is_number and b.value == 0.0:
+        return a
+    affine = None
+    if a.affine and b.affine:
+        affine = (a.affine[0] + b.affine[0], a.affine[1] + b.affine[1])
+    return _node("add", a, b, affine=affine)
+
+
+def negative(a: Node) -> Node:
+    """-a."""
+    if a.is_number:
+        return number(-a.value)
+    if a.operation == "negative":
+        return a.arguments[0]
+    return _node("negative", a, affine=(-a.affine[0], -a.affine[1]) if a.affine else None)
+
+
+def subtract(a: Node, b: Node) -> Node:
+    """a - b."""
+    if a.is_number and b.is_number:
+        return _fold(lambda x, y: x - y, a.value, b.value)
+    if a.is_number and a.value == 0.0:
+        return negative(b)
+    if b.is_number and b.value == 0.0:
+        return a
+    affine = None
+    if a.affine and b.affine:
+        affine = (a.affine[0] - b.affine[0], a.affine[1] - b.affine[1])
+    return _node("subtract", a, b, affine=affine)
+
+
+def multiply(a: Node, b: Node) -> Node:
+    """a b. A factor 0 is not folded: 0 log(t) must keep failing where log(t) does."""
+    if a.is_number and b.is_number:
+        return _fold(lambda x, y: x * y, a.value, b.value)
+    if a.is_number and a.value == 1.0:
+        return b
+    if b.is_number and b.value == 1.0:
+        return a
+    affine = None
+    if a.is_number and b.affine:
+        affine = (a.value * b.affine[0], a.value * b.affine[1])
+    elif b.is_number and a.affine:
+        affine = (a.affine[0] * b.value, a.affine[1] * b.value)
+    return _node("multiply", a, b, affine=affine)
+
+
+def divide(a: Node, b: Node) -> Node:
+    """a / b."""
+    if b.is_number and b.value == 0.0:
+        raise FoldError("it divides by zero")
+    if a.is_number and b.is_number:
+        return _fold(lambda x, y: x / y, a.value, b.value)
+    if b.is_number and b.value == 1.0:
+        return a
+    affine = (a.affine[0] / b.value, a.affine[1] / b.value) if b.is_number and a.affine else None
+    return _node("divide", a, b, affine=affine)
+
+
+def power(a: Node, b: Node) -> Node:
+    """a ** b: a power with a constant exponent, else exp(b log a), which needs a > 0."""
+    if a.is_number and b.is_number:
+        return _fold(lambda x, y: x**y, a.value, b.value)
+    if not b.is_number:
+        return function("exp", multiply(b, function("log", a)))
+    if b.value == 0.0:
+        return ONE
+    if b.value == 1.0:
+        return a
+    return _node("power", a, value=b.value)
+
+
+def sign(x: float) -> float:
+    """-1, 0 or 1."""
+    return float((x > 0) - (x < 0))
+
+
+FUNCTIONS: dict[str, Callable[[float], float]] = {
+    "sin": math.sin,
+    "cos": math.cos,
+    "tan": math.tan,
+    "exp": math.exp,
+    "log": math.log,
+    "sqrt": math.sqrt,
+    "sinh": math.sinh,
+    "cosh": math.cosh,
+    "tanh": math.tanh,
+    "abs": abs,
+    "sign": sign,
+}
+
+
+def function(name: str, a: Node) -> Node:
+    """One of FUNCTIONS of a."""
+    if a.is_number:
+        return _fold(FUNCTIONS[name], a.value)
+    if name == "sqrt":
+        return power(a, number(0.5))
+    return _node(name, a, smooth={"sign": 0.0, "abs": 1.0}.get(name, math.inf))
+
+
+def step(a: Node) -> Node:
+    """0 before the instant at which the affine argument passes zero, 1 from then on.
+
+    A falling argument gives 1 before and 0 from then on: step(t1 - t) = 1 - step(t - t1).
+    """
+    if a.is_number:
+        raise FoldError("the argument of step does not depend on t")
+    if a.affine is None:
+        raise FoldError("the argument of step must be affine in t, such as step(t - 2)")
+    offset, slope = a.affine
+    rising = _node("step", value=_fold(lambda c, s: -c / s, offset, slope).value, smooth=0.0)
+    return rising if slope > 0 else subtract(ONE, rising)
+
+
+def derivative(a: Node) -> Node:
+    """da/dt."""
+    if a.affine:
+        return number(a.affine[1])
+    if a.smooth < 1:
+        raise FoldError("d(.) of something that jumps (step or sign) is an impulse, no function")
+    if a.derivatives >= MAX_DERIVATIVES:
+        raise FoldError(f"more than {MAX_DERIVATIVES} d(.) inside each other")
+    return Node("derivative", (a,), 0.0, None, a.derivatives + 1, a.smooth - 1)

@@ -1,0 +1,83 @@
+"""Small dense linear algebra over a batch of matrices (leading axis: time).
+
+Ranks are judged against the size of what a matrix was made from, never against its own largest
+singular value: a one-column product of size 1e-17 has rank 0, not 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpebo_cli.systems.descriptor import Array
+
+
+def transpose(a: Array) -> Array:
+    """Transpose the last two axes."""
+    return np.swapaxes(a, -1, -2)
+
+
+def orthonormal_complement(basis: Array) -> Array:
+    """Projector onto the orthogonal complement of orthonormal columns, shape (..., n, n)."""
+    return np.eye(basis.shape[-2]) - basis @ transpose(basis)
+
+
+def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Array, Array]:
+    """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p), singular Ω included.
+
+    With Ω = U Σ Vᵀ, adj(Ω) = det(U) det(V) V diag(∏_{j≠i} σ_j) Uᵀ. The usual det(Ω)·inv(Ω) is
+    rejected: it is undefined at the start, where every extension begins at Ω = 0.
+
+    Returns:
+        det(Ω) of shape (...,), adj(Ω) b of shape (..., p), and the reciprocal condition number
+        σ_min/σ_max of shape (...,), zero where Ω = 0.
+    """
+    p = omega.shape[-1]
+    u, sigma, vt = np.linalg.svd(omega)
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    # Products of all singular values but one, by prefix and suffix products: no division.
+    ones = np.ones((*sigma.shape[:-1], 1))
+    before = np.concatenate([ones, np.cumprod(sigma[..., :-1], axis=-1)], axis=-1)
+    after = np.concatenate([np.cumprod(sigma[..., :0:-1], axis=-1)[..., ::-1], ones], axis=-1)
+    determinant = sign * before[..., p - 1] * sigma[..., p - 1]
+    coordinates = np.einsum("...ji,...j->...i", u, rhs) * before * after
+    action = sign[..., None] * np.einsum("...ji,...j->...i", vt, coordinates)
+    largest = sigma[..., 0]
+    reciprocal = np.divide(sigma[..., -1], largest, out=np.zeros_like(largest), where=largest > 0)
+    return determinant, action, reciprocal
+
+
+_SCAN_LIMIT = 1 << 11  # above this many parallel recurrences a plain loop over k moves less memory
+
+
+def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
+    """All z_k of z_{k+1} = a_k z_k + b_k along axis 0.
+
+    For few recurrences a parallel prefix scan: it composes neighbouring affine maps in log2(K)
+    vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the recurrence. For
+    many, the recurrence itself, each step vectorised over all of them.
+
+    Args:
+        factor: a, shape (K, ...), broadcastable against ``shift``.
+        shift: b, shape (K, ...).
+        start: z_0, broadcastable against (...).
+
+    Returns:
+        z_0 … z_K, shape (K + 1, ...).
+    """
+    shape = np.broadcast_shapes(factor.shape, shift.shape)
+    out = np.empty((shape[0] + 1, *shape[1:]))
+    out[0] = start
+    if np.prod(shape[1:], dtype=np.int64) > _SCAN_LIMIT:
+        for k in range(shape[0]):
+            np.multiply(factor[k], out[k], out=out[k + 1])
+            out[k + 1] += shift[k]
+        return out
+    a, b = np.broadcast_to(factor, shape).copy(), np.broadcast_to(shift, shape).copy()
+    step = 1
+    while step < len(b):
+        # Right-hand sides are formed before they are stored: the two slices overlap.
+        b[step:] = b[step:] + a[step:] * b[:-step]
+        a[step:] = a[step:] * a[:-step]
+        step *= 2
+    out[1:] = a * out[0] + b
+    return out

@@ -1,0 +1,171 @@
+"""From a plain mapping to a frozen dataclass: every key known, every value of its type.
+
+The dataclass is the schema. A field is found by its name, or by ``metadata["key"]`` where the
+name is a word of Python's (``lambda``). Numbers may come as text: YAML 1.1 reads ``1e-9`` as a
+string, and refusing it would help nobody.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+
+from gpebo_cli.errors import ConfigError
+
+T = TypeVar("T")
+
+_SHOWN = 60  # characters of a wrong value that a message repeats
+
+
+def nearest(given: str, known: Iterable[str]) -> str:
+    """``"; did you mean x?"`` where one of the known names is near, else nothing."""
+    near = difflib.get_close_matches(given[:_SHOWN], list(known), 1, cutoff=0.5)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def shown(value: object) -> str:
+    """A value as a message repeats it: on one line, printable, and not too long."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer with too many digits, or a cycle
+        return f"a {type(value).__name__} that cannot be shown"
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def read(cls: type[T], mapping: object, where: str) -> T:
+    """An instance of the dataclass ``cls`` from plain data.
+
+    Args:
+        cls: a dataclass whose fields are numbers, text, literals, lists, mappings, unions of
+            them, or dataclasses; a field annotated ``object`` takes anything.
+        mapping: the data, keys being the fields' names; what is absent has its default.
+        where: the name of the whole, for messages (``solver``).
+
+    Raises:
+        ConfigError: not a mapping, an unknown or missing key, or a value of the wrong type.
+    """
+    if not isinstance(mapping, Mapping):
+        raise ConfigError(f"{where}: expected a mapping of keys to values, got {shown(mapping)}")
+    if not is_dataclass(cls):
+        raise TypeError(f"{cls!r} is not a dataclass")
+    hints = typing.get_type_hints(cls)
+    by_key = {field.metadata.get("key", field.name): field for field in fields(cls)}
+    for key in mapping:
+        if key not in by_key:
+            raise ConfigError(
+                f"{where}.{key}: no such key; {where} has {', '.join(by_key)}"
+                + nearest(str(key), by_key)
+            )
+    values: dict[str, Any] = {}
+    for key, field in by_key.items():
+        if key in mapping:
+            values[field.name] = convert(mapping[key], hints[field.name], f"{where}.{key}")
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise ConfigError(f"{where}.{key} is missing; it has no default")
+    return cls(**values)
+
+
+def convert(value: object, kind: Any, where: str) -> Any:
+    """``value`` as the annotated type ``kind``, or a ConfigError that names what is accepted.
+
+    The type is ``Any`` because annotations are: ``float | None`` is not a ``type``.
+    """
+    if kind is object or kind is Any:
+        return value
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Union or origin is types.UnionType:
+        return _alternative(value, kind, arguments, where)
+    if origin is Literal:
+        if isinstance(value, str | bool | int) and value in arguments:
+            return value
+        names = [str(name) for name in arguments]
+        raise ConfigError(
+            f"{where}: expected {_describe(kind)}, got {shown(value)}" + nearest(str(value), names)
+        )
+    if is_dataclass(kind):
+        return read(typing.cast("Any", kind), value, where)
+    if origin is not None:
+        return _collection(value, kind, where)
+    found = _scalar(value, kind)
+    if found is None:
+        raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}")
+    return found
+
+
+def _collection(value: object, kind: Any, where: str) -> Any:
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is list and isinstance(value, Sequence) and not isinstance(value, str):
+        return [convert(v, arguments[0], f"{where}[{i}]") for i, v in enumerate(value)]
+    if origin is not list and isinstance(value, Mapping):
+        return {
+            _name(k, where): convert(v, arguments[1], f"{where}.{k}") for k, v in value.items()
+        }
+    raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}")
+
+
+def _scalar(value: object, kind: Any) -> Any:
+    """``value`` as a number, text or truth value, or None if it is not one of that kind."""
+    if kind not in (float, int):
+        return value if isinstance(value, kind) else None
+    if kind is int and isinstance(value, int) and not isinstance(value, bool):
+        return value  # not by way of float: integers beyond 2**53 are kept
+    number = _number(value)
+    if number is None or not math.isfinite(number):
+        return None
+    if kind is float:
+        return number
+    return int(number) if number == int(number) else None
+
+
+def _alternative(value: object, kind: Any, alternatives: Sequence[Any], where: str) -> Any:
+    for alternative in alternatives:
+        if alternative is type(None):
+            if value is None:
+                return None
+            continue
+        try:
+            return convert(value, alternative, where)
+        except ConfigError:
+            continue  # the message below names all alternatives
+    raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}")
+
+
+def _number(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return None
+    try:
+        return float(value)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _name(key: object, where: str) -> str:
+    if not isinstance(key, str):
+        raise ConfigError(f"{where}: names must be text, got {shown(key)}")
+    return key
+
+
+def _describe(kind: Any) -> str:
+    """A type in the words of a person who writes YAML."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Union or origin is types.UnionType:
+        return " or ".join(_describe(a) for a in arguments)
+    if origin is Literal:
+        return " or ".join(str(a) for a in arguments)
+    if origin is list:
+        return f"a list (each {_describe(arguments[0])})"
+    if origin is not None and issubclass(origin, Mapping):
+        return f"a mapping of names (each {_describe(arguments[1])})"
+    words = {
+        float: "a finite number",
+        int: "a whole number",
+        bool: "true or false",
+        str: "text",
+        type(None): "null",
+    }
+    return words.get(kind, f"a mapping ({getattr(kind, '__name__', kind)})")

@@ -1,0 +1,146 @@
+"""What a run returns: sampled signals with their names, evidence, and how long each stage took.
+
+Plain frozen dataclasses over arrays, time first. The output layer turns them into tables,
+figures and ``summary.json``; nothing in here knows about files, pandas or matplotlib.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from gpebo_cli.settings import Settings
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+
+
+@dataclass(frozen=True)
+class StateChange:
+    """A state that consistent initialisation (or a jump of the input) moved."""
+
+    state: str
+    given: float
+    used: float
+    time: float
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """The plant's signals on the output grid and how they were obtained."""
+
+    t: Array  # (N,)
+    inputs: Array  # (N, m)
+    outputs: Array  # (N, r)
+    states: Array  # (N, n)
+    index: int  # differentiation index: strangeness index + 1, or 0 for an explicit ODE
+    strangeness_index: int
+    differential: int  # d, number of differential equations
+    algebraic: int  # a, number of constraints, hidden ones included
+    initial_state: Array  # (n,) the consistent one
+    moved: tuple[StateChange, ...]  # by consistent initialisation at the start
+    jumps: tuple[StateChange, ...]  # at jumps of the inputs inside the horizon
+    impulses: tuple[tuple[float, str], ...]  # (time, state) where a jump puts a Dirac impulse
+    error_estimate: float  # relative to each state's own size
+    elements: int
+
+
+@dataclass(frozen=True)
+class RegressionResult:
+    """Y = psi eta on the output grid."""
+
+    t: Array  # (N,)
+    Y: Array  # (N, rows)
+    psi: Array  # (N, rows, p)
+    parameters: tuple[str, ...]  # p names: the plant's unknowns, then e0_<state>
+    true_parameters: Array  # (p,)
+    error_estimate: float
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A unit vector in parameter space, by name."""
+
+    components: Mapping[str, float]
+
+    def __str__(self) -> str:
+        largest = max((abs(v) for v in self.components.values()), default=0.0)
+        terms = [f"{v:+.3g} {k}" for k, v in self.components.items() if abs(v) >= 0.05 * largest]
+        return " ".join(terms)
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Interval and persistent excitation, as evidence and not a bare yes.
+
+    ``gram_eigenvalues[i]`` are those of G(t_i) = ∫ψᵀψ from the start to t_i, ascending.
+    """
+
+    t: Array  # (N,)
+    gram_eigenvalues: Array  # (N, p)
+    pe_level: Array  # (N,) smallest eigenvalue of the Gram matrix over the trailing window
+    window: float
+    is_ie: bool
+    t_c: float | None  # first time with lambda_min(G) >= rho
+    rho: float
+    lambda_min: float  # at the horizon
+    condition: float  # lambda_max / lambda_min at the horizon
+    weakest_direction: Direction
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """What an estimator needs of the regressor, and what it got."""
+
+    name: str  # "PE", "IE", "Δ not in L2", ...
+    holds: bool
+    evidence: Mapping[str, float]
+    text: str  # one sentence
+
+
+@dataclass(frozen=True)
+class EstimationResult:
+    """Estimates of every case (a case is one combination of gains) on a grid of times."""
+
+    cases: tuple[Mapping[str, float], ...]  # G combinations, gain name -> value
+    t: Array  # (M,) perhaps coarser than the output grid when there are many cases
+    parameters: Array  # (G, M, p)
+    states: Array  # (G, M, n), NaN for a state the observer does not see
+    delta: Array | None  # (D, M), D = 1 if it is the same for every case, else G; None: no mixing
+    checks: Mapping[str, Array]  # further estimates by column name, (G, M) each
+    requirement: Requirement
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """One number per case; NaN where a time was never reached."""
+
+    seconds_to_1pct_parameters: Array  # (G,)
+    seconds_to_1pct_states: Array  # (G,)
+    final_error_parameters: Array  # (G,) max abs
+    final_error_states: Array  # (G,) max abs
+    rms_error_states: Array  # (G,)
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """One of the paper's assumptions (or a prerequisite), with its evidence."""
+
+    name: str  # "Assumption 1", ...
+    statement: str  # what it says, one line
+    holds: bool
+    evidence: Mapping[str, float | int | str | None]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Everything one run produced; the later stages are None when ``observer=none``."""
+
+    settings: Settings
+    system: DescriptorSystem
+    simulation: SimulationResult
+    regression: RegressionResult | None
+    excitation: Excitation | None
+    estimation: EstimationResult | None
+    metrics: Metrics | None
+    assumptions: tuple[Assumption, ...]
+    timings: Mapping[str, float]  # stage -> seconds
+    verdict: str  # the last line a person reads

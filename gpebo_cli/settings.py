@@ -1,0 +1,79 @@
+"""Everything a run can be told, as frozen dataclasses with their defaults.
+
+These are the only description of a run below the command layer: no Hydra, no files. The reader
+in ``reading.py`` builds them from a plain mapping and refuses keys that are not fields here.
+The plant and the estimator are described by their own modules, found by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class TimeSettings:
+    """The experiment runs on [start, start + horizon]; ``samples`` is the output grid only."""
+
+    start: float = 0.0
+    horizon: float = 20.0
+    samples: int = 1001
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """How differential equations are integrated; ``tol`` is relative to each signal's own size."""
+
+    name: Literal["collocation", "ivp"] = "collocation"
+    tol: float = 1e-12
+    stages: int = 12  # Radau IIA stages per element, order 2 * stages - 1
+    max_elements: int = 200_000
+    max_strangeness_index: int = 6
+    rank_tol: float = 1e-10  # singular values below rank_tol * (size of the factors) are zero
+
+
+@dataclass(frozen=True)
+class ObserverSettings:
+    """Which observer, and what it is free to choose."""
+
+    name: Literal["gpebo", "canonical", "none"] = "gpebo"
+    # Where the dynamic extension starts: by state name, or a list of n_a numbers; None: what the
+    # plant proposes, else zero.
+    xi_a0: Mapping[str, float] | list[float] | None = None
+    # gpebo: the whole residual, or its last r rows as the paper has it.
+    regression: Literal["projected", "paper"] = "projected"
+    # canonical: the output that Proposition 4 rests on (None: the first that fits), its gain
+    # (diagonal, remark4, or two expressions of t) and the start of its state.
+    output: str | None = None
+    L_w: str | list[str] = "diagonal"
+    r0: list[float] = field(default_factory=lambda: [0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class ExcitationSettings:
+    """Level and window of the excitation evidence."""
+
+    rho: float | None = None  # level asked of lambda_min(G); None: 1e-8 of the regressor's own size
+    window: float | None = None  # sliding window of the PE level, seconds; None: horizon / 10
+
+
+@dataclass(frozen=True)
+class OutputSettings:
+    """What is drawn and how much is written."""
+
+    figures: bool | list[str] = True  # True: all, False: none, or names of figures
+    max_rows: int = 100_000  # of estimates.csv; many cases keep fewer samples each
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One run, complete."""
+
+    plant: Mapping[str, object]
+    estimator: Mapping[str, object]
+    time: TimeSettings = field(default_factory=TimeSettings)
+    solver: SolverSettings = field(default_factory=SolverSettings)
+    observer: ObserverSettings = field(default_factory=ObserverSettings)
+    excitation: ExcitationSettings = field(default_factory=ExcitationSettings)
+    output: OutputSettings = field(default_factory=OutputSettings)

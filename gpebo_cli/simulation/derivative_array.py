@@ -1,0 +1,456 @@
+"""From a descriptor system of any index to an equivalent strangeness-free one.
+
+Kunkel & Mehrmann, Differential-Algebraic Equations (EMS 2006), chapter 3: differentiate the model
+μ times and read off, at every time, all constraints (hidden ones too) and the differential
+equations that are left. In Taylor coefficients e_k = E^(k)/k!, x_k = x^(k)/k!, … the i-th
+derivative of E x' = A x + f is, free of binomials,
+
+    Σ_j (j + 1) e_{i−j} x_{j+1} = Σ_j a_{i−j} x_j + f_i            i = 0 … μ
+
+or M (x_1, …, x_{μ+1}) = N x_0 + g with M_ij = (j + 1) e_{i−j} − a_{i−j−1}, N_i = a_i, g_i = f_i.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.errors import ModelError
+from gpebo_cli.linalg import transpose
+from gpebo_cli.systems.descriptor import Array, BoolArray, Coefficients, DescriptorSystem, IntArray
+
+_PROBES = 65  # times at which the structure is established before anything is integrated
+_DIP = 0.2  # a singular value that falls below this share of its maximum is followed down
+_DIP_ROUNDS = 14
+_DIP_POINTS = 17
+
+
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """Constant scalings under which ranks are judged: rows, states and the unit of time.
+
+    Farads beside kiloohms would otherwise make an honest equation look like a rank deficiency.
+    Powers of two, so that scaling commits no rounding error.
+    """
+
+    rows: Array  # (n,)
+    columns: Array  # (n,) x = columns * x̃
+    time: float  # τ, derivatives are taken with respect to t/τ
+
+
+@dataclass(frozen=True, eq=False)
+class Pivots:
+    """Rows and columns of M that carry its rank at one time, for cheap elimination at others.
+
+    Z2 and Z1 are only needed up to scalings of rows, so any basis will do: M[rest] − X M[rows]
+    with X = M[rest, columns] M[rows, columns]⁻¹ costs one LU where an SVD costs thirty.
+    """
+
+    rows: IntArray  # (r,)
+    rest: IntArray  # (a,)
+    columns: IntArray  # (r,)
+    Z1: Array  # (n, d) orthonormal, completes the constraints at that time
+
+
+@dataclass(frozen=True, eq=False)
+class Bases:
+    """Z1 and Z2 themselves, where E and A are constant."""
+
+    Z1: Array  # (1, n, d) orthonormal
+    Z2: Array  # (1, (μ+1) n, a) orthonormal
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The characteristic values of the system and how they were judged."""
+
+    mu: int  # strangeness index μ
+    a: int  # number of constraints
+    d: int  # number of differential equations, n − a
+    scaling: Scaling
+    rank_tol: float
+    smallest_singular_value: float  # smallest one counted as nonzero, relative, over the probes
+    time_invariant: bool  # E and A are constant
+    reference: Pivots | Bases  # of one time, to start from at the others
+
+    @property
+    def index(self) -> int:
+        """Differentiation index: 0 for an explicit ODE, else μ + 1."""
+        return self.mu + 1 if self.a else 0
+
+
+@dataclass(frozen=True, eq=False)
+class StrangenessFree:
+    """E1 x' = A1 x + f1 (d rows) and 0 = A2 x + f2 (a rows) at N times.
+
+    The matrices have a leading axis of 1 when E and A are constant.
+    """
+
+    E1: Array
+    A1: Array
+    f1: Array  # (N, d)
+    A2: Array
+    f2: Array  # (N, a)
+    u: Array  # (N, m) the inputs and
+    C: Array  # (N, r, n) the output matrix at the same times
+
+    def stacked(self) -> tuple[Array, Array, Array]:
+        """Ê, Â of shape (N or 1, n, n) and f̂ (N, n) of Ê x' = Â x + f̂."""
+        E = np.concatenate([self.E1, np.zeros_like(self.A2)], axis=1)
+        A = np.concatenate([self.A1, self.A2], axis=1)
+        return E, A, np.concatenate([self.f1, self.f2], axis=1)
+
+
+def forcing(c: Coefficients, theta: Array) -> Array:
+    """Taylor coefficients of f = B u + F θ, shape (K + 1, N, n)."""
+    orders = len(c.E)
+    f = c.F @ theta
+    for k in range(orders):
+        for i in range(k + 1):
+            f[k] += np.einsum("nij,nj->ni", c.B[i], c.u[k - i])
+    return np.asarray(f)
+
+
+def scaled(c: Coefficients, s: Scaling) -> tuple[Array, Array]:
+    """Taylor coefficients of E and A in scaled rows, states and time."""
+    powers = s.time ** np.arange(len(c.E), dtype=np.float64)[:, None, None, None]
+    weight = s.rows[:, None] * s.columns
+    return c.E * weight * powers / s.time, c.A * weight * powers
+
+
+def derivative_array(e: Array, a: Array, mu: int) -> tuple[Array, Array]:
+    """M (N, (μ+1) n, (μ+1) n) and N (N, (μ+1) n, n) from Taylor coefficients (K + 1, N, n, n)."""
+    count, n = e.shape[1], e.shape[2]
+    M = np.zeros((count, mu + 1, n, mu + 1, n))
+    for i in range(mu + 1):
+        for j in range(i + 1):
+            M[:, i, :, j] = (j + 1) * e[i - j]
+            if i - j - 1 >= 0:
+                M[:, i, :, j] -= a[i - j - 1]
+    N = np.moveaxis(a[: mu + 1], 0, 1).reshape(count, (mu + 1) * n, n)
+    return M.reshape(count, (mu + 1) * n, (mu + 1) * n), N
+
+
+def balance(system: DescriptorSystem, t: Array) -> Scaling:
+    """Scalings that bring the rows and columns of E/τ and A to comparable size over time."""
+    c = system.coefficients.taylor(t, 0)
+    E, A = np.abs(c.E[0]).max(axis=0), np.abs(c.A[0]).max(axis=0)
+    rows, columns, tau = np.ones(system.n), np.ones(system.n), 1.0
+    if not E.any() or not A.any():
+        tau = 1.0
+    for _ in range(4):
+        weight = rows[:, None] * columns
+        if E.any() and A.any():
+            tau = float(np.linalg.norm(E * weight) / np.linalg.norm(A * weight))
+        W = E / tau + A
+        rows = _reciprocal((W * columns).max(axis=1))
+        columns = _reciprocal((W * rows[:, None]).max(axis=0))
+    return Scaling(_power_of_two(rows), _power_of_two(columns), float(_power_of_two(np.array(tau))))
+
+
+def _reciprocal(x: Array) -> Array:
+    return np.where(x > 0, 1.0 / np.where(x > 0, x, 1.0), 1.0)
+
+
+def _power_of_two(x: Array) -> Array:
+    return np.asarray(np.exp2(np.rint(np.log2(x))))
+
+
+def analyse(
+    system: DescriptorSystem, start: float, stop: float, *, max_mu: int, rank_tol: float
+) -> Structure:
+    """Find the smallest μ for which the system is strangeness-free after μ differentiations.
+
+    Three ranks decide (Kunkel & Mehrmann, Hypothesis 3.48): that of M, that of the constraints
+    Â2 = Z2ᵀN, and that of E on their kernel. Each must be the same at every time; between the
+    probes, singular values that dip are followed to the bottom.
+
+    Raises:
+        ModelError: no μ ≤ ``max_mu`` does it, or a rank changes; names the time and the values.
+    """
+    t = _probe_times(system, start, stop)
+    scaling = balance(system, t)
+    invariant = {"E", "A"} <= system.coefficients.constant
+    if invariant:
+        t = t[:1]
+    reason = ""
+    for mu in range(max_mu + 1):
+        levels = _levels(system, t, mu, scaling, rank_tol)
+        if levels.failure:
+            reason = levels.failure
+            continue
+        if not invariant:
+            _follow_dips(system, t, levels, mu, scaling, rank_tol)
+        return Structure(
+            mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
+            smallest_singular_value=float(levels.smallest.min()), time_invariant=invariant,
+            reference=_reference(
+                system, t[len(t) // 2 : len(t) // 2 + 1], mu, levels.a, scaling, invariant
+            ),
+        )
+    raise ModelError(
+        f"{_who(system)} is not uniquely solvable, or its index is above {max_mu + 1}: with "
+        f"{max_mu} differentiations {reason}"
+    )
+
+
+def _who(system: DescriptorSystem) -> str:
+    return f"plant {system.name}" + (f" ({system.source})" if system.source else "")
+
+
+def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
+    """Interior times, none of them special: equal spacing would hit the zeros of sin(k π t)."""
+    golden = (np.arange(1, _PROBES + 1) * 0.6180339887498949) % 1.0
+    t = start + (stop - start) * np.sort(np.concatenate([[1e-3, 1.0 - 1e-3], golden]))
+    cuts = np.concatenate([[start], system.coefficients.breakpoints(start, stop), [stop]])
+    middles = 0.5 * (cuts[:-1] + cuts[1:])  # no piece between jumps goes unprobed
+    return np.unique(np.concatenate([t, middles])) if len(middles) > 1 else t
+
+
+@dataclass(frozen=True, eq=False)
+class _Levels:
+    """Singular values that must stay away from zero, or why this μ will not do."""
+
+    a: int
+    smallest: Array  # (N, 3) of M, Â2 and E T2, relative to the size of their factors
+    failure: str
+
+
+def _levels(
+    system: DescriptorSystem, t: Array, mu: int, scaling: Scaling, rank_tol: float,
+    a: int | None = None,
+) -> _Levels:
+    """Ranks at the times t; with ``a`` given, the singular values that belong to that rank."""
+    n = system.n
+    e, aa = scaled(system.coefficients.taylor(t, mu), scaling)
+    M, N = derivative_array(e, aa, mu)
+    U, sigma, _ = np.linalg.svd(M)
+    size = sigma[:, :1]
+    # The size of what M was made from: with E = 0 the derivative array is still judged against A.
+    size = np.maximum(size, np.abs(aa).max(axis=(0, 2, 3))[:, None])
+    relative = sigma / size
+    smallest = np.full((len(t), 3), np.inf)
+    if a is None:
+        ranks = (relative > rank_tol).sum(axis=1)
+        if (ranks != ranks[0]).any():
+            k = int(np.argmax(ranks != ranks[0]))
+            return _Levels(0, smallest, _changes("the derivative array", ranks, k, t, relative[k]))
+        a = (mu + 1) * n - int(ranks[0])
+    if a > n:
+        return _Levels(
+            a, smallest, f"{a} constraints appear for {n} states (t = {t[0]:.6g})"
+        )
+    r = M.shape[1] - a
+    if r:
+        smallest[:, 0] = relative[:, r - 1]
+    A2 = transpose(U[:, :, r:]) @ N
+    _, s2, V2 = np.linalg.svd(A2)
+    s2 = s2 / np.maximum(np.linalg.norm(N, axis=(1, 2)), np.finfo(float).tiny)[:, None]
+    if a:
+        smallest[:, 1] = s2[:, -1]
+    T2 = transpose(V2)[:, :, a:]
+    s3 = np.linalg.svd(e[0] @ T2, compute_uv=False)
+    s3 = s3 / np.maximum(np.linalg.norm(e[0], axis=(1, 2)), np.finfo(float).tiny)[:, None]
+    if a < n:
+        smallest[:, 2] = s3[:, -1]
+    for column, what in ((1, "constraints are linearly dependent"),
+                         (2, "some states are in no equation's derivative and in no constraint")):
+        bad = smallest[:, column] <= rank_tol
+        if bad.any():
+            k = int(np.argmax(bad))
+            return _Levels(
+                a, smallest, f"{what} at t = {t[k]:.6g} (singular value {smallest[k, column]:.1e})"
+            )
+    return _Levels(a, smallest, "")
+
+
+def _changes(what: str, ranks: Array, k: int, t: Array, sigma: Array) -> str:
+    border = min(int(ranks[k]), int(ranks[0]))
+    return (
+        f"the rank of {what} changes from {ranks[0]} at t = {t[0]:.6g} to {ranks[k]} at "
+        f"t = {t[k]:.6g} (singular value {sigma[border]:.1e})"
+    )
+
+
+def _follow_dips(
+    system: DescriptorSystem, t: Array, levels: _Levels, mu: int, scaling: Scaling,
+    rank_tol: float,
+) -> None:
+    """Follow local minima of the decisive singular values between the probes.
+
+    A rank that drops at an isolated time is never hit by a grid: |sin t| is 1e-2 at the nearest
+    probe and looks harmless. Each deep local minimum is bracketed and cut by 8 per round; a value
+    that shrinks with its bracket all the way to rank_tol is a rank change.
+    """
+    names = ("derivative array", "constraints", "differential part")
+    for column in range(3):
+        values = levels.smallest[:, column]
+        if not np.isfinite(values).all():
+            continue
+        padded = np.concatenate([[np.inf], values, [np.inf]])
+        is_minimum = (values <= padded[:-2]) & (values <= padded[2:])
+        deep = np.flatnonzero(is_minimum & (values < _DIP * values.max()))
+        for k in deep[np.argsort(values[deep])][:6]:
+            left, right = t[max(k - 1, 0)], t[min(k + 1, len(t) - 1)]
+            lowest, where = values[k], t[k]
+            for _ in range(_DIP_ROUNDS):
+                grid = np.linspace(left, right, _DIP_POINTS)
+                found = _levels(system, grid, mu, scaling, rank_tol, levels.a)
+                line = found.smallest[:, column]
+                best = int(np.argmin(line))
+                shrinking = line[best] < 0.5 * lowest
+                lowest, where = min(lowest, line[best]), grid[best]
+                left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+                if lowest <= rank_tol or not shrinking:
+                    break
+            if lowest <= max(rank_tol, 1e-9):
+                raise ModelError(
+                    f"{_who(system)}: the rank of the {names[column]} changes at t = {where:.9g} "
+                    f"(singular value {lowest:.1e}); choose a horizon that avoids this time"
+                )
+
+
+def _reference(
+    system: DescriptorSystem, t: Array, mu: int, a: int, scaling: Scaling, invariant: bool
+) -> Pivots | Bases:
+    e, aa = scaled(system.coefficients.taylor(t, mu), scaling)
+    M, N = derivative_array(e, aa, mu)
+    r = M.shape[1] - a
+    Z2 = np.linalg.svd(M[0])[0][:, r:]
+    T2 = np.linalg.svd(Z2.T @ N[0])[2][a:].T
+    Z1 = np.linalg.svd(e[0, 0] @ T2, full_matrices=False)[0]
+    if invariant:
+        return Bases(Z1[None], Z2[None])
+    rows = np.sort(_independent_rows(M[0], r))
+    columns = np.sort(_independent_rows(M[0, rows].T, r))
+    rest = np.setdiff1d(np.arange(len(M[0])), rows)
+    return Pivots(rows, rest, columns, Z1)
+
+
+def _independent_rows(matrix: Array, count: int) -> IntArray:
+    """Indices of ``count`` rows by QR with pivoting: each time the largest remaining row."""
+    left = matrix.copy()
+    chosen = np.empty(count, dtype=np.intp)
+    for k in range(count):
+        sizes = np.einsum("ij,ij->i", left, left)
+        chosen[k] = np.argmax(sizes)
+        direction = left[chosen[k]] / np.sqrt(sizes[chosen[k]])
+        left = left - np.outer(left @ direction, direction)
+        left[chosen[: k + 1]] = 0.0
+    return chosen
+
+
+_MAX_GROWTH = 1e2  # of the elimination; beyond it singular vectors are computed instead
+_RESIDUAL = 1e-13  # rows that should vanish after elimination, relative to the array
+
+
+def reduce(
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array, theta: Array
+) -> StrangenessFree:
+    """The strangeness-free equations at the times t (N,), one sweep over all of them.
+
+    Elimination on the pivots of one reference time where that is well conditioned, singular
+    vectors at the times where it is not.
+
+    Raises:
+        ModelError: a rank differs from that of ``structure``; names the time.
+    """
+    mu, scaling = structure.mu, structure.scaling
+    c = system.coefficients.taylor(t, mu, inside)
+    f = forcing(c, theta)
+    count = slice(0, 1) if structure.time_invariant else slice(None)
+    E, A = c.E[:, count], c.A[:, count]
+    e, aa = scaled(Coefficients(E, A, c.B, c.F, c.C, c.u), scaling)
+    M, N = derivative_array(e, aa, mu)
+    reference = structure.reference
+    if isinstance(reference, Bases):
+        Z1, Z2, poor = reference.Z1, reference.Z2, np.zeros(1, dtype=bool)
+    else:
+        Z1, Z2, poor = _by_elimination(structure, reference, e[0], M, N)
+    if poor.any():
+        Z1[poor], Z2[poor] = _by_singular_vectors(
+            system, structure, e[0][poor], M[poor], N[poor], t[count][poor]
+        )
+    # Back to the model's own states: only rows stay scaled, and row scalings do not matter.
+    W1 = transpose(Z1) * scaling.rows
+    weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows  # of g = (f_0, …, f_mu)
+    g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1)
+    return StrangenessFree(
+        E1=W1 @ E[0],
+        A1=W1 @ A[0],
+        f1=_apply(W1, f[0]),
+        A2=transpose(Z2) @ N / scaling.columns,
+        f2=_apply(transpose(Z2), g),
+        u=c.u[0],
+        C=c.C[0],
+    )
+
+
+def _by_elimination(
+    structure: Structure, pivots: Pivots, E: Array, M: Array, N: Array
+) -> tuple[Array, Array, BoolArray]:
+    """Z1 (N, n, d), Z2 (N, (μ+1) n, a) on the reference pivots, and where they will not do."""
+    count = len(M)
+    rows, rest, columns = pivots.rows, pivots.rest, pivots.columns
+    Z1 = np.repeat(pivots.Z1[None], count, axis=0)
+    Z2 = np.zeros((count, M.shape[1], structure.a))
+    if structure.a == 0:
+        return Z1, Z2, np.zeros(count, dtype=bool)
+    kept = M[:, rows]
+    try:
+        solved = np.asarray(
+            np.linalg.solve(transpose(kept[:, :, columns]), transpose(M[:, rest][:, :, columns])),
+            dtype=np.float64,
+        )
+    except np.linalg.LinAlgError:
+        return Z1, Z2, np.ones(count, dtype=bool)
+    X = transpose(solved)
+    Z2[:, rows] = -solved
+    Z2[:, rest] = np.eye(structure.a)
+    size = np.abs(M).max(axis=(1, 2), initial=0.0)
+    residual = np.abs(M[:, rest] - X @ kept).max(axis=(1, 2), initial=0.0)
+    whole = np.concatenate([transpose(Z1) @ E, transpose(Z2) @ N], axis=1)
+    scale = np.abs(whole).max(axis=2, keepdims=True)
+    whole = whole / np.maximum(scale, np.finfo(float).tiny)
+    try:
+        growth = np.abs(np.linalg.inv(whole)).max(axis=(1, 2))
+    except np.linalg.LinAlgError:
+        return Z1, Z2, np.ones(count, dtype=bool)
+    grows = np.abs(X).max(axis=(1, 2), initial=0.0)
+    poor = (residual > _RESIDUAL * size) | (grows > _MAX_GROWTH) | (growth > _MAX_GROWTH)
+    return Z1, Z2, poor | ~np.isfinite(growth)
+
+
+def _by_singular_vectors(
+    system: DescriptorSystem, structure: Structure, E: Array, M: Array, N: Array, t: Array
+) -> tuple[Array, Array]:
+    """Orthonormal Z1 and Z2 at times where the reference pivots will not do."""
+    a = structure.a
+    r = M.shape[1] - a
+    U, sigma, _ = np.linalg.svd(M)
+    _check_gap(system, structure, sigma, r, t)
+    Z2 = U[:, :, r:]
+    T2 = transpose(np.linalg.svd(transpose(Z2) @ N)[2])[:, :, a:]
+    return np.linalg.svd(E @ T2, full_matrices=False)[0], Z2
+
+
+def _apply(matrix: Array, vectors: Array) -> Array:
+    """matrix (N or 1, i, j) times vectors (N, j)."""
+    return np.asarray(np.matmul(matrix, vectors[:, :, None])[:, :, 0])
+
+
+def _check_gap(
+    system: DescriptorSystem, structure: Structure, sigma: Array, r: int, t: Array
+) -> None:
+    size = sigma[:, 0]
+    zero = sigma[:, r] > 1e3 * structure.rank_tol * size
+    lost = sigma[:, r - 1] <= structure.rank_tol * size if r else np.zeros(len(sigma), bool)
+    bad = zero | lost
+    if bad.any():
+        k = int(np.argmax(bad))
+        value = sigma[k, r] if zero[k] else sigma[k, r - 1]
+        raise ModelError(
+            f"{_who(system)}: the rank of the derivative array changes near t = {t[k]:.9g} "
+            f"(singular value {value / size[k]:.1e})"
+        )

@@ -1,0 +1,113 @@
+"""The independent path: the same linear problems through ``scipy.integrate.solve_ivp``.
+
+It shares with the collocation engine nothing but the mesh on which results are stored: another
+integrator (DOP853), and for the plant another reduction (the underlying ODE instead of the
+strangeness-free equations). It exists to check the engine, and is selected by ``solver=ivp``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+
+import numpy as np
+
+from gpebo_cli.collocation.linear import LinearProblem, LinearSolution, unresolved_signals
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.errors import SolverError
+from gpebo_cli.simulation.derivative_array import Structure, derivative_array, forcing, scaled
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+
+_MAX_ROUNDS = 12
+
+
+def underlying_ode(
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array, theta: Array
+) -> tuple[Array, Array]:
+    """x' = A x + f from one differentiation more than the strangeness index.
+
+    The derivative array of order μ + 1 determines x_1 = x' uniquely (it is 1-full), so the first
+    n rows of its minimum-norm solution are the ODE. Solutions drift off the constraints slowly;
+    the tolerance of the check is chosen accordingly.
+
+    Returns:
+        A (N, n, n) and f (N, n).
+    """
+    mu, n = structure.mu + 1, system.n
+    c = system.coefficients.taylor(t, mu, inside)
+    scaling = structure.scaling
+    M, N = derivative_array(*scaled(c, scaling), mu)
+    weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
+    g = np.moveaxis(forcing(c, theta) * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
+    inverse = np.linalg.pinv(M, rcond=structure.rank_tol)[:, :n]
+    # Back from x̃ = x/columns and time t/τ.
+    back = scaling.columns[:, None] / scaling.time
+    return back * (inverse @ N) / scaling.columns, (back * (inverse @ g))[:, :, 0]
+
+
+def solve(
+    problem: LinearProblem,
+    mesh: Mesh,
+    *,
+    tol: float,
+    max_elements: int,
+    restarts: Mapping[float, Callable[[Array], Array]] | None = None,
+) -> LinearSolution:
+    """Same meaning as :func:`gpebo_cli.collocation.linear.solve`, for E = I only.
+
+    Raises:
+        SolverError: solve_ivp gave up, or the mesh cannot resolve the result.
+    """
+    for rounds in range(1, _MAX_ROUNDS + 1):
+        values = _sample(problem, mesh, max(tol, 1e-13), restarts or {})
+        extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
+        extras = tuple(e.reshape(*mesh.points.shape, *e.shape[1:]) for e in extras)
+        tail = unresolved_signals(problem, mesh, values, extras)
+        poor = tail > 1e3 * tol  # its dense output is of lower order than its steps
+        if not poor.any():
+            estimate = float(max(tail.max(initial=0.0), 1e2 * tol))
+            return LinearSolution(Trajectory(mesh, values), estimate, rounds, extras)
+        if mesh.size + poor.sum() > max_elements:
+            break
+        mesh, _ = mesh.split(np.where(poor, 2, 1))
+    raise SolverError(
+        f"solver=ivp: the {problem.name} is not resolved to {tol:.1e} near "
+        f"t = {mesh.edges[int(np.argmax(tail))]:.6g}; loosen solver.tol or use solver=collocation"
+    )
+
+
+def _sample(
+    problem: LinearProblem, mesh: Mesh, tol: float,
+    restarts: Mapping[float, Callable[[Array], Array]],
+) -> Array:
+    """Integrate piece by piece between restarts, sampled at all points of the mesh."""
+    from scipy.integrate import solve_ivp
+
+    shape = problem.start.shape
+    values = np.empty((mesh.size, mesh.rule.stages + 1, *shape))
+    cuts = sorted({0, mesh.size, *(int(np.searchsorted(mesh.edges, t)) for t in restarts)})
+    state = problem.start
+    for first, last in pairwise(cuts):
+        left, right = mesh.edges[first], mesh.edges[last]
+        if first and float(left) in restarts:
+            state = restarts[float(left)](state)
+        margin = 1e-9 * (right - left)
+
+        def derivative(
+            t: float, x: Array, low: float = left + margin, high: float = right - margin
+        ) -> Array:
+            c = problem.coefficients(np.array([t]), np.array([min(max(t, low), high)]))
+            return np.asarray((c.A[0] @ x.reshape(shape) + c.f[0]).ravel())
+
+        t = mesh.points[first:last].ravel()
+        unique, where = np.unique(t, return_inverse=True)
+        solution = solve_ivp(
+            derivative, (left, right), state.ravel(), method="DOP853", t_eval=unique,
+            rtol=tol, atol=tol * 1e-2 * max(1e-3, float(np.abs(state).max())),
+        )
+        if not solution.success:
+            raise SolverError(f"solver=ivp: the {problem.name} failed: {solution.message}")
+        piece = solution.y.T[where].reshape(last - first, -1, *shape)
+        values[first:last] = piece
+        state = piece[-1, -1]
+    return values
