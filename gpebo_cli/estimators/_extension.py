@@ -1,0 +1,52 @@
+"""Dynamic regressor extension: from one row of ψ to a square system Ω η = 𝒴."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpebo_cli.collocation.mesh import Trajectory, unresolved
+from gpebo_cli.regression import LinearRegression
+from gpebo_cli.systems.descriptor import Array
+
+_TOLERANCE = 1e-11
+_ROUNDS = 30
+
+
+def kreisselmeier(regression: LinearRegression, rates: Array) -> Trajectory:
+    """[Ω | 𝒴] of shape (p, p + 1) with Ω' = −Λ(Ω − ψᵀψ), 𝒴' = −Λ(𝒴 − ψᵀY), zero start.
+
+    Λ = diag(``rates``): one filter λ_i/(p + λ_i) per row, as in the paper (Section V); all rates
+    equal is the classical extension. Since Λ multiplies rows, Ω η = 𝒴 holds for any rates.
+    """
+    return resolved_low_pass(regression.outer, rates[:, None])
+
+
+def resolved_low_pass(signal: Trajectory, rate: Array) -> Trajectory:
+    """``signal.low_pass(rate)`` on a mesh fine enough for the filter's own transient."""
+    tail = np.zeros(0)
+    for _ in range(_ROUNDS):
+        filtered = signal.low_pass(rate)
+        flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
+        tail = unresolved(flat, signal.mesh.rule)
+        poor = tail > _TOLERANCE
+        smallest = 1e-13 * max(1.0, float(np.abs(signal.mesh.edges).max()))
+        poor &= signal.mesh.steps * np.max(rate) > 0.5  # else it is the signal, not the filter
+        poor &= signal.mesh.steps > smallest
+        if not poor.any():
+            break
+        finer, _ = signal.mesh.split(np.where(poor, 4, 1))
+        points, inside = finer.points.ravel(), finer.inside.ravel()
+        values = signal(points, inside).reshape(*finer.points.shape, *signal.values.shape[2:])
+        signal = Trajectory(finer, values)
+    return filtered
+
+
+def lion(regression: LinearRegression, rates: Array) -> Trajectory:
+    """[Ω | 𝒴] of shape (p, p + 1), row i being λ_i/(p + λ_i) of one row of [ψ | Y].
+
+    Row i takes row i mod r of the regression: with one output every row is a filtered copy of the
+    same ψ, and rates must differ for Ω to be invertible.
+    """
+    both = np.concatenate([regression.psi.values, regression.Y.values[..., None]], axis=-1)
+    rows = np.arange(regression.p) % both.shape[2]
+    return resolved_low_pass(Trajectory(regression.mesh, both[:, :, rows]), rates[:, None])

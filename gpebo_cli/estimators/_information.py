@@ -1,0 +1,122 @@
+"""Least squares in information form, with and without forgetting.
+
+The covariance F of least squares, F' = −α F ψᵀψ F + β F with F(0) = I/f₀, is never integrated:
+its inverse is linear. With the memory z = e^{−∫β} and
+
+    G_z(t) = ∫ (z(t)/z(s)) ψᵀψ ds,      h_z(t) = ∫ (z(t)/z(s)) ψᵀY ds
+
+    F⁻¹ = z f₀ I + α G_z,      η̂ = F (z f₀ η̂₀ + α h_z).
+
+For β = 0, z = 1 and these are the Gram matrix and ∫ψᵀY: regularised batch least squares.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.collocation.mesh import Trajectory
+from gpebo_cli.errors import SolverError
+from gpebo_cli.estimators._extension import resolved_low_pass
+from gpebo_cli.regression import LinearRegression
+from gpebo_cli.systems.descriptor import Array
+
+_PICARD_ROUNDS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """G_z and h_z with their memory z, on a mesh."""
+
+    gram: Trajectory  # [G_z | h_z], shape (p, p + 1)
+    memory: Trajectory  # z, scalar
+
+    def spectrum(self, t: Array, inside: Array | None = None) -> Spectrum:
+        """G_z = V diag(λ) Vᵀ at the times t (M,)."""
+        sampler = self.gram.mesh.sampler(t, inside)
+        values = sampler(self.gram.values)
+        eigenvalues, vectors = np.linalg.eigh(values[..., :-1])
+        rotated = np.einsum("...ji,...j->...i", vectors, values[..., -1])
+        return Spectrum(np.maximum(eigenvalues, 0.0), vectors, rotated, sampler(self.memory.values))
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """G_z = V diag(λ) Vᵀ and Vᵀh_z at M times."""
+
+    eigenvalues: Array  # (M, p) ascending
+    vectors: Array  # (M, p, p)
+    rotated: Array  # (M, p) Vᵀ h_z
+    memory: Array  # (M,) z
+
+
+def information(
+    regression: LinearRegression, alpha: float, f0: float, beta: float, bound: float | None
+) -> Information:
+    """G_z, h_z and z for one set of gains.
+
+    Args:
+        regression: Y = ψη.
+        alpha: α > 0, matters only with a bound.
+        f0: f₀ > 0, matters only with a bound.
+        beta: forgetting rate, β₀ ≥ 0.
+        bound: M of β = β₀ (1 − ‖F‖/M), at least 1/f₀; None: constant β = β₀.
+    """
+    if beta == 0.0:
+        ones = np.ones(regression.outer.values.shape[:2])
+        return Information(regression.gram, Trajectory(regression.mesh, ones))
+    if bound is None:
+        filtered = resolved_low_pass(regression.outer, np.array(beta))  # β ∫ e^{−β(t−s)} (·) ds
+        mesh = filtered.mesh
+        memory = np.exp(-beta * (mesh.points - mesh.edges[0]))
+        return Information(
+            Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory)
+        )
+    return _bounded(regression, alpha, f0, beta, bound)
+
+
+def _bounded(
+    regression: LinearRegression, alpha: float, f0: float, beta0: float, bound: float
+) -> Information:
+    """Forgetting that stops where ‖F‖ reaches the bound: β = β₀ (1 − ‖F‖/M).
+
+    ‖F‖ = 1/λ_min(F⁻¹) depends on the past of β, so elements are solved one after the other, each
+    by fixed-point iteration on β at its nodes; the map contracts with the element's length.
+    """
+    outer = regression.outer
+    mesh = outer.mesh
+    longest = 0.25 / beta0
+    parts = np.maximum(1, np.ceil(mesh.steps / longest)).astype(np.intp)
+    if (parts > 1).any():
+        finer, _ = mesh.split(parts)
+        values = outer(finer.points.ravel(), finer.inside.ravel())
+        outer = Trajectory(finer, values.reshape(*finer.points.shape, *outer.values.shape[2:]))
+        mesh = finer
+    R, p = mesh.rule.integration, regression.p
+    gram, memory = np.empty_like(outer.values), np.empty(outer.values.shape[:2])
+    G, z = np.zeros(outer.values.shape[2:]), 1.0
+    eye = f0 * np.eye(p)
+    for k, h in enumerate(mesh.steps):
+        gram[k, 0], memory[k, 0] = G, z
+        added = outer.values[k, 1:]
+        beta = np.zeros(len(R))
+        for _ in range(_PICARD_ROUNDS):
+            decay = np.exp(-h * (R @ beta))[:, None, None]  # z(t_i)/z(left)
+            nodes = decay * (G + h * np.tensordot(R, added / decay, axes=1))
+            inverse = z * decay * eye + alpha * nodes[..., :p]
+            size = 1.0 / np.linalg.eigvalsh(inverse)[:, 0]
+            update = beta0 * (1.0 - size / bound)
+            change = float(np.abs(update - beta).max())
+            beta = update
+            if change <= 1e-13 * beta0:
+                break
+        else:
+            raise SolverError(
+                f"least squares with forgetting does not settle near t = {mesh.edges[k]:.6g}; "
+                "lower estimator.beta"
+            )
+        decay = np.exp(-h * (R @ beta))
+        gram[k, 1:], memory[k, 1:] = nodes, z * decay
+        G, z = nodes[-1], z * decay[-1]
+    return Information(Trajectory(mesh, gram), Trajectory(mesh, memory))

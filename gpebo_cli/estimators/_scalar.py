@@ -1,0 +1,172 @@
+"""The scalar law of DREM, η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i), for any number of gains at once.
+
+In the variable I = ∫Δ² and with η̄ = 𝐘/Δ the law is dη̂/dI = γ (η̄ − η̂). Without noise η̄ is
+constant and the law has the closed form η̂ = η̄ + e^{−γI} (η̂(0) − η̄): exact at any gain, one
+exponential per gain and time. With noise or forgetting η̄ varies, and where Δ changes sign it has
+poles that the law itself does not have; then the law is integrated as it stands, by the same
+L-stable collocation as everything else, all gains as one batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.collocation.mesh import Mesh, Trajectory, unresolved
+from gpebo_cli.errors import SolverError
+from gpebo_cli.linalg import affine_scan
+from gpebo_cli.systems.descriptor import Array
+
+# (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p)
+MixedSignals = Callable[[Array, Array], tuple[Array, Array]]
+
+# Relative variation of η̄, weighted by what it can do: below the first η̄ counts as constant, below
+# the second as linear in I between neighbouring points, which is then accurate enough.
+_CONSTANT, _SMALL = 1e-13, 1e-8
+_TOLERANCE = 1e-10
+_MAX_ELEMENTS = 100_000
+_MAX_PARTS = 8
+_LANES = 1 << 22  # numbers in one batch of gains
+
+
+@dataclass(frozen=True, eq=False)
+class ScalarPath:
+    """The mixed regression along the points of a mesh, and the times at which to report."""
+
+    mesh: Mesh
+    signals: MixedSignals
+    quotient: Array  # (K, s + 1, p) η̄, usable everywhere
+    energy: Array  # (K, s + 1) I
+    t: Array  # (M,)
+    energy_at_t: Array  # (M,)
+
+
+def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
+    """Estimates at the times of the path.
+
+    Args:
+        path: the mixed regression.
+        start: η̂ at the start, shape (p,).
+        gains: γ, shape (g, p) or (g, 1).
+
+    Returns:
+        η̂, shape (g, M, p).
+
+    Raises:
+        SolverError: the law cannot be resolved.
+    """
+    length = np.maximum(np.diff(path.energy, axis=1), 0.0)
+    weight = np.minimum(1.0, float(gains.max(initial=0.0)) * length)
+    change = np.diff(path.quotient, axis=1)
+    size = max(float(np.abs(path.quotient[-1]).max(initial=0.0)), float(np.abs(start).max()))
+    variation = float((weight[..., None] * np.abs(change)).max(initial=0.0))
+    if variation <= _CONSTANT * size:
+        final = path.quotient[-1, -1]
+        decay = np.exp(-gains[:, None, :] * path.energy_at_t[:, None])  # (g, M, p or 1)
+        return np.asarray(final + decay * (start - final))
+    if variation <= _SMALL * size:
+        return _closed_form(path, length, change, start, gains)
+    lanes = path.mesh.points.size * path.quotient.shape[2] * path.mesh.rule.stages
+    batch = max(1, _LANES // lanes)
+    return np.concatenate(
+        [_integrate(path, start, gains[i : i + batch]) for i in range(0, len(gains), batch)]
+    )
+
+
+def _closed_form(
+    path: ScalarPath, length: Array, change: Array, start: Array, gains: Array
+) -> Array:
+    """η̄ linear in I between neighbouring points: what little it varies is second order.
+
+    A step x = γ δI of the distance ε = η̂ − η̄, which stays accurate after convergence, is
+    ε₊ = e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄).
+    """
+    s, p = change.shape[1:]
+    x = gains * length.reshape(-1, 1, 1)  # (N, g, p or 1)
+    following = np.concatenate([path.quotient[1:, 0], path.quotient[-1:, -1]])
+    jump = np.zeros_like(change)  # of η̄ between elements; η̂ is continuous
+    jump[:, -1] = following - path.quotient[:, -1]
+    left = path.quotient[:, :-1].reshape(-1, 1, p)
+    change = change.reshape(-1, 1, p)
+    shift = -_mean_decay(x) * change - jump.reshape(-1, 1, p)
+    distance = affine_scan(np.exp(-x), shift, start - left[0])[:-1]  # at each left end
+
+    sampler = path.mesh.sampler(path.t)
+    element = sampler.element
+    local = (path.t - path.mesh.edges[element]) / path.mesh.steps[element]
+    index = np.clip(np.searchsorted(path.mesh.rule.points, local, side="right") - 1, 0, s - 1)
+    n = element * s + index
+    step = length[element, index]
+    partial = np.clip(path.energy_at_t - path.energy[element, index], 0.0, step)
+    share = np.divide(partial, step, out=np.zeros_like(partial), where=step > 0)[:, None, None]
+    x = gains * partial[:, None, None]
+    eta = left[n] + np.exp(-x) * distance[n] + share * (1.0 - _mean_decay(x)) * change[n]
+    return np.ascontiguousarray(np.swapaxes(eta, 0, 1))
+
+
+def _mean_decay(x: Array) -> Array:
+    """(1 − e^{−x})/x and its limit 1."""
+    return np.divide(-np.expm1(-x), x, out=np.ones_like(x), where=x > 0.0)
+
+
+def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
+    """The law on a mesh refined until every gain of the batch is resolved."""
+    mesh, p, g = path.mesh, path.quotient.shape[2], len(gains)
+    while True:
+        delta, Y = path.signals(mesh.points.ravel(), mesh.inside.ravel())
+        delta, Y = delta.reshape(mesh.points.shape), Y.reshape(*mesh.points.shape, p)
+        values = _solve_batch(mesh, delta, Y, start, gains)  # (K, s + 1, g, p)
+        tail = unresolved(values.reshape(*values.shape[:2], g * p), mesh.rule)
+        poor = tail > _TOLERANCE
+        # The signals themselves are known to about 1e-12 of their size; nothing is gained below
+        # steps at which they do not change.
+        poor &= mesh.steps > 1e-12 * np.maximum(np.abs(mesh.edges[1:]), mesh.steps.max())
+        if not poor.any():
+            sampled = mesh.sampler(path.t)(values)
+            return np.ascontiguousarray(np.swapaxes(sampled, 0, 1))
+        parts = np.ones(mesh.size, dtype=np.intp)
+        wanted = 1.25 * (tail[poor] / _TOLERANCE) ** (1.0 / mesh.rule.stages)
+        parts[poor] = np.clip(np.ceil(wanted), 2, _MAX_PARTS).astype(np.intp)
+        if parts.sum() > _MAX_ELEMENTS:
+            raise SolverError(
+                f"the estimator is not resolved near t = {mesh.edges[int(np.argmax(tail))]:.6g} "
+                f"with {_MAX_ELEMENTS} elements; lower its gain"
+            )
+        mesh, _ = mesh.split(parts)
+
+
+def _solve_batch(mesh: Mesh, delta: Array, Y: Array, start: Array, gains: Array) -> Array:
+    """Collocation of η̂' = γΔ𝐘 − γΔ²η̂ for gains (g, p or 1): point values (K, s + 1, g, p)."""
+    rule, (g, lanes), p = mesh.rule, gains.shape, len(start)
+    h = mesh.steps[:, None, None]
+    rate = (h * (delta[:, 1:] ** 2)[:, None, :])[:, None] * gains[None, :, :, None]  # (K, g, l, s)
+    operator = np.broadcast_to(
+        rule.differentiation, (mesh.size, g, lanes, rule.stages, rule.stages)
+    ).copy()
+    diagonal = np.arange(rule.stages)
+    operator[..., diagonal, diagonal] += rate
+    forcing = h * delta[:, 1:, None] * Y[:, 1:]  # (K, s, p)
+    per_lane = p // lanes  # parameters that share a gain
+    right = np.empty((mesh.size, g, lanes, rule.stages, 1 + per_lane))
+    right[..., 0] = rule.differentiation.sum(axis=1)
+    by_lane = forcing.reshape(mesh.size, rule.stages, lanes, per_lane)
+    right[..., 1:] = np.moveaxis(by_lane, 1, 2)[:, None] * gains[None, :, :, None, None]
+    solved = np.asarray(np.linalg.solve(operator, right), dtype=np.float64)
+    ends = solved[:, :, :, -1]  # (K, g, l, 1 + per_lane)
+    starts = affine_scan(ends[..., :1], ends[..., 1:], start.reshape(lanes, per_lane))[:-1]
+    values = np.empty((mesh.size, rule.stages + 1, g, lanes, per_lane))
+    values[:, 0] = starts
+    inner = solved[..., :1] * starts[:, :, :, None] + solved[..., 1:]  # (K, g, l, s, per_lane)
+    values[:, 1:] = np.moveaxis(inner, 3, 1)
+    return values.reshape(mesh.size, rule.stages + 1, g, p)
+
+
+def scalar_path(mesh: Mesh, signals: MixedSignals, delta: Array, quotient: Array, t: Array
+                ) -> ScalarPath:
+    """Prepare the law for Δ (K, s + 1) and η̄ (K, s + 1, p), reported at the times t (M,)."""
+    energy = np.maximum.accumulate(Trajectory(mesh, delta**2).integral().values.ravel())
+    energy = energy.reshape(delta.shape)
+    at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
+    return ScalarPath(mesh, signals, quotient, energy, t, at_t)

@@ -1,0 +1,86 @@
+"""Vector laws η̂' = Γ Mᵀ (b − N η̂), integrated so that no gain is too large."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
+from gpebo_cli.collocation.mesh import Trajectory
+from gpebo_cli.result import Requirement
+from gpebo_cli.systems.descriptor import Array
+
+_MAX_ELEMENTS = 200_000
+_TOLERANCE = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class VectorLaw:
+    """The signals M (k, p), N (k, p) and b (k,) of a law, packed as [Mᵀ ; N ; b] on one mesh."""
+
+    M: Trajectory
+    N: Trajectory
+    b: Trajectory
+
+    def solve(self, gains: Array, start: Array) -> Trajectory:
+        """η̂ (p,) for one gain vector Γ = diag(``gains``), shape (p,).
+
+        The residual ν = b − N η̂ is an unknown of its own:
+
+            η̂' = Γ Mᵀ ν,      0 = b − N η̂ − ν.
+
+        Eliminating it puts γ MᵀN into the matrix, whose rounding errors then drive the slow
+        directions: at γ = 1e14 nothing would be left of them. In this form the limit γ → ∞ is an
+        ordinary differential-algebraic equation.
+        """
+        mesh, p = self.M.mesh, len(start)
+        k = self.b.values.shape[2]
+        packed = Trajectory(
+            mesh,
+            np.concatenate([self.M.values, self.N.values, self.b.values[..., None]], axis=-1),
+        )
+        E = np.zeros((1, p + k, p + k))
+        E[0, :p, :p] = np.eye(p)
+
+        def coefficients(t: Array, inside: Array) -> Coefficients:
+            signals = packed(t, inside)
+            A = np.zeros((len(t), p + k, p + k))
+            A[:, :p, p:] = gains[:, None] * np.swapaxes(signals[:, :, :p], 1, 2)
+            A[:, p:, :p] = -signals[:, :, p : 2 * p]
+            A[:, p:, p:] = -np.eye(k)
+            f = np.zeros((len(t), p + k, 1))
+            f[:, p:, 0] = signals[:, :, -1]
+            return Coefficients(E, A, f)
+
+        first = packed.values[0, 0]
+        residual = first[:, -1] - first[:, p : 2 * p] @ start
+        problem = LinearProblem(
+            coefficients, np.concatenate([start, residual])[:, None], name="estimator"
+        )
+        solution = solve(problem, mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS)
+        trajectory = solution.trajectory
+        return Trajectory(trajectory.mesh, trajectory.values[:, :, :p, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class VectorEstimates:
+    """Estimates of a vector law, one integration per case when it is asked for."""
+
+    law: VectorLaw
+    start: Array  # (p,)
+    gains: Array  # (cases, p or 1)
+    t: Array  # (M,)
+    requirement: Requirement
+
+    def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
+        """Nothing is mixed."""
+        return
+
+    def parameters(self, cases: slice) -> Array:
+        """η̂ of some cases, shape (g, M, p)."""
+        p = len(self.start)
+        return np.array([
+            self.law.solve(np.broadcast_to(gain, (p,)), self.start)(self.t)
+            for gain in self.gains[cases]
+        ])

@@ -1,0 +1,44 @@
+"""DREM as in the paper: Kreisselmeier extension, mixing, scalar gradient laws (Section V)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from gpebo_cli.estimators._base import combinations
+from gpebo_cli.estimators._extension import kreisselmeier
+from gpebo_cli.estimators._mixed import MixedEstimates, estimate_mixed, gain_axis
+from gpebo_cli.regression import LinearRegression
+from gpebo_cli.systems.descriptor import Array
+
+
+@dataclass(frozen=True)
+class Drem:
+    """Kreisselmeier filters, mixing, and η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i).
+
+    Without noise η̃(t) = e^{−γ∫Δ²} η̃(0): it converges if and only if Δ is not square integrable.
+    Interval excitation alone is not enough, because the filters forget.
+
+    Attributes:
+        gamma: γ, a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
+            parameter (one gain each).
+        rates: λ of the filters, a number, one per parameter, or a mapping by parameter; None is
+            0.1, 0.2, 0.3, …, for three parameters the paper's choice.
+        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
+    """
+
+    gamma: object = 1e10
+    rates: object = field(default=None, metadata={"key": "lambda"})
+    initial: object = 0.0
+
+    @property
+    def cases(self) -> tuple[Mapping[str, float], ...]:
+        """One case per gain; a gain per parameter is one case."""
+        return combinations(gain_axis(self.gamma, "estimator.gamma"))
+
+    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
+        """Extend, mix, and keep what the closed form needs at the times t (M,)."""
+        return estimate_mixed(regression, t, kreisselmeier, self)
+
+
+ESTIMATOR = Drem

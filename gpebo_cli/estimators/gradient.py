@@ -1,0 +1,50 @@
+"""The classical gradient estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.collocation.mesh import Trajectory
+from gpebo_cli.estimators._base import combinations, per_parameter
+from gpebo_cli.estimators._mixed import gain_axis, gain_matrix
+from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
+from gpebo_cli.excitation import persistent
+from gpebo_cli.regression import LinearRegression
+from gpebo_cli.systems.descriptor import Array
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """η̂' = γ ψᵀ(Y − ψη̂): converges exponentially if and only if ψ is persistently exciting.
+
+    Attributes:
+        gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
+            parameter (one gain each).
+        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
+    """
+
+    gamma: object = 10.0
+    initial: object = 0.0
+
+    @property
+    def cases(self) -> tuple[Mapping[str, float], ...]:
+        """One case per gain; a gain per parameter is one case."""
+        return combinations(gain_axis(self.gamma, "estimator.gamma"))
+
+    def estimate(self, regression: LinearRegression, t: Array) -> VectorEstimates:
+        """Prepare the law; each case is integrated when it is asked for."""
+        information = Trajectory(regression.mesh, regression.outer.values[..., : regression.p])
+        gains = gain_matrix(self.gamma, regression.parameters, "estimator.gamma")
+        return VectorEstimates(
+            law=VectorLaw(regression.psi, regression.psi, regression.Y),
+            start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
+            gains=gains,
+            t=np.asarray(t),
+            requirement=persistent(information, float(gains.min())),
+        )
+
+
+ESTIMATOR = Gradient

@@ -1,0 +1,134 @@
+"""Least squares with or without forgetting, in information form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators._base import axis, combinations, number, per_parameter
+from gpebo_cli.estimators._information import Spectrum, information
+from gpebo_cli.regression import LinearRegression
+from gpebo_cli.result import Requirement
+from gpebo_cli.systems.descriptor import Array
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """η̂' = α F ψᵀ(Y − ψη̂), F' = −α F ψᵀψ F + β F, F(0) = I/f₀.
+
+    Without forgetting η̂ = (f₀ I + α G)⁻¹ (f₀ η̂₀ + α h): it converges as f₀/(α λ_min(G)).
+
+    Attributes:
+        alpha: α > 0; a number, a list, or ``logspace(a, b, n)``.
+        f0: f₀ > 0, likewise.
+        beta: forgetting rate ≥ 0, likewise; 0 remembers everything.
+        bound: M ≥ 1/f₀ of β (1 − ‖F‖/M), or None for constant forgetting.
+        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
+    """
+
+    alpha: object = 1.0
+    f0: object = 1e-6
+    beta: object = 0.0
+    bound: object = None
+    initial: object = 0.0
+
+    @property
+    def cases(self) -> tuple[Mapping[str, float], ...]:
+        """Every combination of α, f₀ and β."""
+        return combinations(self.axes())
+
+    def axes(self) -> dict[str, Sequence[float]]:
+        """The gains as axes, f₀ checked against the bound."""
+        axes: dict[str, Sequence[float]] = {
+            "alpha": axis(self.alpha, "estimator.alpha"),
+            "f0": axis(self.f0, "estimator.f0"),
+            "beta": axis(self.beta, "estimator.beta", positive=False),
+        }
+        if min(axes["beta"]) < 0:
+            raise ConfigError("estimator.beta: forgetting rates must be 0 or positive")
+        bound = self.covariance_bound
+        if bound is not None and bound < 1.0 / min(axes["f0"]):
+            raise ConfigError(
+                f"estimator.bound = {bound:g} is below 1/f0 = {1.0 / min(axes['f0']):g}, where the "
+                "covariance starts"
+            )
+        return axes
+
+    @property
+    def covariance_bound(self) -> float | None:
+        """M, or None."""
+        return None if self.bound is None else number(self.bound, "estimator.bound")
+
+    def spectra(self, regression: LinearRegression, t: Array) -> list[Spectrum]:
+        """The spectrum of G_z at the times t for every case, computed once where it is shared."""
+        bound = self.covariance_bound
+        made: dict[tuple[float, ...], Spectrum] = {}
+        out = []
+        for case in self.cases:
+            key: tuple[float, ...] = (case["beta"],)
+            if bound is not None and case["beta"] > 0:
+                key = (case["alpha"], case["f0"], case["beta"])
+            if key not in made:
+                info = information(regression, case["alpha"], case["f0"], case["beta"], bound)
+                made[key] = info.spectrum(t)
+            out.append(made[key])
+        return out
+
+    def estimate(self, regression: LinearRegression, t: Array) -> LeastSquaresEstimates:
+        """Everything but the gains, at the times t (M,)."""
+        return LeastSquaresEstimates(
+            self.cases,
+            self.spectra(regression, t),
+            per_parameter(self.initial, regression.parameters, "estimator.initial"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquaresEstimates:
+    """The regularised solution of every case."""
+
+    cases: tuple[Mapping[str, float], ...]
+    spectra: list[Spectrum]
+    start: Array  # (p,)
+
+    def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
+        """Nothing is mixed."""
+        return
+
+    @property
+    def requirement(self) -> Requirement:
+        """α λ_min(G)/f₀ at the horizon: the slowest direction's error has shrunk by 1 + that."""
+        ratios = [
+            case["alpha"] * float(s.eigenvalues[-1, 0]) / (case["f0"] * float(s.memory[-1]))
+            if s.memory[-1] > 0
+            else np.inf
+            for case, s in zip(self.cases, self.spectra, strict=True)
+        ]
+        reached = float(min(ratios))
+        return Requirement(
+            name="λ_min(G) → ∞",
+            holds=reached >= 99.0,
+            evidence={"alpha_lambda_min_over_f0": reached, "needed": 99.0},
+            text=f"α λ_min(G)/f₀ = {reached:.3g}; 1 % of the initial error needs 99",
+        )
+
+    def parameters(self, cases: slice) -> Array:
+        """η̂ of some cases, shape (g, M, p)."""
+        return np.array([
+            solution(spectrum, case["alpha"], case["f0"], self.start)
+            for case, spectrum in zip(self.cases[cases], self.spectra[cases], strict=True)
+        ])
+
+
+def solution(s: Spectrum, alpha: float, f0: float, start: Array) -> Array:
+    """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z) from the spectrum, shape (M, p)."""
+    weight = (s.memory * f0)[:, None]
+    rotated_start = np.einsum("mji,j->mi", s.vectors, start)
+    coordinates = (weight * rotated_start + alpha * s.rotated) / (weight + alpha * s.eigenvalues)
+    return np.asarray(np.einsum("mij,mj->mi", s.vectors, coordinates))
+
+
+ESTIMATOR = LeastSquares

@@ -1,0 +1,115 @@
+"""LS+DREM: least squares as the extension, so that interval excitation is enough.
+
+Ortega, Romero, Aranovskiy, Systems & Control Letters 169 (2022) 105377, cited by the paper as the
+estimator that Proposition 1 needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.estimators._base import combinations, per_parameter
+from gpebo_cli.estimators._information import Information, Spectrum, information
+from gpebo_cli.estimators._mixed import MixedEstimates, gain_axis, gain_matrix
+from gpebo_cli.estimators._mixing import SINGULAR, filled
+from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
+from gpebo_cli.estimators.least_squares import LeastSquares
+from gpebo_cli.regression import LinearRegression
+from gpebo_cli.systems.descriptor import Array, BoolArray
+
+
+@dataclass(frozen=True)
+class LsDrem:
+    """H = I − z f₀ F, Δ = det H, 𝐘 = adj(H)(ĝ − z f₀ F ĝ₀), then η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i).
+
+    ĝ and F are the estimate and the covariance of the least-squares part, z' = −βz its memory.
+    Without forgetting H = αG (f₀I + αG)⁻¹, so 0 ≤ Δ < 1 never falls and, once ψ was exciting,
+    Δ is not square integrable: a γ of order 1 does what 1e10 does behind fading filters.
+
+    Attributes:
+        gamma: γ; a number, a list, ``logspace(a, b, n)``, or a mapping by parameter.
+        alpha, f0, beta, bound: of the least-squares part, see ``least_squares``.
+        initial: η̂ (and ĝ) at the start.
+    """
+
+    gamma: object = 10.0
+    alpha: object = 1.0
+    f0: object = 1e-4
+    beta: object = 0.0
+    bound: object = None
+    initial: object = 0.0
+
+    @property
+    def least_squares(self) -> LeastSquares:
+        """The part that extends the regressor."""
+        return LeastSquares(self.alpha, self.f0, self.beta, self.bound, self.initial)
+
+    @property
+    def cases(self) -> tuple[Mapping[str, float], ...]:
+        """Every combination of α, f₀, β and γ, γ fastest."""
+        return combinations(
+            {**self.least_squares.axes(), **gain_axis(self.gamma, "estimator.gamma")}
+        )
+
+    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
+        """Mix every combination of α, f₀, β at the times t (M,)."""
+        part = self.least_squares
+        groups = tuple(
+            mix_least_squares(
+                information(
+                    regression, case["alpha"], case["f0"], case["beta"], part.covariance_bound
+                ),
+                case["alpha"], case["f0"], t,
+            )
+            for case in part.cases
+        )
+        return MixedEstimates(
+            groups=groups,
+            start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
+            gains=gain_matrix(self.gamma, regression.parameters, "estimator.gamma"),
+            condition="IE",
+        )
+
+
+def mix_least_squares(
+    info: Information, alpha: float, f0: float, t: Array
+) -> ScalarPath:
+    """The path of H = I − z f₀ F that the scalar law takes, reported at the times t (M,).
+
+    In the eigenbasis of G_z, H = diag(h_i) with h_i = αλ_i/(αλ_i + z f₀), without cancellation.
+    𝐘 = adj(H) F α h_z, because ĝ − z f₀ F ĝ₀ = F α h_z, and so 𝐘/Δ = G_z⁻¹ h_z.
+    """
+    mesh = info.gram.mesh
+
+    def signals(t: Array, inside: Array) -> tuple[Array, Array]:
+        s = info.spectrum(t, inside)
+        shares = _shares(s, alpha, f0)
+        others = np.stack(
+            [np.prod(np.delete(shares, i, axis=1), axis=1) for i in range(shares.shape[1])], axis=1
+        )
+        covariance = alpha / (alpha * s.eigenvalues + (s.memory * f0)[:, None])
+        Y = np.einsum("mij,mj->mi", s.vectors, others * covariance * s.rotated)
+        return np.prod(shares, axis=1), Y
+
+    s = info.spectrum(mesh.points.ravel(), mesh.inside.ravel())
+    usable: BoolArray = np.asarray(s.eigenvalues[:, 0] > SINGULAR * s.eigenvalues[:, -1])
+    inverse = np.divide(
+        s.rotated, s.eigenvalues, out=np.zeros_like(s.rotated), where=usable[:, None]
+    )
+    quotient = np.einsum("mij,mj->mi", s.vectors, inverse)  # 𝐘/Δ = G_z⁻¹ h_z
+    delta = np.prod(_shares(s, alpha, f0), axis=1)
+    shape = mesh.points.shape
+    quotient = filled(quotient.reshape(*shape, -1), usable.reshape(shape))
+    return scalar_path(mesh, signals, delta.reshape(shape), quotient, t)
+
+
+def _shares(s: Spectrum, alpha: float, f0: float) -> Array:
+    """Eigenvalues of H, shape (M, p): the share of each direction that the data decide."""
+    data = alpha * s.eigenvalues
+    return np.asarray(data / (data + (s.memory * f0)[:, None]))
+
+
+ESTIMATOR = LsDrem

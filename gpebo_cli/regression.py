@@ -1,0 +1,51 @@
+"""The linear regression Y = ψ η: what an observer hands to any estimator (paper, eq. lre)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.systems.descriptor import Array
+
+
+@dataclass(frozen=True, eq=False)
+class LinearRegression:
+    """Y (rows,) and ψ (rows, p) on one mesh, with the parameters' names.
+
+    ``scale`` is the size of the terms ψ was formed from, before they cancelled: a regressor of
+    1e-16 beside a scale of 1 is zero, whatever its eigenvalues say.
+    """
+
+    Y: Trajectory
+    psi: Trajectory
+    parameters: tuple[str, ...]
+    scale: float
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh of all signals."""
+        return self.psi.mesh
+
+    @property
+    def p(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    @cached_property
+    def outer(self) -> Trajectory:
+        """[ψᵀψ | ψᵀY], shape (p, p + 1): everything an estimator needs of the regression."""
+        return Trajectory(self.mesh, outer_products(self.psi.values, self.Y.values))
+
+    @cached_property
+    def gram(self) -> Trajectory:
+        """[G | h] with G(t) = ∫ψᵀψ, h(t) = ∫ψᵀY from the start, shape (p, p + 1)."""
+        return self.outer.integral()
+
+
+def outer_products(psi: Array, Y: Array) -> Array:
+    """[ψᵀψ | ψᵀY] of shape (..., p, p + 1) from ψ (..., rows, p) and Y (..., rows)."""
+    both = np.concatenate([psi, Y[..., None]], axis=-1)
+    return np.asarray(np.swapaxes(psi, -1, -2) @ both)
