@@ -1,0 +1,30 @@
+"""Where the configuration lives, and the names it offers."""
+
+from __future__ import annotations
+
+import os
+
+GROUPS = ("plant", "observer", "estimator", "solver", "experiment")
+
+DATA_GROUPS = ("plant", "observer", "estimator", "solver")
+"""Groups whose files are values only; an experiment may choose from groups and set anything."""
+
+
+def conf_folder() -> str:
+    """The folder of configuration files: inside the installed package, else the checkout's.
+
+    A wheel carries it as ``gpebo_cli/conf``. An editable installation has no such copy (it
+    ignores what a wheel is told to include), and a checkout keeps it at the top.
+    """
+    package = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    shipped = os.path.join(package, "conf")
+    return shipped if os.path.isdir(shipped) else os.path.join(os.path.dirname(package), "conf")
+
+
+def choices(folder: str, group: str) -> list[str]:
+    """Names of the files of a group in ``folder``, sorted; none if there is no such group."""
+    try:
+        names = os.listdir(os.path.join(folder, group))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))

@@ -1,0 +1,165 @@
+"""What `--help` prints. Plain text: it is shown without importing anything."""
+
+from __future__ import annotations
+
+from gpebo_cli.commands.locations import GROUPS, choices, conf_folder
+
+HELP = """\
+gpebo: adaptive state observers for linear time-varying descriptor systems
+
+usage: gpebo COMMAND …
+
+commands:
+  run [OVERRIDES]     one experiment: simulate, observe, estimate, check excitation
+  check [OVERRIDES]   every assumption of the plant and the observer, with its evidence
+  compare DIR …       one table and figures over finished runs and sweeps
+  figures [NAME …]    the paper's figures and tables, in outputs/paper
+  list [KIND]         what there is: plants, observers, estimators, experiments
+
+options:
+  -h, --help          this text; gpebo run --help has groups, defaults and more examples
+  -V, --version       the version
+
+examples:
+  gpebo run plant=circuit estimator=drem             # the paper's experiment
+  gpebo run 'estimator.gamma=[1e8,1e10]'             # two gains in one run
+  gpebo run -m estimator.gamma=1e6,1e8,1e10          # a run for each, one results.csv
+  gpebo run --config-dir . plant=mine                # your plant, in ./plant/mine.yaml
+  gpebo check plant=canonical observer=canonical     # what holds, what does not, by how much
+  gpebo compare outputs/sweeps/FOLDER                # who was best, by which gain
+  gpebo figures                                      # the paper's figures, outputs/paper
+  gpebo list plants
+
+exit codes: 0 done, 1 the run failed, 2 wrong usage or configuration, 130 interrupted
+"""
+
+FIGURES_HELP = """\
+usage: gpebo figures [NAME …] [OPTIONS]
+
+Runs recipes, by default those of the paper, and writes their figures to outputs/paper, a CSV
+file with what is drawn beside each, and a page with all of them, index.html. The same code on the
+same machine writes the same tables, byte for byte.
+
+options:
+  figures.formats=[png,pdf,svg]  formats besides PNG, which is always written
+  --output DIR        where to write
+  --check DIR         compare with the tables in DIR; exit code 1 if a curve differs
+  --update DIR        write the tables that --check compares with
+  -h, --help          this text
+
+examples:
+  gpebo figures
+  gpebo figures paper_circuit 'figures.formats=[png,pdf]'
+  gpebo figures --check tests/data/paper
+"""
+
+COMPARE_HELP = """\
+usage: gpebo compare DIR … [OPTIONS]
+
+One table over finished runs and sweeps, the best first, and figures: error curves overlaid,
+metrics over every gain that varies, a heat map where two do. DIR is a folder of a run or of a
+sweep; of a sweep that is not finished, what is there. Gains, tolerances, whatever varies and is
+a positive number makes an axis.
+
+options:
+  --sort COLUMN       seconds_to_1pct_parameters by default; heat maps show it
+  --reverse           largest first
+  --csv FILE          the whole table, every digit
+  --output DIR        where to draw; outputs/comparisons/<time> by default
+  --no-figures        the table only
+  -h, --help          this text
+
+examples:
+  gpebo compare outputs/sweeps/FOLDER
+  gpebo compare outputs/runs/* --sort final_error_states --csv best.csv --no-figures
+"""
+
+CHECK_HELP = """\
+usage: gpebo check [OVERRIDES] [OPTIONS]
+
+Checks every assumption that a run with these OVERRIDES (those of gpebo run) would rest on:
+solvability and index, a consistent start, the rank of E, impulse observability, excitation, and
+those of the canonical form. Nothing is estimated or written. Exit code 1 if something that is
+needed does not hold.
+
+options:
+  --json              for a program instead of a person
+  --config-dir DIR    a folder of yours with plant/NAME.yaml
+  -h, --help          this text
+
+examples:
+  gpebo check plant=circuit
+  gpebo check plant=circuit observer.regression=paper
+  gpebo check plant=canonical observer=canonical --json
+  gpebo check --config-dir . plant=mine
+"""
+
+LIST_HELP = """\
+usage: gpebo list [KIND …] [--config-dir DIR]
+
+What can be chosen in gpebo run, one line each: its name and what it is. KIND is plants,
+observers, estimators or experiments; without one, all are listed. With --config-dir, yours too.
+
+examples:
+  gpebo list
+  gpebo list plants
+  gpebo list plants experiments --config-dir .
+"""
+
+_RUN_HELP = """\
+usage: gpebo run [OVERRIDES] [OPTIONS]
+
+Runs one experiment and writes its tables, figures and summary.json to a new folder in
+outputs/runs. OVERRIDES are Hydra's: group=choice, key.subkey=value, in any order.
+
+groups (the first is the default unless marked):
+{groups}
+other keys, with their defaults:
+  time.start=0 time.horizon=20 time.samples=1001     seconds; samples are the output grid only
+  excitation.rho=null excitation.window=null         null: chosen from the regressor, the horizon
+  figures=null                                       all, none or [names]; null: none in a sweep
+  output.max_rows=100000                             of estimates.csv
+  hydra.run.dir=FOLDER                               where to write
+  gpebo run --cfg job prints every key with its value
+
+options:
+  -m, --multirun      a run for every combination of the values given as key=a,b,c, and for each
+                      value of key=logspace(a,b,n); key=[a,b,c] is one run with three cases
+  --dry-run           of a sweep: list the jobs
+  resume=FOLDER       of a sweep: the same command again runs what is missing or failed
+  fail_fast=true      of a sweep: stop at the first job that fails
+  launcher=NAME       of a sweep: basic, one after the other; joblib, all cores; ray; slurm
+  --config-dir DIR    a folder of yours with plant/NAME.yaml, experiment/NAME.yaml, …
+  --config-name NAME  another primary configuration; a run's own is config.yaml in its folder
+  --cfg job           print the configuration and stop; add --resolve to fill in ${{…}}
+  --hydra-help        options of Hydra that are rarely needed
+  -h, --help          this text
+
+examples:
+  gpebo run plant=circuit estimator=drem
+  gpebo run time.horizon=10 estimator.gamma=1e9 figures=[regressor]
+  gpebo run 'estimator.gamma=[1e8,1e10]'             # one run, a case for each gain
+  gpebo run 'estimator.gamma=logspace(6,12,1000)'
+  gpebo run -m estimator.gamma=1e6,1e8 solver=collocation,ivp
+  gpebo run -m 'time.horizon=10,20' 'estimator.gamma=logspace(6,10,5)' launcher=joblib
+  gpebo run experiment=paper_circuit
+  gpebo run observer=none plant=circuit              # simulate only
+  gpebo run --config-dir outputs/runs/FOLDER --config-name config    # repeat a run
+"""
+
+
+def run_help() -> str:
+    """The help of ``gpebo run``, with the groups' choices as they are on disk."""
+    folder = conf_folder()
+    lines = []
+    for group in GROUPS:
+        names = choices(folder, group)
+        default = _DEFAULTS.get(group)
+        names.sort(key=lambda name: name != default)  # stable: the default first, rest by name
+        lines.append(f"  {group + '=':<12} {' '.join(names)}{_NOTES.get(group, '')}\n")
+    return _RUN_HELP.format(groups="".join(lines))
+
+
+# As in conf/gpebo.yaml, which is not read: a YAML parser costs more than all the rest of this.
+_DEFAULTS = {"plant": "circuit", "observer": "gpebo", "estimator": "drem", "solver": "collocation"}
+_NOTES = {"experiment": "   (a recipe; none by default)"}

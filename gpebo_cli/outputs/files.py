@@ -1,0 +1,61 @@
+"""Files that appear complete or not at all: written beside under another name, then renamed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from gpebo_cli.errors import GpeboError
+
+
+def write_file(path: Path, chunks: Iterable[bytes]) -> None:
+    """Write ``chunks`` to ``path``; a reader sees the old file, or none, until it is complete.
+
+    There is no fsync: the promise is against interruption and a full disk, not a power cut, and
+    waiting for the disk would cost more than computing what is written.
+
+    Raises:
+        GpeboError: the file cannot be written; its name and the system's reason are given.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        try:
+            with open(beside, "wb") as stream:
+                stream.writelines(chunks)
+            os.replace(beside, path)
+        except BaseException:  # KeyboardInterrupt too: nothing half-written stays behind
+            beside.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise GpeboError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write ``text`` to ``path`` as UTF-8; see :func:`write_file`."""
+    write_file(path, [text.encode()])
+
+
+def make_folder(path: Path) -> None:
+    """Create the folder ``path`` and its parents; one that exists is kept.
+
+    Raises:
+        GpeboError: it cannot be created, for instance because a file has that name.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GpeboError(f"cannot create the folder {path}: {error.strerror or error}") from error
+
+
+def remove_files(paths: Iterable[Path]) -> None:
+    """Remove those of ``paths`` that exist.
+
+    Raises:
+        GpeboError: one of them cannot be removed.
+    """
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise GpeboError(f"cannot remove {path}: {error.strerror or error}") from error

@@ -1,0 +1,65 @@
+"""The run folder: tables, summary, configuration and figures of one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gpebo_cli.outputs import tables
+from gpebo_cli.outputs.figures import FIGURES, draw
+from gpebo_cli.outputs.files import make_folder, remove_files, write_text
+from gpebo_cli.outputs.provenance import Provenance, provenance
+from gpebo_cli.outputs.style import save
+from gpebo_cli.outputs.summary import summary_text
+from gpebo_cli.result import RunResult
+
+TABLES = ("signals.csv", "regression.csv", "excitation.csv", "estimates.csv", "cases.csv")
+
+
+def write_run(
+    result: RunResult, folder: Path, config_text: str, made_by: Provenance | None = None
+) -> None:
+    """Write everything a run leaves behind to ``folder``, which is created where needed.
+
+    What the run does not have (without an observer: all but the plant's signals) is not written,
+    and files of the same names from an earlier run in the same folder are removed: none of
+    them tells of another run than the others. ``summary.json`` comes last, so that a folder
+    that has one is complete.
+
+    Args:
+        result: the run; ``settings.output.figures`` chooses the figures.
+        folder: where to write.
+        config_text: the resolved configuration, as YAML.
+        made_by: versions and commit; by default those of this process.
+
+    Raises:
+        ConfigError: a figure asked for does not exist; nothing has been written then.
+        GpeboError: a file cannot be written; the message names it.
+    """
+    wanted = result.settings.output.figures
+    figures = draw(result, None if wanted is True else wanted or [])
+    make_folder(folder)
+    _remove_earlier(folder)
+
+    write_text(folder / "config.yaml", config_text)
+    tables.write_signals(folder / "signals.csv", result.system, result.simulation)
+    regression, estimation = result.regression, result.estimation
+    if regression is not None:
+        tables.write_regression(folder / "regression.csv", regression)
+    if result.excitation is not None:
+        tables.write_excitation(folder / "excitation.csv", result.excitation)
+    if regression is not None and estimation is not None:
+        tables.write_estimates(
+            folder / "estimates.csv", regression.parameters, result.system.states, estimation
+        )
+    if estimation is not None and result.metrics is not None:
+        tables.write_cases(folder / "cases.csv", estimation, result.metrics)
+    for name, figure in figures:
+        make_folder(folder / "figures")
+        save(figure, folder / "figures" / f"{name}.png")
+    write_text(folder / "summary.json", summary_text(result, made_by or provenance()))
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Remove what an earlier run left, by name: a folder may hold files that are not ours."""
+    remove_files([folder / "summary.json", *(folder / name for name in TABLES)])
+    remove_files(folder / "figures" / f"{name}.png" for name in FIGURES)

@@ -1,0 +1,154 @@
+"""``summary.json``: everything about a run that is not a table, as strict JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli.outputs.provenance import Provenance
+from gpebo_cli.result import (
+    EstimationResult,
+    Excitation,
+    Metrics,
+    RegressionResult,
+    Requirement,
+    RunResult,
+    StateChange,
+)
+
+MAX_LISTED_CASES = 100  # beyond, cases.csv is the place to look and the summary gives ranges
+
+
+def summary_text(result: RunResult, made_by: Provenance) -> str:
+    """Render :func:`summary` as strict JSON: NaN and infinities are ``null``."""
+    content = plain(summary(result, made_by))
+    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
+    """Summarise a run as nested dicts in the order they are printed; parts it lacks are None."""
+    system, simulation = result.system, result.simulation
+    regression, estimation = result.regression, result.estimation
+    return {
+        "status": "done",
+        "verdict": result.verdict,
+        "plant": system.name,
+        "title": system.title,
+        "reference": system.reference,
+        "observer": result.settings.observer.name,
+        "estimator": dict(result.settings.estimator) if estimation else None,
+        "index": simulation.index,
+        "strangeness_index": simulation.strangeness_index,
+        "differential": simulation.differential,
+        "algebraic": simulation.algebraic,
+        "initial_state": {
+            "given": dict(zip(system.states, system.initial_state, strict=True)),
+            "used": dict(zip(system.states, simulation.initial_state, strict=True)),
+            "moved": {change.state: _change(change) for change in simulation.moved},
+        },
+        "jumps": [
+            {"time": change.time, "state": change.state, **_change(change)}
+            for change in simulation.jumps
+        ],
+        "impulses": [{"time": time, "state": state} for time, state in simulation.impulses],
+        "parameters": _parameters(regression),
+        "assumptions": [
+            {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
+            for a in result.assumptions
+        ],
+        "excitation": _excitation(result.excitation),
+        "estimator_requirement": _requirement(estimation),
+        "cases": _cases(estimation, result.metrics),
+        "error_estimate": {
+            "states": simulation.error_estimate,
+            "regression": regression.error_estimate if regression else None,
+        },
+        "elements": simulation.elements,
+        "timings": dict(result.timings),
+        "versions": made_by.versions,
+        "git": {"commit": made_by.git.commit, "dirty": made_by.git.dirty} if made_by.git else None,
+    }
+
+
+def plain(value: object) -> Any:
+    """Reduce ``value`` to what strict JSON knows; a number that is not finite becomes None."""
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (Sequence, set, frozenset)):
+        return [plain(item) for item in value]
+    return str(value)
+
+
+def _change(change: StateChange) -> dict[str, float]:
+    return {"from": change.given, "to": change.used, "change": change.used - change.given}
+
+
+def _parameters(regression: RegressionResult | None) -> dict[str, float] | None:
+    if regression is None:
+        return None
+    return dict(zip(regression.parameters, regression.true_parameters, strict=True))
+
+
+def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:
+    if excitation is None:
+        return None
+    # Before one window has passed the trailing window is a shorter one, which is no evidence.
+    full = excitation.t - excitation.t[0] >= excitation.window * (1 - 1e-9)
+    levels = excitation.pe_level[full & np.isfinite(excitation.pe_level)]
+    return {
+        "is_ie": excitation.is_ie,
+        "t_c": excitation.t_c,
+        "rho": excitation.rho,
+        "lambda_min": excitation.lambda_min,
+        "condition": excitation.condition,
+        "weakest_direction": excitation.weakest_direction.components,
+        "pe_level_min": levels.min() if levels.size else None,
+        "window": excitation.window,
+    }
+
+
+def _requirement(estimation: EstimationResult | None) -> dict[str, Any] | None:
+    if estimation is None:
+        return None
+    requirement: Requirement = estimation.requirement
+    return {
+        "name": requirement.name,
+        "holds": requirement.holds,
+        "evidence": requirement.evidence,
+        "text": requirement.text,
+    }
+
+
+def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> object:
+    """List the cases with gains and metrics; ranges of the metrics when they are many."""
+    if estimation is None or metrics is None:
+        return None
+    columns = {field.name: np.asarray(getattr(metrics, field.name)) for field in fields(Metrics)}
+    if len(estimation.cases) <= MAX_LISTED_CASES:
+        return [
+            {"case": case, "gains": gains, **{name: col[case] for name, col in columns.items()}}
+            for case, gains in enumerate(estimation.cases)
+        ]
+    return {
+        "count": len(estimation.cases),
+        **{name: _range(column[np.isfinite(column)]) for name, column in columns.items()},
+    }
+
+
+def _range(finite: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
+    """Give the smallest and largest of those that are finite, and how many those are."""
+    smallest, largest = (finite.min(), finite.max()) if finite.size else (None, None)
+    return {"min": smallest, "max": largest, "finite": finite.size}

@@ -1,0 +1,123 @@
+"""The five CSV tables of a run. Floats are written ``%.17g``, so reading them gives them back.
+
+A table is a header and an array, formatted a chunk of rows at a time by one ``%`` operation: some
+0.35 µs per number, three quarters of what ``numpy.savetxt`` takes. pandas is left alone: importing
+it takes longer than most runs.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from gpebo_cli.outputs.files import write_file
+from gpebo_cli.result import (
+    EstimationResult,
+    Excitation,
+    Metrics,
+    RegressionResult,
+    SimulationResult,
+)
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+
+_CHUNK_ROWS = 2048  # large enough to amortise the call, small enough to stay in cache
+
+
+def write_signals(path: Path, system: DescriptorSystem, simulation: SimulationResult) -> None:
+    """Write ``t``, inputs, outputs and true states, by name."""
+    header = ["t", *system.inputs, *system.outputs, *system.states]
+    table = np.column_stack(
+        [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
+    )
+    write_file(path, _lines(header, table))
+
+
+def write_regression(path: Path, regression: RegressionResult) -> None:
+    """Write ``t``, ``Y_1…``, then ``psi_<row>_<parameter>`` row by row."""
+    count = regression.Y.shape[1]
+    rows = range(1, count + 1)
+    header = ["t", *(f"Y_{i}" for i in rows)]
+    header += [f"psi_{i}_{name}" for i in rows for name in regression.parameters]
+    width = count * len(regression.parameters)  # spelled out: -1 is ambiguous if there are none
+    psi = regression.psi.reshape(len(regression.t), width)
+    write_file(path, _lines(header, np.column_stack([regression.t, regression.Y, psi])))
+
+
+def write_excitation(path: Path, excitation: Excitation) -> None:
+    """Write ``t``, the eigenvalues of the Gram matrix in ascending order, and ``pe_level``."""
+    count = excitation.gram_eigenvalues.shape[1]
+    header = ["t", *(f"gram_eig_{i}" for i in range(1, count + 1)), "pe_level"]
+    table = np.column_stack([excitation.t, excitation.gram_eigenvalues, excitation.pe_level])
+    write_file(path, _lines(header, table))
+
+
+def write_estimates(
+    path: Path,
+    parameters: Sequence[str],
+    states: Sequence[str],
+    estimation: EstimationResult,
+) -> None:
+    """Write the long table ``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, checks.
+
+    Columns of states the observer does not see are empty.
+    """
+    header = ["case", "t", *(f"{name}_hat" for name in (*parameters, *states))]
+    if estimation.delta is not None:
+        header.append("delta")
+    header += estimation.checks
+    write_file(path, _estimate_chunks(header, estimation))
+
+
+def write_cases(path: Path, estimation: EstimationResult, metrics: Metrics) -> None:
+    """Write one row per case: ``case``, its gains, its metrics; NaN is an empty cell."""
+    gains = gain_names(estimation)
+    names = [field.name for field in fields(Metrics)]
+    columns = [getattr(metrics, name) for name in names]
+    lines = [_header(["case", *gains, *names])]
+    for case, values in enumerate(estimation.cases):
+        numbers = [values.get(gain, np.nan) for gain in gains] + [col[case] for col in columns]
+        cells = ["" if np.isnan(number) else f"{number:.17g}" for number in numbers]
+        lines.append(",".join([str(case), *cells]).encode() + b"\n")
+    write_file(path, lines)
+
+
+def gain_names(estimation: EstimationResult) -> list[str]:
+    """Names of the gains of all cases, in order of first appearance."""
+    return list(dict.fromkeys(name for case in estimation.cases for name in case))
+
+
+def _estimate_chunks(header: Sequence[str], estimation: EstimationResult) -> Iterator[bytes]:
+    yield _header(header)
+    delta = estimation.delta
+    for case in range(len(estimation.cases)):
+        columns = [estimation.t, estimation.parameters[case], estimation.states[case]]
+        if delta is not None:
+            columns.append(delta[case if len(delta) > 1 else 0])
+        columns += [check[case] for check in estimation.checks.values()]
+        yield from _rows(np.column_stack(columns), prefix=f"{case},")
+
+
+def _lines(header: Sequence[str], table: Array) -> Iterator[bytes]:
+    yield _header(header)
+    yield from _rows(table)
+
+
+def _header(names: Sequence[str]) -> bytes:
+    # csv quotes a name that needs it; the numbers below never do.
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerow(names)
+    return stream.getvalue().encode()
+
+
+def _rows(table: Array, prefix: str = "") -> Iterator[bytes]:
+    """Format ``table`` (rows, columns); every line starts with ``prefix`` (free of ``%``)."""
+    line = prefix + ",".join(["%.17g"] * table.shape[1]) + "\n"
+    for start in range(0, len(table), _CHUNK_ROWS):
+        chunk = table[start : start + _CHUNK_ROWS]
+        text = (line * len(chunk) % tuple(chunk.ravel().tolist())).encode()
+        yield text.replace(b"nan", b"") if np.isnan(chunk).any() else text
