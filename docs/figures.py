@@ -1,0 +1,76 @@
+"""Regenerate the figures of the documentation: ``python docs/figures.py``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from gpebo_cli.collocation.linear import LinearProblem, solve
+from gpebo_cli.collocation.mesh import Trajectory, initial_mesh
+from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli.commands.locations import conf_folder
+from gpebo_cli.observers.canonical import (
+    canonical_blocks,
+    diagonalising_gain,
+    unknown_input_matrices,
+)
+from gpebo_cli.outputs.files import make_folder
+from gpebo_cli.outputs.style import Curve, Panel, compose, line, save
+from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.systems.plant import plant_from_mapping
+
+IMAGES = Path(__file__).parent / "img"
+HORIZON = 20.0
+ELEMENTS = 200
+
+
+def error_matrices(t: Array, inside: Array) -> tuple[Array, Array]:
+    """M_w and the matrix that Assumption 7 prints, (N, 2, 2), with one gain that diagonalises M_w.
+
+    The plant is the shipped canonical one, its second output is y_ℓ.
+    """
+    text = (Path(conf_folder()) / "plant" / "canonical.yaml").read_text(encoding="utf-8")
+    blocks = canonical_blocks(plant_from_mapping(yaml.safe_load(text)), t, inside)
+    c, dc, N = blocks.C[:, 1, 2:4], blocks.dC[:, 1, 2:4], blocks.N
+    L = diagonalising_gain(c, dc, N)
+    M_w, _, _ = unknown_input_matrices(c, dc, N, np.zeros((len(t), 3)), L)
+
+    a1 = 1.0 / N[:, 1, 0]
+    printed = np.empty_like(M_w)
+    printed[:, 0, 0], printed[:, 0, 1] = L[:, 0] * c[:, 0], L[:, 0] * c[:, 1] - a1
+    printed[:, 1, 0] = L[:, 1] * c[:, 0] + dc[:, 0] / c[:, 0]
+    printed[:, 1, 1] = L[:, 1] * c[:, 1] + (dc[:, 1] + c[:, 0] * a1) / c[:, 1]
+    return M_w, printed
+
+
+def transition_norm(M: Trajectory, t: Array) -> Array:
+    """‖Φ_w(t)‖₂ of φ̇ = M φ from the identity at the start, shape (N,)."""
+    problem = LinearProblem(
+        lambda t, inside: (None, M(t, inside), np.zeros((1, 2, 2))), np.eye(2), name="M_w"
+    )
+    solution = solve(problem, M.mesh, tol=1e-11, max_elements=10_000)
+    return np.asarray(np.linalg.norm(solution.trajectory(t), 2, axis=(1, 2)))
+
+
+def errata_assumption7(path: Path) -> None:
+    """Draw the error of Proposition 4's observer: corrected, and with the printed matrix."""
+    mesh = initial_mesh(0.0, HORIZON, [], ELEMENTS, radau_rule(9))
+    t = np.linspace(0.0, HORIZON, 1001)
+    shape = (*mesh.points.shape, 2, 2)
+    norms = [
+        transition_norm(Trajectory(mesh, M.reshape(shape)), t)
+        for M in error_matrices(mesh.points.ravel(), mesh.inside.ravel())
+    ]
+    labels = ("corrected M_w", "as printed in Assumption 7")
+    curves = tuple(
+        Curve(t, norm, label, line(k))
+        for k, (norm, label) in enumerate(zip(norms, labels, strict=True))
+    )
+    save(compose([Panel("‖Φ_w(t)‖", curves, log=True, legend=True)]), path)
+
+
+if __name__ == "__main__":
+    make_folder(IMAGES)
+    errata_assumption7(IMAGES / "errata_assumption7.png")
