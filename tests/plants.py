@@ -1,0 +1,42 @@
+"""Plants used by several tests, and the published problems as plants."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from gpebo_cli.systems.descriptor import DescriptorSystem
+from gpebo_cli.systems.plant import plant_from_mapping
+
+DATA = Path(__file__).parent / "data"
+CONF = Path(__file__).parent.parent / "conf"
+
+
+def shipped(name: str, **changes: Any) -> DescriptorSystem:
+    """A plant from ``conf/plant``, with some of its keys replaced."""
+    import yaml
+
+    mapping = yaml.safe_load((CONF / "plant" / f"{name}.yaml").read_text(encoding="utf-8"))
+    return plant_from_mapping({**mapping, **changes}, f"{name}.yaml")
+
+
+def reference(name: str) -> dict[str, Any]:
+    """Reference values computed by another method and another code."""
+    return json.loads((DATA / "reference" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def problem(path: Path) -> tuple[dict[str, Any], DescriptorSystem]:
+    """A published problem: its description and the plant."""
+    data = json.loads(path.read_text(encoding="utf-8"))
+    n, m, r = len(data["E"]), len(data["u"]), len(data["C"])
+    states = [f"x{i + 1}" for i in range(n)]
+    mapping = {
+        "name": data["name"],
+        "states": states,
+        "inputs": {f"u{i + 1}": data["u"][i] for i in range(m)},
+        "outputs": [f"y{i + 1}" for i in range(r)],
+        **{key: data[key] for key in "EABC"},
+        "initial_state": data["x0"],
+    }
+    return data, plant_from_mapping(mapping, path.name)

@@ -1,0 +1,125 @@
+"""``gpebo check``: every assumption with its evidence, as a table and as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plants import shipped
+
+from gpebo_cli.assumptions import check
+from gpebo_cli.settings import ObserverSettings, Settings
+from gpebo_cli.systems.plant import plant_from_mapping
+
+ROOT = Path(__file__).parent.parent
+
+
+def found(system, **observer):
+    settings = Settings(plant={}, estimator={}, observer=ObserverSettings(**observer))
+    return {a.name: a for a in check(settings, system)}
+
+
+def command(*words, cwd):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, "-m", "gpebo_cli", *words], cwd=cwd, env=environment, timeout=120,
+        capture_output=True, text=True, check=False,
+    )
+
+
+def test_the_circuit_satisfies_everything():
+    names = found(shipped("circuit"))
+    assert all(a.holds for a in names.values())
+    assert names["Solvability"].evidence["index"] == 2
+    assert names["Solvability"].evidence["strangeness_index"] == 1
+    assert names["Assumption 2"].evidence["t_c"] > 0
+    assert "Regularity" not in names  # a notion for constant coefficients
+
+
+def test_the_literal_regressor_fails_the_excitation_assumption():
+    names = found(shipped("circuit"), regression="paper")
+    assert not names["Assumption 2"].holds
+    assert [name for name, a in names.items() if not a.holds] == ["Assumption 2"]
+
+
+def test_the_canonical_form_has_its_own_assumptions():
+    names = found(shipped("canonical"), name="canonical")
+    assert {f"Assumption {k}" for k in (3, 4, 5, 6, 7)} <= set(names)
+    assert all(a.holds for a in names.values())
+
+
+def test_an_unstable_unknown_input_observer_is_seen():
+    """c1 < 0 turns the sign of a1 c1/c2: M_w is unstable for every gain (errata, Remark 4)."""
+    names = found(
+        shipped("canonical", C=[[1, 0, 0, 0, 0], [0.5, 0, "-c1", "c2", 0]]), name="canonical"
+    )
+    assert not names["Assumption 7"].holds
+    assert names["Assumption 7"].evidence["transition_norm"] > 1e3
+
+
+def lti(**changes):
+    return plant_from_mapping({
+        "name": "lti", "states": ["x", "v"], "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, 1]], "C": [[1, 0]],
+        "initial_state": [1, -1], **changes,
+    })
+
+
+def test_constant_coefficients_get_regularity_and_the_rank_condition():
+    names = found(lti())
+    assert names["Regularity"].holds
+    assert names["Rank condition D2"].holds
+    blind = found(lti(A=[[-1, 1], [1, 0]]))  # neither A22 nor C sees v
+    assert not blind["Rank condition D2"].holds
+    assert not blind["Assumption 1"].holds
+
+
+def test_an_unsolvable_plant_stops_at_the_first_assumption():
+    names = found(lti(E=[[1, 0], [0, 0]], A=[[-1, 1], [0, 0]]))
+    assert list(names) == ["Solvability"]
+    assert not names["Solvability"].holds
+    assert "not uniquely solvable" in names["Solvability"].evidence["found"]
+
+
+def test_growth_of_the_fundamental_matrix_is_reported():
+    growing = plant_from_mapping({
+        "name": "g", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[1]], "C": [[1]],
+        "initial_state": [1],
+    })
+    names = found(growing)
+    assert names["Growth of Φ"].evidence["largest_entry"] == pytest.approx(np.exp(20), rel=1e-9)
+    assert not names["Growth of Φ"].holds
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "last"),
+    [
+        (["plant=circuit"], 0, "everything that is needed holds"),
+        (["plant=circuit", "observer.regression=paper"], 1, "Assumption 2 failed"),
+        (["plant=canonical"], 1, "Assumption 1 failed"),
+    ],
+)
+def test_command(words, code, last, tmp_path):
+    done = command("check", *words, cwd=tmp_path)
+    assert done.returncode == code
+    assert done.stdout.splitlines()[-1] == last
+    assert not any(tmp_path.iterdir())  # a check leaves nothing behind
+
+
+def test_command_as_json(tmp_path):
+    done = command("check", "plant=canonical", "observer=canonical", "--json", cwd=tmp_path)
+    assert done.returncode == 0
+    answer = json.loads(done.stdout)
+    assert answer["holds"] is True
+    assert {"name", "statement", "holds", "evidence"} == set(answer["assumptions"][0])
+
+
+def test_command_with_a_wrong_word(tmp_path):
+    done = command("check", "plant=circut", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "did you mean circuit" in done.stderr

@@ -1,0 +1,184 @@
+"""Propositions 3 and 4: the canonical-form observer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plants import reference, shipped
+
+from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.experiment import run_experiment
+from gpebo_cli.observers import observe
+from gpebo_cli.observers.canonical import unknown_input_matrices
+from gpebo_cli.settings import ObserverSettings, Settings, SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+
+SOLVER = SolverSettings()
+
+
+def run(system, estimator=None, samples=2001, **observer):
+    settings = Settings(
+        plant={},
+        estimator=estimator or {"name": "ls_drem", "gamma": 100.0, "f0": 1e-6},
+        observer=ObserverSettings(name="canonical", **observer),
+        time=TimeSettings(samples=samples),
+    )
+    return run_experiment(settings, system)
+
+
+def test_za_is_recovered():
+    result = run(shipped("canonical"))
+    truth = result.simulation.states[:, :2]
+    error = np.abs(result.estimation.states[0, :, :2] - truth)
+    assert error[-1].max() < 1e-10
+    assert result.metrics.final_error_parameters[0] < 1e-6
+
+
+def test_zw_error_decays_as_the_reference_says():
+    """From the time z_a is known on, the error of ẑ_w follows the reference's decay."""
+    system = shipped("canonical")
+    result = run(system)
+    t = result.simulation.t
+    error = result.estimation.states[0, :, 2:4] - result.simulation.states[:, 2:4]
+    rows = reference("canonical")["at"]
+    decay = {row["t"]: np.array(row["unknown_input_observer_error_over_initial_error"])
+             for row in rows}
+    at = {when: error[int(np.argmin(np.abs(t - when)))] for when in decay}
+    for when in (10.0, 15.0, 20.0):
+        np.testing.assert_allclose(at[when] / at[5.0], decay[when] / decay[5.0], rtol=2e-3)
+
+
+def test_zw_error_with_za_known_matches_the_reference_at_every_time():
+    """With ξ_a(0) = z_a(0) there is nothing to estimate in z_a: the decay is the reference's."""
+    system = shipped("canonical")
+    result = run(system, xi_a0={"za1": 1.0}, r0=[1.0, 3.0])
+    t = result.simulation.t
+    error = result.estimation.states[0, :, 2:4] - result.simulation.states[:, 2:4]
+    for row in reference("canonical")["at"]:
+        k = int(np.argmin(np.abs(t - row["t"])))
+        expected = row["unknown_input_observer_error_over_initial_error"]
+        np.testing.assert_allclose(error[k] / error[0], expected, atol=1e-8)
+
+
+def test_algebraic_zb_is_exact_once_za_is():
+    result = run(shipped("canonical"))
+    checks = result.estimation.checks
+    truth = result.simulation.states
+    late = result.simulation.t > 5
+    np.testing.assert_allclose(checks["zb1_algebraic"][0], truth[:, 2], atol=1e-9)
+    np.testing.assert_allclose(checks["zb2_algebraic"][0, late], truth[late, 3], atol=1e-9)
+
+
+def test_zb3_is_not_invented():
+    result = run(shipped("canonical"), samples=11)
+    assert np.isnan(result.estimation.states[..., 4]).all()
+    assert np.isfinite(result.metrics.final_error_states).all()
+
+
+def test_zb3_is_estimated_where_an_output_sees_it():
+    system = shipped(
+        "canonical", outputs=["y1", "y2", "y3"],
+        C=[[1, 0, 0, 0, 0], [0.5, 0, "c1", "c2", 0], [0, 1, 0, 0, "2 + sin(t)"]],
+    )
+    result = run(system)
+    error = result.estimation.states[0, -1] - result.simulation.states[-1]
+    assert abs(error[4]) < 1e-4  # limited by ẑ_w, which decays with M_w
+    assert np.abs(error).max() < 1e-4
+
+
+def test_all_suitable_outputs_are_stacked():
+    system = shipped(
+        "canonical", outputs=["y1", "y2", "y3"],
+        C=[[1, 0, 0, 0, 0], [0.5, 0, "c1", "c2", 0], [0, "cos(t)", 0, 0, 0]],
+    )
+    signals = simulate(system, TimeSettings(), SOLVER).signals
+    observation = observe(
+        system, signals.inputs, signals.outputs, ObserverSettings(name="canonical"), SOLVER
+    )
+    assert observation.regression.psi.values.shape[2] == 2
+    assert observation.regression.parameters == ("e0_za1", "e0_za2")
+
+
+def test_regression_identity_with_unknown_parameters():
+    """Proposition 2: strangeness-free canonical form with θ."""
+    system = shipped("strangeness_free", C=[[1, 0, 0, 0]])
+    result = run(system)
+    regression = result.regression
+    residual = regression.Y - regression.psi @ regression.true_parameters
+    assert np.abs(residual).max() < 1e-9
+    assert result.metrics.final_error_parameters[0] < 1e-6
+
+
+def test_strangeness_free_with_the_general_observer():
+    settings = Settings(
+        plant={}, estimator={"name": "ls_drem", "gamma": 100.0, "f0": 1e-6}, time=TimeSettings()
+    )
+    result = run_experiment(settings, shipped("strangeness_free"))
+    assert result.simulation.strangeness_index == 0
+    assert result.excitation.is_ie
+    assert result.metrics.final_error_parameters[0] < 1e-6
+    assert result.metrics.final_error_states[0] < 1e-6
+
+
+@pytest.mark.parametrize("L_w", ["diagonal", ["1 + 0.1*sin(t)", "0.5"]])
+def test_any_gain_gives_the_same_limit(L_w):
+    result = run(shipped("canonical"), L_w=L_w)
+    error = result.estimation.states[0, -1, 2:4] - result.simulation.states[-1, 2:4]
+    decays = {a.name: a for a in result.assumptions}["Assumption 7"]
+    assert decays.holds
+    assert np.abs(error).max() < 10 * decays.evidence["transition_norm"] + 1e-9
+
+
+def test_remark_4_gain_for_constant_coefficients():
+    """a1 c1/c2 > 0 and constant: Remark 4's L_w gives a stable M_w."""
+    system = shipped(
+        "canonical", parameters={"N21": 1, "N31": 0.5, "N32": 1.5, "c1": 1, "c2": 2}
+    )
+    result = run(system, L_w="remark4")
+    seven = {a.name: a for a in result.assumptions}["Assumption 7"]
+    assert seven.holds
+    error = result.estimation.states[0, -1, 2:4] - result.simulation.states[-1, 2:4]
+    assert np.abs(error).max() < 1e-3
+
+
+def test_matrices_against_their_definition():
+    """M_w = [I − G c⊤] A_w − L c⊤ − G ċ⊤ and the rest, straight from the paper's (sysobs)."""
+    rng = np.random.default_rng(3)
+    c, dc, L, f_b = (rng.uniform(0.5, 2, (5, k)) for k in (2, 2, 2, 3))
+    N = np.zeros((5, 3, 3))
+    N[:, 1, 0], N[:, 2, 0], N[:, 2, 1] = rng.uniform(0.5, 2, (3, 5))
+    M, from_y, forcing = unknown_input_matrices(c, dc, N, f_b, L)
+    for k in range(5):
+        a1, a2 = 1 / N[k, 1, 0], -N[k, 2, 0] / (N[k, 2, 1] * N[k, 1, 0])
+        A_w = np.array([[0, a1], [0, a2]])
+        G, dG = np.array([0, 1 / c[k, 1]]), np.array([0, -dc[k, 1] / c[k, 1] ** 2])
+        keep = np.eye(2) - np.outer(G, c[k])
+        M_w = keep @ A_w - np.outer(L[k], c[k]) - np.outer(G, dc[k])
+        np.testing.assert_allclose(M[k], M_w, atol=1e-12)
+        np.testing.assert_allclose(from_y[k], M_w @ G + L[k] - dG, atol=1e-12)
+        d_w = np.array([
+            f_b[k, 1] / N[k, 1, 0],
+            f_b[k, 2] / N[k, 2, 1] - N[k, 2, 0] * f_b[k, 1] / (N[k, 2, 1] * N[k, 1, 0]),
+        ])
+        np.testing.assert_allclose(forcing[k], keep @ d_w, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "error", "message"),
+    [
+        ({"C": [[1, 0, 0, 0, 1], [0.5, 0, "c1", "c2", 0]]}, {}, ModelError, "Assumption 3 fails"),
+        ({"C": [[1, 0, 0, 0, 0], [0.5, 0, 0, "c2", 0]]}, {}, ModelError, "Assumption 6 fails"),
+        ({}, {"output": "y1"}, ModelError, "Assumption 6 fails: output y1"),
+        ({}, {"output": "y9"}, ConfigError, "'y9' is not an output"),
+        ({}, {"L_w": ["t", "x"]}, ConfigError, "observer.L_w"),
+        ({}, {"r0": [1.0]}, ConfigError, "two finite numbers"),
+    ],
+)
+def test_what_does_not_fit_is_named(changes, settings, error, message):
+    with pytest.raises(error, match=message):
+        run(shipped("canonical", **changes), **settings)
+
+
+def test_a_plant_that_is_not_canonical_is_refused_by_entry():
+    with pytest.raises(ModelError, match=r"not in canonical form: E\[0\]\[0\]|A\["):
+        run(shipped("circuit"))

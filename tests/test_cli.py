@@ -1,0 +1,522 @@
+"""The command line as a user meets it: a process, its streams and its exit code."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+FAST = ["figures=none", "time.samples=51"]
+
+MINE = """\
+name: mine
+title: a decaying state
+reference: nowhere
+states: [x]
+outputs: [y]
+E: [[1]]
+A: [[-1]]
+C: [[1]]
+initial_state: {x: 1}
+"""
+
+
+def environment(**more):
+    inherited = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
+    return {**inherited, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", **more}
+
+
+def gpebo(*words, cwd, **more):
+    command = [sys.executable, "-m", "gpebo_cli", *map(str, words)]
+    return subprocess.run(
+        command, cwd=cwd, env=environment(**more), capture_output=True, text=True,
+        check=False, timeout=120, stdin=subprocess.DEVNULL,
+    )
+
+
+def folders(cwd, kind="runs"):
+    return sorted((cwd / "outputs" / kind).glob("*"))
+
+
+@pytest.fixture
+def mine(tmp_path):
+    folder = tmp_path / "mine"
+    (folder / "plant").mkdir(parents=True)
+    (folder / "plant" / "mine.yaml").write_text(MINE)
+    return folder
+
+
+# Help, list, version ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", [[], ["--help"], ["-h"], ["help"]])
+def test_help(tmp_path, words):
+    done = gpebo(*words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "gpebo run plant=circuit estimator=drem" in done.stdout
+
+
+@pytest.mark.parametrize("words", [["--version"], ["-V"], ["run", "--version"]])
+def test_version(tmp_path, words):
+    done = gpebo(*words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("gpebo ")
+
+
+def test_run_help_lists_every_choice(tmp_path):
+    done = gpebo("run", "--help", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    for group in ("plant", "observer", "estimator", "solver", "experiment"):
+        for path in (ROOT / "conf" / group).glob("*.yaml"):
+            assert path.stem in done.stdout
+
+
+def test_run_help_names_the_real_defaults(tmp_path):
+    defaults = yaml.safe_load((ROOT / "conf" / "gpebo.yaml").read_text())["defaults"]
+    chosen = {k: v for entry in defaults if isinstance(entry, dict) for k, v in entry.items()}
+    text = gpebo("run", "--help", cwd=tmp_path).stdout
+    for group in ("plant", "observer", "estimator", "solver"):
+        line = next(x for x in text.splitlines() if x.strip().startswith(f"{group}="))
+        assert line.split("=", 1)[1].split()[0] == chosen[group]
+
+
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["list"], ["--version"]])
+def test_help_imports_nothing_heavy(tmp_path, words):
+    script = (
+        "import sys; sys.argv = ['gpebo', *sys.argv[1:]]; from gpebo_cli.app import main; "
+        "main(); heavy = {'numpy', 'hydra', 'omegaconf', 'yaml', 'argparse', 'pathlib', 're', "
+        "'dataclasses'} & set(sys.modules); sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    # -S: what site-packages' own .pth files import is not ours to answer for
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", script, *words], env=environment(), cwd=tmp_path,
+        capture_output=True, text=True, check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_composing_imports_no_numbers(tmp_path):
+    script = (
+        "import sys; sys.argv = ['gpebo', 'run', '--cfg', 'job']; "
+        "from gpebo_cli.app import main; main(); sys.exit('numpy' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment(), cwd=tmp_path,
+        capture_output=True, text=True, check=False,
+    )
+    assert done.returncode == 0
+
+
+def test_a_run_without_figures_imports_neither_tables_nor_drawing(tmp_path):
+    script = (
+        "import sys; sys.argv = ['gpebo', 'run', *sys.argv[1:]]; "
+        "from gpebo_cli.app import main; main(); "
+        "heavy = {'pandas', 'sympy', 'matplotlib'} & set(sys.modules); "
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, *FAST], env=environment(), cwd=tmp_path,
+        capture_output=True, text=True, check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_list_names_and_titles(tmp_path, mine):
+    everything = gpebo("list", cwd=tmp_path)
+    assert everything.returncode == 0
+    for word in ("plants", "circuit", "drem", "gpebo", "paper_circuit", "arXiv:2407.14373"):
+        assert word in everything.stdout
+    plants = gpebo("list", "plants", "--config-dir", mine, cwd=tmp_path)
+    assert "mine" in plants.stdout
+    assert "a decaying state [nowhere]" in plants.stdout
+    assert "drem" not in plants.stdout
+
+
+def test_every_file_of_a_group_has_a_title():
+    for group in ("plant", "observer", "estimator", "solver", "experiment"):
+        for path in (ROOT / "conf" / group).glob("*.yaml"):
+            assert yaml.safe_load(path.read_text())["title"], path
+
+
+def test_a_title_cannot_command_the_terminal(tmp_path, mine):
+    (mine / "plant" / "evil.yaml").write_text("title: a\x1b[31mb\n")
+    assert "\x1b" not in gpebo("list", "plants", "--config-dir", mine, cwd=tmp_path).stdout
+
+
+# Errors: one line, its exit code, a suggestion ----------------------------------------------
+
+WRONG = [
+    (["rnu"], "unknown command 'rnu'; known: run, "),
+    (["rnu"], "did you mean run?"),
+    (["plant=circuit"], "did you mean `gpebo run plant=circuit`?"),
+    (["list", "plans"], "did you mean plants?"),
+    (["list", "--config-dir", "nowhere"], "--config-dir nowhere: there is no such folder"),
+    (["run", "plant=circut"], "plant=circut: there is no such plant"),
+    (["run", "plant=circut"], "did you mean circuit?"),
+    (["run", "experiment=paper"], "did you mean paper_circuit?"),
+    (["run", "estimtor=drem"], "did you mean estimator?"),
+    (["run", "estimator.gama=1"], "estimator.gama: no such key"),
+    (["run", "estimator.gama=1"], "did you mean gamma?"),
+    (["run", "+estimator.foo=1"], "estimator.foo: no such key"),
+    (["run", "+plant.foo=1"], "unknown key 'foo'"),
+    (["run", "+foo=1"], "foo: no such key"),
+    (["run", "+plant=circuit"], "plant is chosen twice"),
+    (["run", "~plant"], "plant.name is missing"),
+    (["run", "plant"], "'plant' is not key=value"),
+    (["run", "plant=cir[cuit"], "cannot be read as key=value"),
+    (["run", "estimator.gamma=1,2"], "write 'estimator.gamma=[1,2]'"),
+    (["run", "estimator.gamma=-1"], "estimator.gamma"),
+    (["run", "time.samples=1.5"], "time.samples: expected a whole number, got 1.5"),
+    (["run", "time.samples=1"], "time.samples: expected 2 to"),
+    (["run", "time.horizon=abc"], "time.horizon: expected a finite number, got 'abc'"),
+    (["run", "time.horizon=-1"], "time.horizon: expected a positive number, got -1"),
+    (["run", "time=3"], "time: expected a mapping"),
+    (["run", "time.start=???"], "time.start has no value yet"),
+    (["run", "time.start=${plant.nme}"], "plant.nme"),
+    (["run", "solver.tol=1e-30"], "solver.tol: expected 1e-15 to 0.1"),
+    (["run", "observer.regression=papr"], "did you mean paper?"),
+    (["run", "figures=regressor"], "did you mean figures=[regressor]?"),
+    (["run", "figures=[nope]"], "nope"),
+    (["run", "plant.title=${oc.env:HOME}"], "plant.title: ${…} is not allowed in a plant"),
+    (["run", "--multrun"], "did you mean --multirun?"),
+    (["run", "--multirun=3"], "--multirun takes no value"),
+    (["run", "--cfg", "jb"], "--cfg needs one of job, hydra, all, got 'jb'"),
+    (["run", "--config-dir"], "--config-dir needs a value"),
+    (["run", "--config-dir", "nowhere"], "--config-dir nowhere: there is no such folder"),
+    (["run", "--config-name", "gpbo"], "did you mean gpebo?"),
+    (["run", "-m", "plant=circuit,circut"], "plant=circut: there is no such plant"),
+]
+
+
+@pytest.mark.parametrize(("words", "expected"), WRONG)
+def test_wrong_usage_is_one_line_and_exit_code_2(tmp_path, words, expected):
+    done = gpebo(*words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("gpebo: error: ")
+    assert done.stderr.count("\n") == 1
+    assert expected in done.stderr
+    assert folders(tmp_path) == [], "a run that never began leaves no folder"
+
+
+def test_a_failed_run_is_exit_code_1(tmp_path):
+    (tmp_path / "taken").touch()
+    done = gpebo("run", "hydra.run.dir=taken", *FAST, cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr == "gpebo: error: taken: File exists\n"
+
+
+def test_a_traceback_when_it_is_asked_for(tmp_path):
+    done = gpebo("run", "plant=circut", cwd=tmp_path, HYDRA_FULL_ERROR="1")
+    assert done.returncode == 2
+    assert "Traceback" in done.stderr
+    assert done.stderr.splitlines()[-1].startswith("gpebo: error: plant=circut")
+
+
+def test_an_unexpected_error_is_one_line_too(tmp_path):
+    script = (
+        "import sys; from gpebo_cli import app\n"
+        "def broken(words): raise RuntimeError('first\\nsecond')\n"
+        "app._dispatch = broken; sys.exit(app.main())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment(), cwd=tmp_path, capture_output=True,
+        text=True, check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        "gpebo: error: internal error: RuntimeError: first second "
+        "(set HYDRA_FULL_ERROR=1 for the traceback)\n"
+    )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+def test_an_interruption_is_exit_code_130_and_one_line(tmp_path):
+    words = ["run", "estimator.gamma=logspace(0,12,200000)", "output.max_rows=400000"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "gpebo_cli", *words], cwd=tmp_path, env=environment(),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:
+        deadline = time.monotonic() + 60
+        while not folders(tmp_path) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error == "gpebo: error: interrupted\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_behind_stdout_is_one_line(tmp_path):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "gpebo_cli", "list"], cwd=tmp_path, env=environment(),
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+
+
+def test_a_reader_that_stops_reading_is_no_error(tmp_path):
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "gpebo_cli", "list"], cwd=tmp_path, env=environment(),
+            stdout=writing, stderr=subprocess.PIPE, text=True, check=False,
+        )
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+# Runs -----------------------------------------------------------------------------------------
+
+
+def test_a_run_prints_table_folder_and_verdict(tmp_path):
+    done = gpebo("run", "estimator.gamma=[1e8,1e10]", *FAST, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    *table, moved, folder, verdict = done.stdout.splitlines()
+    assert len(table) == 3
+    assert table[0].split()[0] == "gamma"
+    assert "iv -0.25 → -3.45" in moved
+    assert (tmp_path / folder / "summary.json").is_file()
+    assert verdict.startswith("interval-exciting from t = ")
+    assert folder.endswith("_circuit_drem")
+
+
+def test_output_survives_a_terminal_that_knows_ascii_only(tmp_path):
+    done = gpebo("run", *FAST, cwd=tmp_path, PYTHONIOENCODING="ascii")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_many_cases_are_a_short_table(tmp_path):
+    done = gpebo("run", "estimator.gamma=logspace(6,10,100)", *FAST, cwd=tmp_path)
+    assert len(done.stdout.splitlines()) < 20
+    assert "… 88 more in cases.csv" in done.stdout
+
+
+def test_a_gain_may_be_logspace_without_quotes(tmp_path):
+    done = gpebo("run", "estimator.gamma=logspace(8, 10, 3)", *FAST, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    with (folders(tmp_path)[0] / "cases.csv").open() as stream:
+        assert [float(row["gamma"]) for row in csv.DictReader(stream)] == [1e8, 1e9, 1e10]
+
+
+def test_simulate_only(tmp_path):
+    done = gpebo("run", "observer=none", *FAST, cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout.splitlines()[-1].startswith("simulated: index 2")
+
+
+def test_an_experiment_chooses_gains(tmp_path):
+    done = gpebo("run", "experiment=paper_circuit", *FAST, cwd=tmp_path)
+    assert done.returncode == 0
+    with (folders(tmp_path)[0] / "cases.csv").open() as stream:
+        assert [float(row["gamma"]) for row in csv.DictReader(stream)] == [1e8, 1e10]
+
+
+def test_a_plant_of_ones_own(tmp_path, mine):
+    done = gpebo("run", "--config-dir", mine, "plant=mine", *FAST, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert folders(tmp_path)[0].name.endswith("_mine_drem")
+
+
+def test_an_error_in_a_plant_names_its_file(tmp_path, mine):
+    (mine / "plant" / "bad.yaml").write_text(MINE.replace("A: [[-1]]", "A: [[-z]]"))
+    done = gpebo("run", "--config-dir", mine, "plant=bad", *FAST, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "plant/bad.yaml" in done.stderr
+
+
+def test_a_saved_configuration_repeats_the_run_in_a_new_folder(tmp_path, mine):
+    words = ["--config-dir", mine, "plant=mine", "estimator.gamma=[1,2.5]", *FAST]
+    assert gpebo("run", *words, "hydra.run.dir=first", cwd=tmp_path).returncode == 0
+    first = tmp_path / "first"
+    before = {path.name: path.read_bytes() for path in first.iterdir() if path.is_file()}
+    again = gpebo("run", "--config-dir", first, "--config-name", "config", cwd=tmp_path)
+    assert (again.returncode, again.stderr) == (0, "")
+    (second,) = folders(tmp_path)
+    assert second.name.endswith("_mine_drem")
+    for name in ("signals.csv", "estimates.csv", "cases.csv", "config.yaml"):
+        assert (second / name).read_bytes() == before[name], name
+    assert {path.name: path.read_bytes() for path in first.iterdir() if path.is_file()} == before
+    # once more with a change on the command line
+    changed = gpebo(
+        "run", "--config-dir", first, "--config-name", "config", "time.horizon=5", cwd=tmp_path
+    )
+    assert changed.returncode == 0
+    assert len(folders(tmp_path)) == 2
+    group = gpebo(
+        "run", "--config-dir", first, "--config-name", "config", "plant=circuit", cwd=tmp_path
+    )
+    assert group.returncode == 2
+    assert "has plant written out" in group.stderr
+
+
+def test_cfg_prints_the_configuration_and_runs_nothing(tmp_path):
+    done = gpebo("run", "--cfg", "job", "plant=descriptor", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert yaml.safe_load(done.stdout)["plant"]["name"] == "descriptor"
+    assert folders(tmp_path) == []
+
+
+# Sweeps ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["-m", "estimator.gamma=1e6,1e8", *FAST],
+        ["plant=circuit", "-m", "estimator.gamma=1e6,1e8", *FAST],
+        ["estimator.gamma=1e6,1e8", *FAST, "--multirun"],
+    ],
+)
+def test_the_flag_of_a_sweep_may_stand_anywhere(tmp_path, words):
+    done = gpebo("run", *words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    (sweep,) = folders(tmp_path, "sweeps")
+    with (sweep / "results.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [float(row["estimator.gamma"]) for row in rows] == [1e6, 1e8]
+    assert [row["status"] for row in rows] == ["done", "done"]
+    slow, fast = (float(row["seconds_to_1pct_parameters"]) for row in rows)
+    assert fast < slow
+    assert not list(sweep.glob("*/figures"))
+
+
+def test_a_sweep_may_be_stored_in_a_recipe(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "gains.yaml").write_text(
+        "# @package _global_\n"
+        "hydra: {mode: MULTIRUN, sweeper: {params: {estimator.gamma: '1e6,1e8'}}}\n"
+    )
+    done = gpebo("run", "--config-dir", ".", "experiment=gains", *FAST, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1] == "2 jobs, 2 done, 0 failed"
+
+
+def test_a_failed_job_is_recorded_and_the_next_one_runs(tmp_path):
+    done = gpebo("run", "-m", "estimator.gamma=-1,[1e6,1e8]", *FAST, cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "1 of 2 jobs failed: job 0: estimator.gamma" in done.stderr
+    (sweep,) = folders(tmp_path, "sweeps")
+    with (sweep / "results.csv").open() as stream:
+        failed, *cases = csv.DictReader(stream)
+    assert failed["status"] == "failed"
+    assert "estimator.gamma" in failed["error"]
+    assert [(row["job"], row["case"], float(row["gamma"])) for row in cases] == [
+        ("1", "0", 1e6), ("1", "1", 1e8),
+    ]
+    record = json.loads((sweep / "0" / "result.json").read_text())
+    assert record["status"] == "failed"
+    assert record["overrides"]["estimator.gamma"] == "-1"
+    assert (sweep / "1" / "summary.json").is_file()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+def test_an_interrupted_sweep_keeps_what_is_done(tmp_path):
+    words = ["run", "-m", f"time.horizon=1,{','.join(str(1000 + k) for k in range(20))}", *FAST]
+    with subprocess.Popen(
+        [sys.executable, "-m", "gpebo_cli", *words], cwd=tmp_path, env=environment(),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:
+        deadline = time.monotonic() + 60
+        pattern = "outputs/sweeps/*/0/result.json"
+        while not list(tmp_path.glob(pattern)) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error == "gpebo: error: interrupted\n"
+    (sweep,) = folders(tmp_path, "sweeps")
+    with (sweep / "results.csv").open() as stream:
+        assert next(csv.DictReader(stream))["status"] == "done"
+
+
+# Files of strangers ---------------------------------------------------------------------------
+
+BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n"
+    for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+HOSTILE = [
+    ("plant/x.yaml", BOMB, "entries, aliases expanded"),
+    ("plant/x.yaml", "a: &a [*a]\n", "*a contains itself"),
+    ("plant/x.yaml", "a: " + "[" * 100_000, "levels deep"),
+    ("plant/x.yaml", "#" * 2_000_001, "bytes; at most"),
+    ("plant/x.yaml", MINE.replace("mine", "${oc.env:HOME}"), "${…} is not allowed"),
+    ("plant/x.yaml", MINE.replace("[[-1]]", "[['${oc.env:HOME}']]"), "${…} is not allowed"),
+    ("plant/x.yaml", MINE.replace("name: mine", "name: ../../mine"), "part of a folder's name"),
+    ("plant/x.yaml", MINE.replace("name: mine\n", ""), "name is missing"),
+    ("plant/x.yaml", "# @package hydra.callbacks\n" + MINE, "`# @package` is not allowed"),
+    ("plant/x.yaml", MINE + "defaults: [_self_]\n", "has no defaults list"),
+    ("plant/x.yaml", MINE + "x: {_target_: os.system}\n", "`_target_` is not allowed"),
+    ("plant/x.yaml", "!!python/object/apply:os.system ['touch pwned']", "not valid YAML"),
+    ("plant/x.yaml", "name: [", "not valid YAML"),
+    ("experiment/x.yaml", "# @package hydra.job_logging\na: 1\n", "only `# @package _global_`"),
+    (
+        "experiment/x.yaml",
+        "# @package _global_\nhydra: {job_logging: {handlers: {a: {(): os.system}}}}\n",
+        "hydra.job_logging is not allowed",
+    ),
+    (
+        "experiment/x.yaml",
+        "# @package _global_\ndefaults: [{/plant@hydra.callbacks: circuit}]\n",
+        "a defaults list may choose",
+    ),
+    (
+        "experiment/x.yaml",
+        "# @package _global_\nplant: {title: '${oc.env:HOME}'}\n",
+        "${…} is not allowed",
+    ),
+]
+
+
+@pytest.mark.parametrize(("path", "text", "expected"), HOSTILE)
+def test_hostile_files_get_one_line_quickly(tmp_path, path, text, expected):
+    target = tmp_path / "evil" / path
+    target.parent.mkdir(parents=True)
+    target.write_text(text)
+    group = target.parent.name
+    done = gpebo("run", "--config-dir", "evil", f"{group}=x", *FAST, cwd=tmp_path)  # or a time-out
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert expected in done.stderr
+    assert not (tmp_path / "pwned").exists()
+
+
+def test_a_launcher_from_the_folder_cannot_be_chosen_by_it(tmp_path):
+    folder = tmp_path / "evil"
+    (folder / "experiment").mkdir(parents=True)
+    (folder / "hydra" / "launcher").mkdir(parents=True)
+    (folder / "hydra" / "launcher" / "mine.yaml").write_text("_target_: os.system\n")
+    (folder / "experiment" / "x.yaml").write_text(
+        "# @package _global_\ndefaults: [{override /hydra/launcher: mine}]\n"
+    )
+    done = gpebo("run", "--config-dir", folder, "experiment=x", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "a defaults list may choose" in done.stderr
+
+
+def test_half_written_neighbours_do_no_harm(tmp_path, mine):
+    (mine / "plant" / "other.yaml").write_text("name: [")
+    done = gpebo("run", "--config-dir", mine, "plant=mine", *FAST, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_file_that_would_be_ignored_is_refused(tmp_path, mine):
+    (mine / "plant" / "circuit.yaml").write_text(MINE)
+    done = gpebo("run", "--config-dir", mine, "plant=circuit", *FAST, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "would be ignored; rename it" in done.stderr

@@ -1,0 +1,163 @@
+"""The collocation engine: rule, order of convergence, refinement, honesty of the estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
+from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli.errors import SolverError
+
+
+@pytest.mark.parametrize("stages", range(2, 13))
+def test_rule_integrates_polynomials_exactly(stages):
+    rule = radau_rule(stages)
+    for degree in range(stages):
+        inside = rule.integration @ rule.nodes**degree
+        np.testing.assert_allclose(inside, rule.nodes ** (degree + 1) / (degree + 1), atol=1e-14)
+    for degree in range(2 * stages - 1):  # order 2s − 1 at the end
+        end = rule.integration[-1] @ rule.nodes**degree
+        assert end == pytest.approx(1 / (degree + 1), abs=1e-14)
+
+
+def test_two_stage_rule_is_the_textbook_one():
+    rule = radau_rule(2)
+    np.testing.assert_allclose(rule.nodes, [1 / 3, 1], atol=1e-15)
+    np.testing.assert_allclose(rule.integration, [[5 / 12, -1 / 12], [3 / 4, 1 / 4]], atol=1e-15)
+
+
+def fixed(coefficients, start, mesh):
+    """Solve without refinement."""
+    return solve(
+        LinearProblem(coefficients, np.asarray(start, dtype=float)), mesh, tol=1e300,
+        max_elements=10_000,
+    ).trajectory
+
+
+def oscillator(t, inside):
+    """x1' = x2, x2' = −x1 and the constraint 0 = x1 + t x2 − x3."""
+    n = len(t)
+    E, A = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    E[:, 0, 0] = E[:, 1, 1] = 1.0
+    A[:, 0, 1], A[:, 1, 0] = 1.0, -1.0
+    A[:, 2, 0], A[:, 2, 1], A[:, 2, 2] = 1.0, t, -1.0
+    return Coefficients(E, A, np.zeros((n, 3, 1)))
+
+
+@pytest.mark.parametrize("stages", [2, 3, 4])
+def test_order_of_convergence(stages):
+    """2s − 1 at the element ends, for differential and algebraic components."""
+    errors = []
+    for elements in (8, 16, 32):
+        mesh = initial_mesh(0.0, 4.0, [], elements, radau_rule(stages))
+        end = fixed(oscillator, [[1.0], [0.0], [1.0]], mesh).final[:, 0]
+        truth = np.array([np.cos(4.0), -np.sin(4.0), np.cos(4.0) - 4.0 * np.sin(4.0)])
+        errors.append(np.abs(end - truth))
+    rates = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert rates[-1] == pytest.approx(2 * stages - 1, abs=0.35)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 4), st.integers(0, 2**32 - 1), st.floats(0.2, 8.0))
+def test_constant_coefficients_give_the_matrix_exponential(n, seed, horizon):
+    A = np.random.default_rng(seed).normal(size=(n, n))
+    mesh = initial_mesh(0.0, horizon, [], 4, radau_rule(9))
+    constant = Coefficients(None, A[None], np.zeros((1, n, n)))
+    problem = LinearProblem(lambda t, inside: constant, np.eye(n))
+    result = solve(problem, mesh, tol=1e-11, max_elements=10_000)
+    truth = expm(horizon * A)
+    error = np.abs(result.trajectory.final - truth).max() / max(1.0, np.abs(truth).max())
+    assert error < 1e-8  # the problem itself is as ill-conditioned as it is unstable
+    assert error < 10 * result.error_estimate
+
+
+@pytest.mark.parametrize("tol", [1e-5, 1e-8, 1e-11])
+def test_refinement_reaches_the_tolerance_where_the_signal_is_fast(tol):
+    """A pulse of width 0.02 in a horizon of 10: elements go where it is."""
+
+    def pulse(t, inside):
+        f = -2.0 * 2500.0 * (t - 6.1) * np.exp(-2500.0 * (t - 6.1) ** 2)
+        return Coefficients(None, np.zeros((len(t), 1, 1)), f[:, None, None])
+
+    mesh = initial_mesh(0.0, 10.0, [], 24, radau_rule(9))
+    result = solve(LinearProblem(pulse, np.zeros((1, 1))), mesh, tol=tol, max_elements=10_000)
+    t = np.linspace(0, 10, 2001)
+    error = np.abs(result.trajectory(t)[:, 0, 0] - np.exp(-2500.0 * (t - 6.1) ** 2)).max()
+    assert error <= 10 * tol
+    steps = result.trajectory.mesh.steps
+    assert steps.min() < 0.1
+    assert steps.max() > 0.4
+
+
+def test_a_stiff_transient_is_resolved_and_forgotten():
+    """x' = −1e8 (x − cos t): the layer is resolved, the rest costs what a smooth signal costs."""
+
+    def stiff(t, inside):
+        n = len(t)
+        f = (1e8 * np.cos(t) - np.sin(t))[:, None, None]
+        return Coefficients(None, np.full((n, 1, 1), -1e8), f)
+
+    mesh = initial_mesh(0.0, 10.0, [], 8, radau_rule(9))
+    result = solve(LinearProblem(stiff, np.array([[3.0]])), mesh, tol=1e-10, max_elements=10_000)
+    t = np.concatenate([np.geomspace(1e-10, 1e-6, 50), np.linspace(0.01, 10, 50)])
+    truth = np.cos(t) + 2.0 * np.exp(-1e8 * t)
+    assert np.abs(result.trajectory(t)[:, 0, 0] - truth).max() < 1e-9
+    assert result.trajectory.mesh.size < 200
+
+
+def test_an_unannounced_singularity_is_an_error_that_names_the_time():
+    def singular(t, inside):
+        with np.errstate(divide="ignore"):
+            f = 1.0 / np.sqrt(np.abs(t - 0.7))
+        return Coefficients(None, np.zeros((len(t), 1, 1)), f[:, None, None])
+
+    mesh = initial_mesh(0.0, 1.0, [], 8, radau_rule(9))
+    with pytest.raises(SolverError, match=r"t = 0\.(69|7)"):
+        solve(LinearProblem(singular, np.zeros((1, 1))), mesh, tol=1e-10, max_elements=2000)
+
+
+def test_a_solution_that_overflows_is_an_error():
+    mesh = initial_mesh(0.0, 1.0, [], 8, radau_rule(9))
+    constant = Coefficients(None, np.full((1, 1, 1), 1e4), np.zeros((1, 1, 1)))
+    problem = LinearProblem(lambda t, inside: constant, np.ones((1, 1)))
+    with pytest.raises(SolverError):
+        solve(problem, mesh, tol=1e-10, max_elements=50_000)
+
+
+def smooth_signal(mesh: Mesh) -> Trajectory:
+    return Trajectory(mesh, np.stack([np.sin(mesh.points), mesh.points**3], axis=-1))
+
+
+def test_trajectory_samples_integrates_and_filters():
+    mesh = initial_mesh(0.5, 4.5, [1.3], 12, radau_rule(9))
+    signal = smooth_signal(mesh)
+    t = np.linspace(0.5, 4.5, 333)
+    np.testing.assert_allclose(signal(t), np.stack([np.sin(t), t**3], axis=-1), atol=1e-12)
+    truth = np.stack([np.cos(0.5) - np.cos(t), (t**4 - 0.5**4) / 4], axis=-1)
+    np.testing.assert_allclose(signal.integral()(t), truth, atol=1e-12)
+    rate = np.array([0.7, 2.0])
+    filtered = signal.low_pass(rate)
+    # z' = −λ (z − s): check through its own integral equation.
+    residual = filtered.values - rate * (signal.integral().values - filtered.integral().values)
+    assert np.abs(residual).max() < 1e-11
+
+
+def test_a_jump_is_right_continuous_and_can_be_asked_for_from_the_left():
+    mesh = initial_mesh(0.0, 2.0, [1.0], 4, radau_rule(5))
+    step = Trajectory(mesh, (mesh.inside > 1.0).astype(float))
+    one = np.array([1.0])
+    assert step(one)[0] == 1.0
+    assert step(np.nextafter(one, 0))[0] == pytest.approx(1.0)  # one ulp early is the edge
+    assert step(one, one - 0.01)[0] == 0.0
+
+
+def test_splitting_keeps_edges_and_marks_what_is_new():
+    mesh = initial_mesh(0.0, 3.0, [], 3, radau_rule(3))
+    finer, kept = mesh.split(np.array([1, 3, 1]))
+    np.testing.assert_allclose(finer.edges, [0, 1, 4 / 3, 5 / 3, 2, 3])
+    assert kept.tolist() == [0, -1, -1, -1, 2]

@@ -1,0 +1,389 @@
+"""Every estimator against its defining ODEs, its limits, and its identities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plants import reference, shipped
+from regressions import ETA, adjugate, fading, integrate, regression, three
+
+from gpebo_cli import estimators
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators._extension import kreisselmeier, lion
+from gpebo_cli.observers import observe
+from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+
+T = np.linspace(0, 10, 101)
+START = [0.3, 0.1, -0.2]
+
+
+def wobble(t):
+    return 0.2 * np.sin(3.0 * np.asarray(t))
+
+
+NOISY = regression(three, ETA, disturbance=wobble)
+CLEAN = regression(three, ETA)
+
+
+def estimate(name, regression, t=T, **gains):
+    built = estimators.build({"name": name, **gains})
+    return built.estimate(regression, t)
+
+
+def run(name, regression, t=T, **gains):
+    return estimate(name, regression, t, **gains).parameters(slice(None))
+
+
+def signals(t):
+    psi = three(t)
+    return psi, float(psi @ ETA + wobble(t))
+
+
+def gradient_ode(gamma):
+    def f(t, x):
+        psi, Y = signals(t)
+        return gamma * psi * (Y - psi @ x)
+
+    return f, np.array(START), slice(None)
+
+
+def least_squares_ode(alpha, f0, beta, bound=None):
+    def f(t, x):
+        psi, Y = signals(t)
+        F = x[:9].reshape(3, 3)
+        b = beta * (1 - np.linalg.norm(F, 2) / bound) if bound else beta
+        return np.concatenate([
+            (-alpha * F @ np.outer(psi, psi) @ F + b * F).ravel(),
+            alpha * F @ psi * (Y - psi @ x[9:12]),
+        ])
+
+    return f, np.concatenate([(np.eye(3) / f0).ravel(), START]), slice(9, 12)
+
+
+def drem_ode(gamma, lam, kind):
+    lam = np.asarray(lam)
+
+    def f(t, x):
+        psi, Y = signals(t)
+        omega, calY, eta = x[:9].reshape(3, 3), x[9:12], x[12:]
+        if kind == "kreisselmeier":
+            d_omega = -lam[:, None] * (omega - np.outer(psi, psi))
+            d_calY = -lam * (calY - psi * Y)
+        else:
+            d_omega, d_calY = -lam[:, None] * (omega - psi), -lam * (calY - Y)
+        delta = np.linalg.det(omega)
+        law = gamma * delta * (adjugate(omega) @ calY - delta * eta)
+        return np.concatenate([d_omega.ravel(), d_calY, law])
+
+    return f, np.concatenate([np.zeros(12), START]), slice(12, 15)
+
+
+def ls_drem_ode(gamma, alpha, f0, beta, bound=None):
+    start = np.array(START)
+
+    def f(t, x):
+        psi, Y = signals(t)
+        F, g, z, eta = x[:9].reshape(3, 3), x[9:12], x[12], x[13:]
+        b = beta * (1 - np.linalg.norm(F, 2) / bound) if bound else beta
+        H = np.eye(3) - z * f0 * F
+        delta = np.linalg.det(H)
+        mixed = adjugate(H) @ (g - z * f0 * F @ start)
+        return np.concatenate([
+            (-alpha * F @ np.outer(psi, psi) @ F + b * F).ravel(),
+            alpha * F @ psi * (Y - psi @ g),
+            [-b * z],
+            gamma * delta * (mixed - delta * eta),
+        ])
+
+    return (
+        f,
+        np.concatenate([(np.eye(3) / f0).ravel(), START, [1.0], START]),
+        slice(13, 16),
+    )
+
+
+def mre_ode(gamma, lam):
+    def f(t, x):
+        psi, Y = signals(t)
+        omega, calY, eta = x[:9].reshape(3, 3), x[9:12], x[12:]
+        return np.concatenate([
+            (-lam * (omega - np.outer(psi, psi))).ravel(),
+            -lam * (calY - psi * Y),
+            gamma * (calY - omega @ eta),
+        ])
+
+    return f, np.concatenate([np.zeros(12), START]), slice(12, 15)
+
+
+@pytest.mark.parametrize(
+    ("name", "gains", "ode", "tolerance"),
+    [
+        ("gradient", {"gamma": 3}, gradient_ode(3), 1e-9),
+        ("least_squares", {"alpha": 2, "f0": 0.5}, least_squares_ode(2, 0.5, 0), 1e-9),
+        ("least_squares", {"alpha": 2, "f0": 0.5, "beta": 0.3},
+         least_squares_ode(2, 0.5, 0.3), 1e-9),
+        ("least_squares", {"alpha": 2, "f0": 0.5, "beta": 0.3, "bound": 5},
+         least_squares_ode(2, 0.5, 0.3, 5), 1e-8),
+        ("drem", {"gamma": 100, "lambda": [0.1, 0.2, 0.3]},
+         drem_ode(100, [0.1, 0.2, 0.3], "kreisselmeier"), 1e-7),
+        ("drem", {"gamma": 1e4, "lambda": 0.5}, drem_ode(1e4, [0.5] * 3, "kreisselmeier"), 1e-7),
+        ("lion", {"gamma": 1e4, "lambda": [0.5, 1, 2]}, drem_ode(1e4, [0.5, 1, 2], "lion"), 1e-7),
+        ("ls_drem", {"gamma": 10, "alpha": 2, "f0": 0.5}, ls_drem_ode(10, 2, 0.5, 0), 1e-7),
+        ("ls_drem", {"gamma": 10, "alpha": 2, "f0": 0.5, "beta": 0.3},
+         ls_drem_ode(10, 2, 0.5, 0.3), 1e-7),
+        ("ls_drem", {"gamma": 10, "alpha": 2, "f0": 0.5, "beta": 0.3, "bound": 5},
+         ls_drem_ode(10, 2, 0.5, 0.3, 5), 1e-7),
+        ("mre", {"gamma": 5, "lambda": 0.2}, mre_ode(5, 0.2), 1e-9),
+    ],
+    ids=lambda value: value if isinstance(value, str) else None,
+)
+def test_against_an_integration_of_the_defining_odes(name, gains, ode, tolerance):
+    f, x0, columns = ode
+    expected = integrate(f, x0, T)[:, columns]
+    found = run(name, NOISY, initial=START, **gains)[0]
+    assert np.abs(found - expected).max() < tolerance
+
+
+def test_finite_time_law_against_an_integration_with_its_energy():
+    """The DREM ODEs with I' = Δ² beside them, then w_c and η̂_f from their definitions."""
+    gamma, mu, lam = 1e3, 0.2, [0.3, 0.5, 0.7]
+    inner, x0, columns = drem_ode(gamma, lam, "kreisselmeier")
+
+    def f(t, x):
+        delta = np.linalg.det(x[:9].reshape(3, 3))
+        return np.append(inner(t, x[:-1]), delta**2)
+
+    found = integrate(f, np.append(x0, 0.0), T)
+    w_c = np.minimum(np.exp(-gamma * found[:, -1]), 1 - mu)[:, None]
+    expected = (found[:, columns] - w_c * START) / (1 - w_c)
+    ours = run("fct", NOISY, gamma=gamma, mu=mu, initial=START, **{"lambda": lam})[0]
+    assert np.abs(ours - expected).max() < 1e-6
+
+
+def test_least_squares_without_forgetting_is_regularised_batch_least_squares():
+    alpha, f0 = 3.0, 0.7
+    gram = NOISY.gram(T)
+    expected = [
+        np.linalg.solve(f0 * np.eye(3) + alpha * g[:, :3], f0 * np.array(START) + alpha * g[:, 3])
+        for g in gram
+    ]
+    found = run("least_squares", NOISY, alpha=alpha, f0=f0, initial=START)[0]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_drem_with_one_parameter_is_the_gradient_law_on_omega():
+    """p = 1: Δ = Ω, 𝐘 = 𝒴."""
+    one = regression(lambda t: (1.0 + 0.5 * np.sin(t))[..., None], np.array([2.0]))
+    omega = kreisselmeier(one, np.array([0.4]))
+
+    def f(t, x):
+        O, calY = omega(np.array([t]))[0, 0]
+        return [50.0 * O * (calY - O * x[0])]
+
+    expected = integrate(f, np.zeros(1), T)
+    np.testing.assert_allclose(run("drem", one, gamma=50, **{"lambda": 0.4})[0], expected,
+                               atol=1e-9)
+
+
+@pytest.mark.parametrize("gamma", [1e2, 1e6, 1e10, 1e14])
+def test_noise_free_error_is_the_exponential_of_the_energy(gamma):
+    answer = estimate("drem", CLEAN, gamma=gamma)
+    energy = answer.groups[0].energy_at_t
+    error = answer.parameters(slice(None))[0] - ETA
+    np.testing.assert_allclose(
+        error, -np.exp(-gamma * energy)[:, None] * ETA, atol=1e-12, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("make", [kreisselmeier, lion])
+def test_mixed_regression_holds(make):
+    """𝐘 = Δ η to 1e-11 of their size, at every time, Ω = 0 at the start included."""
+    from gpebo_cli.linalg import determinant_and_adjugate_action
+
+    values = make(CLEAN, np.array([0.1, 0.2, 0.3]))(T)
+    delta, Y, _ = determinant_and_adjugate_action(values[..., :3], values[..., 3])
+    assert delta[0] == 0.0
+    np.testing.assert_allclose(Y, delta[:, None] * ETA, atol=1e-11 * np.abs(delta).max())
+
+
+def test_ls_drem_delta_is_the_reference_one():
+    system = shipped("circuit")
+    signals = simulate(system, TimeSettings(), SolverSettings()).signals
+    observation = observe(
+        system, signals.inputs, signals.outputs, ObserverSettings(), SolverSettings()
+    )
+    rows = reference("circuit")["at"]
+    t = np.array([row["t"] for row in rows])
+    found = estimate("ls_drem", observation.regression, t, alpha=1, f0=1).delta(t)[0]
+    expected = [row["delta_ls_alpha1_f01"] for row in rows]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    gram = observation.regression.gram(t)[..., :-1]
+    literal = [np.linalg.det(g @ np.linalg.inv(np.eye(3) + g)) for g in gram]
+    np.testing.assert_allclose(found, literal, rtol=1e-6, atol=1e-15)
+    mixed = estimate("drem", observation.regression, t)
+    key = "delta_kreisselmeier_rows_0.1_0.2_0.3"
+    np.testing.assert_allclose(mixed.delta(t)[0], [row[key] for row in rows], rtol=1e-9)
+    np.testing.assert_allclose(
+        mixed.groups[0].energy_at_t, [row["integral_delta_squared_rows"] for row in rows], rtol=1e-6
+    )
+    same = estimate("drem", observation.regression, t, **{"lambda": 0.2})
+    np.testing.assert_allclose(
+        same.delta(t)[0], [row["delta_kreisselmeier_0.2"] for row in rows], rtol=1e-9
+    )
+
+
+def test_ls_drem_delta_is_between_0_and_1_and_never_falls():
+    delta = estimate("ls_drem", CLEAN, alpha=1, f0=1e-3).delta(T)[0]
+    assert (np.diff(delta) >= -1e-14).all()
+    assert delta[0] == 0.0
+    assert delta[-1] < 1.0
+
+
+@pytest.mark.parametrize("extension", ["kreisselmeier", "least_squares"])
+def test_finite_time_estimate_is_exact_after_its_threshold_and_not_before(extension):
+    gains = {"gamma": 2e3 if extension == "kreisselmeier" else 3.0, "mu": 0.3, "f0": 0.1}
+    answer = estimate("fct", CLEAN, extension=extension, **gains)
+    energy = gains["gamma"] * answer.groups[0].energy_at_t
+    error = np.abs(answer.parameters(slice(None))[0] - ETA).max(axis=1)
+    threshold = -np.log1p(-0.3)
+    assert (error[energy > threshold + 1e-9] < 1e-11).all()
+    assert (error[energy < 0.9 * threshold] > 1e-2).all()
+    assert (energy > threshold).any()
+
+
+def test_a_regressor_that_dies_out_separates_the_estimators():
+    """IE, not PE: fading filters and a gradient stall, LS+DREM converges."""
+    faded = regression(fading, ETA, horizon=60.0, elements=240)
+    t = np.array([0.0, 20.0, 60.0])
+    stalled = estimate("drem", faded, t, gamma=100.0)
+    error = np.abs(stalled.parameters(slice(None))[0] - ETA).max(axis=1)
+    assert error[2] > 0.5 * error[0]
+    assert error[2] > 0.99 * error[1]
+    assert not stalled.requirement.holds
+    gradient = estimate("gradient", faded, t, gamma=0.5)
+    assert np.abs(gradient.parameters(slice(None))[0, 2] - ETA).max() > 0.05
+    assert not gradient.requirement.holds
+    converged = estimate("ls_drem", faded, t, gamma=5.0)
+    assert np.abs(converged.parameters(slice(None))[0, 2] - ETA).max() < 1e-9
+    assert converged.requirement.holds
+
+
+@settings(max_examples=40, deadline=None)
+@given(p=st.integers(1, 6), seed=st.integers(0, 2**32 - 1))
+def test_random_regressors(p, seed):
+    """Noise-free, any p: each exact law moves from its start towards η and never beyond."""
+    rng = np.random.default_rng(seed)
+    frequency, phase = rng.uniform(0.2, 3, p), rng.uniform(0, 6, p)
+    eta = rng.normal(size=p)
+    drawn = regression(lambda t: np.sin(np.asarray(t)[..., None] * frequency + phase), eta,
+                       elements=60)
+    for name in ("drem", "ls_drem"):
+        answer = estimate(name, drawn, gamma=1e3)
+        error = answer.parameters(slice(None))[0] - eta
+        size = np.abs(eta).max()
+        assert (np.abs(error) <= np.abs(eta) * (1 + 1e-9) + 1e-9 * size).all()
+        assert (np.diff(np.abs(error), axis=0) <= 1e-7 * size).all()
+        assert (np.diff(answer.groups[0].energy_at_t) >= 0).all()
+    ls = run("least_squares", drawn, alpha=1, f0=1e-3)[0] - eta
+    information = 1e-3 * np.eye(p) + drawn.gram(T)[..., :p]
+    level = np.einsum("mi,mij,mj->m", ls, information, ls)  # η̃ᵀF⁻¹η̃ never grows
+    assert (np.diff(level) <= 1e-9 * level[0]).all()
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1e4, 1e8, 1e14])
+def test_gradient_is_as_accurate_at_any_gain(gamma):
+    """Two parameters in two rows: η̂ = η at once for γ → ∞; and the limit is approached as 1/γ."""
+    square = regression(three, ETA)
+    psi = np.stack([three(square.mesh.points), three(square.mesh.points + 1.0),
+                    three(2.0 * square.mesh.points + 2.0)], axis=-2)
+    square = replace(
+        square,
+        psi=type(square.psi)(square.mesh, psi),
+        Y=type(square.Y)(square.mesh, psi @ ETA),
+    )
+    error = run("gradient", square, gamma=gamma)[0] - ETA
+    if gamma >= 1e4:
+        assert np.abs(error[50:]).max() < 1e-9
+    assert np.abs(error).max() <= 2 * np.abs(ETA).max()
+
+
+def test_stiff_gradient_matches_its_limit():
+    """γ = 1e14 against γ = 1e10 with one row: both are the limit of the fast direction."""
+    high = run("gradient", CLEAN, gamma=1e14)[0]
+    low = run("gradient", CLEAN, gamma=1e10)[0]
+    np.testing.assert_allclose(high, low, atol=1e-8)
+
+
+# --- gains ----------------------------------------------------------------------------------
+
+
+def test_cases_are_the_product_of_the_lists():
+    built = estimators.build(
+        {"name": "ls_drem", "gamma": [1, 10, 100], "f0": "logspace(-3, -1, 2)"}
+    )
+    assert len(built.cases) == 6
+    assert [case["gamma"] for case in built.cases[:3]] == [1, 10, 100]
+    assert built.cases[3]["f0"] == pytest.approx(0.1)
+    together = built.estimate(NOISY, T)
+    all_cases = together.parameters(slice(None))
+    for i, case in enumerate(built.cases):
+        alone = run("ls_drem", NOISY, gamma=case["gamma"], f0=case["f0"])[0]
+        np.testing.assert_allclose(all_cases[i], alone, atol=1e-9)
+    np.testing.assert_allclose(together.parameters(slice(2, 5)), all_cases[2:5], atol=1e-9)
+    assert together.delta(T).shape == (6, len(T))
+
+
+def test_many_gains_are_the_same_as_one_at_a_time():
+    """Above the limit of the prefix scan another path is taken; the numbers stay."""
+    gains = np.logspace(2, 12, 1000)
+    many = estimate("drem", NOISY, T[::10], gamma=gains.tolist()).parameters(slice(None))
+    for i in (0, 333, 999):
+        one = run("drem", NOISY, T[::10], gamma=float(gains[i]))[0]
+        np.testing.assert_allclose(many[i], one, rtol=1e-9, atol=1e-12)
+
+
+def test_a_gain_per_parameter_by_name():
+    gains = {"p1": 10.0, "p2": 100.0, "p3": 1000.0}
+    answer = run("drem", NOISY, gamma=gains)
+    assert len(answer) == 1
+    for i, gamma in enumerate(gains.values()):
+        np.testing.assert_allclose(
+            answer[0, :, i], run("drem", NOISY, gamma=gamma)[0, :, i], atol=1e-12
+        )
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"name": "dream"}, "'dream' is not an estimator"),
+        ({"name": "drem", "gamma": -1}, "positive number"),
+        ({"name": "drem", "gamma": []}, "empty list"),
+        ({"name": "drem", "gamma": "logspace(0, 400, 5)"}, "±300"),
+        ({"name": "drem", "gamma": "import os"}, "not a positive number"),
+        ({"name": "drem", "gamma": float("nan")}, "positive number"),
+        ({"name": "drem", "gama": 1}, "gama"),
+        ({"name": "drem", "lambda": [0.1, 0.2]}, r"2 values but there are 3 parameters \(p1, p2"),
+        ({"name": "drem", "initial": {"p9": 1}}, "unknown 'p9'; the parameters are p1, p2, p3"),
+        ({"name": "drem", "gamma": {"p1": 1.0}}, "no value for 'p2'"),
+        ({"name": "least_squares", "beta": -1}, "forgetting"),
+        ({"name": "least_squares", "bound": 1, "f0": 0.1}, r"below 1/f0 = 10"),
+        ({"name": "fct", "mu": 1.5}, "between 0 and 1"),
+        ({"name": "ls_drem", "gamma": "logspace(0,9,10000)", "alpha": "logspace(0,9,10000)"},
+         "cases"),
+    ],
+)
+def test_wrong_settings_are_refused_with_one_line(settings, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        estimators.build(settings).estimate(CLEAN, T)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_estimator_has_a_config():
+    from plants import CONF
+
+    assert estimators.names() == sorted(path.stem for path in (CONF / "estimator").glob("*.yaml"))

@@ -1,0 +1,114 @@
+"""Excitation evidence against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plants import reference, shipped
+from regressions import ETA, fading, regression, three
+from scipy.integrate import quad_vec
+
+from gpebo_cli.excitation import assess, persistent
+from gpebo_cli.metrics import settling_time, time_rms
+from gpebo_cli.observers import observe
+from gpebo_cli.settings import (
+    ExcitationSettings,
+    ObserverSettings,
+    SolverSettings,
+    TimeSettings,
+)
+from gpebo_cli.simulation.simulate import simulate
+
+T = np.linspace(0, 10, 201)
+CLEAN = regression(three, ETA)
+
+
+def gram(psi, a, b):
+    return quad_vec(lambda t: np.outer(psi(t), psi(t)), a, b, epsabs=1e-13)[0]
+
+
+def outer(regression):
+    return type(regression.outer)(regression.mesh, regression.outer.values[..., :3])
+
+
+def test_eigenvalues_of_the_circuit_match_the_reference():
+    system = shipped("circuit")
+    signals = simulate(system, TimeSettings(), SolverSettings()).signals
+    regression = observe(
+        system, signals.inputs, signals.outputs, ObserverSettings(), SolverSettings()
+    ).regression
+    rows = reference("circuit")["at"]
+    t = np.array([row["t"] for row in rows])
+    found = assess(regression, t, ExcitationSettings())
+    np.testing.assert_allclose(
+        found.gram_eigenvalues, [row["gram_eigenvalues"] for row in rows], rtol=1e-7
+    )
+    assert found.is_ie
+
+
+def test_eigenvalues_and_window_against_quadrature():
+    found = assess(CLEAN, T, ExcitationSettings(rho=0.5, window=2.5))
+    for k in (40, 120, 200):
+        np.testing.assert_allclose(
+            found.gram_eigenvalues[k], np.linalg.eigvalsh(gram(three, 0, T[k])), atol=1e-11
+        )
+    assert np.isnan(found.pe_level[T < 2.5]).all()
+    for k in (50, 111, 200):
+        expected = np.linalg.eigvalsh(gram(three, T[k] - 2.5, T[k]))[0]
+        assert found.pe_level[k] == pytest.approx(expected, abs=1e-12)
+
+
+def test_t_c_is_the_first_time_the_level_is_reached():
+    found = assess(CLEAN, T, ExcitationSettings(rho=0.5))
+    assert np.linalg.eigvalsh(gram(three, 0, found.t_c))[0] == pytest.approx(0.5, rel=1e-6)
+    never = assess(CLEAN, T, ExcitationSettings(rho=1e6))
+    assert never.t_c is None
+    assert not never.is_ie
+
+
+def test_the_weakest_direction_is_named():
+    blind = regression(
+        lambda t: np.stack([np.sin(t), np.sin(t), np.cos(t)], axis=-1), ETA
+    )  # p1 and p2 cannot be told apart
+    found = assess(blind, T, ExcitationSettings())
+    assert not found.is_ie
+    direction = found.weakest_direction.components
+    assert abs(direction["p1"]) == pytest.approx(np.sqrt(0.5), abs=1e-9)
+    assert direction["p1"] == pytest.approx(-direction["p2"], abs=1e-9)
+    assert str(found.weakest_direction).replace("+", "-") == "-0.707 p1 -0.707 p2"
+
+
+def test_rounding_is_not_excitation():
+    zero = regression(lambda t: 1e-16 * three(t), ETA)
+    assert not assess(zero, T, ExcitationSettings()).is_ie
+
+
+def test_a_fading_regressor_is_ie_and_not_pe():
+    faded = regression(fading, ETA, horizon=40.0, elements=160)
+    t = np.linspace(0, 40, 101)
+    found = assess(faded, t, ExcitationSettings())
+    assert found.is_ie
+    assert found.pe_level[-1] == pytest.approx(0.0, abs=1e-30)  # no cancellation noise
+    assert not persistent(outer(faded), 100.0).holds
+    assert persistent(outer(CLEAN), 1e5).holds
+    assert not persistent(outer(CLEAN), 1e-3).holds
+
+
+def test_settling_time_of_an_exponential_is_exact():
+    t = np.linspace(2.0, 12.0, 37)
+    error = np.array([np.exp(-0.8 * (t - 2.0)), np.ones_like(t), np.zeros_like(t)])
+    found = settling_time(t, error)
+    assert found[0] == pytest.approx(np.log(100) / 0.8, rel=1e-12)
+    assert np.isnan(found[1])
+    assert found[2] == 0.0
+
+
+def test_settling_time_counts_the_last_excursion():
+    t = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    error = np.array([[1.0, 1e-3, 0.5, 1e-3, 1e-3]])
+    assert 2.0 < settling_time(t, error)[0] < 3.0
+
+
+def test_time_rms():
+    t = np.linspace(0, 2 * np.pi, 20_001)
+    assert time_rms(t, np.sin(t)[None])[0] == pytest.approx(np.sqrt(0.5), rel=1e-6)

@@ -1,0 +1,386 @@
+"""Figures: named axes, legends beside the curves, nothing clipped, readable in one column."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from factories import UNITS, make_result, with_figures, without_observer
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from PIL import Image
+
+from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.outputs import style
+from gpebo_cli.outputs.figures import FIGURES, draw
+from gpebo_cli.outputs.folder import write_run
+from gpebo_cli.outputs.provenance import Provenance
+from gpebo_cli.result import EstimationResult, RunResult
+
+CIRCUIT_FIGURES = {
+    "regressor",
+    "states",
+    "estimates_a",
+    "estimates_b",
+    "parameter_error",
+    "state_error_a",
+    "state_error_b",
+    "gram",
+    "delta",
+}
+LONG_NAMES = {"gamma": 1e10, "alpha": 0.25, "lambda_1": 0.1, "forgetting_factor": 1e-3}
+
+
+def estimation_of(result: RunResult) -> EstimationResult:
+    assert result.estimation is not None
+    return result.estimation
+
+
+def many_gains() -> RunResult:
+    """Nine cases in which four gains vary, with long names: the widest legend there can be."""
+    result = make_result(gammas=tuple(np.logspace(8, 12, 9)), samples=101)
+    cases = tuple({k: v * (i + 1) for k, v in LONG_NAMES.items()} for i in range(9))
+    return replace(result, estimation=replace(estimation_of(result), cases=cases))
+
+
+def wild() -> RunResult:
+    """Estimates that blow up, turn into NaN, or are exact from the start."""
+    result = make_result(samples=101)
+    estimation = estimation_of(result)
+    states = estimation.states.copy()
+    states[0, 50:, 0] = np.nan
+    states[1, :, 1] = 1e200
+    states[:, :, 2] = result.simulation.states[:, 2]
+    parameters = estimation.parameters.copy()
+    parameters[:, :, 0] = 1.0
+    return replace(result, estimation=replace(estimation, states=states, parameters=parameters))
+
+
+def long_names() -> RunResult:
+    """States whose names do not fit beside a panel, with values in the millions."""
+    result = make_result(samples=101, parameters=())
+    names = tuple(f"current_of_the_{i}th_inductor_from_left" for i in range(6))
+    system = replace(result.system, states=names, units=dict.fromkeys(names, "mA"))
+    states = result.simulation.states * 1e6
+    simulation = replace(result.simulation, states=states)
+    estimation = replace(estimation_of(result), states=estimation_of(result).states * 1e6)
+    return replace(result, system=system, simulation=simulation, estimation=estimation)
+
+
+def not_excited() -> RunResult:
+    """The regressor that is zero throughout, in two rows."""
+    result = make_result(samples=101)
+    assert result.regression is not None
+    assert result.excitation is not None
+    regression = replace(result.regression, psi=np.zeros((101, 2, 3)))
+    excitation = replace(result.excitation, gram_eigenvalues=np.zeros((101, 3)), t_c=None, rho=0.0)
+    delta = np.zeros((1, 101))
+    estimation = replace(estimation_of(result), delta=delta)
+    return replace(result, regression=regression, excitation=excitation, estimation=estimation)
+
+
+def diverging() -> RunResult:
+    """Estimates at the end of the range of floats and beyond."""
+    result = make_result(samples=101)
+    states = np.full_like(estimation_of(result).states, 1.7e308)
+    states[1] = np.inf
+    states[:, :, 1] = 5e-324
+    states[:, :, 2] = np.nan
+    return replace(result, estimation=replace(estimation_of(result), states=states))
+
+
+def at_times(start: float, stop: float) -> RunResult:
+    """Other horizons: what the labels of the time axis have to cope with."""
+    result = make_result(samples=101)
+    assert result.regression is not None
+    assert result.excitation is not None
+    t = np.linspace(start, stop, 101)
+    return replace(
+        result,
+        simulation=replace(result.simulation, t=t),
+        regression=replace(result.regression, t=t),
+        excitation=replace(result.excitation, t=t, t_c=float(t[10])),
+        estimation=replace(estimation_of(result), t=t),
+    )
+
+
+RESULTS: dict[str, Callable[[], RunResult]] = {
+    "circuit": make_result,
+    "one case": lambda: make_result(gammas=(1e10,), samples=101),
+    "many gains": many_gains,
+    "wild": wild,
+    "long names": long_names,
+    "diverging": diverging,
+    "microseconds": lambda: at_times(0.0, 2e-6),
+    "days": lambda: at_times(86400.0, 1e6),
+    "late": lambda: at_times(1000.0, 1000.05),
+    "not excited": not_excited,
+    "rotating kernel": lambda: make_result(parameters=("e0_1", "e0_2", "e0_3"), thin=7),
+    "no units": lambda: make_result(units={}, samples=101),
+    "no observer": lambda: without_observer(make_result(samples=101)),
+}
+
+
+def rendered(figure: Figure) -> Any:
+    """Return the canvas of ``figure``, drawn; matplotlib gives it no types."""
+    canvas: Any = figure.canvas
+    canvas.draw()
+    return canvas
+
+
+def visible_texts(figure: Figure) -> list[Text]:
+    return [
+        text
+        for text in figure.findobj(lambda artist: isinstance(artist, Text))
+        if isinstance(text, Text) and text.get_visible() and text.get_text()
+    ]
+
+
+@pytest.mark.parametrize("kind", RESULTS)
+def test_layout(kind: str) -> None:
+    """Every axis is named; legends and texts keep clear of curves, each other and the edge."""
+    for name, figure in draw(RESULTS[kind]()):
+        page = figure.bbox
+        renderer = rendered(figure).get_renderer()
+        boxes = [axes.get_window_extent() for axes in figure.axes]
+        for axes in figure.axes:
+            assert axes.get_ylabel(), name
+            assert axes.get_title() == ""
+            legend = axes.get_legend()
+            if legend is not None:
+                extent = legend.get_window_extent(renderer)
+                assert not any(extent.overlaps(box) for box in boxes), name
+                assert extent.x1 <= page.x1, name
+                assert extent.y1 <= page.y1, name
+            ticks = [*axes.get_yticklabels()]
+            extents = [label.get_window_extent(renderer) for label in ticks if label.get_text()]
+            assert 1 <= len(extents) <= 6
+            for low, high in pairwise(extents):
+                assert low.y1 < high.y0, name
+            label = axes.yaxis.label.get_window_extent(renderer)
+            assert all(label.x1 < extent.x0 for extent in extents), name
+        assert re.fullmatch(r"time t \((10[⁻⁰-⁹¹²³]+ )?s\)", figure.axes[-1].get_xlabel())
+        times = [label.get_window_extent(renderer) for label in figure.axes[-1].get_xticklabels()]
+        assert len(times) >= 2
+        for left, right in pairwise(times):
+            assert left.x1 < right.x0
+        for text in visible_texts(figure):
+            extent = text.get_window_extent(renderer)
+            assert extent.x0 >= -1, (name, text)
+            assert extent.x1 <= page.x1 + 1, (name, text)
+            assert extent.y0 >= -1, (name, text)
+            assert extent.y1 <= page.y1 + 1, (name, text)
+
+
+def test_the_circuit_has_the_figures_of_the_paper() -> None:
+    assert {name for name, _ in draw(make_result(samples=51))} == CIRCUIT_FIGURES
+
+
+def test_axes_carry_the_units_of_their_signals() -> None:
+    figures = dict(draw(make_result(samples=51)))
+    labels = {name: [axes.get_ylabel() for axes in fig.axes] for name, fig in figures.items()}
+    assert labels["states"] == ["states (V)", "states (A)"]
+    assert labels["estimates_a"] == ["e1 (V)", "e2 (V)", "il (A)"]
+    assert labels["estimates_b"] == ["ir1 (A)", "ir2 (A)", "iv (A)"]
+    assert labels["parameter_error"] == [
+        "error of e0_e1 (V)",
+        "error of e0_e2 (V)",
+        "error of e0_il (A)",
+    ]
+    assert labels["state_error_a"][2] == "error of il (A)"
+
+
+def test_time_axis_of_other_scales() -> None:
+    for result, label in ((make_result(samples=9), "s"), (at_times(0.0, 2e-6), "10⁻⁶ s")):
+        [(_, figure)] = draw(result, ["states"])
+        assert figure.axes[-1].get_xlabel() == f"time t ({label})"
+
+
+def test_power_of_ten_stands_with_the_unit() -> None:
+    [(_, figure)] = draw(long_names(), ["states"])
+    assert figure.axes[0].get_ylabel() == "states (10⁷ mA)"
+    assert all(len(label.get_text()) <= 4 for label in figure.axes[0].get_yticklabels())
+
+
+def test_without_an_observer_there_are_states_and_signals() -> None:
+    result = without_observer(make_result(samples=51))
+    assert {name for name, _ in draw(result)} == {"states", "signals"}
+    assert list(draw(result, ["gram", "delta"])) == []
+
+
+def test_rotating_kernel_does_not_divide_the_states() -> None:
+    names = {name for name, _ in draw(RESULTS["rotating kernel"]())}
+    assert {"estimates", "state_error"} <= names
+    assert not {"estimates_a", "estimates_b", "state_error_a", "state_error_b"} & names
+
+
+def test_without_mixing_there_is_no_delta() -> None:
+    assert "delta" not in dict(draw(make_result(samples=51, mixing=False)))
+
+
+def test_cases_are_labelled_by_the_gain_that_varies() -> None:
+    figures = dict(draw(make_result(samples=51), ["parameter_error"]))
+    legend = figures["parameter_error"].axes[0].get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["γ = 10¹⁰", "γ = 10⁸"]
+
+
+def test_of_many_cases_four_are_drawn_and_counted() -> None:
+    [(_, figure)] = draw(
+        make_result(gammas=tuple(np.logspace(6, 12, 25)), samples=51), ["state_error_a"]
+    )
+    axes = figure.axes[0]
+    legend = axes.get_legend()
+    assert legend is not None
+    assert legend.get_title().get_text() == "4 of 25 cases:"
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["γ = 10⁶", "γ = 10⁸", "γ = 10¹⁰", "γ = 10¹²"]
+
+
+def test_small_errors_are_visible_and_zeros_are_not_drawn() -> None:
+    result = make_result()
+    estimation = estimation_of(result)
+    parameters = estimation.parameters.copy()
+    parameters[0, 100, 0] = 1.0  # the truth: error zero
+    parameters[0, 200, 0] = 1.0 + 2.3e-16
+    result = replace(result, estimation=replace(estimation, parameters=parameters))
+    [(_, figure)] = draw(result, ["parameter_error"])
+    axes = figure.axes[0]
+    low, high = axes.get_ylim()
+    assert axes.get_yscale() == "log"
+    assert 1e-17 < low <= 1e-15
+    assert high >= 1.0
+    drawn = np.asarray(axes.get_lines()[0].get_ydata())
+    assert np.isnan(drawn[100])
+
+
+def test_thinned_estimates_are_compared_at_their_own_times() -> None:
+    [(_, figure)] = draw(make_result(thin=7), ["state_error_b"])
+    final = np.asarray(figure.axes[0].get_lines()[0].get_ydata())[-1]
+    assert final < 1e-13
+
+
+def test_excitation_level_and_its_time_are_marked() -> None:
+    [(_, figure)] = draw(make_result(samples=51), ["gram"])
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["λ₁", "λ₂", "λ₃", "ρ = 10⁻⁷", "t_c = 0.24 s"]
+
+
+def test_a_name_too_long_for_its_axis_stands_above_it() -> None:
+    figure = dict(draw(long_names(), ["state_error"]))["state_error"]
+    assert [axes.get_ylabel() for axes in figure.axes] == ["(mA)"] * 6
+    above = [text.get_text() for text in figure.texts]
+    assert above == [f"error of {name}" for name in long_names().system.states]
+
+
+def test_one_case_that_diverges_does_not_hide_the_others() -> None:
+    [(_, figure)] = draw(wild(), ["state_error_a"])
+    low, high = figure.axes[1].get_ylim()
+    assert low < 1e-12
+    assert high > 1e199
+
+
+def test_at_most_eight_panels_and_it_says_so() -> None:
+    panel = style.Panel("x", (style.Curve(np.arange(3.0), np.arange(3.0), "", style.line(0)),))
+    figure = style.compose([panel] * 30)
+    assert len(figure.axes) == style.MAX_PANELS
+    assert figure.texts[0].get_text() == "8 of 30 shown"
+
+
+def test_unknown_figures_are_refused_at_once() -> None:
+    with pytest.raises(ConfigError, match="there is no figure 'gramm'; did you mean 'gram'"):
+        draw(make_result(samples=5), ["gramm"])
+    with pytest.raises(ConfigError, match="there are: signals, regressor"):
+        draw(make_result(samples=5), ["zzz"])
+
+
+def test_png_files_fill_one_column(tmp_path: Path) -> None:
+    result = with_figures(make_result(), True)
+    write_run(result, tmp_path, "", Provenance({}, None))
+    paths = sorted((tmp_path / "figures").iterdir())
+    assert {path.stem for path in paths} == CIRCUIT_FIGURES
+    for path in paths:
+        with Image.open(path) as image:
+            image.load()  # checks every checksum
+            assert image.width == 700
+            assert image.info["dpi"][0] == pytest.approx(style.DPI, rel=1e-4)
+
+
+def test_a_figure_that_cannot_be_written_names_its_file(tmp_path: Path) -> None:
+    [(_, figure)] = draw(make_result(samples=51), ["delta"])
+    with pytest.raises(GpeboError, match=r"cannot write .*nowhere/delta\.png"):
+        style.save(figure, tmp_path / "nowhere" / "delta.png")
+
+
+def test_drawing_leaves_the_settings_of_matplotlib_alone() -> None:
+    settings: Any = mpl.rcParams
+    before = {key: settings[key] for key in style.RC}
+    for _ in draw(make_result(samples=51), ["states"]):
+        assert {key: settings[key] for key in style.RC} == before
+
+
+def test_lines_differ_without_their_colours() -> None:
+    assert len({line.dashes for line in style.LINES}) == len(style.LINES)
+    lines = [style.line(number) for number in range(49)]
+    assert len({(line.color, line.dashes) for line in lines}) == 49
+
+
+@given(
+    st.floats(-1e6, 1e6, allow_subnormal=False),
+    st.floats(1e-3, 1e6, allow_subnormal=False),
+    st.integers(3, 7),
+)
+def test_linear_ticks_are_few_inside_and_distinct(low: float, span: float, most: int) -> None:
+    high = low + span
+    ticks, decimals = style.linear_ticks(low, high, most)
+    assert 1 <= len(ticks) <= most
+    room = 1e-6 * span
+    assert low - room <= ticks[0]
+    assert ticks[-1] <= high + room
+    assert len({f"{tick:.{decimals}f}" for tick in ticks}) == len(ticks)
+
+
+@given(st.integers(-320, 300), st.integers(1, 600), st.integers(3, 6))
+def test_log_ticks_are_few(low: int, span: int, most: int) -> None:
+    ticks = style.log_ticks(low, low + span, most)
+    assert 1 <= len(ticks) <= most
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1e10, "10¹⁰"),
+        (-1e-7, "−10⁻⁷"),
+        (2.5e-7, "2.5·10⁻⁷"),
+        (0.5, "0.5"),
+        (0.0, "0"),
+        (9999.0, "9999"),
+        (-3.25, "−3.25"),
+    ],
+)
+def test_number_text(value: float, text: str) -> None:
+    assert style.number_text(value) == text
+
+
+@pytest.mark.parametrize(
+    ("gain", "text"),
+    [("gamma", "γ"), ("gamma_2", "γ₂"), ("f0", "f₀"), ("lambda_1", "λ₁"), ("window", "window")],
+)
+def test_symbol(gain: str, text: str) -> None:
+    assert style.symbol(gain) == text
+
+
+def test_every_figure_is_found_by_the_name_of_its_file() -> None:
+    assert set(FIGURES) >= CIRCUIT_FIGURES
+    assert set(UNITS) >= {"e1", "V", "y"}

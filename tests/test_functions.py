@@ -1,0 +1,123 @@
+"""Plants from NumPy arrays and functions, the same ones as text, and large ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plants import shipped
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.experiment import run_experiment
+from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+from gpebo_cli.systems.functions import Names, system_from_functions
+
+SOLVER = SolverSettings()
+
+
+def circuit_E(t):
+    E = np.zeros((len(t), 6, 6), dtype=t.dtype)
+    E[:, 0, 0], E[:, 1, 1] = 3 + np.cos(t / 3), 2 - np.cos(2 * t)
+    E[:, 2, 2] = 2 - np.exp(-t)
+    return E
+
+
+def circuit_A(t):
+    A = np.zeros((len(t), 6, 6), dtype=t.dtype)
+    A[:, 0, 0], A[:, 1, 1], A[:, 2, 2] = np.sin(t / 3) / 3, -2 * np.sin(2 * t), -np.exp(-t)
+    A[:, 0, 3], A[:, 0, 4], A[:, 0, 5] = 1, -1, 1
+    A[:, 1, 2], A[:, 1, 3], A[:, 2, 1] = -1, -1, 1
+    A[:, 3, 0], A[:, 3, 1], A[:, 3, 3] = -1, 1, -(4 + 2 * np.sin(t))
+    A[:, 4, 0], A[:, 4, 4], A[:, 5, 0] = -1, -(2 + np.sin(t)), -1
+    return A
+
+
+def circuit(**changes):
+    entries = {
+        "E": circuit_E, "A": circuit_A, "B": [[0], [0], [0], [0], [0], [-1]],
+        "u": lambda t: (4 * np.cos(2 * t) * np.sin(t / 5))[:, None],
+        "C": [[0, 0, 1, 0, 0, 1]], "initial_state": [0, 1, 2, 0.25, 0, -0.25],
+        "names": Names(states=("e1", "e2", "il", "ir1", "ir2", "iv")),
+    }
+    return system_from_functions("circuit", **{**entries, **changes})
+
+
+def test_taylor_coefficients_agree_with_those_of_the_text():
+    t = np.linspace(0.1, 9, 23)
+    ours, text = (s.coefficients.taylor(t, 3) for s in (circuit(), shipped("circuit")))
+    for name in ("E", "A", "B", "F", "C", "u"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(text, name), atol=1e-11)
+
+
+def test_the_experiment_does_not_see_where_a_plant_comes_from():
+    settings = Settings(plant={}, estimator={"name": "drem"}, time=TimeSettings(horizon=8.0))
+    ours = run_experiment(settings, circuit())
+    text = run_experiment(settings, shipped("circuit"))
+    assert ours.simulation.index == 2
+    np.testing.assert_allclose(ours.simulation.states, text.simulation.states, atol=1e-10)
+
+
+def test_given_derivatives_are_used_instead_of_complex_times():
+    def real_only(t):
+        if np.iscomplexobj(t):
+            raise TypeError("no complex times")
+        return circuit_E(t)
+
+    with pytest.raises(ConfigError, match="E needs derivatives and does not take complex times"):
+        circuit(E=real_only).coefficients.taylor(np.array([1.0]), 1)
+
+    def derivative(t):
+        dE = np.zeros((len(t), 6, 6))
+        dE[:, 0, 0], dE[:, 1, 1], dE[:, 2, 2] = -np.sin(t / 3) / 3, 2 * np.sin(2 * t), np.exp(-t)
+        return dE
+
+    found = circuit(E=[real_only, derivative]).coefficients.taylor(np.array([1.0]), 1)
+    expected = shipped("circuit").coefficients.taylor(np.array([1.0]), 1)
+    np.testing.assert_allclose(found.E, expected.E, atol=1e-14)
+
+
+def test_a_function_that_is_not_analytic_is_refused_where_it_matters():
+    def kinked(t):
+        return circuit_E(t) * (1 + np.abs(t))[:, None, None]
+
+    with pytest.raises(ConfigError, match="not analytic"):
+        circuit(E=kinked).coefficients.taylor(np.array([0.5]), 1)
+    circuit(E=kinked).coefficients.taylor(np.array([0.5]), 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"E": np.eye(5)}, r"E has shape \(5, 5\), expected \(6, 6\)"),
+        ({"u": None}, "B and u go together"),
+        ({"names": Names(states=("a", "b"))}, "2 names given for 6"),
+        ({"A": lambda t: circuit_A(t)[:, :5]}, r"A returned shape \(1, 5, 6\)"),
+        ({"A": lambda t: circuit_A(t) / 0.0}, "A is not finite at t = 1"),
+    ],
+)
+def test_what_does_not_fit_is_named(changes, message):
+    with np.errstate(all="ignore"), pytest.raises(ConfigError, match=message):
+        circuit(**changes).coefficients.taylor(np.array([1.0]), 0)
+
+
+def test_a_large_plant():
+    """A chain of 40 oscillators whose ends are tied together: index 3, constant coefficients."""
+    masses = 40
+    n = 2 * masses + 1
+    E, A = np.eye(n), np.zeros((n, n))
+    E[-1, -1] = 0.0
+    A[:masses, masses : 2 * masses] = np.eye(masses)
+    stiffness = 2 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
+    A[masses : 2 * masses, :masses] = -stiffness
+    A[masses, -1], A[2 * masses - 1, -1] = 1.0, -1.0  # the force that ties the first to the last
+    A[-1, 0], A[-1, masses - 1] = 1.0, -1.0
+    x0 = np.zeros(n)
+    x0[:masses] = np.sin(np.pi * np.arange(1, masses + 1) / (masses + 1))  # symmetric: consistent
+    system = system_from_functions("chain", E, A, initial_state=x0)
+    result = simulate(system, TimeSettings(horizon=10.0), SolverSettings(tol=1e-9, stages=8))
+    assert result.structure.index == 3
+    # The symmetric mode never strains the tie: it is the free mode of the chain.
+    frequency = 2 * np.sin(np.pi / (2 * (masses + 1)))
+    t = np.linspace(0, 10, 21)
+    expected = np.cos(frequency * t)[:, None] * x0[:masses]
+    np.testing.assert_allclose(result.signals.states(t)[:, :masses], expected, atol=1e-8)

@@ -1,0 +1,57 @@
+"""Adjugates, scans."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gpebo_cli.linalg import affine_scan, determinant_and_adjugate_action
+
+
+def adjugate(omega: np.ndarray) -> np.ndarray:
+    """By cofactors, the definition."""
+    p = len(omega)
+    out = np.empty((p, p))
+    for i in range(p):
+        for j in range(p):
+            minor = np.delete(np.delete(omega, i, axis=0), j, axis=1)
+            out[j, i] = (-1) ** (i + j) * (np.linalg.det(minor) if p > 1 else 1.0)
+    return out
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 6), st.integers(0, 6), st.integers(0, 2**32 - 1))
+def test_adjugate_of_any_rank(p, rank, seed):
+    rng = np.random.default_rng(seed)
+    rank = min(rank, p)
+    omega = rng.normal(size=(p, rank)) @ rng.normal(size=(rank, p))
+    b = rng.normal(size=p)
+    det, action, _ = determinant_and_adjugate_action(omega[None], b[None])
+    size = max(1.0, np.linalg.norm(omega, 2)) ** p
+    assert det[0] == pytest.approx(np.linalg.det(omega), abs=1e-12 * size)
+    np.testing.assert_allclose(action[0], adjugate(omega) @ b, atol=1e-11 * size)
+
+
+def test_mixing_identity():
+    """adj(Ω) Ω η = det(Ω) η."""
+    rng = np.random.default_rng(1)
+    omega, eta = rng.normal(size=(50, 4, 4)), rng.normal(size=4)
+    det, action, _ = determinant_and_adjugate_action(omega, omega @ eta)
+    np.testing.assert_allclose(action, det[:, None] * eta, atol=1e-12 * np.abs(det).max())
+
+
+@pytest.mark.parametrize("width", [3, 3000])  # prefix scan and plain recurrence
+def test_affine_scan_is_the_recurrence(width):
+    rng = np.random.default_rng(2)
+    a, b, z = rng.uniform(0, 1, (77, width)), rng.normal(size=(77, width)), rng.normal(size=width)
+    out = affine_scan(a, b, z)
+    expected = [z]
+    for k in range(77):
+        expected.append(a[k] * expected[-1] + b[k])
+    np.testing.assert_allclose(out, expected, rtol=1e-13, atol=1e-13)
+
+
+def test_affine_scan_of_nothing_is_the_start():
+    assert affine_scan(np.zeros((0, 2)), np.zeros((0, 2)), np.ones(2)).tolist() == [[1.0, 1.0]]

@@ -1,0 +1,247 @@
+"""The GPEBO observer: the identity Y = ψη, the paper's block formulas, rotating kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plants import reference, shipped
+
+from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.observers import observe
+from gpebo_cli.observers.gpebo import observer_matrices
+from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+from gpebo_cli.systems.plant import plant_from_mapping
+
+SOLVER = SolverSettings()
+T = np.linspace(0, 20, 801)
+
+# Four states, index 2, one unknown: the kernel of E(t) rotates in the (x1, x3) and (x2, x4)
+# planes at different speeds. x = R(t) z with z from a system in diagonal form.
+ROTATING = {
+    "name": "rotating",
+    "parameters": {
+        "c": "cos(t)", "s": "sin(t)", "C": "cos(t/2)", "S": "sin(t/2)",
+    },
+    "states": ["x1", "x2", "x3", "x4"],
+    "inputs": {"u": "sin(2*t)"},
+    "unknowns": {"theta": 0.7},
+    "outputs": ["y"],
+    # E = E_z Rᵀ with E_z = diag(1, 1, 0, 0), Rᵀ x = z
+    "E": [["c", 0, "s", 0], [0, "C", 0, "S"], [0, 0, 0, 0], [0, 0, 0, 0]],
+    # z1' = −z1 + z3 + θ, z2' = z1 − z2 + z4, 0 = z1 + z2 (fixes z3: index 2) − u, 0 = z2 + 2 z4
+    # A = A_z Rᵀ − E_z (Rᵀ)', because z' = Rᵀ x' + (Rᵀ)' x
+    "A": [
+        ["-c - s + s", 0, "-s + c - c", 0],
+        ["c", "-C - S + S/2", "s", "-S + C - C/2"],
+        ["c", "C", "s", "S"],
+        [0, "C - 2*S", 0, "S + 2*C"],
+    ],
+    "B": [[0], [0], [-1], [0]],
+    "F": [[1], [0], [0], [0]],
+    "C": [["-s", 0, "c", "1"]],
+    "initial_state": [0.5, -0.5, 0, 0],
+}
+
+
+def run(system, **settings):
+    simulation = simulate(system, TimeSettings(), SOLVER)
+    signals = simulation.signals
+    observation = observe(
+        system, signals.inputs, signals.outputs, ObserverSettings(**settings), SOLVER
+    )
+    truth = observation.true_parameters(system.theta, simulation.initial_state)
+    return simulation, observation, truth
+
+
+def assert_identity(simulation, observation, truth, tolerance=1e-9, t=T):
+    regression = observation.regression
+    residual = regression.Y(t) - regression.psi(t) @ truth
+    assert np.abs(residual).max() < tolerance
+    states = observation.state_map.at(t)(np.tile(truth, (1, len(t), 1)))[0]
+    assert np.abs(states - simulation.signals.states(t)).max() < tolerance
+
+
+@pytest.mark.parametrize("name", ["circuit", "descriptor"])
+def test_regression_holds_with_the_true_parameters(name):
+    simulation, observation, truth = run(shipped(name))
+    assert_identity(simulation, observation, truth)
+    expected = reference(name)
+    e0 = truth[len(shipped(name).unknowns):]
+    np.testing.assert_allclose(e0, expected["e0"], atol=1e-12)
+
+
+def test_circuit_regressor_matches_the_reference_up_to_sign():
+    _, observation, _ = run(shipped("circuit"))
+    for row in reference("circuit")["at"]:
+        psi = observation.regression.psi(np.array([row["t"]]))[0, 0]
+        expected = np.array(row["psi_up_to_sign"])
+        np.testing.assert_allclose(psi * np.sign(psi[0] * expected[0]), expected, atol=1e-10)
+    assert observation.regression.parameters == ("e0_e1", "e0_e2", "e0_il")
+
+
+def test_kept_row_of_the_circuit_is_the_source_equation():
+    """0 = −e1 − u gives u + ξ_a1 = [1 0 0] Φ e₀, the row the paper's choice throws away."""
+    system = shipped("circuit")
+    simulation, observation, _ = run(system)
+    u = simulation.signals.inputs(T)[:, 0]
+    xi_a1 = observation.state_map.offset(T)[:, 0]
+    Y = observation.regression.Y(T)
+    assert Y.shape[1] == 1
+    np.testing.assert_allclose(np.abs(Y[:, 0]), np.abs(u + xi_a1), atol=1e-9)
+
+
+def test_literal_regressor_of_the_circuit_is_identically_zero():
+    _, observation, _ = run(shipped("circuit"), regression="paper")
+    assert np.abs(observation.regression.psi(T)).max() < 1e-12
+    assert np.abs(observation.regression.Y(T)).max() < 1e-10
+
+
+def test_literal_regressor_is_lossless_where_A22_is_invertible():
+    _, ours, truth = run(shipped("descriptor"))
+    _, paper, _ = run(shipped("descriptor"), regression="paper")
+    np.testing.assert_allclose(paper.regression.Y(T), paper.regression.psi(T) @ truth, atol=1e-9)
+    rank = [np.linalg.matrix_rank(o.regression.gram.final[:, :-1], tol=1e-9) for o in (ours, paper)]
+    assert rank == [4, 4]
+
+
+def random_block_system(rng, n_a, n_b, r, q, varying):
+    """E = diag(E_a(t), 0) with E_a = I or diagonal and time-varying; A22 singular on purpose."""
+    n = n_a + n_b
+
+    def entries(rows, columns):
+        values = rng.normal(size=(rows, columns)).round(3)
+        return [[f"{v} + {w}*sin({k}*t)" for v, w, k in zip(
+            row, rng.normal(size=columns).round(3), rng.integers(1, 4, columns), strict=True)]
+            for row in values]
+
+    E = [["0"] * n for _ in range(n)]
+    for i in range(n_a):
+        E[i][i] = f"2 + cos({i + 1}*t)" if varying else "1"
+    A = entries(n, n)
+    for j in range(n_a, n):
+        A[n - 1][j] = "0"  # last row of A22 vanishes
+    return plant_from_mapping({
+        "name": "random", "states": [f"x{i}" for i in range(n)],
+        "inputs": {"u1": "sin(t)", "u2": "cos(3*t)"},
+        "unknowns": {f"th{i}": 1 for i in range(q)},
+        "outputs": [f"y{i}" for i in range(r)],
+        "E": E, "A": A, "B": entries(n, 2), "C": entries(r, n),
+        **({"F": entries(n, q)} if q else {}),
+        "initial_state": [0] * n,
+    })
+
+
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize("q", [0, 2])
+def test_equal_to_the_papers_block_formulas(varying, q):
+    """A_0, B_0, D_0 and the output gain of Proposition 1, typed in from the paper."""
+    rng = np.random.default_rng(7 + q)
+    n_a, n_b, r = 3, 2, 2
+    system = random_block_system(rng, n_a, n_b, r, q, varying)
+    t = np.linspace(0, 3, 11)
+    ours = observer_matrices(system, t, t, 1e-10)
+    c = system.coefficients.taylor(t, 0)
+    for k in range(len(t)):
+        E, A, B, F, C = c.E[0, k], c.A[0, k], c.B[0, k], c.F[0, k], c.C[0, k]
+        inverse = np.linalg.inv(E[:n_a, :n_a])
+        A11, A12 = inverse @ A[:n_a, :n_a], inverse @ A[:n_a, n_a:]
+        B1, F1 = inverse @ B[:n_a], inverse @ F[:n_a]
+        calA = np.vstack([A[n_a:, n_a:], C[:, n_a:]])
+        dagger = np.linalg.inv(calA.T @ calA) @ calA.T
+        rest = np.vstack([A[n_a:, :n_a], C[:, :n_a]])
+        B2, F2 = np.vstack([B[n_a:], np.zeros((r, 2))]), np.vstack([F[n_a:], np.zeros((r, q))])
+        y = np.vstack([np.zeros((n_b, r)), np.eye(r)])
+        np.testing.assert_allclose(
+            ours.A0[k, :n_a, :n_a], A11 - A12 @ dagger @ rest, atol=1e-11)
+        np.testing.assert_allclose(ours.from_inputs[k, :n_a], B1 - A12 @ dagger @ B2, atol=1e-11)
+        np.testing.assert_allclose(ours.from_outputs[k, :n_a], A12 @ dagger @ y, atol=1e-11)
+        np.testing.assert_allclose(ours.D0[k, :n_a], F1 - A12 @ dagger @ F2, atol=1e-11)
+        # the paper's ψ_1 and ψ_2 are the last r rows of the residual
+        psi_2 = C[:, n_a:] @ dagger @ rest - C[:, :n_a]
+        literal = (ours.residual[k] @ ours.algebraic[k])[-r:, :n_a]
+        np.testing.assert_allclose(literal, -psi_2, atol=1e-11)
+
+
+def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
+    system = plant_from_mapping(ROTATING)
+    t = np.linspace(0, 5, 23)
+    o = observer_matrices(system, t, t, 1e-10)
+    R, P = o.residual, o.projector
+    np.testing.assert_allclose(R @ R, R, atol=1e-13)
+    np.testing.assert_allclose(R @ o.algebraic @ (np.eye(4) - P), 0, atol=1e-13)
+
+
+def test_rotating_kernel_with_unknown_parameter():
+    simulation, observation, truth = run(plant_from_mapping(ROTATING))
+    assert simulation.structure.index == 2
+    assert observation.initial_basis.shape == (4, 2)
+    assert_identity(simulation, observation, truth)
+    gram = observation.regression.gram.final
+    estimate = np.linalg.solve(gram[:, :-1], gram[:, -1])
+    np.testing.assert_allclose(estimate, truth, atol=1e-9)
+
+
+def test_solver_ivp_is_an_independent_check_of_the_observer():
+    system = shipped("descriptor")
+    time, t = TimeSettings(horizon=4.0), np.linspace(0, 4, 101)
+    results = []
+    for solver in (SOLVER, SolverSettings(name="ivp")):
+        signals = simulate(system, time, solver).signals
+        observation = observe(
+            system, signals.inputs, signals.outputs, ObserverSettings(), solver
+        )
+        results.append(observation.regression.psi(t))
+    np.testing.assert_allclose(results[0], results[1], atol=1e-8)
+
+
+def test_assumption_1_violated_names_the_time_and_the_singular_value():
+    signals = simulate(shipped("circuit"), TimeSettings(), SOLVER).signals
+    blind = shipped("circuit", C=[[0, 0, 1, 0, 0, 0]])
+    with pytest.raises(ModelError, match=r"Assumption 1 .* t = .* singular value"):
+        observe(blind, signals.inputs, signals.outputs, ObserverSettings(), SOLVER)
+
+
+def test_rank_of_E_that_changes_is_an_error_of_the_observer():
+    system = shipped(
+        "descriptor", E=[[1, 0, 0], [0, 1, 0], [0, 0, "1e-3*step(t - 3)"]]
+    )
+    t = np.array([1.0, 5.0])
+    with pytest.raises(ModelError, match="rank of E changes from 2 at t = 1 to 3 at t = 5"):
+        observer_matrices(system, t, t, 1e-10)
+
+
+@pytest.mark.parametrize(
+    ("xi_a0", "message"),
+    [
+        ([1.0, 2.0], "has 2 values but there are 3 differential states"),
+        ({"iv": 1.0}, "'iv' is not a differential state; accepted: e1, e2, il"),
+        ({"e1": float("nan")}, "finite number"),
+    ],
+)
+def test_xi_a0_that_does_not_fit(xi_a0, message):
+    with pytest.raises(ConfigError, match=message):
+        run(shipped("circuit"), xi_a0=xi_a0)
+
+
+def test_units_of_an_equation_do_not_change_the_rank_of_E():
+    """The descriptor example with one equation in units of 1e-12."""
+    plain = shipped("descriptor")
+    small = shipped(
+        "descriptor",
+        E=[["1e-12", 0, 0], [0, 1, 0], [0, 0, 0]],
+        A=[["-1e-12", "1e-12*(0.5 + sin(t)/4)", "1e-12"],
+           [-0.5, "-0.5 - cos(t)/4", 0.5], [0.5, -1, "2 + sin(t)"]],
+        F=[["1e-12", 0], [0, "cos(t)"], [0.5, 0]],
+    )
+    (_, ours, truth), (_, expected, _) = run(small), run(plain)
+    assert ours.regression.parameters == expected.regression.parameters
+    np.testing.assert_allclose(ours.regression.psi(T), expected.regression.psi(T), atol=1e-10)
+    residual = ours.regression.Y(T) - ours.regression.psi(T) @ truth
+    assert np.abs(residual).max() < 1e-9
+
+
+def test_starting_value_of_the_extension_is_free():
+    """Another ξ_a(0) changes e₀ and nothing else."""
+    _, _, truth = run(shipped("circuit"), xi_a0=[0.0, 0.0, 0.0])
+    np.testing.assert_allclose(truth, [0, -1, -2], atol=1e-12)

@@ -1,0 +1,353 @@
+"""The run folder: tables that round-trip, strict JSON, and files that are whole or absent."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from factories import STATES, make_result, with_figures, without_observer
+
+from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.outputs import files
+from gpebo_cli.outputs.folder import TABLES, write_run
+from gpebo_cli.outputs.provenance import GitState, Provenance, git_state, provenance
+from gpebo_cli.outputs.summary import plain, summary_text
+from gpebo_cli.result import EstimationResult, RunResult
+
+MADE_BY = Provenance({"gpebo": "0.1.0"}, GitState("c0ffee", False))
+
+
+def write(result: RunResult, folder: Path, figures: bool | list[str] = False) -> Path:
+    write_run(with_figures(result, figures), folder, "plant: circuit\n", MADE_BY)
+    return folder
+
+
+def read_table(path: Path) -> tuple[list[str], np.ndarray[Any, np.dtype[np.float64]]]:
+    with open(path, newline="") as stream:
+        header, *rows = csv.reader(stream)
+    return header, np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is not JSON")
+
+    content: dict[str, Any] = json.loads(
+        (folder / "summary.json").read_text(encoding="utf-8"), parse_constant=refuse
+    )
+    return content
+
+
+def test_signals_round_trip_with_their_names(tmp_path: Path) -> None:
+    result = make_result(samples=5001)  # more rows than one chunk
+    header, table = read_table(write(result, tmp_path) / "signals.csv")
+    simulation = result.simulation
+    assert header == ["t", "V", "y", *STATES]
+    expected = [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
+    np.testing.assert_array_equal(table, np.column_stack(expected))
+
+
+def test_regression_is_written_row_by_row(tmp_path: Path) -> None:
+    result = make_result(samples=50)
+    assert result.regression is not None
+    psi = np.concatenate([result.regression.psi, 2.0 * result.regression.psi], axis=1)
+    Y = np.concatenate([result.regression.Y, 2.0 * result.regression.Y], axis=1)
+    regression = replace(result.regression, psi=psi, Y=Y)
+    folder = write(replace(result, regression=regression), tmp_path)
+    header, table = read_table(folder / "regression.csv")
+    names = ["e0_e1", "e0_e2", "e0_il"]
+    assert header == [
+        "t",
+        "Y_1",
+        "Y_2",
+        *(f"psi_1_{name}" for name in names),
+        *(f"psi_2_{name}" for name in names),
+    ]
+    np.testing.assert_array_equal(table[:, 1:3], Y)
+    np.testing.assert_array_equal(table[:, 3:6], psi[:, 0])
+    np.testing.assert_array_equal(table[:, 6:], psi[:, 1])
+
+
+def test_excitation_table(tmp_path: Path) -> None:
+    result = make_result(samples=50)
+    assert result.excitation is not None
+    header, table = read_table(write(result, tmp_path) / "excitation.csv")
+    assert header == ["t", "gram_eig_1", "gram_eig_2", "gram_eig_3", "pe_level"]
+    np.testing.assert_array_equal(table[:, 1:4], result.excitation.gram_eigenvalues)
+    np.testing.assert_array_equal(table[:, 4], result.excitation.pe_level)
+
+
+@pytest.mark.parametrize("mixing", [True, False])
+def test_estimates_are_long_and_count_cases_from_zero(tmp_path: Path, mixing: bool) -> None:
+    result = make_result(samples=200, thin=10, mixing=mixing)
+    estimation = result.estimation
+    assert estimation is not None
+    header, table = read_table(write(result, tmp_path) / "estimates.csv")
+    hats = [f"{name}_hat" for name in ("e0_e1", "e0_e2", "e0_il", *STATES)]
+    assert header == ["case", "t", *hats, *(["delta"] if mixing else [])]
+    assert table.shape == (2 * 20, len(header))
+    np.testing.assert_array_equal(table[:, 0], np.repeat([0, 1], 20))
+    for case in (0, 1):
+        rows = table[table[:, 0] == case]
+        np.testing.assert_array_equal(rows[:, 1], estimation.t)
+        np.testing.assert_array_equal(rows[:, 2:5], estimation.parameters[case])
+        np.testing.assert_array_equal(rows[:, 5:11], estimation.states[case])
+        if estimation.delta is not None:
+            np.testing.assert_array_equal(rows[:, 11], estimation.delta[0])
+
+
+def test_each_case_gets_its_own_delta(tmp_path: Path) -> None:
+    result = make_result(samples=30)
+    assert result.estimation is not None
+    assert result.estimation.delta is not None
+    delta = np.concatenate([result.estimation.delta, 3.0 * result.estimation.delta])
+    result = replace(result, estimation=replace(result.estimation, delta=delta))
+    _, table = read_table(write(result, tmp_path) / "estimates.csv")
+    np.testing.assert_array_equal(table[:, -1], delta.ravel())
+
+
+def test_cases_name_their_gains_and_leave_unreached_times_empty(tmp_path: Path) -> None:
+    result = make_result(gammas=(1e6, 1e10))
+    path = write(result, tmp_path) / "cases.csv"
+    header, table = read_table(path)
+    assert header == [
+        "case",
+        "gamma",
+        "seconds_to_1pct_parameters",
+        "seconds_to_1pct_states",
+        "final_error_parameters",
+        "final_error_states",
+        "rms_error_states",
+    ]
+    np.testing.assert_array_equal(table[:, 1], [1e6, 1e10])
+    first, second = path.read_text().splitlines()[1:]
+    assert first.startswith("0,1000000,,,")
+    assert second.startswith("1,10000000000,6,")
+
+
+def test_cases_with_different_gains_share_the_columns(tmp_path: Path) -> None:
+    result = make_result()
+    estimation: EstimationResult | None = result.estimation
+    assert estimation is not None
+    cases = ({"gamma": 1.0}, {"gamma": 2.0, "alpha": 0.1})
+    result = replace(result, estimation=replace(estimation, cases=cases))
+    header, table = read_table(write(result, tmp_path) / "cases.csv")
+    assert header[:3] == ["case", "gamma", "alpha"]
+    np.testing.assert_array_equal(table[:, 1:3], [[1.0, np.nan], [2.0, 0.1]])
+
+
+@pytest.mark.parametrize("value", [0.1, 1 / 3, 5e-324, -0.0, 1.7976931348623157e308, np.inf])
+def test_every_float_survives(tmp_path: Path, value: float) -> None:
+    result = make_result(samples=3)
+    states = np.full_like(result.simulation.states, value)
+    result = replace(result, simulation=replace(result.simulation, states=states))
+    _, table = read_table(write(result, tmp_path) / "signals.csv")
+    assert table[:, 3:].tobytes() == states.tobytes()  # the sign of zero too
+
+
+def test_a_complete_folder(tmp_path: Path) -> None:
+    folder = write(make_result(), tmp_path / "deep" / "run", figures=["delta"])
+    found = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert found == {*TABLES, "config.yaml", "summary.json", "figures/delta.png"}
+    assert (folder / "config.yaml").read_text() == "plant: circuit\n"
+
+
+def test_without_an_observer_only_signals_are_written(tmp_path: Path) -> None:
+    folder = write(without_observer(make_result()), tmp_path)
+    assert sorted(os.listdir(folder)) == ["config.yaml", "signals.csv", "summary.json"]
+    summary = read_summary(folder)
+    assert summary["status"] == "done"
+    assert summary["observer"] == "none"
+    for key in ("estimator", "excitation", "cases", "estimator_requirement", "parameters"):
+        assert summary[key] is None
+
+
+def test_no_table_of_an_earlier_run_stays(tmp_path: Path) -> None:
+    write(make_result(), tmp_path, figures=["delta", "states"])
+    (tmp_path / "notes.txt").write_text("mine")
+    write(without_observer(make_result()), tmp_path, figures=["states"])
+    assert sorted(os.listdir(tmp_path)) == [
+        "config.yaml",
+        "figures",
+        "notes.txt",
+        "signals.csv",
+        "summary.json",
+    ]
+    assert os.listdir(tmp_path / "figures") == ["states.png"]
+
+
+def test_summary_has_the_evidence(tmp_path: Path) -> None:
+    summary = read_summary(write(make_result(), tmp_path))
+    assert summary["plant"] == "circuit"
+    assert summary["reference"] == "arXiv:2407.14373"
+    assert (summary["index"], summary["strangeness_index"]) == (2, 1)
+    assert summary["estimator"] == {"name": "drem", "gamma": [1e10, 1e8]}
+    moved = summary["initial_state"]["moved"]
+    assert moved == {"iv": {"from": -0.25, "to": -3.45, "change": pytest.approx(-3.2)}}
+    assert summary["initial_state"]["given"]["iv"] == -0.25
+    excitation = summary["excitation"]
+    assert set(excitation) == {
+        "is_ie",
+        "t_c",
+        "rho",
+        "lambda_min",
+        "condition",
+        "weakest_direction",
+        "pe_level_min",
+        "window",
+    }
+    assert list(excitation["weakest_direction"]) == ["e0_e1", "e0_e2", "e0_il"]
+    # Only full windows count: the level at t = 0 is zero in every run.
+    assert excitation["pe_level_min"] == pytest.approx(0.01 * (1 - np.exp(-2.0)))
+    assert summary["assumptions"][0]["evidence"] == {"sigma_min": 0.3, "at": None}
+    assert summary["estimator_requirement"]["name"] == "Δ not in L2"
+    assert summary["error_estimate"] == {"states": 3e-13, "regression": 2e-13}
+    assert [case["gains"] for case in summary["cases"]] == [{"gamma": 1e10}, {"gamma": 1e8}]
+    assert summary["git"] == {"commit": "c0ffee", "dirty": False}
+    assert summary["verdict"].startswith("done")
+
+
+def test_summary_gives_ranges_for_many_cases(tmp_path: Path) -> None:
+    gammas = (1e6, *np.logspace(8, 12, 100))
+    summary = read_summary(write(make_result(gammas=gammas, samples=11), tmp_path))
+    assert summary["cases"]["count"] == 101
+    seconds = summary["cases"]["seconds_to_1pct_parameters"]
+    assert seconds == {"min": pytest.approx(5.0), "max": pytest.approx(7.5), "finite": 100}
+
+
+def test_summary_is_strict_json(tmp_path: Path) -> None:
+    result = make_result(gammas=(1e6,))  # never reaches 1 %: NaN
+    assert result.excitation is not None
+    excitation = replace(
+        result.excitation, condition=np.inf, t_c=None, pe_level=np.full(1001, np.nan)
+    )
+    summary = read_summary(write(replace(result, excitation=excitation), tmp_path))
+    assert summary["cases"][0]["seconds_to_1pct_states"] is None
+    assert summary["excitation"]["condition"] is None
+    assert summary["excitation"]["pe_level_min"] is None
+
+
+def test_plain_reduces_numpy_and_containers() -> None:
+    value = {
+        "a": np.float64("nan"),
+        "b": (np.int64(3), np.bool_(True)),
+        "c": np.array([1.0, -np.inf]),
+    }
+    assert plain(value) == {"a": None, "b": [3, True], "c": [1.0, None]}
+    assert plain(Path("x")) == "x"
+
+
+def test_summary_keeps_the_order_of_its_keys() -> None:
+    keys = list(json.loads(summary_text(make_result(), MADE_BY)))
+    assert keys[:3] == ["status", "verdict", "plant"]
+    assert keys[-3:] == ["timings", "versions", "git"]
+
+
+@pytest.mark.parametrize("name", ["signals.csv", "estimates.csv", "summary.json", "config.yaml"])
+def test_a_full_disk_leaves_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    replaced = os.replace
+
+    def full(source: str | Path, target: str | Path) -> None:
+        if Path(target).name == name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replaced(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(GpeboError) as caught:
+        write(make_result(samples=11), tmp_path)
+    assert str(tmp_path / name) in str(caught.value)
+    assert "No space left" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert name not in os.listdir(tmp_path)
+    assert not [found for found in os.listdir(tmp_path) if found.endswith(".tmp")]
+    # summary.json is what tells a finished folder.
+    assert "summary.json" not in os.listdir(tmp_path)
+
+
+def test_an_interrupted_write_keeps_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("old")
+
+    def chunks() -> Any:
+        yield b"new"
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        files.write_file(path, chunks())
+    assert os.listdir(tmp_path) == ["table.csv"]
+    assert path.read_text() == "old"
+
+
+def test_a_file_in_the_place_of_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("")
+    with pytest.raises(GpeboError, match=r"cannot create the folder .*run"):
+        write(make_result(samples=11), tmp_path / "run")
+
+
+def test_an_unknown_figure_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'parameter_eror'; did you mean 'parameter_error'"):
+        write(make_result(samples=11), tmp_path / "run", figures=["states", "parameter_eror"])
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_regression_without_parameters_is_written(tmp_path: Path) -> None:
+    result = make_result(parameters=(), samples=11)
+    folder = write(result, tmp_path, figures=True)
+    assert read_table(folder / "regression.csv")[0] == ["t", "Y_1"]
+    assert read_table(folder / "excitation.csv")[0] == ["t", "pe_level"]
+
+
+def test_provenance_names_the_versions() -> None:
+    versions = provenance().versions
+    assert versions["numpy"] == np.__version__
+    assert {"gpebo", "python", "scipy", "hydra-core", "matplotlib"} <= set(versions)
+
+
+def git(folder: Path, *words: str) -> None:
+    identity = ["-c", "user.name=test", "-c", "user.email=test@example.org"]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("GIT_")}
+    command = ["git", "-C", str(folder), *identity, *words]
+    subprocess.run(command, check=True, capture_output=True, env=environment)
+
+
+def test_git_state_of_a_checkout(tmp_path: Path) -> None:
+    assert git_state(tmp_path) is None
+    git(tmp_path, "init")
+    assert git_state(tmp_path) == GitState(None, False)
+    (tmp_path / "a").write_text("a")
+    git(tmp_path, "add", "a")
+    git(tmp_path, "commit", "-m", "first")
+    state = git_state(tmp_path)
+    assert state is not None
+    assert state.commit is not None
+    assert len(state.commit) == 40
+    assert not state.dirty
+    (tmp_path / "a").write_text("b")
+    assert git_state(tmp_path) == GitState(state.commit, True)
+
+
+def test_git_state_never_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / ".git").mkdir()  # not a repository
+    assert git_state(tmp_path) is None
+    monkeypatch.setenv("PATH", "")
+    assert git_state(tmp_path) is None
+
+
+def test_tables_need_neither_matplotlib_nor_pandas() -> None:
+    code = (
+        "import sys, gpebo_cli.outputs.tables, gpebo_cli.outputs.folder;"
+        "print([name for name in ('matplotlib', 'pandas', 'scipy', 'PIL') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

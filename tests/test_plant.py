@@ -1,0 +1,387 @@
+"""Plant files: the shipped ones against hand formulas, and everything that is refused."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.systems.descriptor import MATRIX_NAMES, CoefficientSource, DescriptorSystem
+from gpebo_cli.systems.plant import KEYS, plant_from_mapping
+
+PLANTS = Path(__file__).parents[1] / "conf" / "plant"
+TIMES = np.array([0.0, 0.4, 1.7, 6.3, 19.5])
+
+Plain = dict[str, Any]
+
+
+def shipped(name: str) -> DescriptorSystem:
+    """A plant of this project."""
+    return plant_from_mapping(yaml.safe_load((PLANTS / f"{name}.yaml").read_text("utf-8")))
+
+
+def mine(**changes: object) -> Plain:
+    """Two states, two inputs, an unknown and an output; ``None`` removes a key."""
+    plain: Plain = {
+        "name": "mine",
+        "parameters": {"R": "2 + sin(t)", "k": 3},
+        "states": ["x1", "x2"],
+        "inputs": {"V": "cos(t)", "I": "k*step(t - 1)"},
+        "unknowns": {"theta": 1.5},
+        "outputs": ["y"],
+        "E": [[1, 0], [0, 0]],
+        "A": [["-d(R)", 1], ["k", "R"]],
+        "B": [[1, 0], [0, "t"]],
+        "F": [[0], [1]],
+        "C": [[1, "k/2"]],
+        "initial_state": {"x1": 1, "x2": "-k/2"},
+    }
+    plain.update(changes)
+    return {key: value for key, value in plain.items() if value is not None}
+
+
+def without(*keys: str, **changes: object) -> Plain:
+    """The same with keys removed."""
+    return {key: value for key, value in mine(**changes).items() if key not in keys}
+
+
+# The shipped plants
+
+
+def test_circuit_matrices() -> None:
+    t = TIMES
+    system = shipped("circuit")
+    c = system.coefficients.taylor(t, 2)
+    zero, one = np.zeros_like(t), np.ones_like(t)
+    capacity = np.array([3 + np.cos(t / 3), 2 - np.cos(2 * t), 2 - np.exp(-t)])
+    slopes = np.array([-np.sin(t / 3) / 3, 2 * np.sin(2 * t), np.exp(-t)])
+    curvatures = np.array([-np.cos(t / 3) / 9, 4 * np.cos(2 * t), -np.exp(-t)])
+    E = np.zeros((len(t), 6, 6))
+    for k in range(3):
+        E[:, k, k] = capacity[k]
+    np.testing.assert_allclose(c.E[0], E, rtol=1e-14)
+    for k in range(3):
+        np.testing.assert_allclose(c.E[1, :, k, k], slopes[k], rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(c.E[2, :, k, k], curvatures[k] / 2, rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(c.A[1, :, k, k], -curvatures[k], rtol=1e-13, atol=1e-15)
+    R1, R2 = -(4 + 2 * np.sin(t)), -(2 + np.sin(t))
+    A = np.array(
+        [
+            [-slopes[0], zero, zero, one, -one, one],
+            [zero, -slopes[1], -one, -one, zero, zero],
+            [zero, one, -slopes[2], zero, zero, zero],
+            [-one, one, zero, R1, zero, zero],
+            [-one, zero, zero, zero, R2, zero],
+            [-one, zero, zero, zero, zero, zero],
+        ]
+    )
+    np.testing.assert_allclose(c.A[0], np.moveaxis(A, 2, 0), rtol=1e-14, atol=1e-15)
+    np.testing.assert_array_equal(c.B[0, 0, :, 0], [0, 0, 0, 0, 0, -1])
+    np.testing.assert_array_equal(c.C[0, 0], [[0, 0, 1, 0, 0, 1]])
+    np.testing.assert_allclose(c.u[0, :, 0], 4 * np.cos(2 * t) * np.sin(t / 5), rtol=1e-14)
+    assert c.F.shape == (3, len(t), 6, 0)
+
+
+def test_circuit_names_and_values() -> None:
+    system = shipped("circuit")
+    assert (system.name, system.source) == ("circuit", "")
+    assert system.states == ("e1", "e2", "il", "ir1", "ir2", "iv")
+    assert (system.inputs, system.outputs, system.unknowns) == (("V",), ("y",), ())
+    assert system.initial_state.tolist() == [0, 1, 2, 0.25, 0, -0.25]
+    assert system.units["e2"] == system.units["V"] == "V"
+    assert system.units["il"] == system.units["y"] == "A"
+    assert system.observer_defaults == {"xi_a0": {"e1": 1, "e2": 0, "il": 0}}
+    assert system.coefficients.constant == {"B", "C", "F"}
+    assert "2407.14373" in system.reference
+
+
+def test_descriptor() -> None:
+    t = TIMES
+    system = shipped("descriptor")
+    c = system.coefficients.taylor(t, 0)
+    k = 2
+    s, cosine = np.sin(t[k]), np.cos(t[k])
+    np.testing.assert_array_equal(c.E[0, k], np.diag([1, 1, 0]))
+    np.testing.assert_allclose(
+        c.A[0, k],
+        [[-1, 0.5 + s / 4, 1], [-0.5, -0.5 - cosine / 4, 0.5], [0.5, -1, 2 + s]],
+        rtol=1e-15,
+    )
+    np.testing.assert_array_equal(c.B[0, k], [[0], [1], [0.5]])
+    np.testing.assert_allclose(c.F[0, k], [[1, 0], [0, cosine], [0.5, 0]], rtol=1e-15)
+    np.testing.assert_array_equal(c.C[0, k], [[1, 0, 0.5]])
+    np.testing.assert_allclose(c.u[0, :, 0], np.sin(t) + np.cos(2 * t) / 2, rtol=1e-14)
+    assert system.theta.tolist() == [1.5, -0.8]
+    assert system.unknowns == ("theta1", "theta2")
+    assert system.initial_state[:2].tolist() == [1, -1]
+    assert system.observer_defaults == {"xi_a0": {"x1": 0, "x2": 0}}
+
+
+def test_canonical() -> None:
+    t = TIMES
+    system = shipped("canonical")
+    c = system.coefficients.taylor(t, 0)
+    assert system.states == ("za1", "za2", "zb1", "zb2", "zb3")
+    N = c.E[0, :, 2:, 2:]
+    np.testing.assert_array_equal(c.E[0, :, :2, :2], np.broadcast_to(np.eye(2), (5, 2, 2)))
+    np.testing.assert_allclose(N[:, 1, 0], 1 + 0.3 * np.sin(t), rtol=1e-15)
+    np.testing.assert_allclose(N[:, 2, 0], 0.5 + 0.2 * np.cos(t), rtol=1e-15)
+    np.testing.assert_allclose(N[:, 2, 1], 1.5 + 0.5 * np.sin(2 * t), rtol=1e-15)
+    assert not np.triu(N).any()
+    assert not c.E[0, :, :2, 2:].any()
+    assert not c.E[0, :, 2:, :2].any()
+    np.testing.assert_allclose(c.A[0, :, 1, 0], -2 - np.sin(t), rtol=1e-15)
+    np.testing.assert_array_equal(c.A[0, 0, 1, 1], -0.5)
+    np.testing.assert_array_equal(c.A[0, :, 0], np.broadcast_to([0, 1, 0, 0, 0], (5, 5)))
+    np.testing.assert_array_equal(c.A[0, :, 2:], np.broadcast_to(np.eye(5)[2:], (5, 3, 5)))
+    forcing = np.einsum("tij,tj->ti", c.B[0], c.u[0])
+    want = [np.zeros(5), np.sin(t), np.sin(t), np.cos(2 * t), np.sin(t / 2)]
+    np.testing.assert_allclose(forcing, np.array(want).T, rtol=1e-15)
+    np.testing.assert_array_equal(c.C[0, :, 0], np.broadcast_to([1, 0, 0, 0, 0], (5, 5)))
+    np.testing.assert_allclose(
+        c.C[0, 2, 1], [0.5, 0, 1 + 0.3 * np.cos(t[2]), 2 + 0.5 * np.sin(t[2]), 0], rtol=1e-15
+    )
+    assert system.initial_state[:2].tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("name", ["circuit", "descriptor", "canonical"])
+def test_shipped_plants_use_documented_keys_only(name: str) -> None:
+    plain = yaml.safe_load((PLANTS / f"{name}.yaml").read_text("utf-8"))
+    assert set(plain) <= set(KEYS)
+    assert plain["title"]
+    assert plain["reference"]
+    assert plain["name"] == name
+
+
+# The coefficient source
+
+
+def test_shapes_and_broadcast_constants() -> None:
+    system = plant_from_mapping(mine())
+    source: CoefficientSource = system.coefficients
+    c = source.taylor(TIMES, 3)
+    shapes = {"E": (2, 2), "A": (2, 2), "B": (2, 2), "F": (2, 1), "C": (1, 2), "u": (2,)}
+    for key in MATRIX_NAMES:
+        assert getattr(c, key).shape == (4, 5, *shapes[key])
+    assert source.constant == {"E", "F", "C"}
+    np.testing.assert_array_equal(c.C[:, 3], [[[1, 1.5]], [[0, 0]], [[0, 0]], [[0, 0]]])
+    np.testing.assert_array_equal(c.B[:2, 2], [[[1, 0], [0, 1.7]], [[0, 0], [0, 1]]])
+    np.testing.assert_allclose(c.A[0, :, 0, 0], -np.cos(TIMES), rtol=1e-15)
+    np.testing.assert_allclose(c.A[3, :, 1, 1], -np.cos(TIMES) / 6, rtol=1e-15)
+    np.testing.assert_array_equal(c.A[1:, :, 1, 0], 0)
+
+
+def test_breakpoints_and_inside_reach_the_expressions() -> None:
+    source = plant_from_mapping(mine()).coefficients
+    assert source.breakpoints(0.0, 5.0).tolist() == [1.0]
+    assert source.breakpoints(1.0, 5.0).tolist() == []
+    t = np.array([1.0, 1.0])
+    assert source.taylor(t, 0, np.array([0.5, 1.5])).u[0, :, 1].tolist() == [0.0, 3.0]
+    assert source.taylor(t, 0).u[0, :, 1].tolist() == [3.0, 3.0]
+
+
+def test_a_value_that_is_not_finite_names_the_entry() -> None:
+    plain = mine(A=[["-d(R)", 1], ["k", "1/(t - 2)"]])
+    source = plant_from_mapping(plain, "mine.yaml").coefficients
+    with pytest.raises(ConfigError) as caught:
+        source.taylor(np.array([1.0, 2.0]), 1)
+    says = "A[1][1] = '1/(t - 2)' has no finite value at t = 2"
+    assert str(caught.value) == f"plant mine (mine.yaml): {says}"
+
+
+def test_a_plant_copies_to_other_processes() -> None:
+    system = shipped("circuit")
+    copied = pickle.loads(pickle.dumps(system))  # noqa: S301  our own bytes
+    np.testing.assert_array_equal(
+        copied.coefficients.taylor(TIMES, 1).A, system.coefficients.taylor(TIMES, 1).A
+    )
+
+
+# What may be left out
+
+
+def test_a_plant_without_inputs_unknowns_or_outputs() -> None:
+    plain = without(
+        "inputs", "unknowns", "outputs", "B", "F", "C", "parameters", A=[[1, 0], [0, 1]]
+    )
+    plain["initial_state"] = [1, "2*pi"]
+    system = plant_from_mapping(plain)
+    assert (system.n, system.m, system.q, system.r) == (2, 0, 0, 0)
+    c = system.coefficients.taylor(TIMES, 1)
+    assert c.B.shape == (2, 5, 2, 0)
+    assert c.C.shape == (2, 5, 0, 2)
+    assert c.u.shape == (2, 5, 0)
+    assert system.coefficients.constant == set(MATRIX_NAMES)
+    assert system.initial_state.tolist() == [1, 2 * np.pi]
+    assert system.theta.shape == (0,)
+
+
+@pytest.mark.parametrize("nothing", [None, [], {}])
+def test_empty_keys_are_as_good_as_absent_ones(nothing: object) -> None:
+    plain = without("inputs", "B")
+    plain |= {"inputs": nothing, "B": None if nothing == {} else nothing, "units": None}
+    assert plant_from_mapping(plain).m == 0
+
+
+def test_texts_become_one_line() -> None:
+    system = plant_from_mapping(mine(title="two\n  lines", reference=2024), source="f.yaml")
+    assert (system.title, system.reference, system.source) == ("two lines", "2024", "f.yaml")
+
+
+def test_values_may_use_parameters_and_unknowns_keep_their_order() -> None:
+    plain = mine(unknowns={"b": "k/2", "a": 2}, F=[[0, 1], [1, 0]])
+    system = plant_from_mapping(plain)
+    assert system.unknowns == ("b", "a")
+    assert system.theta.tolist() == [1.5, 2.0]
+    assert system.initial_state.tolist() == [1.0, -1.5]
+
+
+def test_initial_state_by_name_in_any_order() -> None:
+    system = plant_from_mapping(mine(initial_state={"x2": 5, "x1": 4}))
+    assert system.initial_state.tolist() == [4.0, 5.0]
+
+
+def test_a_parameter_may_share_the_name_of_an_input() -> None:
+    plain = mine(parameters={"V": "cos(t)", "R": "t", "k": 1}, inputs={"V": "V", "I": "2*V"})
+    u = plant_from_mapping(plain).coefficients.taylor(TIMES, 0).u[0]
+    np.testing.assert_allclose(u[:, 1], 2 * np.cos(TIMES), rtol=1e-15)
+
+
+# Refusals
+
+REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+    "not a mapping": (lambda: ["name"], "must be a mapping"),
+    "no name": (lambda: without("name"), "name is missing"),
+    "name is a number": (lambda: mine(name=12), "name is '12'"),
+    "name is a path": (lambda: mine(name="../../etc"), "name is '../../etc'"),
+    "name is empty": (lambda: mine(name=""), "name is ''"),
+    "name of two lines": (lambda: mine(name="a\nb"), "name is"),
+    "unknown key": (lambda: mine(paramters={}), "'paramters'; did you mean parameters?"),
+    "boolean key": (lambda: {**mine(), True: 1}, "unknown key 'True'"),
+    "no states": (lambda: without("states"), "states is missing"),
+    "empty states": (lambda: mine(states=[]), "states is empty"),
+    "states is text": (lambda: mine(states="x1"), "states must be a list of names"),
+    "states are booleans": (lambda: mine(states=[True, False]), "boolean true as a name; quote it"),
+    "states are numbers": (lambda: mine(states=[1, 2]), "the name '1'"),
+    "state is reserved": (lambda: mine(states=["t", "x2"]), "t, which is reserved"),
+    "state is a function": (lambda: mine(states=["sin", "x2"]), "sin, which is reserved"),
+    "state is no identifier": (lambda: mine(states=["x-1", "x2"]), "the name 'x-1'"),
+    "state is not ASCII": (lambda: mine(states=["θ", "x2"]), "the name"),
+    "state twice": (lambda: mine(states=["x1", "x1"]), "x1 is a state twice"),
+    "state and input": (
+        lambda: mine(inputs={"V": 1, "x1": 2}),
+        "x1 is a state and an input; every name must be used once",
+    ),
+    "state and output": (lambda: mine(outputs=["x2"]), "x2 is a state and an output"),
+    "input and unknown": (lambda: mine(unknowns={"V": 1}), "V is an input and an unknown"),
+    "unknown and initial error": (lambda: mine(unknowns={"e0_x1": 1}), "the unknown e0_x1 has"),
+    "inputs is a list": (lambda: mine(inputs=["V", "I"]), "inputs must map names to values"),
+    "unknowns is a list": (lambda: mine(unknowns=["a"]), "unknowns must map names to values"),
+    "outputs is a mapping": (lambda: mine(outputs={"y": 1}), "outputs must be a list"),
+    "input is a boolean": (lambda: mine(inputs={"V": True, "I": 0}), "inputs.V is the boolean"),
+    "input name is a boolean": (lambda: mine(inputs={False: 1, "I": 0}), "boolean false as a name"),
+    "parameters is text": (lambda: mine(parameters="R"), "parameters must map names"),
+    "parameter is reserved": (lambda: mine(parameters={"exp": 1}), "exp, which is reserved"),
+    "parameter is a keyword": (lambda: mine(parameters={"lambda": 1}), "write lambda_"),
+    "parameter of a state": (
+        lambda: mine(parameters={"R": "x1", "k": 3}),
+        "parameters.R = 'x1': x1 is a state and cannot be used here",
+    ),
+    "parameter used early": (
+        lambda: mine(parameters={"R": "k", "k": 3}),
+        "k is a parameter defined further down",
+    ),
+    "parameter of itself": (
+        lambda: mine(parameters={"R": "R + 1", "k": 3}),
+        "R is this parameter itself",
+    ),
+    "parameter not defined": (lambda: mine(parameters={"k": "1/0"}), "parameters.k = '1/0'"),
+    "matrix of a state": (lambda: mine(A=[["x1", 1], [0, 1]]), "A[0][0] = 'x1': x1 is a state"),
+    "matrix of an input": (lambda: mine(A=[[0, "V"], [0, 1]]), "A[0][1] = 'V': V is an input"),
+    "matrix of an unknown": (lambda: mine(A=[[0, 1], ["theta", 1]]), "theta is an unknown"),
+    "input of an input": (lambda: mine(inputs={"V": 1, "I": "V"}), "inputs.I = 'V': V is an input"),
+    "unknown of time": (lambda: mine(unknowns={"a": "t"}), "unknowns.a = 't' must not depend on t"),
+    "no E": (lambda: without("E"), "E is missing; there are 2 states (x1, x2)"),
+    "no A": (lambda: without("A"), "A is missing"),
+    "no B": (lambda: without("B"), "B is missing; there are 2 inputs (V, I), so it needs 2 rows"),
+    "no F": (lambda: without("F"), "F is missing; there is 1 unknown (theta)"),
+    "no C": (lambda: without("C"), "C is missing; there is 1 output (y), so it needs 1 row of 2"),
+    "A is a number": (lambda: mine(A=0), "A must be a list of 2 rows, not '0'"),
+    "A is text": (lambda: mine(A="R"), "A must be a list of 2 rows, not 'R'"),
+    "A has too few rows": (lambda: mine(A=[[0, 1]]), "A has 1 row but there are 2 states (x1, x2)"),
+    "A has too many columns": (
+        lambda: mine(A=[[0, 1, 2], [0, 1, 2]]),
+        "A has 3 columns but there are 2 states (x1, x2)",
+    ),
+    "A is ragged": (
+        lambda: mine(A=[[0, 1], [0]]),
+        "the rows of A differ: A[0] has length 2, A[1] has length 1",
+    ),
+    "a row is a number": (lambda: mine(F=[0, 1]), "F[0] must be a list, one entry per unknown"),
+    "B has too many columns": (
+        lambda: mine(B=[[1, 0, 0], [0, 1, 0]]),
+        "plant mine: B has 3 columns but there are 2 inputs (V, I)",
+    ),
+    "B without inputs": (lambda: without("inputs"), "B has 2 columns but there are 0 inputs"),
+    "F without unknowns": (lambda: without("unknowns"), "F has 1 column but there are 0 unknowns"),
+    "C without outputs": (lambda: without("outputs"), "C has 1 row but there are 0 outputs"),
+    "entry is empty": (lambda: mine(E=[[1, None], [0, 0]]), "E[0][1] is empty"),
+    "entry is a list": (lambda: mine(E=[[1, [0]], [0, 0]]), "E[0][1] is a list"),
+    "entry is hostile": (lambda: mine(E=[[1, "__import__('os')"], [0, 0]]), "E[0][1] = "),
+    "no initial state": (lambda: without("initial_state"), "initial_state is missing"),
+    "initial state lacks": (lambda: mine(initial_state={"x1": 1}), "initial_state lacks x2"),
+    "initial state unknown": (
+        lambda: mine(initial_state={"x1": 1, "x3": 0}),
+        "initial_state has 'x3', which is not a state; did you mean",
+    ),
+    "initial state too long": (
+        lambda: mine(initial_state=[1, 2, 3]),
+        "initial_state has 3 values but there are 2 states (x1, x2)",
+    ),
+    "initial state a number": (lambda: mine(initial_state=0), "initial_state must map states"),
+    "initial state of time": (
+        lambda: mine(initial_state={"x1": "1 + t", "x2": 0}),
+        "initial_state.x1 = '1 + t' must not depend on t",
+    ),
+    "units of nothing": (lambda: mine(units={"x3": "V"}), "units has 'x3'"),
+    "units is text": (lambda: mine(units="V"), "units must be a mapping"),
+    "unit is a list": (lambda: mine(units={"x1": ["V"]}), "units.x1 must be one line of text"),
+    "title is a list": (lambda: mine(title=["a"]), "title must be one line of text"),
+    "title is a boolean": (lambda: mine(title=True), "title must be one line of text"),
+    "defaults is a list": (lambda: mine(observer_defaults=[1]), "observer_defaults must be"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_in_one_line(case: str) -> None:
+    make, says = REFUSED[case]
+    mapping: Any = make()
+    with pytest.raises(ConfigError) as caught:
+        plant_from_mapping(mapping)
+    message = str(caught.value)
+    assert says in message
+    assert message.startswith("plant")
+    assert len(message.splitlines()) == 1
+
+
+def test_messages_name_the_file() -> None:
+    with pytest.raises(ConfigError, match=r"^plant mine \(dir/mine.yaml\): A is missing"):
+        plant_from_mapping(without("A"), "dir/mine.yaml")
+    with pytest.raises(ConfigError, match=r"^plant \(dir/mine.yaml\): name is missing"):
+        plant_from_mapping({}, "dir/mine.yaml")
+
+
+def test_an_expanding_yaml_file_is_refused_with_a_short_message() -> None:
+    bomb: list[Any] = ["x"] * 9
+    for _ in range(12):
+        bomb = [bomb] * 9
+    for changes in ({"states": bomb}, {"A": bomb[:2]}, {"initial_state": bomb[:2]}):
+        with pytest.raises(ConfigError) as caught:
+            plant_from_mapping(mine(**changes))
+        assert len(str(caught.value)) < 400

@@ -1,0 +1,291 @@
+"""Simulation: structure, consistent starts, jumps, references, honesty of the error estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plants import reference, shipped
+from scipy.integrate import solve_ivp
+
+from gpebo_cli.errors import ModelError
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+from gpebo_cli.systems.plant import plant_from_mapping
+
+SOLVER = SolverSettings()
+
+
+def plant(**mapping):
+    mapping.setdefault("name", "p")
+    return plant_from_mapping(mapping, "p.yaml")
+
+
+@pytest.mark.parametrize("name", ["circuit", "descriptor", "canonical"])
+def test_states_match_the_reference(name):
+    expected = reference(name)
+    system = shipped(name)
+    result = simulate(system, TimeSettings(), SOLVER)
+    assert result.structure.index == expected["index"]
+    np.testing.assert_allclose(
+        result.initial_state, expected["consistent_initial_state"], atol=1e-12
+    )
+    t = np.array([row["t"] for row in expected["at"]])
+    x = np.array([row["x"] for row in expected["at"]])
+    error = np.abs(result.signals.states(t) - x)
+    assert error.max() < 1e-10
+    assert error.max() <= 10 * SOLVER.tol * np.abs(x).max()
+
+
+def test_only_the_inconsistent_state_of_the_circuit_moves():
+    system = shipped("circuit")
+    result = simulate(system, TimeSettings(horizon=1.0), SOLVER)
+    moved = dict(zip(system.states, result.initial_state - system.initial_state, strict=True))
+    assert moved.pop("iv") == pytest.approx(-3.2, abs=1e-12)
+    assert max(map(abs, moved.values())) < 1e-12
+
+
+def test_consistent_start_keeps_the_differential_part():
+    """0 = x1 + x2 − x3 with E = diag(1, 4, 0): only x3 may move, whatever was asked for."""
+    system = plant(
+        states=["x1", "x2", "x3"],
+        E=[[1, 0, 0], [0, 4, 0], [0, 0, 0]],
+        A=[[-1, 0, 0], [0, -1, 0], [1, 1, -1]],
+        initial_state=[1, 2, 50],
+    )
+    result = simulate(system, TimeSettings(horizon=1.0), SOLVER)
+    np.testing.assert_allclose(result.initial_state, [1, 2, 3], atol=1e-13)
+
+
+def test_consistent_start_on_a_differential_constraint_is_the_E_weighted_projection():
+    """0 = x1 − x2 ties two differential states: the E-nearest point is the weighted mean."""
+    system = plant(
+        states=["x1", "x2", "x3"],
+        E=[[1, 0, 0], [0, 2, 0], [0, 0, 0]],
+        A=[[0, 0, 1], [0, 0, -1], [1, -1, 0]],
+        initial_state=[0, 5, 0],
+    )
+    result = simulate(system, TimeSettings(horizon=1.0), SOLVER)
+    # min (a)² + 4 (a − 5)² at a = 4
+    np.testing.assert_allclose(result.initial_state[:2], [4, 4], atol=1e-12)
+
+
+SCALES = [1.0, 1e-6, 1e6]
+
+
+@pytest.mark.parametrize("farad", SCALES)
+@pytest.mark.parametrize("ohm", SCALES)
+def test_units_do_not_change_the_structure(farad, ohm):
+    """An RC circuit behind an ideal source, index 2, in any units."""
+    system = plant(
+        states=["v", "i"],
+        inputs={"V": "sin(t)"},
+        E=[[farad, 0], [0, 0]],
+        A=[[-1 / ohm, 1], [-1, 0]],
+        B=[[0], [1]],
+        initial_state=[0, 0],
+    )
+    result = simulate(system, TimeSettings(horizon=3.0), SOLVER)
+    assert (result.structure.index, result.structure.d) == (2, 0)
+    t = np.linspace(0, 3, 50)
+    truth = np.stack([np.sin(t), farad * np.cos(t) + np.sin(t) / ohm], axis=1)
+    error = np.abs(result.signals.states(t) - truth) / np.abs(truth).max(axis=0)
+    assert error.max() < 1e-10
+
+
+def test_an_explicit_ode_has_index_zero():
+    system = plant(states=["x"], E=[["2 + t"]], A=[[-1]], initial_state=[1])
+    result = simulate(system, TimeSettings(horizon=2.0), SOLVER)
+    assert result.structure.index == 0
+    assert result.signals.states(np.array([2.0]))[0, 0] == pytest.approx(0.5, abs=1e-12)
+
+
+def test_a_rank_drop_of_E_that_the_model_tolerates_is_no_error():
+    """E = diag(1, t) loses rank at t = 0.37…, a singular point; E = diag(1, 0) does not care."""
+    singular = plant(
+        states=["a", "b"], E=[[1, 0], [0, "t - 0.3712"]], A=[[-1, 0], [0, -1]],
+        initial_state=[1, 1],
+    )
+    with pytest.raises(ModelError, match=r"t = 0\.3712"):
+        simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+
+
+def test_index_above_the_limit_is_refused():
+    n = 6  # a chain of 6: index 6
+    E = [[1 if j == i + 1 else 0 for j in range(n)] for i in range(n)]
+    A = [[1 if i == j else 0 for j in range(n)] for i in range(n)]
+    chain = plant(
+        states=[f"x{i}" for i in range(n)], inputs={"u": "sin(t)"}, E=E, A=A,
+        B=[[0]] * (n - 1) + [[1]], initial_state=[0] * n,
+    )
+    solved = simulate(chain, TimeSettings(horizon=1.0), SOLVER)
+    assert solved.structure.index == 6
+    with pytest.raises(ModelError, match="index is above 4"):
+        simulate(chain, TimeSettings(horizon=1.0), SolverSettings(max_strangeness_index=3))
+
+
+# --- jumps ----------------------------------------------------------------------------------
+
+
+def test_a_step_of_the_input_of_an_ode():
+    system = plant(
+        states=["x"], inputs={"u": "step(t - 0.7)"}, E=[[1]], A=[[-1]], B=[[1]], initial_state=[0]
+    )
+    result = simulate(system, TimeSettings(horizon=2.0), SOLVER)
+    t = np.linspace(0, 2, 401)
+    truth = np.where(t >= 0.7, 1 - np.exp(-(t - 0.7)), 0.0)
+    np.testing.assert_allclose(result.signals.states(t)[:, 0], truth, atol=1e-12)
+    np.testing.assert_allclose(result.signals.inputs(t)[:, 0], t >= 0.7, atol=1e-14)
+
+
+def test_a_step_through_a_constraint_restarts_the_algebraic_part_only():
+    """x' = z, 0 = x + z − u: z jumps with u, x does not."""
+    system = plant(
+        states=["x", "z"], inputs={"u": "1 + 2*step(t - 1)"}, E=[[1, 0], [0, 0]],
+        A=[[0, 1], [-1, -1]], B=[[0], [1]], initial_state=[0, 1],
+    )
+    result = simulate(system, TimeSettings(horizon=2.0), SOLVER)
+    (when, before, jump), = result.jumps
+    assert when == 1.0
+    assert jump.after - before == pytest.approx([0.0, 2.0], abs=1e-12)
+    assert not jump.impulses.any()
+
+
+def test_an_impulse_that_drives_a_differential_state_moves_it():
+    """x1' = x3, x2' = 2 x3, 0 = x1 − u: a step of u moves x2 by twice as much.
+
+    Keeping E x as near as possible would leave x2 where it is. Checked against smooth
+    approximations of the step, whose solutions converge to this one.
+    """
+
+    def after(u):
+        system = plant(
+            states=["x1", "x2", "x3"], inputs={"u": u},
+            E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]],
+            A=[[0, 0, 1], [0, "-t", 2], [1, 0, 0]], B=[[0], [0], [-1]],
+            initial_state=[0, 1, 0],
+        )
+        return simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
+
+    exact = after("step(t - 1)")
+    (_, before, jump), = exact.jumps
+    assert jump.after - before == pytest.approx([1.0, 2.0, 0.0], abs=1e-9)
+    assert jump.impulses[0] == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
+    end = np.array([2.0])
+    for width, bound in ((0.05, 0.06), (0.005, 0.006)):
+        smooth = after(f"0.5 + 0.5*tanh((t - 1)/{width})")
+        difference = smooth.signals.states(end)[0, 1] - exact.signals.states(end)[0, 1]
+        assert abs(difference) < bound
+
+
+def test_a_jump_of_the_third_order():
+    """Index 3 chain with time-varying coefficients, step input: distributional solution."""
+    # 0 = x1 − u, x1' (1 + t) = x2, x2' = x3 + x4', written without x4: E rows below.
+    system = plant(
+        states=["x1", "x2", "x3", "x4"], inputs={"u": "step(t - 1)"},
+        E=[[0, 0, 0, 0], ["1 + t", 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]],
+        A=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 1, 1, 0]],
+        B=[[-1], [0], [0], [0]], initial_state=[0, 0, 0, 0],
+    )
+    # x2 = (1 + t) δ(t − 1) = 2 δ, x3 = 2 δ', so x4' = 2 δ + 2 δ': x4 jumps by 2 (and has 2 δ).
+    result = simulate(system, TimeSettings(horizon=2.0), SOLVER)
+    (_, before, jump), = result.jumps
+    assert jump.after - before == pytest.approx([1.0, 0.0, 0.0, 2.0], abs=1e-9)
+    assert jump.impulses[0] == pytest.approx([0.0, 2.0, 0.0, 2.0], abs=1e-9)
+    assert jump.impulses[1] == pytest.approx([0.0, 0.0, 2.0, 0.0], abs=1e-9)
+
+
+def test_a_coefficient_that_moves_while_an_impulse_passes():
+    """(1 + t) δ'(t − 1) = 2 δ' − δ: the derivative of the coefficient makes an impulse of its own.
+
+    0 = x1 − u, x1' = x2, (1 + t) x2' = x3, x4' = x3, u a unit step at 1: x4 = ∫(1 + t) u'' falls
+    by 1, for any rise of u from 0 to 1, however smooth.
+    """
+
+    def after(u):
+        system = plant(
+            states=["x1", "x2", "x3", "x4"], inputs={"u": u},
+            E=[[0, 0, 0, 0], [1, 0, 0, 0], [0, "1 + t", 0, 0], [0, 0, 0, 1]],
+            A=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 0]],
+            B=[[-1], [0], [0], [0]], initial_state=[0, 0, 0, 0],
+        )
+        return simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
+
+    exact = after("step(t - 1)")
+    ((_, before, jump),) = exact.jumps
+    assert jump.after - before == pytest.approx([1.0, 0.0, 0.0, -1.0], abs=1e-9)
+    assert jump.impulses[0] == pytest.approx([0.0, 1.0, -1.0, 2.0], abs=1e-9)
+    assert jump.impulses[1] == pytest.approx([0.0, 0.0, 2.0, 0.0], abs=1e-9)
+    smooth = after("0.5 + 0.5*tanh(20*(t - 1))")
+    end = np.array([2.0])
+    assert smooth.signals.states(end)[0, 3] == pytest.approx(-1.0, abs=1e-6)
+
+
+def test_a_switch_in_A_is_an_element_boundary():
+    system = plant(
+        states=["x"], E=[[1]], A=[["-1 - 3*step(t - 0.5)"]], initial_state=[1]
+    )
+    result = simulate(system, TimeSettings(horizon=1.0), SOLVER)
+    end = result.signals.states(np.array([1.0]))[0, 0]
+    assert end == pytest.approx(np.exp(-0.5 - 2.0), abs=1e-13)
+
+
+def test_E_that_jumps_where_the_state_jumps_is_refused():
+    system = plant(
+        states=["v", "i"], inputs={"V": "step(t - 1)"},
+        E=[["1 + step(t - 1)", 0], [0, 0]], A=[[0, 1], [-1, 0]], B=[[0], [1]],
+        initial_state=[0, 0],
+    )
+    with pytest.raises(ModelError, match="E jumps at t = 1"):
+        simulate(system, TimeSettings(horizon=2.0), SOLVER)
+
+
+def test_a_kink_costs_no_accuracy():
+    system = plant(
+        states=["x"], inputs={"u": "abs(sin(3*t))"}, E=[[1]], A=[[0]], B=[[1]], initial_state=[0]
+    )
+    result = simulate(system, TimeSettings(horizon=4.0), SOLVER)
+    from scipy.integrate import quad
+
+    truth = quad(lambda t: abs(np.sin(3 * t)), 0, 4, points=[k * np.pi / 3 for k in (1, 2, 3)])[0]
+    assert result.signals.states(np.array([4.0]))[0, 0] == pytest.approx(truth, abs=1e-11)
+
+
+@pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
+@pytest.mark.parametrize("name", ["circuit", "descriptor", "canonical"])
+def test_true_error_is_within_ten_tolerances_and_ten_estimates(name, tol):
+    system = shipped(name)
+    best = simulate(system, TimeSettings(), SolverSettings(tol=1e-13, stages=12))
+    result = simulate(system, TimeSettings(), SolverSettings(tol=tol))
+    t = np.linspace(0, 20, 1501)
+    truth = best.signals.states(t)
+    size = np.maximum(np.abs(truth).max(axis=0), 1e-3 * np.abs(truth).max())
+    error = (np.abs(result.signals.states(t) - truth) / size).max()
+    assert error <= max(10 * tol, 2e-13)
+    assert error <= 10 * result.error_estimate
+
+
+def test_an_independent_integration_of_the_hand_reduced_circuit():
+    """e1 = −V is algebraic; e2 and il are a plain ODE that a student would write down."""
+
+    def rhs(t, x):
+        V, C2, L = 4 * np.cos(2 * t) * np.sin(t / 5), 2 - np.cos(2 * t), 2 - np.exp(-t)
+        e1, R1 = -V, -(4 + 2 * np.sin(t))
+        ir1 = (e1 - x[0]) / R1
+        return [
+            (-2 * np.sin(2 * t) * x[0] - x[1] - ir1) / C2,
+            (x[0] - np.exp(-t) * x[1]) / L,
+        ]
+
+    t = np.linspace(0, 20, 301)
+    truth = solve_ivp(rhs, (0, 20), [1, 2], method="DOP853", rtol=1e-12, atol=1e-13, t_eval=t).y.T
+    ours = simulate(shipped("circuit"), TimeSettings(), SOLVER).signals.states(t)
+    np.testing.assert_allclose(ours[:, 1:3], truth, atol=1e-10)
+
+
+def test_start_need_not_be_zero():
+    system = plant(
+        states=["x"], inputs={"u": "cos(t)"}, E=[[1]], A=[[0]], B=[[1]], initial_state=["sin(3)"]
+    )
+    result = simulate(system, TimeSettings(start=3.0, horizon=5.0), SOLVER)
+    t = np.linspace(3, 8, 77)
+    np.testing.assert_allclose(result.signals.states(t)[:, 0], np.sin(t), atol=1e-12)

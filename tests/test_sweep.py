@@ -1,0 +1,441 @@
+"""Sweeps: planned, recorded on disk, killed in the middle, resumed, compared."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gpebo_cli.commands.arguments import logspace, parse, quoted
+from gpebo_cli.commands.sweep_folder import (
+    JobRecord,
+    Plan,
+    read_plan,
+    read_record,
+    table,
+    write_record,
+)
+from gpebo_cli.commands.sweep_progress import line
+from gpebo_cli.errors import ConfigError
+
+ROOT = Path(__file__).parents[1]
+FAST = ["figures=none", "time.samples=51"]
+SWEEP = ["run", "-m", "estimator.gamma=logspace(6,9,4)", "estimator=drem,ls_drem", *FAST]
+posix = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+
+
+def environment():
+    inherited = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
+    return {**inherited, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
+
+
+def gpebo(*words, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "gpebo_cli", *map(str, words)], cwd=cwd, env=environment(),
+        capture_output=True, text=True, check=False, timeout=120, stdin=subprocess.DEVNULL,
+    )
+
+
+def begin(*words, cwd):
+    return subprocess.Popen(
+        [sys.executable, "-m", "gpebo_cli", *words], cwd=cwd, env=environment(),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )
+
+
+def wait_for(folder, pattern, count):
+    deadline = time.monotonic() + 60
+    while len(list(folder.glob(pattern))) < count and time.monotonic() < deadline:
+        time.sleep(0.005)
+
+
+def rows(folder):
+    with (folder / "results.csv").open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def without_seconds(folder):
+    return [{k: v for k, v in row.items() if k != "seconds"} for row in rows(folder)]
+
+
+def stamps(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.glob("*/result.json")}
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    done = gpebo(*SWEEP, "hydra.sweep.dir=sweep", cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder / "sweep"
+
+
+# What is run ----------------------------------------------------------------------------------
+
+
+def test_logspace_is_one_job_for_each_value(uninterrupted):
+    table = rows(uninterrupted)
+    gains = [float(row["gamma"]) for row in table]
+    assert gains[::2] == gains[1::2] == pytest.approx([1e6, 1e7, 1e8, 1e9], rel=1e-15)
+    assert [row["estimator"] for row in table] == ["drem", "ls_drem"] * 4
+    assert [row["job"] for row in table] == [str(n) for n in range(8)]
+
+
+def test_logspace_has_the_numbers_of_the_axis_of_one_run():
+    from gpebo_cli.estimators._base import axis
+
+    text = "logspace(-3, 7, 23)"
+    assert [float(v) for v in logspace(text, "g").split(",")] == list(axis(text, "g"))
+    assert logspace("1e6", "g") is None
+    with pytest.raises(ConfigError, match="whole number"):
+        logspace("logspace(0,1,2.5)", "estimator.gamma")
+
+
+def test_logspace_is_an_axis_without_m_and_where_it_is_quoted():
+    assert parse(["g=logspace(0,1,2)"]).overrides == ("g='logspace(0,1,2)'",)
+    assert parse(["-m", "g=logspace(0,1,2)"]).overrides == ("g=1,10",)
+    assert parse(["-m", "g='logspace(0,1,2)'"]).overrides == ("g='logspace(0,1,2)'",)
+
+
+@pytest.mark.parametrize("text", ["a", "it's", "a\\b", "a\\", "a\\'b", "a,b {c}=[d] $"])
+def test_quoted_text_is_read_back_by_hydra(text):
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    (override,) = OverridesParser.create().parse_overrides([f"key={quoted(text)}"])
+    assert override.value() == text
+
+
+def test_a_sweep_stored_in_a_recipe(tmp_path):
+    done = gpebo("run", "experiment=gain_multirun", "--dry-run", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    *_, last = done.stdout.splitlines()
+    assert last == "10 jobs; nothing was run"
+
+
+def test_dry_run_lists_the_jobs_and_leaves_nothing(tmp_path):
+    done = gpebo(*SWEEP, "--dry-run", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    head, *jobs, last = done.stdout.splitlines()
+    assert head.split()[:3] == ["job", "estimator.gamma", "estimator"]
+    assert len(jobs) == 8
+    assert last == "8 jobs; nothing was run"
+    assert not (tmp_path / "outputs").exists()
+
+
+@pytest.mark.parametrize("word", ["--dry-run", "resume=.", "fail_fast=true"])
+def test_words_of_a_sweep_are_refused_without_one(tmp_path, word):
+    done = gpebo("run", word, *FAST, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "is for a sweep; add -m" in done.stderr
+    assert list(tmp_path.glob("outputs/runs/*")) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["resume=nowhere"], "resume=nowhere: there is no such folder"),
+        (["fail_fast=maybe"], "fail_fast: expected true or false"),
+        (["hydra/sweeper=basic"], "has a sweeper of its own"),
+        (["hydra.sweep.subdir=x"], "the folders of jobs are numbered"),
+        (["estimator=drem,dremm"], "estimator=dremm: there is no such estimator"),
+        (["estimator.gama=1,2"], "estimator.gama: no such key"),
+        (["hydra/launcher=joblibb"], "launcher"),
+    ],
+)
+def test_wrong_words_are_one_line_before_anything_runs(tmp_path, words, expected):
+    done = gpebo("run", "-m", "estimator.gamma=1e6,1e7", *words, *FAST, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert expected in done.stderr
+    assert not list(tmp_path.glob("outputs/sweeps/*/*"))
+
+
+def test_figures_when_they_are_asked_for(tmp_path):
+    words = ["time.samples=51", "estimator.gamma=1e8", "hydra.sweep.dir=sweep"]
+    done = gpebo("run", "-m", "figures=[regressor]", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in tmp_path.glob("sweep/0/figures/*")] == ["regressor.png"]
+
+
+# Failures -------------------------------------------------------------------------------------
+
+
+def test_fail_fast_stops_at_the_first_and_the_rest_can_be_run_later(tmp_path):
+    words = ["run", "-m", "estimator.gamma=1e6,-1,1e8", *FAST]
+    done = gpebo(*words, "hydra.sweep.dir=sweep", "fail_fast=true", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "1 of 3 jobs failed: job 1: estimator.gamma" in done.stderr
+    assert "1 job without a result (fail_fast); go on with resume=sweep" in done.stderr
+    assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "failed", "missing"]
+    again = gpebo(*words, "resume=sweep", cwd=tmp_path)
+    assert again.returncode == 1
+    assert again.stderr.count("\n") == 1
+    assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "failed", "done"]
+
+
+def test_a_folder_with_a_sweep_is_not_taken_for_another(tmp_path, uninterrupted):
+    done = gpebo(*SWEEP, f"hydra.sweep.dir={uninterrupted}", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "has a sweep already; add resume=" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["estimator.gamma=1e6,1e7", "estimator=drem,ls_drem", *FAST], "has 8 jobs and this one 4"),
+        ([*SWEEP[2:], "time.horizon=10"], "job 0 had time.horizon=None and has '10' now"),
+    ],
+)
+def test_another_sweep_is_not_resumed(tmp_path, uninterrupted, words, expected):
+    done = gpebo("run", "-m", *words, f"resume={uninterrupted}", cwd=tmp_path)
+    assert done.returncode == 2
+    assert expected in done.stderr
+
+
+def test_only_a_sweep_is_resumed(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    done = gpebo(*SWEEP, "resume=.", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "resume=.: there is no sweep.json in it" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_plant_that_has_changed_is_not_mixed_with_the_old_one(tmp_path):
+    plant = tmp_path / "plant" / "mine.yaml"
+    plant.parent.mkdir()
+    text = (
+        "name: mine\nstates: [x]\noutputs: [y]\nE: [[1]]\nA: [[-1]]\nC: [[1]]\n"
+        "initial_state: {x: 1}\n"
+    )
+    plant.write_text(text)
+    words = ["run", "-m", "--config-dir", ".", "plant=mine", "estimator.gamma=1,2", *FAST]
+    assert gpebo(*words, "hydra.sweep.dir=sweep", cwd=tmp_path).returncode == 0
+    plant.write_text(text.replace("-1", "-2"))
+    done = gpebo(*words, "resume=sweep", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "a configuration file has changed" in done.stderr
+
+
+# Interrupted and resumed ----------------------------------------------------------------------
+
+
+@posix
+@pytest.mark.parametrize(
+    ("pattern", "count"), [("sweep.json", 1), ("1/config.yaml", 1), ("*/result.json", 4)]
+)
+def test_killed_and_resumed_is_as_if_nothing_had_happened(tmp_path, uninterrupted, pattern, count):
+    sweep = tmp_path / "sweep"
+    with begin(*SWEEP, "hydra.sweep.dir=sweep", cwd=tmp_path) as process:
+        wait_for(sweep, pattern, count)
+        process.kill()
+    assert not (sweep / "results.csv").exists()
+    before = stamps(sweep)
+    listed = gpebo(*SWEEP, "resume=sweep", "--dry-run", cwd=tmp_path)
+    assert f"8 jobs, {len(before)} of them done; nothing was run" in listed.stdout
+    done = gpebo(*SWEEP, "resume=sweep", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    after = stamps(sweep)
+    assert {path: after[path] for path in before} == before, "a finished job is never run again"
+    assert without_seconds(sweep) == without_seconds(uninterrupted)
+    assert not list(sweep.glob("*/.*"))
+
+
+@posix
+def test_an_interruption_writes_the_table_and_says_where(tmp_path, uninterrupted):
+    with begin(*SWEEP, "hydra.sweep.dir=sweep", cwd=tmp_path) as process:
+        wait_for(tmp_path / "sweep", "*/result.json", 2)
+        process.send_signal(signal.SIGINT)
+        output, error = process.communicate(timeout=60)
+    # `python -m` ends by the signal itself, which a shell shows as 130, too, if it arrived while
+    # CPython executed a string (dataclasses do, when they are imported), handled or not.
+    assert process.returncode in (130, -signal.SIGINT)
+    assert error == "gpebo: error: interrupted\n"
+    assert output.splitlines()[0] == "sweep/results.csv"
+    statuses = [row["status"] for row in rows(tmp_path / "sweep")]
+    assert statuses.count("done") >= 2
+    assert set(statuses) == {"done", "missing"}
+    assert gpebo(*SWEEP, "resume=sweep", cwd=tmp_path).returncode == 0
+    assert without_seconds(tmp_path / "sweep") == without_seconds(uninterrupted)
+
+
+def test_a_finished_sweep_resumes_to_itself(tmp_path, uninterrupted):
+    before = stamps(uninterrupted), (uninterrupted / "results.csv").read_bytes()
+    assert gpebo(*SWEEP, f"resume={uninterrupted}", cwd=tmp_path).returncode == 0
+    assert (stamps(uninterrupted), (uninterrupted / "results.csv").read_bytes()) == before
+
+
+# The files ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"status": "done"}', '{"status": "odd"}'])
+def test_what_is_no_result_is_a_missing_job(tmp_path, text):
+    (tmp_path / "0").mkdir()
+    (tmp_path / "0" / "result.json").write_text(text)
+    assert read_record(tmp_path, 0, {"a": "1"}).status == "missing"
+
+
+def test_a_result_of_other_overrides_is_a_missing_job(tmp_path):
+    (tmp_path / "0").mkdir()
+    record = JobRecord(0, {"a": "1"}, "done", 0.5, "", [{"gamma": 1.0, "x": None}])
+    write_record(tmp_path / "0", record)
+    assert read_record(tmp_path, 0, {"a": "1"}) == record
+    assert read_record(tmp_path, 0, {"a": "2"}).status == "missing"
+
+
+def test_a_plan_is_read_back(tmp_path):
+    plan = Plan(({"a": "[1,2]", "b": "'ü'"}, {}), "0123")
+    assert read_plan(tmp_path) is None
+    plan.write(tmp_path)
+    assert read_plan(tmp_path) == plan
+    (tmp_path / "sweep.json").write_text(json.dumps({"jobs": 3}))
+    with pytest.raises(ConfigError, match="not the plan of a sweep"):
+        read_plan(tmp_path)
+
+
+def test_the_table_has_a_row_for_every_job_and_case():
+    records = [
+        JobRecord(0, {"a": "1"}, "done", 0.5, "", [{"g": 1.0}, {"g": 2.0}]),
+        JobRecord(1, {"a": "2"}, "failed", 0.25, "why"),
+        JobRecord(2, {"a": "3"}, "missing"),
+    ]
+    assert table(records) == [
+        ["job", "a", "status", "case", "g", "seconds", "error"],
+        ["0", "1", "done", "0", "1", "0.5", ""],
+        ["0", "1", "done", "1", "2", "0.5", ""],
+        ["1", "2", "failed", "", "", "0.25", "why"],
+        ["2", "3", "missing", "", "", "", ""],
+    ]
+
+
+def test_progress_has_counts_failures_and_time_left():
+    assert line(0, 8, 0, 0, 1.0) == "[........................] 0/8 jobs"
+    assert line(4, 8, 1, 2, 30.0) == "[############............] 4/8 jobs, 1 failed, 1:00 left"
+    assert line(8, 8, 0, 8, 9.0) == "[########################] 8/8 jobs"
+    assert line(1, 1001, 0, 1, 4.0).endswith("1:06:40 left")
+
+
+# gpebo compare --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compared(uninterrupted, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compared")
+    done = gpebo(
+        "compare", uninterrupted, "--csv", "all.csv", "--output", "drawn", cwd=folder
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder, done.stdout
+
+
+def test_the_comparison_is_sorted_and_agrees_with_the_sweep(compared, uninterrupted):
+    folder, output = compared
+    head, *body = output.splitlines()
+    assert head.split()[:3] == ["run", "estimator", "gamma"], "what is the same for all is left out"
+    with (folder / "all.csv").open() as stream:
+        table = list(csv.DictReader(stream))
+    times = [float(row["seconds_to_1pct_parameters"]) for row in table]
+    assert times == sorted(times)
+    assert len(table) == 8
+    assert [line.split()[0] for line in body[:8]] == [row["run"] for row in table]
+    by_job = {row["job"]: row for row in rows(uninterrupted)}
+    for row in table:
+        job = by_job[row["run"].rpartition("/")[2]]
+        names = ("estimator", "gamma", "final_error_states", "rms_error_states")
+        assert [row[name] for name in names] == [job[name] for name in names]
+
+
+def test_the_comparison_draws_errors_and_metrics_over_the_gain(compared):
+    folder, output = compared
+    drawn = sorted(path.name for path in (folder / "drawn").iterdir())
+    assert drawn == ["errors.png", "over_gamma.png"]
+    assert [line for line in output.splitlines() if line.endswith(".png")] == [
+        f"drawn/{name}" for name in drawn
+    ]
+
+
+def test_runs_and_their_cases_are_compared_with_a_heat_map_of_two_gains(tmp_path):
+    words = ["estimator=ls_drem", "estimator.gamma=[1,10,100]", "estimator.f0=[1e-6,1e-4]", *FAST]
+    assert gpebo("run", *words, "hydra.run.dir=a", cwd=tmp_path).returncode == 0
+    assert gpebo("run", "estimator=drem", *FAST, "hydra.run.dir=b", cwd=tmp_path).returncode == 0
+    words = ["compare", "a", "b", "--sort", "rms_error_states", "--reverse", "--output=drawn"]
+    done = gpebo(*words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    names = {path.stem for path in (tmp_path / "drawn").iterdir()}
+    assert names == {"errors", "over_gamma", "rms_error_states_over_f0_and_gamma"}
+    table = [line.split() for line in done.stdout.splitlines() if line.lstrip()[0] in "ab"]
+    values = [float(cells[-1]) for cells in table]
+    assert len(values) == 7
+    assert values == sorted(values, reverse=True)
+
+
+def test_error_curves_are_those_of_the_run(tmp_path):
+    import numpy as np
+
+    from gpebo_cli.outputs.finished import read_errors, read_run
+
+    words = ["run", "estimator.gamma=[1e6,1e8]", "plant=descriptor", "estimator=ls_drem", *FAST]
+    assert gpebo(*words, "hydra.run.dir=a", cwd=tmp_path).returncode == 0
+    cases = read_run("a", tmp_path / "a", {})
+    slow, fast = read_errors(cases)
+    # At the start the estimates are zero: the error is η itself, (1.5, −0.8, −1, 1).
+    assert slow.parameters[0] == fast.parameters[0] == pytest.approx(np.sqrt(1.5**2 + 0.64 + 2))
+    assert slow.parameter_size == slow.parameters[0]
+    for case, curves in zip(cases, (slow, fast), strict=True):
+        rms = np.sqrt(np.trapezoid(curves.states**2, curves.t) / 20.0)
+        assert case.metrics["rms_error_states"] == pytest.approx(rms, rel=0.2)
+
+
+def test_a_sweep_that_is_not_finished_is_compared_as_far_as_it_is(tmp_path, uninterrupted):
+    import shutil
+
+    shutil.copytree(uninterrupted, tmp_path / "part")
+    (tmp_path / "part" / "3" / "result.json").unlink()
+    done = gpebo("compare", "part", "--no-figures", cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stderr == "part: 1 of 8 jobs are not done and left out\n"
+    assert len(done.stdout.splitlines()) == 1 + 7
+    assert not (tmp_path / "outputs").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], "needs folders"),
+        (["nowhere"], "nowhere: there is no such folder"),
+        (["."], ".: neither a finished run (summary.json) nor a sweep (sweep.json)"),
+        ([".", "--sort"], "--sort needs a column"),
+        ([".", "--srt=x"], "did you mean --sort?"),
+        (["SWEEP", "--sort", "rms_error"], "did you mean rms_error_states?"),
+    ],
+)
+def test_wrong_words_of_compare_are_one_line(tmp_path, uninterrupted, words, expected):
+    words = [str(uninterrupted) if word == "SWEEP" else word for word in words]
+    done = gpebo("compare", *words, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert expected in done.stderr
+
+
+def test_where_jobs_run_is_no_part_of_the_table(tmp_path):
+    """A sweep that began with one launcher config goes on with another, or none."""
+    words = ["run", "-m", "estimator.gamma=1e6,1e8", *FAST]
+    assert gpebo(*words, "launcher=basic", "hydra.sweep.dir=sweep", cwd=tmp_path).returncode == 0
+    assert "launcher" not in rows(tmp_path / "sweep")[0]
+    (tmp_path / "sweep" / "1" / "result.json").unlink()
+    assert gpebo(*words, "resume=sweep", cwd=tmp_path).returncode == 0
+    assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "done"]
+
+
+def test_a_folder_from_a_stranger_cannot_bring_launchers(tmp_path):
+    """A launcher's configuration names code to run."""
+    (tmp_path / "launcher").mkdir()
+    evil = tmp_path / "launcher" / "evil.yaml"
+    evil.write_text("# @package hydra.launcher\n_target_: os.abort\n")
+    done = gpebo("run", "-m", "--config-dir", ".", "launcher=evil", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "cannot bring launchers" in done.stderr

@@ -1,0 +1,111 @@
+"""The wheel, alone, in an empty folder: configuration and recipes are inside it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT],
+        check=True, capture_output=True,
+    )
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """The wheel unpacked as pip would, without its dependencies, which are here already."""
+    folder = tmp_path_factory.mktemp("site")
+    subprocess.run(
+        [
+            sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index",
+            "--disable-pip-version-check", "--target", folder, wheel,
+        ],
+        check=True, capture_output=True,
+    )
+    return folder
+
+
+@pytest.fixture
+def gpebo(installed, tmp_path):
+    environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
+    environment |= {"PYTHONPATH": str(installed), "MPLBACKEND": "Agg"}
+
+    def call(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "gpebo_cli", *words], cwd=tmp_path, env=environment,
+            capture_output=True, text=True, check=False, timeout=120,
+        )
+
+    return call
+
+
+def test_what_is_in_it(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    assert len(names) == len(set(names))
+    for path in (ROOT / "conf").rglob("*.yaml"):
+        assert f"gpebo_cli/conf/{path.relative_to(ROOT / 'conf').as_posix()}" in names
+    for path in (ROOT / "experiments").glob("*.yaml"):
+        assert f"gpebo_cli/conf/experiment/{path.name}" in names
+    tops = {name.split("/")[0] for name in names}
+    # hydra_plugins is a namespace package, of all who have plugins for Hydra
+    assert "hydra_plugins/__init__.py" not in names
+    metadata = next(top for top in tops if top.endswith(".dist-info"))
+    assert tops == {"gpebo_cli", "hydra_plugins", metadata}
+
+
+def test_it_is_the_installed_package_that_runs(installed, gpebo):
+    done = gpebo("run", "--info", "searchpath")
+    assert done.returncode == 0, done.stderr
+    assert str(installed / "gpebo_cli" / "conf") in done.stdout
+
+
+def test_the_main_job(gpebo, tmp_path):
+    done = gpebo("run", "plant=circuit", "estimator=drem", "hydra.run.dir=here")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1].startswith("interval-exciting from t = ")
+    assert len(list((tmp_path / "here" / "figures").glob("*.png"))) >= 7
+    tables = {"signals", "regression", "excitation", "estimates", "cases"}
+    assert {path.stem for path in (tmp_path / "here").glob("*.csv")} == tables
+
+
+def test_a_recipe_a_plant_of_ones_own_and_a_repetition(gpebo, tmp_path):
+    listed = gpebo("list", "experiments")
+    assert "paper_circuit" in listed.stdout
+    assert gpebo("run", "experiment=paper_circuit", "figures=none").returncode == 0
+
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "mine.yaml").write_text(
+        "name: mine\nstates: [x]\noutputs: [y]\nE: [[1]]\nA: [[-1]]\nC: [[1]]\n"
+        "initial_state: {x: 1}\n"
+    )
+    words = ["--config-dir", ".", "plant=mine", "figures=none", "hydra.run.dir=mine"]
+    assert gpebo("run", *words).returncode == 0
+    done = gpebo("run", "--config-dir", "mine", "--config-name", "config")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_sweep_finds_its_sweeper(gpebo, tmp_path):
+    words = ["time.samples=51", "figures=none", "hydra.sweep.dir=sweep"]
+    done = gpebo("run", "-m", "estimator.gamma=1e6,1e8", *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "sweep" / "sweep.json").is_file()
+
+
+def test_errors_are_one_line(gpebo):
+    done = gpebo("run", "plant=circut")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "did you mean circuit?" in done.stderr
