@@ -103,14 +103,13 @@ def run_experiment(
         Y=sampler(regression.Y.values),
         psi=sampler(regression.psi.values),
         parameters=regression.parameters,
-        true_parameters=observation.true_parameters(system.theta, simulation.initial_state),
         error_estimate=observation.error_estimate,
     )
     clock.stage("excitation")
     excitation = assess(regression, t, settings.excitation)
     clock.stage("estimate")
     estimation, metrics = _estimate(
-        settings, estimator, observation, signals.states, sampled.true_parameters, t
+        settings, observation.estimator or estimator, observation, system.theta, signals.states, t
     )
     clock.stage("")
     return RunResult(
@@ -193,8 +192,8 @@ def _estimate(
     settings: Settings,
     estimator: estimators.Estimator,
     observation: Observation,
+    theta: Array,
     states: Trajectory,
-    truth: Array,
     t: Array,
 ) -> tuple[EstimationResult, Metrics]:
     """Run every case on the mesh and the samples that are kept; measure on both."""
@@ -207,7 +206,8 @@ def _estimate(
 
     reconstruct = state_map.at(grid)
     x = states(grid)
-    size, p, n = len(cases), regression.p, x.shape[1]
+    truth = observation.truth(grid, np.broadcast_to(theta, (len(grid), len(theta))), states)
+    size, p, n = len(cases), truth.shape[1], x.shape[1]
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
     numbers = np.empty((5, size))
     batch = max(1, _BATCH // (len(grid) * (2 * p + n)))
@@ -220,7 +220,9 @@ def _estimate(
     result = EstimationResult(
         cases=cases,
         t=kept,
+        names=observation.parameters,
         parameters=parameters,
+        true_parameters=truth[chosen],
         states=estimated,
         delta=estimates.delta(kept),
         checks=state_map.checks(kept, estimated),

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
 
@@ -49,3 +52,37 @@ def outer_products(psi: Array, Y: Array) -> Array:
     """[ψᵀψ | ψᵀY] of shape (..., p, p + 1) from ψ (..., rows, p) and Y (..., rows)."""
     both = np.concatenate([psi, Y[..., None]], axis=-1)
     return np.asarray(np.swapaxes(psi, -1, -2) @ both)
+
+
+class Estimates(Protocol):
+    """The answer of one estimator on fixed times, for any of its cases."""
+
+    def delta(self, t: Array) -> Array | None:
+        """Δ at the times t (M,), shape (1 or cases, M), or None where nothing is mixed."""
+        ...
+
+    @property
+    def requirement(self) -> Requirement:
+        """What the estimator needs of the regressor, and what it got."""
+        ...
+
+    def parameters(self, cases: slice) -> Array:
+        """η̂ of some cases at the times, shape (g, M, p)."""
+        ...
+
+
+class Estimator(Protocol):
+    """Settings of one estimator; immutable."""
+
+    @property
+    def cases(self) -> tuple[Mapping[str, float], ...]:
+        """Every combination of gains, by name."""
+        ...
+
+    def estimate(self, regression: LinearRegression, t: Array) -> Estimates:
+        """Prepare the estimates at the times t (M,), ascending.
+
+        Raises:
+            ConfigError: a setting's length does not match the parameters.
+        """
+        ...

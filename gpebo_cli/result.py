@@ -51,7 +51,6 @@ class RegressionResult:
     Y: Array  # (N, rows)
     psi: Array  # (N, rows, p)
     parameters: tuple[str, ...]  # p names: the plant's unknowns, then e0_<state>
-    true_parameters: Array  # (p,)
     error_estimate: float
 
 
@@ -102,7 +101,9 @@ class EstimationResult:
 
     cases: tuple[Mapping[str, float], ...]  # G combinations, gain name -> value
     t: Array  # (M,) perhaps coarser than the output grid when there are many cases
+    names: tuple[str, ...]  # p names of what is estimated, mostly the regression's parameters
     parameters: Array  # (G, M, p)
+    true_parameters: Array  # (M, p), NaN where nobody knows
     states: Array  # (G, M, n), NaN for a state the observer does not see
     delta: Array | None  # (D, M), D = 1 if it is the same for every case, else G; None: no mixing
     checks: Mapping[str, Array]  # further estimates by column name, (G, M) each

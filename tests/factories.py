@@ -93,7 +93,7 @@ def make_result(
     truth = np.array([1.0, -1.0, -2.0, 0.5, 0.1, 0.2])[:p]
     growth = np.exp(0.08 * t)[:, None]
     psi = (growth * np.cos(0.15 * t[:, None] + 1.2 * np.arange(p)))[:, None, :]
-    regression = RegressionResult(t, psi @ truth, psi, parameters, truth, 2e-13)
+    regression = RegressionResult(t, psi @ truth, psi, parameters, 2e-13)
     k = np.arange(p)
     eigenvalues = 10.0 ** (2 * k - 4) * t[:, None] ** (5 - 2 * k)
     eigenvalues = np.sort(eigenvalues, axis=1)
@@ -131,7 +131,9 @@ def make_result(
         estimation=EstimationResult(
             cases=tuple({"gamma": gamma} for gamma in gammas),
             t=coarse,
+            names=parameters,
             parameters=estimated,
+            true_parameters=np.broadcast_to(truth, (len(coarse), p)),
             states=estimated_states,
             delta=None if delta is None else delta[None],
             checks={},

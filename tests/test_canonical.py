@@ -104,7 +104,7 @@ def test_regression_identity_with_unknown_parameters():
     system = shipped("strangeness_free", C=[[1, 0, 0, 0]])
     result = run(system)
     regression = result.regression
-    residual = regression.Y - regression.psi @ regression.true_parameters
+    residual = regression.Y - regression.psi @ result.estimation.true_parameters[0]
     assert np.abs(residual).max() < 1e-9
     assert result.metrics.final_error_parameters[0] < 1e-6
 

@@ -217,9 +217,9 @@ def test_proposition_3_regressor_is_a_transposed_product():
         system, result.signals.inputs, result.signals.outputs,
         ObserverSettings(name="canonical"), SOLVER,
     )
-    eta = found.true_parameters(system.theta, result.initial_state)
+    eta = found.truth(T, np.broadcast_to(system.theta, (len(T), system.q)), result.signals.states)
     regression = found.regression
-    np.testing.assert_allclose(regression.Y(T), regression.psi(T) @ eta, atol=1e-10)
+    np.testing.assert_allclose(regression.Y(T), regression.psi(T) @ eta[0], atol=1e-10)
     column, Phi = np.array([[1.0], [0.0]]), np.eye(2)
     with pytest.raises(ValueError, match="mismatch"):
         column @ Phi

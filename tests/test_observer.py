@@ -50,7 +50,7 @@ def run(system, **settings):
     observation = observe(
         system, signals.inputs, signals.outputs, ObserverSettings(**settings), SOLVER
     )
-    truth = observation.true_parameters(system.theta, simulation.initial_state)
+    truth = observation.truth(T[:1], system.theta[None], signals.states)[0]
     return simulation, observation, truth
 
 
@@ -175,7 +175,7 @@ def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
 def test_rotating_kernel_with_unknown_parameter():
     simulation, observation, truth = run(plant_from_mapping(ROTATING))
     assert simulation.structure.index == 2
-    assert observation.initial_basis.shape == (4, 2)
+    assert observation.truth.initial_basis.shape == (4, 2)
     assert_identity(simulation, observation, truth)
     gram = observation.regression.gram.final
     estimate = np.linalg.solve(gram[:, :-1], gram[:, -1])

@@ -258,7 +258,7 @@ def test_norms_are_of_all_errors() -> None:
     assert result.estimation is not None
     assert result.regression is not None
     parameters, states = overlay({"one": result})
-    error = result.estimation.parameters[0] - result.regression.true_parameters
+    error = result.estimation.parameters[0] - result.estimation.true_parameters
     np.testing.assert_allclose(parameters.curves[0].y, np.sqrt((error**2).sum(axis=1)))
     assert states.curves[0].label == "one"
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import cast
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.estimators._base import Estimates, Estimator
 from gpebo_cli.reading import nearest, read
+from gpebo_cli.regression import Estimates, Estimator
 
 __all__ = ["Estimates", "Estimator", "build", "names"]
 

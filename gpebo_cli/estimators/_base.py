@@ -1,4 +1,4 @@
-"""What an estimator is, and how gains become an axis.
+"""How gains become an axis.
 
 An estimator sees a regression Y = ψη and times at which to report; it knows nothing of plants.
 Its gains may each be a number, a list, or ``logspace(a, b, n)``: every combination is one case,
@@ -10,52 +10,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.regression import LinearRegression
-from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
 _MAX_CASES = 10_000_000
-
-
-
-class Estimates(Protocol):
-    """The answer of one estimator on fixed times, for any of its cases."""
-
-    def delta(self, t: Array) -> Array | None:
-        """Δ at the times t (M,), shape (1 or cases, M), or None where nothing is mixed."""
-        ...
-
-    @property
-    def requirement(self) -> Requirement:
-        """What the estimator needs of the regressor, and what it got."""
-        ...
-
-    def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases at the times, shape (g, M, p)."""
-        ...
-
-
-class Estimator(Protocol):
-    """Settings of one estimator; immutable."""
-
-    @property
-    def cases(self) -> tuple[Mapping[str, float], ...]:
-        """Every combination of gains, by name."""
-        ...
-
-    def estimate(self, regression: LinearRegression, t: Array) -> Estimates:
-        """Prepare the estimates at the times t (M,), ascending.
-
-        Raises:
-            ConfigError: a setting's length does not match the parameters.
-        """
-        ...
 
 
 def axis(value: object, where: str, *, positive: bool = True) -> tuple[float, ...]:

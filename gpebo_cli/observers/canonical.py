@@ -30,7 +30,7 @@ from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.expressions import parse, taylor
 from gpebo_cli.observers.extension import initial_extension
-from gpebo_cli.observers.observation import Observation, Reconstruction
+from gpebo_cli.observers.observation import InitialError, Observation, Reconstruction
 from gpebo_cli.reading import nearest
 from gpebo_cli.regression import LinearRegression, outer_products
 from gpebo_cli.result import Assumption
@@ -169,8 +169,7 @@ def observe(
             zb=zb,
             n_b=n_b,
         ),
-        initial_basis=np.eye(system.n)[:, :n_a],
-        xi_a0=xi_a0,
+        truth=InitialError(np.eye(system.n)[:, :n_a], xi_a0),
         error_estimate=solution.error_estimate,
         assumptions=(
             Assumption(

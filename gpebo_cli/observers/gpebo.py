@@ -31,7 +31,7 @@ from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.linalg import orthonormal_complement, transpose
 from gpebo_cli.observers.extension import initial_extension
-from gpebo_cli.observers.observation import AffineStateMap, Observation
+from gpebo_cli.observers.observation import AffineStateMap, InitialError, Observation
 from gpebo_cli.regression import LinearRegression, outer_products
 from gpebo_cli.result import Assumption
 from gpebo_cli.settings import ObserverSettings, SolverSettings
@@ -261,8 +261,7 @@ def observe(
             scale=final.psi_scale,
         ),
         state_map=AffineStateMap(on_mesh(final.offset), on_mesh(final.gain)),
-        initial_basis=V1,
-        xi_a0=xi_a0,
+        truth=InitialError(V1, xi_a0),
         error_estimate=solution.error_estimate,
         assumptions=(
             Assumption(

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import Estimator, LinearRegression
 from gpebo_cli.result import Assumption
 from gpebo_cli.systems.descriptor import Array
 
@@ -61,18 +61,46 @@ class AffineStateMap:
         return {}
 
 
+class Truth(Protocol):
+    """What the estimated parameters really are, for those who know the true signals."""
+
+    def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
+        """η at the times t (M,), shape (M, p), from θ there (M, q) and the states (n,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class InitialError:
+    """η = (θ, e₀) with e₀ = ξ_a0 − V1ᵀ P x(start) = ξ_a0 − V1ᵀ x(start)."""
+
+    initial_basis: Array  # (n, n_a) V1, orthonormal basis of range P(start)
+    xi_a0: Array  # (n_a,)
+
+    def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
+        """η at the times t (M,), shape (M, p): e₀ is the same at all of them."""
+        e0 = self.xi_a0 - self.initial_basis.T @ states.values[0, 0]
+        return np.concatenate([theta, np.broadcast_to(e0, (len(t), len(e0)))], axis=1)
+
+
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """The observer's output."""
+    """The observer's output.
+
+    An observer that estimates by itself brings its own ``estimator``; the regression is then the
+    evidence of excitation only. ``names`` are those of what is estimated, where that is not the
+    regression's parameters.
+    """
 
     regression: LinearRegression
     state_map: StateMap
-    initial_basis: Array  # (n, n_a) V1, orthonormal basis of range P(start)
-    xi_a0: Array  # (n_a,)
+    truth: Truth
     error_estimate: float
     assumptions: tuple[Assumption, ...]  # of this observer, with their evidence
     growth: float  # largest ‖Φ(t)‖ entry
+    estimator: Estimator | None = None
+    names: tuple[str, ...] | None = None
 
-    def true_parameters(self, theta: Array, initial_state: Array) -> Array:
-        """η = (θ, e₀) with e₀ = ξ_a0 − V1ᵀ P x(start) = ξ_a0 − V1ᵀ x(start), shape (p,)."""
-        return np.concatenate([theta, self.xi_a0 - self.initial_basis.T @ initial_state])
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of what is estimated, (p,)."""
+        return self.regression.parameters if self.names is None else self.names

@@ -95,19 +95,20 @@ def estimates_b(result: RunResult) -> list[Panel]:
 
 def parameter_error(result: RunResult) -> list[Panel]:
     """Fig. 6: error of every parameter (for the circuit, the initial conditions), logarithmic."""
-    regression, estimation = result.regression, result.estimation
-    if regression is None or estimation is None:
+    estimation = result.estimation
+    if estimation is None:
         return []
-    truth = regression.true_parameters
-    largest = float(np.max(np.abs(truth), initial=0.0))  # the measure of one that is zero
+    truth = estimation.true_parameters
+    size = np.max(np.abs(truth), axis=0)
+    largest = float(np.max(size, initial=0.0))  # the measure of one that is zero
     curves = [
         (
             name,
             _parameter_unit(result, name),
-            estimation.parameters[:, :, i] - truth[i],
-            abs(float(truth[i])) or largest,
+            estimation.parameters[:, :, i] - truth[:, i],
+            float(size[i]) or largest,
         )
-        for i, name in enumerate(regression.parameters)
+        for i, name in enumerate(estimation.names)
     ]
     return _errors(result, estimation, curves)
 
@@ -277,7 +278,7 @@ def _split(result: RunResult) -> tuple[list[int], list[int]]:
 
     Where the kernel of E(t) rotates the parameters are ``e0_1…``, of no single state: none is x_a.
     """
-    parameters = result.regression.parameters if result.regression else ()
+    parameters = result.estimation.names if result.estimation else ()
     names = result.system.states
     differential = [i for i, name in enumerate(names) if _INITIAL + name in parameters]
     return differential, [i for i in range(len(names)) if i not in differential]
@@ -341,8 +342,10 @@ def _varying_gain(estimation: EstimationResult) -> str | None:
 
 
 def _parameter_size(result: RunResult) -> float:
-    regression = result.regression
-    return 0.0 if regression is None else float(np.linalg.norm(regression.true_parameters))
+    if result.estimation is None:
+        return 0.0
+    truth = result.estimation.true_parameters
+    return float(np.max(np.linalg.norm(truth, axis=1), initial=0.0))
 
 
 def _state_size(result: RunResult) -> float:
@@ -356,10 +359,10 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]], note: str) -> list
     of_parameters, of_states = [], []
     sizes = [0.0, 0.0]
     for k, (label, result, case) in enumerate(named):
-        estimation, regression = result.estimation, result.regression
-        if estimation is None or regression is None:
+        estimation = result.estimation
+        if estimation is None:
             continue
-        parameters = estimation.parameters[case] - regression.true_parameters
+        parameters = estimation.parameters[case] - estimation.true_parameters
         seen = _seen(result, range(len(result.system.states)))
         states = (estimation.states[case] - _truth(result, estimation))[:, seen]
         of_parameters.append(

@@ -47,10 +47,8 @@ def write_run(
         tables.write_regression(folder / "regression.csv", regression)
     if result.excitation is not None:
         tables.write_excitation(folder / "excitation.csv", result.excitation)
-    if regression is not None and estimation is not None:
-        tables.write_estimates(
-            folder / "estimates.csv", regression.parameters, result.system.states, estimation
-        )
+    if estimation is not None:
+        tables.write_estimates(folder / "estimates.csv", result.system.states, estimation)
     if estimation is not None and result.metrics is not None:
         tables.write_cases(folder / "cases.csv", estimation, result.metrics)
     for name, figure in figures:

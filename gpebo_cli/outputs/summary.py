@@ -15,7 +15,6 @@ from gpebo_cli.result import (
     EstimationResult,
     Excitation,
     Metrics,
-    RegressionResult,
     Requirement,
     RunResult,
     StateChange,
@@ -56,7 +55,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
             for change in simulation.jumps
         ],
         "impulses": [{"time": time, "state": state} for time, state in simulation.impulses],
-        "parameters": _parameters(regression),
+        "parameters": _parameters(result.estimation),
         "assumptions": [
             {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
             for a in result.assumptions
@@ -96,10 +95,10 @@ def _change(change: StateChange) -> dict[str, float]:
     return {"from": change.given, "to": change.used, "change": change.used - change.given}
 
 
-def _parameters(regression: RegressionResult | None) -> dict[str, float] | None:
-    if regression is None:
+def _parameters(estimation: EstimationResult | None) -> dict[str, float] | None:
+    if estimation is None:
         return None
-    return dict(zip(regression.parameters, regression.true_parameters, strict=True))
+    return dict(zip(estimation.names, estimation.true_parameters[-1], strict=True))
 
 
 def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:

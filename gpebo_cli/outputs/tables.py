@@ -57,16 +57,13 @@ def write_excitation(path: Path, excitation: Excitation) -> None:
 
 
 def write_estimates(
-    path: Path,
-    parameters: Sequence[str],
-    states: Sequence[str],
-    estimation: EstimationResult,
+    path: Path, states: Sequence[str], estimation: EstimationResult
 ) -> None:
     """Write the long table ``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, checks.
 
     Columns of states the observer does not see are empty.
     """
-    header = ["case", "t", *(f"{name}_hat" for name in (*parameters, *states))]
+    header = ["case", "t", *(f"{name}_hat" for name in (*estimation.names, *states))]
     if estimation.delta is not None:
         header.append("delta")
     header += estimation.checks
