@@ -25,7 +25,7 @@ from gpebo_cli.collocation.mesh import (
     Trajectory,
     legendre_tail,
     signal_scale,
-    unresolved,
+    unresolved_kinds,
 )
 from gpebo_cli.collocation.radau import RadauRule
 from gpebo_cli.errors import SolverError
@@ -141,12 +141,11 @@ def solve(
 def unresolved_signals(
     problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...]
 ) -> Array:
-    """:func:`unresolved` over the solution and everything computed from it, shape (K,)."""
-    tail = unresolved(values.reshape(*values.shape[:2], -1), mesh.rule, problem.floor)
+    """:func:`unresolved_kinds` over the solution and everything computed from it, shape (K,)."""
+    kinds = [(values.reshape(*values.shape[:2], -1), problem.floor)]
     if problem.monitor is not None:
-        for signals, floor in problem.monitor(values, extras):
-            tail = np.maximum(tail, unresolved(signals, mesh.rule, floor))
-    return tail
+        kinds += problem.monitor(values, extras)
+    return unresolved_kinds(kinds, mesh.rule)
 
 
 def _visible_noise(values: Array, mesh: Mesh) -> float:
