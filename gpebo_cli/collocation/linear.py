@@ -89,7 +89,7 @@ class LinearSolution:
     trajectory: Trajectory  # values (K, s + 1, n, columns)
     error_estimate: float  # relative to each signal's own size
     rounds: int
-    extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each
+    extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each, or (1, 1, ...)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class _ElementMaps:
 
     homogeneous: Array  # (K, s, n, n)
     particular: Array  # (K, s, n, columns)
-    extras: tuple[Array, ...]  # (K, s + 1, ...) each
+    extras: tuple[Array, ...]  # (K, s + 1, ...) each, or (1, 1, ...) if constant
 
 
 def solve(
@@ -206,7 +206,10 @@ def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArra
     return _ElementMaps(
         merged(old.homogeneous, new.homogeneous),
         merged(old.particular, new.particular),
-        tuple(merged(a, b) for a, b in zip(old.extras, new.extras, strict=True)),
+        tuple(
+            a if a.shape[:2] == (1, 1) else merged(a, b)
+            for a, b in zip(old.extras, new.extras, strict=True)
+        ),
     )
 
 
@@ -231,7 +234,10 @@ def _element_maps(
     return _ElementMaps(
         np.concatenate([p.homogeneous for p in pieces]),
         np.concatenate([p.particular for p in pieces]),
-        tuple(np.concatenate(parts) for parts in zip(*(p.extras for p in pieces), strict=True)),
+        tuple(
+            parts[0] if parts[0].shape[:2] == (1, 1) else np.concatenate(parts)
+            for parts in zip(*(p.extras for p in pieces), strict=True)
+        ),
     )
 
 
@@ -247,6 +253,13 @@ def _at_points(c: Coefficients, part: slice) -> Coefficients:
     )
 
 
+def at_points(values: Array, k: int, s: int) -> Array:
+    """(k (s + 1), ...) -> (k, s + 1, ...); (1, ...) -> (1, 1, ...)."""
+    if len(values) == 1:
+        return values[None]
+    return values.reshape(k, s + 1, *values.shape[1:])
+
+
 def _at_nodes(values: Array, k: int, s: int) -> Array:
     """(k (s + 1), ...) or (1, ...) at points -> (k, s, ...) at nodes."""
     if len(values) == 1:
@@ -259,7 +272,7 @@ def _solve_elements(
 ) -> _ElementMaps:
     k, s = len(h), rule.stages
     n = len(problem.start)
-    extras = tuple(extra.reshape(k, s + 1, *extra.shape[1:]) for extra in c.extras)
+    extras = tuple(at_points(extra, k, s) for extra in c.extras)
     matrices = [c.A] if c.E is None else [c.A, c.E]
     if c.constraints is not None:
         matrices.append(c.constraints.basis)
