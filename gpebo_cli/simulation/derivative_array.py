@@ -13,7 +13,7 @@ or M (x_1, …, x_{μ+1}) = N x_0 + g with M_ij = (j + 1) e_{i−j} − a_{i−j
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -48,9 +48,9 @@ class Pivots:
     with X = M[rest, columns] M[rows, columns]⁻¹ costs one LU where an SVD costs thirty.
     """
 
-    rows: IntArray  # (r,)
-    rest: IntArray  # (a,)
-    columns: IntArray  # (r,)
+    rank: int  # r
+    rows: IntArray  # all of them, the r pivots first
+    columns: IntArray  # likewise
     Z1: Array  # (n, d) orthonormal, completes the constraints at that time
 
 
@@ -185,7 +185,7 @@ def analyse(
         if one.failure:
             reason = one.failure
             continue
-        reference = _reference(e[:, middle], aa[:, middle], mu, one.a, invariant)
+        reference = _reference(e[:, middle], aa[:, middle], mu, one, invariant)
         levels = _all_levels(t, e, aa, mu, rank_tol, one, reference)
         if levels.failure:
             reason = levels.failure
@@ -224,6 +224,8 @@ class _Levels:
     smallest: Array  # (N, 3) of M, Â2 and E T2, relative to the size of their factors; or bounds
     failure: str
     least: float = np.inf  # of those that were computed
+    Z2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, (μ+1) n, a)
+    T2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, n, d)
 
 
 def _levels(
@@ -251,7 +253,8 @@ def _levels(
     r = M.shape[1] - a
     if r:
         smallest[:, 0] = relative[:, r - 1]
-    A2 = transpose(U[:, :, r:]) @ N
+    Z2 = U[:, :, r:]
+    A2 = transpose(Z2) @ N
     _, s2, V2 = np.linalg.svd(A2)
     s2 = s2 / _norm(N)[:, None]
     if a:
@@ -269,7 +272,7 @@ def _levels(
             return _Levels(
                 a, smallest, f"{what} at t = {t[k]:.6g} (singular value {smallest[k, column]:.1e})"
             )
-    return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)))
+    return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)), Z2, T2)
 
 
 def _array_size(M: Array, aa: Array) -> Array:
@@ -297,8 +300,8 @@ def _all_levels(
     M, N = derivative_array(e, aa, mu)
     bounds = np.full((len(t), 3), np.inf)
     try:
-        Q, R = np.linalg.qr(M[:, :, reference.columns], mode="complete")
-        r = len(reference.columns)
+        r = reference.rank
+        Q, R = np.linalg.qr(M[:, :, reference.columns[:r]], mode="complete")
         Q2 = transpose(Q[:, :, r:])
         size = _array_size(np.linalg.norm(M, axis=(1, 2)), aa)
         bounds[:, 0] = _smallest_bound(R[:, :r]) / size
@@ -377,18 +380,23 @@ def _follow_dips(
                 )
 
 
-def _reference(e: Array, aa: Array, mu: int, a: int, invariant: bool) -> Pivots | Bases:
-    """Where to start from at other times, from the coefficients at one."""
-    M, N = derivative_array(e, aa, mu)
-    r = M.shape[1] - a
-    Z2 = np.linalg.svd(M[0])[0][:, r:]
-    T2 = np.linalg.svd(Z2.T @ N[0])[2][a:].T
-    Z1 = np.linalg.svd(e[0, 0] @ T2, full_matrices=False)[0]
+def _reference(
+    e: Array, aa: Array, mu: int, one: _Levels, invariant: bool
+) -> Pivots | Bases:
+    """Where to start from at other times, from the coefficients and the levels of one."""
+    Z1 = np.linalg.svd(e[0, 0] @ one.T2[0], full_matrices=False)[0]
     if invariant:
-        return Bases(Z1[None], Z2[None])
-    rows, columns = _independent(M[0], r)
-    rest = np.setdiff1d(np.arange(len(M[0])), rows)
-    return Pivots(rows, rest, columns, Z1)
+        return Bases(Z1[None], one.Z2[:1])
+    M = derivative_array(e, aa, mu)[0][0]
+    r = len(M) - one.a
+    rows, columns = _independent(M, r)
+    every = np.arange(len(M))
+    return Pivots(
+        r,
+        np.concatenate([rows, np.setdiff1d(every, rows)]),
+        np.concatenate([columns, np.setdiff1d(every, columns)]),
+        Z1,
+    )
 
 
 def _independent(matrix: Array, count: int) -> tuple[IntArray, IntArray]:
@@ -426,17 +434,24 @@ def reduce(
     E, A = c.E[:, count], c.A[:, count]
     e, aa = scaled(Coefficients(E, A, c.B, c.F, c.C, c.u), scaling)
     M, N = derivative_array(e, aa, mu)
+    # [Â2 | f2] = Z2ᵀ [N | g] with g = (f_0, …, f_μ)
+    weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
+    g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
     reference = structure.reference
     if isinstance(reference, Bases):
-        Z1, Z2 = reference.Z1, reference.Z2
-        inverse, poor = _inverse(_whole(Z1, Z2, e[0], N))
+        Z1 = reference.Z1
+        A2, f2 = transpose(reference.Z2) @ N, transpose(reference.Z2) @ g
+        inverse, poor = _inverse(np.concatenate([transpose(Z1) @ e[0], A2], axis=1))
     else:
-        Z1, Z2, inverse, poor = _by_elimination(structure, reference, e[0], M, N)
+        Z1, A2, f2, inverse, poor = _by_elimination(reference, e[0], M, N, g)
         if poor.any():
-            Z1[poor], Z2[poor] = _by_singular_vectors(
+            Z1 = np.repeat(Z1, len(t), axis=0)
+            Z1[poor], Z2 = _by_singular_vectors(
                 system, structure, e[0][poor], M[poor], N[poor], t[poor]
             )
-            inverse[poor], poor[poor] = _inverse(_whole(Z1[poor], Z2[poor], e[0][poor], N[poor]))
+            A2[poor], f2[poor] = transpose(Z2) @ N[poor], transpose(Z2) @ g[poor]
+            whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
+            inverse[poor], poor[poor] = _inverse(whole)
     if poor.any():
         raise ModelError(
             f"{_who(system)}: the equations do not determine the state near "
@@ -444,28 +459,20 @@ def reduce(
         )
     # Back to the model's own states: only rows stay scaled, and row scalings do not matter.
     W1 = transpose(Z1) * scaling.rows
-    weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows  # of g = (f_0, …, f_mu)
-    g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1)
-    f2 = _apply(transpose(Z2), g)
     inverse = scaling.columns[:, None] * inverse
     d = structure.d
     return StrangenessFree(
         E1=W1 @ E[0],
         A1=W1 @ A[0],
         f1=_apply(W1, f[0]),
-        A2=transpose(Z2) @ N / scaling.columns,
-        f2=f2,
+        A2=A2 / scaling.columns,
+        f2=f2[:, :, 0],
         basis=inverse[:, :, :d] / scaling.time if structure.a else None,  # the scaled E is E/τ
-        offset=_apply(inverse[:, :, d:], -f2) if structure.a else None,
+        offset=-(inverse[:, :, d:] @ f2)[:, :, 0] if structure.a else None,
         E=E[0],
         u=c.u[0],
         C=c.C[0],
     )
-
-
-def _whole(Z1: Array, Z2: Array, E: Array, N: Array) -> Array:
-    """[Z1ᵀE; Z2ᵀN]: what x is determined by, given its differential part; (N, n, n)."""
-    return np.concatenate([transpose(Z1) @ E, transpose(Z2) @ N], axis=1)
 
 
 def _inverse(whole: Array) -> tuple[Array, BoolArray]:
@@ -480,40 +487,43 @@ def _inverse(whole: Array) -> tuple[Array, BoolArray]:
     return inverse, ~np.isfinite(inverse).all(axis=(1, 2))
 
 
+def _largest(matrix: Array) -> Array:
+    """Largest entry in size of each matrix, (N,)."""
+    return np.asarray(np.abs(matrix).reshape(len(matrix), -1).max(axis=1, initial=0.0))
+
+
 def _by_elimination(
-    structure: Structure, pivots: Pivots, E: Array, M: Array, N: Array
-) -> tuple[Array, Array, Array, BoolArray]:
-    """Z1 (N, n, d), Z2 (N, (μ+1) n, a) on the reference pivots, the inverse of [Z1ᵀE; Z2ᵀN].
+    pivots: Pivots, E: Array, M: Array, N: Array, g: Array
+) -> tuple[Array, Array, Array, Array, BoolArray]:
+    """Z1 (1, n, d), Â2 (N, a, n), f2 (N, a, 1) on the reference pivots, [Z1ᵀE; Â2]⁻¹.
 
     The last one says where these will not do.
     """
-    count = len(M)
-    rows, rest, columns = pivots.rows, pivots.rest, pivots.columns
-    Z1 = np.repeat(pivots.Z1[None], count, axis=0)
-    Z2 = np.zeros((count, M.shape[1], structure.a))
+    count, n, r = len(M), E.shape[1], pivots.rank
+    right = np.concatenate([N, g], axis=2)[:, pivots.rows]
     poor = np.zeros(count, dtype=bool)
-    if structure.a:
-        kept = M[:, rows]
+    if r < len(pivots.rows):
+        M = M[:, pivots.rows[:, None], pivots.columns]
         try:
-            solved = np.asarray(
-                np.linalg.solve(
-                    transpose(kept[:, :, columns]), transpose(M[:, rest][:, :, columns])
-                ),
+            X = transpose(np.asarray(
+                np.linalg.solve(transpose(M[:, :r, :r]), transpose(M[:, r:, :r])),
                 dtype=np.float64,
-            )
+            ))
         except np.linalg.LinAlgError:
-            return Z1, Z2, np.zeros_like(E), np.ones(count, dtype=bool)
-        Z2[:, rows] = -solved
-        Z2[:, rest] = np.eye(structure.a)
-        size = np.abs(M).max(axis=(1, 2), initial=0.0)
-        residual = np.abs(M[:, rest] - transpose(solved) @ kept).max(axis=(1, 2), initial=0.0)
-        grows = np.abs(solved).max(axis=(1, 2), initial=0.0)
-        poor = (residual > _RESIDUAL * size) | (grows > _MAX_GROWTH)
-    whole = _whole(Z1, Z2, E, N)
+            everywhere = np.ones(count, dtype=bool)
+            left = right[:, r:]
+            return pivots.Z1[None], left[:, :, :n], left[:, :, n:], np.zeros_like(E), everywhere
+        residual = _largest(M[:, r:, r:] - X @ M[:, :r, r:])
+        poor = (residual > _RESIDUAL * _largest(M)) | (_largest(X) > _MAX_GROWTH)
+        constraints = right[:, r:] - X @ right[:, :r]
+    else:
+        constraints = right[:, r:]
+    A2 = constraints[:, :, :n]
+    whole = np.concatenate([pivots.Z1.T @ E, A2], axis=1)
     scale = np.maximum(np.abs(whole).max(axis=2), np.finfo(float).tiny)
     inverse, singular = _inverse(whole / scale[:, :, None])
-    poor |= singular | (np.abs(inverse).max(axis=(1, 2)) > _MAX_GROWTH)
-    return Z1, Z2, inverse / scale[:, None, :], poor
+    poor |= singular | (_largest(inverse) > _MAX_GROWTH)
+    return pivots.Z1[None], A2, constraints[:, :, n:], inverse / scale[:, None, :], poor
 
 
 def _by_singular_vectors(
