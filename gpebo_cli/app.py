@@ -65,7 +65,7 @@ def _dispatch(words: list[str]) -> int:
         sys.stdout.write(HELP)
         return 0
     if command in ("--version", "-V"):
-        from gpebo_cli import __version__
+        from gpebo_cli._version import __version__
 
         sys.stdout.write(f"gpebo {__version__}\n")
         return 0

@@ -229,7 +229,7 @@ def _levels(
     size = sigma[:, :1]
     # The size of what M was made from: with E = 0 the derivative array is still judged against A.
     size = np.maximum(size, np.abs(aa).max(axis=(0, 2, 3))[:, None])
-    relative = sigma / size
+    relative = sigma / np.maximum(size, np.finfo(float).tiny)  # a plant of zeros has no size
     smallest = np.full((len(t), 3), np.inf)
     if a is None:
         ranks = (relative > rank_tol).sum(axis=1)
