@@ -1,4 +1,4 @@
-"""Names that the shell completes: of the figures, without importing what draws them."""
+"""Names that the shell completes: of figures and metrics, without importing what makes them."""
 
 FIGURE_NAMES = (
     "signals",
@@ -17,6 +17,15 @@ FIGURE_NAMES = (
     "error_norms",
 )
 """Every figure of a run, a function of that name in ``outputs/figures.py``, in this order."""
+
+METRICS = (
+    "seconds_to_1pct_parameters",
+    "seconds_to_1pct_states",
+    "final_error_parameters",
+    "final_error_states",
+    "rms_error_states",
+)
+"""What is measured of every case, the fields of :class:`gpebo_cli.result.Metrics`."""
 
 FORMATS = ("png", "pdf", "svg")
 """Of the files of figures."""
