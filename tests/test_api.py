@@ -230,7 +230,7 @@ def test_a_plant_from_functions_and_from_a_mapping(tmp_path):
     np.testing.assert_allclose(one["x2"], other["x2"], atol=1e-13)
     np.testing.assert_allclose(one["x2"], -0.5 * one["x1"], atol=1e-12)
     text = (one.save(tmp_path, figures=False) / "config.yaml").read_text()
-    assert text.startswith("# The plant was given as Python functions")
+    assert text.startswith("# The plant or the estimator was given as a Python object")
     assert load_plant(system) is system
 
 
@@ -316,3 +316,91 @@ def test_a_plant_that_cannot_be_used_is_a_model_error():
     with pytest.raises(ModelError) as caught:
         run(singular)
     assert isinstance(caught.value, GpeboError)
+
+
+RIDGE = """\
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli.result import Requirement
+
+
+@dataclass(frozen=True)
+class Estimates:
+    values: Any
+    requirement: Requirement
+
+    def delta(self, t):
+        return None
+
+    def parameters(self, cases):
+        return self.values[cases]
+
+
+@dataclass(frozen=True)
+class Ridge:
+    f: float = 1e-9
+
+    @property
+    def cases(self):
+        return ({"f": self.f},)
+
+    def estimate(self, regression, t):
+        both = regression.gram(t)
+        G = both[..., :-1] + self.f * np.eye(regression.p)
+        values = np.linalg.solve(G, both[..., -1:])[None, ..., 0]
+        return Estimates(values, Requirement("IE", True, {}, "all data at once"))
+"""
+
+
+def test_an_estimator_of_ones_own(tmp_path):
+    names = {}
+    exec(RIDGE, names)  # noqa: S102  the text below is a package's
+    result = run("descriptor", estimator=names["Ridge"](1e-6), time={"horizon": 10})
+    assert result.cases[0]["f"] == 1e-6
+    assert abs(result.errors["theta1"][0, -1]) < 1e-5
+    text = (result.save(tmp_path, figures=["states"]) / "config.yaml").read_text()
+    assert "does not repeat the run" in text
+    with pytest.raises(ConfigError, match=r"gamma given beside an estimator object"):
+        run("descriptor", estimator=names["Ridge"](), gamma=1)
+    for wrong in (3, names["Ridge"]):
+        with pytest.raises(ConfigError, match="an object with cases and estimate"):
+            run("descriptor", estimator=wrong)
+
+
+def test_an_estimator_of_another_package(tmp_path):
+    """What `pip install` leaves of a package with an entry point, and a file with its settings."""
+    (tmp_path / "theirs.py").write_text(RIDGE)
+    info = tmp_path / "theirs-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[gpebo.estimators]\nridge = theirs:Ridge\nbroken = theirs:Gone\nodd = theirs:RIDGE\n"
+    )
+    (tmp_path / "theirs.py").write_text(RIDGE + "\n\nRIDGE = 3\n")
+    (tmp_path / "estimator").mkdir()
+    for name in ("ridge", "broken", "odd"):
+        (tmp_path / "estimator" / f"{name}.yaml").write_text(f"name: {name}\n")
+
+    def command(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "gpebo_cli", "run", "--config-dir", ".", "plant=descriptor",
+             "figures=none", "hydra.run.dir=out", *words],
+            cwd=tmp_path, env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"},
+            capture_output=True, text=True, check=False, timeout=120,
+        )
+
+    done = command("estimator=ridge", "+estimator.f=1e-6")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split()[0] == "f"
+    for words, expected in (
+        (["estimator=ridge", "+estimator.g=1"], "estimator.g: no such key; estimator has f"),
+        (["estimator=broken"], "estimator.name: broken of theirs cannot be imported"),
+        (["estimator=odd"], "estimator.name: odd of theirs is not a dataclass"),
+        (["estimator.name=ridgee"], "did you mean ridge?"),
+    ):
+        done = command(*words)
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert expected in done.stderr

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import fields
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, cast
 
 from gpebo_cli import assumptions
 from gpebo_cli.api.choice import choose, plain, primary
@@ -13,7 +13,7 @@ from gpebo_cli.api.result import Result
 from gpebo_cli.commands import configuration
 from gpebo_cli.commands.locations import GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.estimators import settings_of
+from gpebo_cli.estimators import Estimator, settings_of
 from gpebo_cli.experiment import run_experiment
 from gpebo_cli.reading import nearest, shown
 from gpebo_cli.result import Assumption
@@ -23,6 +23,7 @@ from gpebo_cli.systems.plant import plant_from_mapping
 
 Plant = str | os.PathLike[str] | Mapping[str, object] | DescriptorSystem
 Choice = str | Mapping[str, object]
+EstimatorChoice = Choice | Estimator
 Folder = str | os.PathLike[str]
 
 _SECTIONS = ("time", "excitation")
@@ -31,7 +32,7 @@ _SECTIONS = ("time", "excitation")
 def run(
     plant: Plant | None = None,
     *,
-    estimator: Choice | None = None,
+    estimator: EstimatorChoice | None = None,
     observer: Choice | None = None,
     solver: Choice | None = None,
     time: Mapping[str, object] | None = None,
@@ -48,7 +49,8 @@ def run(
     Args:
         plant: a name (``gpebo list plants``), the path of a YAML file, the content of one, or a
             system from :func:`system_from_functions` or :func:`load_plant`.
-        estimator: a name, or a mapping with ``name`` and its settings.
+        estimator: a name, a mapping with ``name`` and its settings, or an object of your own
+            with ``cases`` and ``estimate`` (see :class:`gpebo_cli.estimators.Estimator`).
         observer: a name, or a mapping; ``"none"`` simulates only.
         solver: a name, or a mapping such as ``{"tol": 1e-9}``.
         time: ``start`` and ``horizon`` in seconds, ``samples`` of the output grid.
@@ -71,12 +73,21 @@ def run(
         >>> bool(abs(result.errors["il"][1, -1]) < 1e-6)
         True
     """
+    own = None if estimator is None or isinstance(estimator, str | Mapping) else _own(estimator)
     sections: dict[str, object] = {
-        "observer": observer, "estimator": estimator, "solver": solver,
+        "observer": observer, "estimator": None if own else estimator, "solver": solver,
         "time": time, "excitation": excitation,
     }
-    config, system, settings = _configure(plant, sections, gains, config_dir)
-    return Result(run_experiment(settings, system, progress), config)
+    config, system, settings = _configure(plant, sections, {} if own else gains, config_dir)
+    if own is not None:
+        if gains:
+            raise ConfigError(
+                f"run: {', '.join(gains)} given beside an estimator object; give them to "
+                f"{type(own).__name__}(…)"
+            )
+        config["estimator"] = {"name": type(own).__name__}
+        settings = replace(settings, estimator=config["estimator"])
+    return Result(run_experiment(settings, system, progress, own), config)
 
 
 def check(
@@ -177,6 +188,20 @@ def _configure(
     _check_gains(gains, config["estimator"])
     config["estimator"] |= plain(gains)
     return config, system, configuration.settings(config, draw=True)
+
+
+def _own(estimator: object) -> Estimator:
+    """An estimator that is an object of the caller's.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    if isinstance(estimator, type) or not all(hasattr(estimator, k) for k in ("cases", "estimate")):
+        raise ConfigError(
+            "estimator: expected a name, a mapping or an object with cases and estimate, got "
+            f"{shown(estimator)}"
+        )
+    return cast("Estimator", estimator)
 
 
 _EXAMPLES = {"time": '{"horizon": 10}', "excitation": '{"window": 1}'}

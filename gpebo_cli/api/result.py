@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gpebo_cli import estimators
 from gpebo_cli.api.choice import primary
 from gpebo_cli.commands import configuration
 from gpebo_cli.commands.report import case_rows, run_lines
@@ -255,7 +256,9 @@ class Result:
         output = replace(settings.output, figures=chosen)
         details = replace(self.details, settings=replace(settings, output=output))
         word = (None if chosen else "none") if isinstance(chosen, bool) else chosen
-        head = configuration.REPEATS if self.config["plant"] else _FUNCTIONS
+        name = str(self.config["estimator"]["name"])
+        repeats = bool(self.config["plant"]) and name in estimators.names()
+        head = configuration.REPEATS if repeats else _NOT_REPEATED
         text = configuration.config_text(
             {**self.config, "figures": word}, configuration.patterns(primary()), head
         )
@@ -263,4 +266,6 @@ class Result:
         return Path(folder)
 
 
-_FUNCTIONS = "The plant was given as Python functions, so this file alone does not repeat the run."
+_NOT_REPEATED = (
+    "The plant or the estimator was given as a Python object; this file does not repeat the run"
+)

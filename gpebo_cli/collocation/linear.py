@@ -115,7 +115,8 @@ def solve(
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values).all(axis=(1, 2, 3))))
             raise SolverError(
-                f"the solution of the {problem.name} is not finite from t = {mesh.edges[k]:.6g} on"
+                f"the solution of the {problem.name} is not finite from t = {mesh.edges[k]:.6g} "
+                "on: it grows beyond all numbers; is a sign wrong? Else shorten time.horizon"
             )
         tail = unresolved_signals(problem, mesh, values, maps.extras)
         # Rounding floor: an element whose parent was already this good is not cut again.
@@ -253,7 +254,7 @@ def _solve_elements(
     except np.linalg.LinAlgError as error:
         raise SolverError(
             f"the {problem.name} has a singular collocation system between t = {t[0, 0]:.6g} "
-            f"and {t[-1, -1]:.6g}"
+            f"and {t[-1, -1]:.6g}; loosen solver.tol, or choose a horizon that avoids this time"
         ) from error
     solved = np.asarray(stacked, dtype=np.float64).reshape(k, s, n, n + columns)
     return _ElementMaps(solved[..., :n], solved[..., n:], extras)
@@ -283,7 +284,8 @@ def _solve_equal_elements(
             solved = np.linalg.solve(system, right.reshape(s * n, -1)).reshape(s, n, -1)
         except np.linalg.LinAlgError as error:
             raise SolverError(
-                f"the {problem.name} has a singular collocation system near t = {t[0, 0]:.6g}"
+                f"the {problem.name} has a singular collocation system near t = {t[0, 0]:.6g}; "
+                "loosen solver.tol, or choose a horizon that avoids this time"
             ) from error
         out[same, :, :, :n] = solved[:, :, :n]
         particular = solved[:, :, n:].reshape(s, n, len(same), columns)

@@ -191,7 +191,7 @@ def analyse(
         )
     raise ModelError(
         f"{_who(system)} is not uniquely solvable, or its index is above {max_mu + 1}: with "
-        f"{max_mu} differentiations {reason}"
+        f"{max_mu} differentiations {reason}; is an equation missing, or there twice?"
     )
 
 
@@ -452,5 +452,5 @@ def _check_gap(
         value = sigma[k, r] if zero[k] else sigma[k, r - 1]
         raise ModelError(
             f"{_who(system)}: the rank of the derivative array changes near t = {t[k]:.9g} "
-            f"(singular value {value / size[k]:.1e})"
+            f"(singular value {value / size[k]:.1e}); choose a horizon that avoids this time"
         )

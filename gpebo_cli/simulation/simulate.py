@@ -106,7 +106,8 @@ def _initial_state(system: DescriptorSystem, structure: Structure, mesh: Mesh) -
     E = system.coefficients.taylor(t, 0, inside).E[0, 0]
     x0 = consistent_state(E, reduced, system.initial_state)
     if not np.isfinite(x0).all():
-        raise ModelError(f"plant {system.name}: no finite consistent state at t = {t[0]:.6g}")
+        raise ModelError(f"plant {system.name}: no finite consistent state at t = {t[0]:.6g}; look "
+            "for entries that are huge or infinite there")
     return x0
 
 
