@@ -132,7 +132,8 @@ def solve(
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values).all(axis=(1, 2, 3))))
             raise SolverError(
-                f"the solution of the {problem.name} is not finite from t = {mesh.edges[k]:.6g} on"
+                f"the solution of the {problem.name} is not finite from t = {mesh.edges[k]:.6g} "
+                "on: it grows beyond all numbers; is a sign wrong? Else shorten time.horizon"
             )
         tail = unresolved_signals(problem, mesh, values, maps.extras)
         # Rounding floor: an element whose parent was already this good is not cut again.
@@ -282,7 +283,7 @@ def _solve_elements(
     except np.linalg.LinAlgError as error:
         raise SolverError(
             f"the {problem.name} has a singular collocation system between t = {t[0, 0]:.6g} "
-            f"and {t[-1, -1]:.6g}"
+            f"and {t[-1, -1]:.6g}; loosen solver.tol, or choose a horizon that avoids this time"
         ) from error
     if c.constraints is not None:
         solved = _at_nodes(c.constraints.basis, k, s) @ solved

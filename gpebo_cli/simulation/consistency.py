@@ -98,7 +98,8 @@ def jump(
     if residual.max(initial=0.0) > 1e-7 * scale:
         raise ModelError(
             f"plant {system.name}: the jump at t = {t:.6g} has no solution "
-            f"(residual {residual.max() / scale:.1e})"
+            f"(residual {residual.max() / scale:.1e}): no state after it satisfies the equations; "
+            "use an input without it, or a horizon that ends before"
         )
     w = w.reshape(levels, n)
     significant = np.abs(w[1:]) > _IMPULSE * scale

@@ -199,7 +199,7 @@ def analyse(
         )
     raise ModelError(
         f"{_who(system)} is not uniquely solvable, or its index is above {max_mu + 1}: with "
-        f"{max_mu} differentiations {reason}"
+        f"{max_mu} differentiations {reason}; is an equation missing, or there twice?"
     )
 
 
@@ -277,7 +277,8 @@ def _levels(
 
 def _array_size(M: Array, aa: Array) -> Array:
     """Size of what the derivative array was made from: with E = 0 it is still judged against A."""
-    return np.asarray(np.maximum(M, np.abs(aa).max(axis=(0, 2, 3))))
+    size = np.maximum(M, np.abs(aa).max(axis=(0, 2, 3)))
+    return np.asarray(np.maximum(size, np.finfo(float).tiny))  # a plant of zeros has none
 
 
 _PLAIN = 1e-5  # bounds of singular values above this need no closer look
@@ -556,5 +557,5 @@ def _check_gap(
         value = sigma[k, r] if zero[k] else sigma[k, r - 1]
         raise ModelError(
             f"{_who(system)}: the rank of the derivative array changes near t = {t[k]:.9g} "
-            f"(singular value {value / size[k]:.1e})"
+            f"(singular value {value / size[k]:.1e}); choose a horizon that avoids this time"
         )

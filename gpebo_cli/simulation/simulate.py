@@ -120,7 +120,10 @@ def _initial_state(system: DescriptorSystem, reduced: StrangenessFree) -> Array:
     """The consistent state at the start, from the equations at times of which it is the first."""
     x0 = consistent_state(reduced, system.initial_state)
     if not np.isfinite(x0).all():
-        raise ModelError(f"plant {system.name}: no finite consistent state at the start")
+        raise ModelError(
+            f"plant {system.name}: no finite consistent state at the start; look for entries that "
+            "are huge or infinite there"
+        )
     return x0
 
 
