@@ -6,7 +6,7 @@ system → simulate → signals → observer → regression → estimator → es
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
@@ -16,6 +16,7 @@ from gpebo_cli.assumptions import of_observation, of_simulation
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.excitation import assess
+from gpebo_cli.measurement import check_samples, measure, noise_levels
 from gpebo_cli.metrics import settling_time, time_rms
 from gpebo_cli.observers import Observation, observe
 from gpebo_cli.result import (
@@ -74,13 +75,27 @@ def run_experiment(
     clock = _Clock(progress)
     observed = settings.observer.name != "none"
     estimator = estimators.build(settings.estimator) if observed else None
+    levels = noise_levels(settings.noise, system)
+    if not levels.silent:
+        check_samples(
+            settings.time.horizon, settings.noise.sample_time, settings.solver.max_elements
+        )
 
     clock.stage("simulate")
     t = np.linspace(
         settings.time.start, settings.time.start + settings.time.horizon, settings.time.samples
     )
     simulation = simulate(system, settings.time, settings.solver)
+    signals = simulation.signals
+    measured = measure(signals, settings.noise, levels)
     simulated = _sample_simulation(system, simulation, t)
+    if not levels.silent:
+        simulated = replace(
+            simulated,
+            # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
+            measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
+            measured_outputs=np.where(levels.noisy_outputs, measured.outputs(t), simulated.outputs),
+        )
     if estimator is None:
         clock.stage("")
         return RunResult(
@@ -92,9 +107,8 @@ def run_experiment(
 
     clock.stage("observe")
     _refuse_impulses(system, simulated)
-    signals = simulation.signals
     observation = observe(
-        system, signals.inputs, signals.outputs, settings.observer, settings.solver
+        system, measured.inputs, measured.outputs, settings.observer, settings.solver
     )
     regression = observation.regression
     sampler = regression.mesh.sampler(t)

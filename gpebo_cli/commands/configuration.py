@@ -16,6 +16,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import convert, nearest, read, shown
 from gpebo_cli.settings import (
     ExcitationSettings,
+    NoiseSettings,
     ObserverSettings,
     OutputSettings,
     Settings,
@@ -28,6 +29,7 @@ _KEYS = (
     "observer",
     "estimator",
     "solver",
+    "noise",
     "time",
     "excitation",
     "figures",
@@ -46,8 +48,9 @@ _RANGES = {
     "solver.max_strangeness_index": (0, 20),
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),
+    "noise.seed": (0, math.inf),
 }
-_POSITIVE = ("time.horizon", "excitation.rho", "excitation.window")
+_POSITIVE = ("time.horizon", "excitation.rho", "excitation.window", "noise.sample_time")
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -108,6 +111,7 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         observer=read(ObserverSettings, _group(config, "observer"), "observer"),
         excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
         output=_output(config, draw=draw),
+        noise=read(NoiseSettings, _group(config, "noise"), "noise"),
     )
     _check_ranges(built)
     return built

@@ -47,11 +47,11 @@ def states(result: RunResult) -> list[Panel]:
 
 
 def signals(result: RunResult) -> list[Panel]:
-    """Inputs and outputs over time: all an observer gets to see."""
-    simulation, system = result.simulation, result.system
+    """Inputs and outputs over time: all an observer gets to see, beside the truth if it differs."""
+    s, system = result.simulation, result.system
     return [
-        *_by_unit(result, "inputs", system.inputs, simulation.t, simulation.inputs),
-        *_by_unit(result, "outputs", system.outputs, simulation.t, simulation.outputs),
+        *_by_unit(result, "inputs", system.inputs, s.t, s.inputs, s.measured_inputs),
+        *_by_unit(result, "outputs", system.outputs, s.t, s.outputs, s.measured_outputs),
     ]
 
 
@@ -251,13 +251,16 @@ def describe(
 ) -> Iterator[tuple[str, list[Panel]]]:
     """Panels of the figures called ``names``; those the run has nothing for are left out.
 
-    With ``None``, all; ``signals`` only if there was no observer, for the paper has no such figure.
+    With ``None``, all; ``signals``, which the paper does not have, only if there was no observer or
+    it saw something else than the truth.
 
     Raises:
         ConfigError: a name is unknown; at once, not at the first figure.
     """
     if names is None:
-        names = [name for name in FIGURES if name != "signals" or result.estimation is None]
+        noisy = result.simulation.measured_outputs is not None
+        plain = result.estimation is None or noisy
+        names = [name for name in FIGURES if name != "signals" or plain]
     wanted = list(dict.fromkeys(names))
     check_names(wanted)
     described = ((name, FIGURES[name](result)) for name in wanted)
@@ -290,16 +293,26 @@ def _parameter_unit(result: RunResult, parameter: str) -> str:
 
 
 def _by_unit(
-    result: RunResult, kind: str, names: Sequence[str], t: Array, values: Array
+    result: RunResult, kind: str, names: Sequence[str], t: Array, values: Array,
+    measured: Array | None = None,
 ) -> list[Panel]:
-    """One panel per unit, in the order in which the units appear."""
+    """One panel per unit, in the order in which the units appear; what was measured behind."""
     units = [result.system.units.get(name, "") for name in names]
     panels = []
     for unit in dict.fromkeys(units):
         members = [i for i, other in enumerate(units) if other == unit]
         label = names[members[0]] if len(members) == 1 else kind
         curves = tuple(Curve(t, values[:, i], names[i], line(k)) for k, i in enumerate(members))
-        panels.append(Panel(with_unit(label, unit), curves, legend=len(members) > 1))
+        if measured is not None:
+            curves = (
+                *(
+                    Curve(t, measured[:, i], f"{names[i]} measured", style.MEASURED)
+                    for i in members
+                    if np.any(measured[:, i] != values[:, i])
+                ),
+                *curves,
+            )
+        panels.append(Panel(with_unit(label, unit), curves, legend=len(curves) > 1))
     return panels
 
 

@@ -29,12 +29,17 @@ _CHUNK_ROWS = 2048  # large enough to amortise the call, small enough to stay in
 
 
 def write_signals(path: Path, system: DescriptorSystem, simulation: SimulationResult) -> None:
-    """Write ``t``, inputs, outputs and true states, by name."""
+    """Write ``t``, inputs, outputs and true states, by name; what was measured, if it differs."""
     header = ["t", *system.inputs, *system.outputs, *system.states]
-    table = np.column_stack(
-        [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
-    )
-    write_file(path, _lines(header, table))
+    columns = [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
+    for names, seen in (
+        (system.inputs, simulation.measured_inputs),
+        (system.outputs, simulation.measured_outputs),
+    ):
+        if seen is not None:
+            header += [f"{name}_measured" for name in names]
+            columns.append(seen)
+    write_file(path, _lines(header, np.column_stack(columns)))
 
 
 def write_regression(path: Path, regression: RegressionResult) -> None:
