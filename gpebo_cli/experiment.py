@@ -123,7 +123,7 @@ def run_experiment(
     excitation = assess(regression, t, settings.excitation)
     clock.stage("estimate")
     estimation, metrics = _estimate(
-        settings, observation.estimator or estimator, observation, system.theta, signals.states, t
+        settings, observation.estimator or estimator, observation, system, signals.states, t
     )
     clock.stage("")
     return RunResult(
@@ -206,7 +206,7 @@ def _estimate(
     settings: Settings,
     estimator: estimators.Estimator,
     observation: Observation,
-    theta: Array,
+    system: DescriptorSystem,
     states: Trajectory,
     t: Array,
 ) -> tuple[EstimationResult, Metrics]:
@@ -220,8 +220,10 @@ def _estimate(
 
     reconstruct = state_map.at(grid)
     x = states(grid)
-    truth = observation.truth(grid, np.broadcast_to(theta, (len(grid), len(theta))), states)
+    truth = observation.truth(grid, system.theta_at(grid), states)
     size, p, n = len(cases), truth.shape[1], x.shape[1]
+    # Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts.
+    judged = slice(system.q if system.theta_varies else p)
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
     numbers = np.empty((5, size))
     batch = max(1, _BATCH // (len(grid) * (2 * p + n)))
@@ -230,7 +232,7 @@ def _estimate(
         eta = estimates.parameters(part)
         x_hat = reconstruct(eta)
         parameters[part], estimated[part] = eta[:, chosen], x_hat[:, chosen]
-        numbers[:, part] = _measure(grid, eta - truth, x_hat - x)
+        numbers[:, part] = _measure(grid, (eta - truth)[..., judged], x_hat - x)
     result = EstimationResult(
         cases=cases,
         t=kept,

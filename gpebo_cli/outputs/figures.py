@@ -93,8 +93,41 @@ def estimates_b(result: RunResult) -> list[Panel]:
     return _estimates(result, other) if differential else []
 
 
+def parameters(result: RunResult) -> list[Panel]:
+    """Estimates of the parameters over time, with the truth dashed, where the truth varies.
+
+    The components of e₀ are left out: where θ varies they are what makes up for it, of any size.
+    """
+    estimation = result.estimation
+    if estimation is None or not result.system.theta_varies:
+        return []
+    shown = _shown_cases(estimation)
+    labels = _case_labels(result, estimation, shown)
+    panels = []
+    for i, name in enumerate(result.system.unknowns):
+        truth = estimation.true_parameters[:, i]
+        curves = [
+            Curve(estimation.t, estimation.parameters[case, :, i], label, line(k))
+            for k, (case, label) in enumerate(zip(shown, labels, strict=True))
+        ]
+        curves.append(Curve(estimation.t, truth, "true", style.VARYING))
+        panels.append(
+            Panel(
+                with_unit(name, _parameter_unit(result, name)),
+                tuple(curves),
+                limits=_estimate_limits(truth, estimation.parameters[shown, :, i]),
+                legend=i == 0,
+                note=_note(estimation, shown) if i == 0 else "",
+            )
+        )
+    return panels
+
+
 def parameter_error(result: RunResult) -> list[Panel]:
-    """Fig. 6: error of every parameter (for the circuit, the initial conditions), logarithmic."""
+    """Fig. 6: error of every parameter (for the circuit, the initial conditions), logarithmic.
+
+    Where θ varies, of the unknowns only, as in ``parameters``.
+    """
     estimation = result.estimation
     if estimation is None:
         return []
@@ -109,6 +142,7 @@ def parameter_error(result: RunResult) -> list[Panel]:
             float(size[i]) or largest,
         )
         for i, name in enumerate(estimation.names)
+        if not result.system.theta_varies or name in result.system.unknowns
     ]
     return _errors(result, estimation, curves)
 
@@ -221,6 +255,7 @@ FIGURES: dict[str, FigureFunction] = {
         estimates,
         estimates_a,
         estimates_b,
+        parameters,
         parameter_error,
         state_error,
         state_error_a,
