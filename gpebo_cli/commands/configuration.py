@@ -14,6 +14,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import convert, nearest, read, shown
 from gpebo_cli.settings import (
     ExcitationSettings,
+    NoiseSettings,
     ObserverSettings,
     OutputSettings,
     Settings,
@@ -26,6 +27,7 @@ _KEYS = (
     "observer",
     "estimator",
     "solver",
+    "noise",
     "time",
     "excitation",
     "figures",
@@ -44,8 +46,9 @@ _RANGES = {
     "solver.max_strangeness_index": (0, 20),
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),
+    "noise.seed": (0, math.inf),
 }
-_POSITIVE = ("time.horizon", "excitation.rho", "excitation.window")
+_POSITIVE = ("time.horizon", "excitation.rho", "excitation.window", "noise.sample_time")
 
 
 def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
@@ -72,9 +75,20 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         observer=read(ObserverSettings, _group(config, "observer"), "observer"),
         excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
         output=_output(config, draw=draw),
+        noise=read(NoiseSettings, _group(config, "noise"), "noise"),
     )
     _check_ranges(built)
+    _check_no_noise(built.noise)
     return built
+
+
+def _check_no_noise(noise: NoiseSettings) -> None:
+    """A recipe may set levels of a file that the command line then replaces by none."""
+    if noise.name == "none" and noise != NoiseSettings():
+        keys = [key for key, value in vars(noise).items() if value != getattr(NoiseSettings, key)]
+        raise ConfigError(
+            f"noise.{keys[0]}: noise=none has no noise; leave it out, or choose noise=gaussian"
+        )
 
 
 def _group(config: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -168,6 +168,7 @@ examples:
   gpebo run plant=circuit estimator=drem
   gpebo run 'estimator.gamma=logspace(6,12,100)' 'figures=[gains]'    # one run, 100 cases
   gpebo run -m plant=circuit,descriptor estimator=drem,ls_drem        # a run for each of four
+  gpebo run noise=gaussian noise.outputs=0.01 noise.seed=1            # noisy outputs
   gpebo run observer=none time.horizon=5                              # simulate only
   gpebo run experiment=paper_circuit hydra.run.dir=paper              # a recipe, and where to
   gpebo run --config-dir paper --config-name config                   # repeat that run
@@ -187,5 +188,11 @@ def run_help() -> str:
 
 
 # As in conf/gpebo.yaml, which is not read: a YAML parser costs more than all the rest of this.
-_DEFAULTS = {"plant": "circuit", "observer": "gpebo", "estimator": "drem", "solver": "collocation"}
+_DEFAULTS = {
+    "plant": "circuit",
+    "observer": "gpebo",
+    "estimator": "drem",
+    "solver": "collocation",
+    "noise": "none",
+}
 _NOTES = {"experiment": "   (a recipe; none by default)"}

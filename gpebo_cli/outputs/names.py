@@ -7,6 +7,7 @@ FIGURE_NAMES = (
     "estimates",
     "estimates_a",
     "estimates_b",
+    "parameters",
     "parameter_error",
     "state_error",
     "state_error_a",

@@ -37,12 +37,17 @@ class Table:
 
 
 def signals_table(system: DescriptorSystem, simulation: SimulationResult) -> Table:
-    """``t``, inputs, outputs and true states, by name."""
+    """``t``, inputs, outputs and true states, by name; what was measured, if it differs."""
     header = ["t", *system.inputs, *system.outputs, *system.states]
-    return Table(
-        header,
-        np.column_stack([simulation.t, simulation.inputs, simulation.outputs, simulation.states]),
-    )
+    columns = [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
+    for names, seen in (
+        (system.inputs, simulation.measured_inputs),
+        (system.outputs, simulation.measured_outputs),
+    ):
+        if seen is not None:
+            header += [f"{name}_measured" for name in names]
+            columns.append(seen)
+    return Table(header, np.column_stack(columns))
 
 
 def write_signals(path: Path, system: DescriptorSystem, simulation: SimulationResult) -> None:

@@ -64,7 +64,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     )
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
-    first = reduce(system, structure, mesh.points.ravel(), mesh.inside.ravel(), system.theta)
+    first = reduce(system, structure, mesh.points.ravel(), mesh.inside.ravel())
     x0 = _initial_state(system, first)
 
     happened: dict[float, tuple[Array, Jump]] = {}
@@ -73,7 +73,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         restarts[cut] = _restart(system, structure, cut, _width(mesh.edges, cut), happened)
 
     def coefficients(t: Array, inside: Array) -> Coefficients:
-        return _equations(reduce(system, structure, t, inside, system.theta))
+        return _equations(reduce(system, structure, t, inside))
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
         u, C = extras
@@ -138,7 +138,7 @@ def _restart(
     happened: dict[float, tuple[Array, Jump]],
 ) -> Callable[[Array], Array]:
     def restart(before: Array) -> Array:
-        what = jump(system, structure, t, width, before[:, 0], system.theta)
+        what = jump(system, structure, t, width, before[:, 0])
         happened[t] = (before[:, 0].copy(), what)
         return what.after[:, None]
 
@@ -157,7 +157,7 @@ def _integrate(
     """The independent path: the underlying ODE of the derivative array, by scipy."""
 
     def explicit(t: Array, inside: Array) -> Coefficients:
-        A, f = ivp.underlying_ode(system, structure, t, inside, system.theta)
+        A, f = ivp.underlying_ode(system, structure, t, inside)
         c = system.coefficients.taylor(t, 0, inside)
         return Coefficients(None, A, f[:, :, None], (c.u[0], c.C[0]))
 
