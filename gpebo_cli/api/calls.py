@@ -11,13 +11,13 @@ from gpebo_cli import assumptions
 from gpebo_cli.api.choice import choose, plain, primary
 from gpebo_cli.api.result import Result
 from gpebo_cli.commands import configuration
-from gpebo_cli.commands.locations import GROUPS, choices, conf_folder
+from gpebo_cli.commands.locations import DATA_GROUPS, GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import Estimator, settings_of
 from gpebo_cli.experiment import run_experiment
 from gpebo_cli.reading import nearest, shown
 from gpebo_cli.result import Assumption
-from gpebo_cli.settings import ObserverSettings, Settings, SolverSettings
+from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings, SolverSettings
 from gpebo_cli.systems.descriptor import DescriptorSystem
 from gpebo_cli.systems.plant import plant_from_mapping
 
@@ -27,6 +27,7 @@ EstimatorChoice = Choice | Estimator
 Folder = str | os.PathLike[str]
 
 _SECTIONS = ("time", "excitation")
+_CHOSEN = tuple(group for group in DATA_GROUPS if group != "plant")
 
 
 def run(
@@ -35,6 +36,7 @@ def run(
     estimator: EstimatorChoice | None = None,
     observer: Choice | None = None,
     solver: Choice | None = None,
+    noise: Choice | None = None,
     time: Mapping[str, object] | None = None,
     excitation: Mapping[str, object] | None = None,
     config_dir: Folder | None = None,
@@ -53,6 +55,7 @@ def run(
             with ``cases`` and ``estimate`` (see :class:`gpebo_cli.estimators.Estimator`).
         observer: a name, or a mapping; ``"none"`` simulates only.
         solver: a name, or a mapping such as ``{"tol": 1e-9}``.
+        noise: a name, or a mapping such as ``{"name": "gaussian", "outputs": 0.01, "seed": 1}``.
         time: ``start`` and ``horizon`` in seconds, ``samples`` of the output grid.
         excitation: ``rho`` and ``window`` (seconds) of the evidence.
         config_dir: a folder of yours, with ``plant/NAME.yaml``, ``estimator/NAME.yaml``, …
@@ -76,7 +79,7 @@ def run(
     own = None if estimator is None or isinstance(estimator, str | Mapping) else _own(estimator)
     sections: dict[str, object] = {
         "observer": observer, "estimator": None if own else estimator, "solver": solver,
-        "time": time, "excitation": excitation,
+        "noise": noise, "time": time, "excitation": excitation,
     }
     config, system, settings = _configure(plant, sections, {} if own else gains, config_dir)
     if own is not None:
@@ -95,6 +98,7 @@ def check(
     *,
     observer: Choice | None = None,
     solver: Choice | None = None,
+    noise: Choice | None = None,
     time: Mapping[str, object] | None = None,
     excitation: Mapping[str, object] | None = None,
     config_dir: Folder | None = None,
@@ -105,6 +109,7 @@ def check(
         plant: as in :func:`run`; the other arguments, too.
         observer: a name or a mapping.
         solver: a name or a mapping.
+        noise: a name or a mapping.
         time: ``start`` and ``horizon`` in seconds.
         excitation: ``rho`` and ``window`` (seconds).
         config_dir: a folder of yours.
@@ -119,7 +124,7 @@ def check(
         ['Assumption 2']
     """
     sections: dict[str, object] = {
-        "observer": observer, "estimator": None, "solver": solver,
+        "observer": observer, "estimator": None, "solver": solver, "noise": noise,
         "time": time, "excitation": excitation,
     }
     _, system, settings = _configure(plant, sections, {}, config_dir)
@@ -144,7 +149,7 @@ def load_plant(plant: Plant, config_dir: Folder | None = None) -> DescriptorSyst
 
 
 def available(group: str, config_dir: Folder | None = None) -> list[str]:
-    """Names that ``plant``, ``observer``, ``estimator``, ``solver`` or ``experiment`` can have.
+    """Names that a group can have: ``plant``, ``observer``, ``estimator``, ``solver``, ….
 
     Raises:
         ConfigError: there is no such group.
@@ -183,7 +188,7 @@ def _configure(
     else:
         content, source = choose("plant", plant, config_dir)
         config["plant"], system = plain(content), plant_from_mapping(content, source)
-    for name in ("observer", "estimator", "solver"):
+    for name in _CHOSEN:
         config[name], _ = choose(name, sections[name], config_dir)
     _check_gains(gains, config["estimator"])
     config["estimator"] |= plain(gains)
@@ -210,7 +215,7 @@ _EXAMPLES = {"time": '{"horizon": 10}', "excitation": '{"window": 1}'}
 def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -> None:
     """Refuse a keyword that the estimator does not have, with where it may belong."""
     known = settings_of(estimator)
-    words = ("estimator", "observer", "solver", "time", "excitation", "config_dir", "progress")
+    words = (*_CHOSEN, *_SECTIONS, "config_dir", "progress")
     for key in gains:
         if key in known:
             continue
@@ -219,6 +224,7 @@ def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -
             "excitation": tuple(primary()["excitation"]),
             "solver": tuple(field.name for field in fields(SolverSettings)),
             "observer": tuple(field.name for field in fields(ObserverSettings)),
+            "noise": tuple(field.name for field in fields(NoiseSettings)),
         }
         belongs = next((name for name, keys in sections.items() if key in keys), None)
         hint = f'; did you mean {belongs}={{"{key}": …}}?' if belongs else ""
