@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -29,8 +30,9 @@ def names() -> list[str]:
     return sorted({*_ours(), *_theirs()})
 
 
-def _ours() -> list[str]:
-    return [p.stem for p in Path(__file__).parent.glob("*.py") if p.stem[0] != "_"]
+@cache
+def _ours() -> tuple[str, ...]:
+    return tuple(p.stem for p in Path(__file__).parent.glob("*.py") if p.stem[0] != "_")
 
 
 def _theirs() -> dict[str, EntryPoint]:

@@ -172,8 +172,11 @@ def observer_matrices(
         rows = row_sizes(E) if normalise else np.ones(system.n)
     if (rows != 1.0).any():
         E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
-    frame = _frame(E, system.states, rank_tol) if like is None else like.split.frame
-    split = None if frame is None else _split_in_frame(E, frame, rank_tol)
+    if like is None:
+        split = _constant_split(E, system.states, rank_tol)
+    else:
+        frame = like.split.frame
+        split = None if frame is None else _split_in_frame(E, frame, rank_tol)
     if split is None:
         slope = c if turning else system.coefficients.taylor(t, 1, inside)
         dE = slope.E[1][: len(E)] / rows[:, None]
@@ -214,8 +217,8 @@ def observer_matrices(
     )
 
 
-def _frame(E: Array, states: tuple[str, ...], rank_tol: float) -> Frame | None:
-    """Kernel and range of E at the times (N, n, n), if they are the same at all of them.
+def _constant_split(E: Array, states: tuple[str, ...], rank_tol: float) -> Split | None:
+    """E⁺ at the times (N, n, n), if kernel and range of E are the same at all of them.
 
     Coordinate axes where columns and rows are exactly zero, as in E = diag(E_a(t), 0); else from
     the singular vectors at the first time.
@@ -225,17 +228,16 @@ def _frame(E: Array, states: tuple[str, ...], rank_tol: float) -> Frame | None:
     rows, columns = np.flatnonzero(used.any(axis=1)), np.flatnonzero(used.any(axis=0))
     axes = np.eye(n)
     if len(rows) == len(columns):
-        free = np.setdiff1d(np.arange(n), rows)
-        unused = np.setdiff1d(np.arange(n), columns)
+        free, unused = ~used.any(axis=1), ~used.any(axis=0)
         frame = Frame(axes[:, columns], axes[:, rows], axes[:, unused], axes[free])
-        if _split_in_frame(E, frame, rank_tol) is not None:
-            return frame
+        split = _split_in_frame(E, frame, rank_tol)
+        if split is not None:
+            return split
     U, sigma, Vt = np.linalg.svd(E[0])
     rank = int((sigma > rank_tol * np.linalg.norm(E, axis=(1, 2)).max()).sum())
     U1, V2 = U[:, :rank], Vt[rank:].T
     domain, _ = initial_basis(Vt[:rank].T @ Vt[:rank], rank, states)
-    frame = Frame(domain, U1, V2, orthonormal_complement(U1))
-    return frame if _split_in_frame(E, frame, rank_tol) is not None else None
+    return _split_in_frame(E, Frame(domain, U1, V2, orthonormal_complement(U1)), rank_tol)
 
 
 def _split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:

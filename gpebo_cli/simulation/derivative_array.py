@@ -391,27 +391,20 @@ def _reference(
         return Bases(Z1[None], one.Z2[:1])
     M = derivative_array(e, aa, mu)[0][0]
     r = len(M) - one.a
-    rows, columns = _independent(M, r)
-    every = np.arange(len(M))
-    return Pivots(
-        r,
-        np.concatenate([rows, np.setdiff1d(every, rows)]),
-        np.concatenate([columns, np.setdiff1d(every, columns)]),
-        Z1,
-    )
+    return Pivots(r, *_pivots(M, r), Z1)
 
 
-def _independent(matrix: Array, count: int) -> tuple[IntArray, IntArray]:
-    """Indices of ``count`` rows and columns that carry the rank: elimination, complete pivoting."""
+def _pivots(matrix: Array, count: int) -> tuple[IntArray, IntArray]:
+    """All rows and columns, ``count`` that carry the rank first: elimination, complete pivoting."""
     left = matrix.copy()
-    chosen = np.empty((2, count), dtype=np.intp)
-    for k in range(count):
-        i, j = divmod(int(np.argmax(np.abs(left))), left.shape[1])
-        chosen[:, k] = i, j
+    chosen = np.zeros((2, len(matrix)), dtype=bool)
+    for _ in range(count):
+        i, j = divmod(int(np.abs(left).argmax()), len(left))
+        chosen[0, i] = chosen[1, j] = True
         left -= left[:, j, None] * (left[i] / left[i, j])
         left[i], left[:, j] = 0.0, 0.0
-    chosen.sort(axis=1)
-    return chosen[0], chosen[1]
+    rows, columns = np.argsort(~chosen, axis=1, kind="stable")
+    return rows, columns
 
 
 _MAX_GROWTH = 1e2  # of the elimination; beyond it singular vectors are computed instead
