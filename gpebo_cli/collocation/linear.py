@@ -80,6 +80,8 @@ class LinearProblem:
     monitor: Monitor | None = None
     name: str = "equation"
     floor: float = 0.0  # size below which the solution itself is rounding
+    # (n, n + 1) by how much relative rounding of the components, and of 1, reaches each component
+    amplification: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +153,12 @@ def solve(
         floor = np.where(fresh, np.repeat(tail, parts), np.repeat(floor, parts))
         maps = _merge(maps, new, kept, fresh)
         mesh, rounds = finer, rounds + 1
-    noise = _visible_noise(values, mesh)
-    propagated = _propagated_error(maps.homogeneous[:, -1], values, mesh)
-    estimate = max(float(tail.max(initial=0.0)), noise, propagated, _ROUNDING)
+    estimate = max(
+        float(tail.max(initial=0.0)),
+        _visible_noise(values, mesh),
+        _propagated_error(maps.homogeneous[:, -1], values, mesh),
+        _rounding(problem, values),
+    )
     return LinearSolution(Trajectory(mesh, values), estimate, rounds, maps.extras)
 
 
@@ -165,6 +170,19 @@ def unresolved_signals(
     if problem.monitor is not None:
         kinds += problem.monitor(values, extras)
     return unresolved_kinds(kinds, mesh.rule)
+
+
+def _rounding(problem: LinearProblem, values: Array) -> float:
+    """Rounding relative to each component: what the large ones and the coefficients bring along."""
+    flat = values.reshape(*values.shape[:2], -1)
+    scale = signal_scale(flat, problem.floor)
+    unit = float(np.finfo(float).eps) * float(np.abs(flat).max(initial=0.0))
+    brought = np.zeros_like(scale)
+    if problem.amplification is not None:
+        size = np.abs(values).max(axis=(0, 1))  # (n, columns)
+        through = problem.amplification[:, :-1] @ size + problem.amplification[:, -1:]
+        brought = np.finfo(float).eps * through.ravel()
+    return max(_ROUNDING, float(((unit + brought) / scale).max(initial=0.0)))
 
 
 def _visible_noise(values: Array, mesh: Mesh) -> float:

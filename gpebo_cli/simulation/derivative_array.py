@@ -96,6 +96,9 @@ class StrangenessFree:
     f2: Array  # (N, a)
     basis: Array | None  # (N, n, d) T, of the kernel of A2, with E1 T = I; None if a = 0
     offset: Array | None  # (N, n)
+    # (n, n + 1) by how much relative rounding of each state and of f2 reaches each state through
+    # the constraints, the most at some of the times
+    amplification: Array
     E: Array  # (N, n, n) the model's own
     u: Array  # (N, m) the inputs and
     C: Array  # (N, r, n) the output matrix at the same times
@@ -408,6 +411,7 @@ def _pivots(matrix: Array, count: int) -> tuple[IntArray, IntArray]:
 
 
 _MAX_GROWTH = 1e2  # of the elimination; beyond it singular vectors are computed instead
+_LOOKS = 32  # times at which the sensitivity to rounding is looked at
 _RESIDUAL = 1e-13  # rows that should vanish after elimination, relative to the array
 
 
@@ -433,12 +437,16 @@ def reduce(
     weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
     g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
     reference = structure.reference
+    some = slice(0, None, max(1, len(t) // _LOOKS))
     if isinstance(reference, Bases):
         Z1 = reference.Z1
         A2, f2 = transpose(reference.Z2) @ N, transpose(reference.Z2) @ g
+        size = np.abs(transpose(reference.Z2)) @ np.abs(np.concatenate(
+            [np.broadcast_to(N, (len(g), *N.shape[1:]))[some], g[some]], axis=2
+        ))
         inverse, poor = _inverse(np.concatenate([transpose(Z1) @ e[0], A2], axis=1))
     else:
-        Z1, A2, f2, inverse, poor = _by_elimination(reference, e[0], M, N, g)
+        Z1, A2, f2, size, inverse, poor = _by_elimination(reference, e[0], M, N, g, some)
         if poor.any():
             Z1 = np.repeat(Z1, len(t), axis=0)
             Z1[poor], Z2 = _by_singular_vectors(
@@ -456,6 +464,9 @@ def reduce(
     W1 = transpose(Z1) * scaling.rows
     inverse = scaling.columns[:, None] * inverse
     d = structure.d
+    sensitivity = np.abs(inverse[some if len(inverse) > 1 else slice(None), :, d:])
+    amplification = (sensitivity @ size).max(axis=0)
+    amplification[:, :-1] /= scaling.columns
     return StrangenessFree(
         E1=W1 @ E[0],
         A1=W1 @ A[0],
@@ -464,6 +475,7 @@ def reduce(
         f2=f2[:, :, 0],
         basis=inverse[:, :, :d] / scaling.time if structure.a else None,  # the scaled E is E/τ
         offset=-(inverse[:, :, d:] @ f2)[:, :, 0] if structure.a else None,
+        amplification=amplification,
         E=E[0],
         u=c.u[0],
         C=c.C[0],
@@ -488,11 +500,12 @@ def _largest(matrix: Array) -> Array:
 
 
 def _by_elimination(
-    pivots: Pivots, E: Array, M: Array, N: Array, g: Array
-) -> tuple[Array, Array, Array, Array, BoolArray]:
+    pivots: Pivots, E: Array, M: Array, N: Array, g: Array, some: slice
+) -> tuple[Array, Array, Array, Array, Array, BoolArray]:
     """Z1 (1, n, d), Â2 (N, a, n), f2 (N, a, 1) on the reference pivots, [Z1ᵀE; Â2]⁻¹.
 
-    The last one says where these will not do.
+    Before the inverse, the size of the terms of [Â2 | f2] at ``some`` times; the last one says where the
+    pivots will not do.
     """
     count, n, r = len(M), E.shape[1], pivots.rank
     right = np.concatenate([N, g], axis=2)[:, pivots.rows]
@@ -507,18 +520,21 @@ def _by_elimination(
         except np.linalg.LinAlgError:
             everywhere = np.ones(count, dtype=bool)
             left = right[:, r:]
-            return pivots.Z1[None], left[:, :, :n], left[:, :, n:], np.zeros_like(E), everywhere
+            size = np.abs(left[some])
+            return pivots.Z1[None], left[:, :, :n], left[:, :, n:], size, np.zeros_like(E), everywhere
         residual = _largest(M[:, r:, r:] - X @ M[:, :r, r:])
         poor = (residual > _RESIDUAL * _largest(M)) | (_largest(X) > _MAX_GROWTH)
         constraints = right[:, r:] - X @ right[:, :r]
+        size = np.abs(right[some, r:]) + np.abs(X[some]) @ np.abs(right[some, :r])
     else:
         constraints = right[:, r:]
+        size = np.abs(constraints[some])
     A2 = constraints[:, :, :n]
     whole = np.concatenate([pivots.Z1.T @ E, A2], axis=1)
     scale = np.maximum(np.abs(whole).max(axis=2), np.finfo(float).tiny)
     inverse, singular = _inverse(whole / scale[:, :, None])
     poor |= singular | (_largest(inverse) > _MAX_GROWTH)
-    return pivots.Z1[None], A2, constraints[:, :, n:], inverse / scale[:, None, :], poor
+    return pivots.Z1[None], A2, constraints[:, :, n:], size, inverse / scale[:, None, :], poor
 
 
 def _by_singular_vectors(

@@ -85,7 +85,9 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
     floor = 1e-3 * float(np.abs(system.initial_state).max(initial=0.0))
-    problem = LinearProblem(coefficients, x0[:, None], monitor, f"plant {system.name}", floor)
+    problem = LinearProblem(
+        coefficients, x0[:, None], monitor, f"plant {system.name}", floor, first.amplification
+    )
     if solver.name == "ivp":
         solution = _integrate(system, structure, problem, mesh, solver, restarts)
     else:
