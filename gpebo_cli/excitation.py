@@ -15,7 +15,7 @@ from gpebo_cli.settings import ExcitationSettings
 from gpebo_cli.systems.descriptor import Array
 
 _RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
-_ROUNDS = 30
+_ROUNDS, _SAME_TIME = 30, 1e-12
 _AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(10.0)])
 _WINDOWS = 10  # default PE window: this many per horizon
 
@@ -71,7 +71,7 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
     for _ in range(_ROUNDS):
         j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
         low, high = float(points[max(j - 1, 0)]), float(points[j])
-        if high - low <= 4.0 * np.spacing(abs(high)):
+        if high - low <= _SAME_TIME * max(abs(high), mesh.edges[-1] - mesh.edges[0]):
             break
         share = level[j - 1] / (level[j - 1] - level[j])
         guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
