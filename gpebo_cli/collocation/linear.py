@@ -143,9 +143,7 @@ def solve(
         poor = (tail > tol) & ~stalled
         if not poor.any():
             break
-        parts = np.ones(mesh.size, dtype=np.intp)
-        wanted = 1.25 * (tail[poor] / tol) ** (1.0 / mesh.rule.stages)
-        parts[poor] = np.clip(np.ceil(wanted), 2, _MAX_PARTS).astype(np.intp)
+        parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         _check_budget(problem, mesh, tail, parts, max_elements)
         finer, kept = mesh.split(parts)
         fresh = kept < 0
@@ -160,6 +158,14 @@ def solve(
         _rounding(problem, values),
     )
     return LinearSolution(Trajectory(mesh, values), estimate, rounds, maps.extras)
+
+
+def wanted_parts(tail: Array, poor: BoolArray, tol: float, stages: int) -> IntArray:
+    """Into how many parts to cut each element so that its tail falls to ``tol``."""
+    parts = np.ones(len(tail), dtype=np.intp)
+    wanted = 1.25 * (tail[poor] / tol) ** (1.0 / stages)
+    parts[poor] = np.clip(np.ceil(wanted), 2, _MAX_PARTS).astype(np.intp)
+    return parts
 
 
 def unresolved_signals(

@@ -13,8 +13,9 @@ from gpebo_cli.collocation.linear import (
     LinearProblem,
     LinearSolution,
     solve,
+    wanted_parts,
 )
-from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh, unresolved
 from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ModelError
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -64,6 +65,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     )
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
+    mesh = _inputs_resolved(system, mesh, solver)
     first = reduce(system, structure, mesh.points.ravel(), mesh.inside.ravel())
     x0 = _initial_state(system, first)
 
@@ -106,6 +108,27 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         jumps=tuple((t, *happened[t]) for t in sorted(happened)),
         error_estimate=solution.error_estimate,
     )
+
+
+def _inputs_resolved(system: DescriptorSystem, mesh: Mesh, solver: SolverSettings) -> Mesh:
+    """The mesh with elements cut until the inputs are resolved, as far as cutting helps.
+
+    The solution's mesh has to resolve them in any case, and evaluating an input costs next to
+    nothing beside solving for the state on elements that are too long.
+    """
+    if system.m == 0 or "u" in system.coefficients.constant or solver.name == "ivp":
+        return mesh
+    before = np.full(mesh.size, np.inf)
+    while True:
+        u = system.coefficients.taylor(mesh.points.ravel(), 0, mesh.inside.ravel()).u[0]
+        tail = unresolved(u.reshape(*mesh.points.shape, -1), mesh.rule)
+        poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
+        parts = wanted_parts(tail, poor, solver.tol, mesh.rule.stages)
+        too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
+        if not poor.any() or too_short.any() or parts.sum() > solver.max_elements:
+            return mesh
+        before = np.repeat(tail, parts)
+        mesh, _ = mesh.split(parts)
 
 
 def _equations(reduced: StrangenessFree) -> Coefficients:
