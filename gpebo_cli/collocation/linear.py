@@ -31,7 +31,7 @@ from gpebo_cli.collocation.mesh import (
     signal_scale,
     unresolved_kinds,
 )
-from gpebo_cli.collocation.radau import RadauRule
+from gpebo_cli.collocation.radau import RadauRule, differentiation_schur
 from gpebo_cli.errors import SolverError
 from gpebo_cli.systems.descriptor import Array, BoolArray, IntArray
 
@@ -60,6 +60,7 @@ class Coefficients(NamedTuple):
 Monitor = Callable[[Array, tuple[Array, ...]], list[tuple[Array, float]]]
 
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
+_DIRECT = 400  # unknowns
 _MAX_PARTS = 8  # an element is cut into at most this many at once
 _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _ROUNDING = 64 * np.finfo(float).eps
@@ -245,7 +246,10 @@ def _element_maps(
     n, columns = problem.start.shape
     s = mesh.rule.stages
     h, t, inside = mesh.steps[elements], mesh.points[elements], mesh.inside[elements]
-    chunk = max(1, _CHUNK // (s * s * n * n + s * n * (n + columns)))
+    numbers = s * n * (n + columns)
+    if known is None or not _is_constant(known):
+        numbers += s * s * n * n
+    chunk = max(1, _CHUNK // numbers)
     pieces = []
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
@@ -264,6 +268,14 @@ def _element_maps(
             for parts in zip(*(p.extras for p in pieces), strict=True)
         ),
     )
+
+
+def _is_constant(c: Coefficients) -> bool:
+    """Whether everything but the forcing is constant in time."""
+    matrices = [c.A] if c.E is None else [c.A, c.E]
+    if c.constraints is not None:
+        matrices.append(c.constraints.basis)
+    return all(len(matrix) == 1 for matrix in matrices)
 
 
 def _at_points(c: Coefficients, part: slice) -> Coefficients:
@@ -298,21 +310,22 @@ def _solve_elements(
     k, s = len(h), rule.stages
     n = len(problem.start)
     extras = tuple(at_points(extra, k, s) for extra in c.extras)
-    matrices = [c.A] if c.E is None else [c.A, c.E]
-    if c.constraints is not None:
-        matrices.append(c.constraints.basis)
-    constant = k > 1 and all(len(matrix) == 1 for matrix in matrices)
     try:
-        solved = (_solve_equal_elements if constant else _solve_distinct_elements)(rule, h, c, n)
+        if _is_constant(c):
+            from_left, particular = _solve_equal_elements(rule, h, c, n)
+        else:
+            solved = _solve_distinct_elements(rule, h, c, n)
+            if c.constraints is not None:
+                solved = _at_nodes(c.constraints.basis, k, s) @ solved
+            from_left, particular = solved[..., :n], solved[..., n:]
     except np.linalg.LinAlgError as error:
         raise SolverError(
             f"the {problem.name} has a singular collocation system between t = {t[0, 0]:.6g} "
             f"and {t[-1, -1]:.6g}; loosen solver.tol, or choose a horizon that avoids this time"
         ) from error
     if c.constraints is not None:
-        solved = _at_nodes(c.constraints.basis, k, s) @ solved
-        solved[..., n:] += _at_nodes(c.constraints.offset, k, s)
-    return _ElementMaps(solved[..., :n], solved[..., n:], extras)
+        particular += _at_nodes(c.constraints.offset, k, s)
+    return _ElementMaps(from_left, particular, extras)
 
 
 def _forcing(rule: RadauRule, h: Array, c: Coefficients) -> Array:
@@ -365,11 +378,16 @@ def _solve_distinct_elements(rule: RadauRule, h: Array, c: Coefficients, n: int)
     return np.asarray(solved, dtype=np.float64).reshape(right.shape)
 
 
-def _solve_equal_elements(rule: RadauRule, h: Array, c: Coefficients, n: int) -> Array:
+def _solve_equal_elements(
+    rule: RadauRule, h: Array, c: Coefficients, n: int
+) -> tuple[Array, Array]:
     """With constant E, A and T, elements of one length share one factorisation.
 
-    Lengths that differ by rounding only (equal parts of an element) count as equal. Returns what
-    ``_solve_distinct_elements`` does.
+    Lengths that differ by rounding only (equal parts of an element) count as equal.
+
+    Returns:
+        T times the responses to the left end (k, s, n, n), perhaps the same memory for all, and
+        T times the particular solutions (k, s, n, columns).
     """
     k, s = len(h), rule.stages
     f = _forcing(rule, h, c)
@@ -377,20 +395,45 @@ def _solve_equal_elements(rule: RadauRule, h: Array, c: Coefficients, n: int) ->
     E, A = np.eye(n) if c.E is None else c.E[0], c.A[0]
     T = np.eye(n) if c.constraints is None else c.constraints.basis[0]
     start = rule.differentiation.sum(axis=1)[:, None, None]
-    out = np.empty((k, s, d, n + columns))
-    for length in np.unique(np.round(h, 12 - int(np.floor(np.log10(h.max()))))):
+    rounded = np.round(h, 12 - int(np.floor(np.log10(h.max()))))
+    responses, which = [], np.empty(k, dtype=np.intp)
+    particular = np.empty((k, s, n, columns))
+    for length in np.unique(rounded):
         same = np.flatnonzero(np.abs(h - length) <= 1e-11 * h.max())
         step = h[same[0]]
-        system = np.kron(rule.differentiation / step, E @ T) - np.kron(np.eye(s), A @ T)
         right = np.empty((s, d, n + len(same) * columns))
         right[:, :, :n] = start / step * E
         right[:, :, n:] = np.moveaxis(f[same], 0, 2).reshape(s, d, len(same) * columns)
+        solved = T @ solve_constant(rule, step, E @ T, A @ T, right)
+        which[same] = len(responses)
+        responses.append(solved[:, :, :n])
+        columns_apart = solved[:, :, n:].reshape(s, n, len(same), columns)
+        particular[same] = np.moveaxis(columns_apart, 2, 0)
+    if len(responses) == 1:
+        return np.broadcast_to(responses[0], (k, s, n, n)), particular
+    return np.array(responses)[which], particular
+
+
+def solve_constant(rule: RadauRule, step: float, E: Array, A: Array, right: Array) -> Array:
+    """(D/h ⊗ E − I ⊗ A) Z = ``right`` for constant E, A (d, d); Z and ``right`` (s, d, columns).
+
+    With D = U T Uᴴ the stages decouple from the last to the first: s systems of size d instead of
+    one of size s·d. Below _DIRECT unknowns the one system is faster.
+    """
+    s, d, _ = right.shape
+    if s * d <= _DIRECT:
+        system = np.kron(rule.differentiation / step, E) - np.kron(np.eye(s), A)
         solved = np.linalg.solve(system, right.reshape(s * d, right.shape[2]))
-        solved = solved.reshape(right.shape)
-        out[same, :, :, :n] = solved[:, :, :n]
-        particular = solved[:, :, n:].reshape(s, d, len(same), columns)
-        out[same, :, :, n:] = np.moveaxis(particular, 2, 0)
-    return out
+        return np.asarray(solved, dtype=np.float64).reshape(right.shape)
+    U, T = differentiation_schur(s)
+    T = T / step
+    Y = np.tensordot(U.conj().T, right, axes=1)
+    EY = np.empty_like(Y)
+    for i in range(s - 1, -1, -1):
+        later = np.tensordot(T[i, i + 1 :], EY[i + 1 :], axes=1)
+        Y[i] = np.linalg.solve(T[i, i] * E - A, Y[i] - later)
+        EY[i] = E @ Y[i]
+    return np.asarray(np.tensordot(U, Y, axes=1).real)
 
 
 def _chain(

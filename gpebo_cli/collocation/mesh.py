@@ -18,6 +18,7 @@ from gpebo_cli.systems.descriptor import Array, IntArray
 _INSIDE = 1e-3
 _CHUNK = 1 << 22  # numbers gathered at once when sampling
 _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
+_MANY = 2000  # times, from which on sampling them by element pays
 _KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -120,15 +121,46 @@ class Sampler:
 
     def __call__(self, values: Array) -> Array:
         """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
-        shape = values.shape[2:]
         flat = values.reshape(*values.shape[:2], -1)
         out = np.empty((len(self.element), flat.shape[2]))
-        chunk = max(1, _CHUNK // max(1, flat.shape[1] * flat.shape[2]))
-        for i in range(0, len(out), chunk):
-            part = slice(i, i + chunk)
-            gathered = flat[self.element[part]]
-            out[part] = np.matmul(self.weights[part, None, :], gathered)[:, 0, :]
-        return out.reshape(len(out), *shape)
+        if self._grouped is not None:
+            self._by_element(flat, out)
+        else:
+            chunk = max(1, _CHUNK // max(1, flat.shape[1] * flat.shape[2]))
+            for i in range(0, len(out), chunk):
+                part = slice(i, i + chunk)
+                gathered = flat[self.element[part]]
+                out[part] = np.matmul(self.weights[part, None, :], gathered)[:, 0, :]
+        return out.reshape(len(out), *values.shape[2:])
+
+    @cached_property
+    def _grouped(self) -> tuple[IntArray, IntArray, int] | None:
+        """Where many ascending times share elements: the elements, their ends in t, most times."""
+        if len(self.element) < _MANY:
+            return None
+        changes = np.diff(self.element)
+        ends = np.append(np.flatnonzero(changes) + 1, len(self.element))
+        most = int(np.diff(ends, prepend=0).max())
+        if (changes < 0).any() or len(ends) * most > 2 * len(self.element):
+            return None
+        return self.element[ends - 1], ends, most
+
+    def _by_element(self, flat: Array, out: Array) -> None:
+        """One product per element with all its times: nothing is gathered per time."""
+        if self._grouped is None:
+            return
+        elements, ends, most = self._grouped
+        starts = np.append(0, ends[:-1])
+        points, columns = flat.shape[1:]
+        chunk = max(1, _CHUNK // max(1, most * (points + columns)))
+        for i in range(0, len(elements), chunk):
+            first, last = starts[i], ends[min(i + chunk, len(ends)) - 1]
+            counts = (ends - starts)[i : i + chunk]
+            group = np.repeat(np.arange(len(counts)), counts)
+            place = np.arange(last - first) - np.repeat(starts[i : i + chunk] - first, counts)
+            weights = np.zeros((len(counts), most, points))
+            weights[group, place] = self.weights[first:last]
+            out[first:last] = np.matmul(weights, flat[elements[i : i + chunk]])[group, place]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,13 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
+from numpy.typing import NDArray
 
 from gpebo_cli.systems.descriptor import Array
+
+ComplexArray = NDArray[np.complex128]
+
+_QR_STEPS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +77,28 @@ def radau_rule(stages: int) -> RadauRule:
         barycentric=weights / np.abs(weights).max(),
         to_legendre=np.asarray(np.linalg.inv(at_points), dtype=np.float64),
     )
+
+
+@lru_cache(maxsize=16)
+def differentiation_schur(stages: int) -> tuple[ComplexArray, ComplexArray]:
+    """D = U T Uᴴ with unitary U and upper triangular T, by shifted QR iteration.
+
+    Eigenvectors of D would do the same with a diagonal T, but they are nearly dependent: their
+    condition number grows exponentially with the stages.
+    """
+    T = radau_rule(stages).differentiation.astype(np.complex128)
+    U = np.eye(stages, dtype=np.complex128)
+    size = float(np.linalg.norm(T))
+    for last in range(stages - 1, 0, -1):
+        part = slice(0, last + 1)
+        for _ in range(_QR_STEPS):
+            if np.abs(T[last, :last]).max() <= np.finfo(float).eps * size:
+                break
+            values = np.linalg.eigvals(T[part, part])
+            shift = values[np.argmin(np.abs(values - T[last, last]))] * np.eye(last + 1)
+            Q, R = np.linalg.qr(T[part, part] - shift)
+            T[part, part] = R @ Q + shift
+            T[part, last + 1 :] = Q.conj().T @ T[part, last + 1 :]
+            U[:, part] = U[:, part] @ Q
+        T[last, :last] = 0.0
+    return U, T

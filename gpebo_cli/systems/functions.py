@@ -47,6 +47,8 @@ class FunctionCoefficients:
     def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:  # noqa: ARG002
         """Taylor coefficients up to ``order`` at the times t (N,); these functions do not jump.
 
+        Constant matrices come as read-only broadcast arrays.
+
         Raises:
             ConfigError: a function returns the wrong shape, something not finite, or is not
                 analytic where a derivative of it is needed.
@@ -54,12 +56,14 @@ class FunctionCoefficients:
         out = {}
         for name in MATRIX_NAMES:
             shape = self.shapes[name]
-            values = np.zeros((order + 1, len(t), *shape))
             if name in self.fixed:
-                values[0] = self.fixed[name]
+                once = np.zeros((order + 1, 1, *shape))
+                once[0] = self.fixed[name]
+                out[name] = np.broadcast_to(once, (order + 1, len(t), *shape))
             else:
+                values = np.zeros((order + 1, len(t), *shape))
                 self._fill(name, values, t)
-            out[name] = values
+                out[name] = values
         return Coefficients(**out)
 
     def breakpoints(self, start: float, stop: float) -> Array:  # noqa: ARG002
