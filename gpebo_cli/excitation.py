@@ -66,7 +66,7 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
         return None
     k = int(reached[0])
     points = mesh.points[k]
-    level = np.linalg.eigvalsh(gram.values[k])[:, 0] - rho
+    level = np.asarray(np.linalg.eigvalsh(gram.values[k])[:, 0] - rho, dtype=np.float64)
     element = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
     for _ in range(_ROUNDS):
         j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
@@ -76,7 +76,7 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
         share = level[j - 1] / (level[j - 1] - level[j])
         guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
         points = np.unique(np.clip(guess + (high - low) * _AROUND, low, high))
-        level = np.linalg.eigvalsh(element(points))[:, 0] - rho
+        level = np.asarray(np.linalg.eigvalsh(element(points))[:, 0] - rho, dtype=np.float64)
         level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
     return high
 

@@ -8,9 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
+from gpebo_cli.collocation.linear import (
+    Coefficients,
+    Constraints,
+    LinearProblem,
+    solve,
+    solve_constant,
+)
 from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh
-from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli.collocation.radau import differentiation_schur, radau_rule
 from gpebo_cli.errors import SolverError
 
 
@@ -161,3 +167,65 @@ def test_splitting_keeps_edges_and_marks_what_is_new():
     finer, kept = mesh.split(np.array([1, 3, 1]))
     np.testing.assert_allclose(finer.edges, [0, 1, 4 / 3, 5 / 3, 2, 3])
     assert kept.tolist() == [0, -1, -1, -1, 2]
+
+
+def test_constraints_given_apart_change_nothing():
+    """X = T z + offset with another T at every node gives what the whole DAE gives."""
+
+    def apart(t, inside):
+        whole = oscillator(t, inside)
+        basis = np.zeros((len(t), 3, 2))
+        basis[:, 0, 0] = basis[:, 1, 1] = basis[:, 2, 0] = 1.0
+        basis[:, 2, 1] = t
+        turn = np.array([[1.0, 0.3], [-0.4, 2.0]]) * (1.0 + (np.arange(len(t)) % 3))[:, None, None]
+        constraints = Constraints(basis @ turn, np.zeros((len(t), 3, 1)))
+        return Coefficients(whole.E[:, :2], whole.A[:, :2], whole.f[:, :2], (), constraints)
+
+    mesh = initial_mesh(0.0, 4.0, [], 6, radau_rule(7))
+    start = [[1.0], [0.0], [1.0]]
+    np.testing.assert_allclose(
+        fixed(apart, start, mesh).values, fixed(oscillator, start, mesh).values, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("stages", [2, 7, 14])
+@pytest.mark.parametrize("d", [3, 210])
+def test_stages_of_a_constant_system_decouple(stages, d):
+    """On both sides of the size from which the Schur form is used."""
+    rng = np.random.default_rng(d)
+    rule, step = radau_rule(stages), 0.3
+    E, A = np.eye(d) + 0.1 * rng.normal(size=(d, d)) / np.sqrt(d), rng.normal(size=(d, d)) / 9
+    right = rng.normal(size=(stages, d, 2))
+    Z = solve_constant(rule, step, E, A, right)
+    back = np.einsum("ij,kl,jlc->ikc", rule.differentiation / step, E, Z, optimize=True) - A @ Z
+    np.testing.assert_allclose(back, right, atol=1e-11 * np.abs(Z).max() * stages**2)
+
+
+@pytest.mark.parametrize("stages", [2, 5, 14, 16])
+def test_schur_form_of_the_differentiation_matrix(stages):
+    U, T = differentiation_schur(stages)
+    D = radau_rule(stages).differentiation
+    np.testing.assert_allclose(U @ T @ U.conj().T, D, atol=1e-14 * np.abs(D).max())
+    np.testing.assert_allclose(U.conj().T @ U, np.eye(stages), atol=1e-13)
+    assert not np.tril(T, -1).any()
+
+
+def test_many_samples_are_those_of_few():
+    mesh = initial_mesh(0.5, 4.5, [1.3], 12, radau_rule(9))
+    signal = smooth_signal(mesh)
+    t = np.linspace(0.5, 4.5, 4001)
+    few = np.concatenate([signal(part) for part in np.array_split(t, 40)])
+    np.testing.assert_allclose(signal(t), few, rtol=0, atol=1e-12)
+    backwards = signal(t[::-1])
+    np.testing.assert_allclose(backwards, few[::-1], rtol=0, atol=1e-12)
+    gap = t[(t < 1.0) | (t > 3.7)]  # elements without samples
+    np.testing.assert_allclose(signal(gap), few[(t < 1.0) | (t > 3.7)], rtol=0, atol=1e-12)
+
+
+def test_a_kept_sampler_is_not_used_for_other_times():
+    """Samplers are kept with a copy of their times, which the caller may overwrite."""
+    signal = smooth_signal(initial_mesh(0.0, 2.0, [], 4, radau_rule(9)))
+    t = np.array([0.3, 0.7])
+    signal(t)
+    t += 0.5
+    np.testing.assert_allclose(signal(t)[:, 0], np.sin([0.8, 1.2]), atol=1e-12)

@@ -396,7 +396,8 @@ def _solve_equal_elements(
     T = np.eye(n) if c.constraints is None else c.constraints.basis[0]
     start = rule.differentiation.sum(axis=1)[:, None, None]
     rounded = np.round(h, 12 - int(np.floor(np.log10(h.max()))))
-    responses, which = [], np.empty(k, dtype=np.intp)
+    responses: list[Array] = []
+    which = np.empty(k, dtype=np.intp)
     particular = np.empty((k, s, n, columns))
     for length in np.unique(rounded):
         same = np.flatnonzero(np.abs(h - length) <= 1e-11 * h.max())

@@ -85,7 +85,7 @@ class Mesh:
 
     @cached_property
     def _samplers(self) -> list[tuple[Array, Array | None, Sampler]]:
-        """The last few samplers: all signals of a run are reported at the same few sets of times."""
+        """The last few: all signals of a run are reported at the same few sets of times."""
         return []
 
     def _new_sampler(self, t: Array, inside: Array | None) -> Sampler:
@@ -230,7 +230,8 @@ def _filter(
     right[..., 0] = rule.differentiation.sum(axis=1)  # the response to the left end
     for i, those in enumerate(columns):
         right[i, :, :, 1 : 1 + len(those)] = hl[i] * values[:, 1:, those]
-    solved = np.linalg.solve(rule.differentiation + hl * np.eye(rule.stages), right)
+    operator = rule.differentiation + hl * np.eye(rule.stages)
+    solved = np.asarray(np.linalg.solve(operator, right), dtype=np.float64)
     last = np.moveaxis(solved[:, :, -1], 0, 1)  # (K, rates, 1 + columns)
     starts = affine_scan(last[..., :1], last[..., 1:], np.zeros(()))[:-1]
     for i, those in enumerate(columns):

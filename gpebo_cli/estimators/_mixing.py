@@ -43,9 +43,8 @@ def determinant_and_quotient(omega: Array, rhs: Array) -> tuple[Array, Array, Bo
     if usable.any():
         # Ω⁻¹ beside Ω⁻¹𝒴: ‖Ω‖ ‖Ω⁻¹‖ is at most p times the condition number.
         square = omega[usable]
-        both = np.concatenate(
-            [np.broadcast_to(np.eye(omega.shape[-1]), square.shape), rhs[usable][..., None]], axis=-1
-        )
+        unit = np.broadcast_to(np.eye(omega.shape[-1]), square.shape)
+        both = np.concatenate([unit, rhs[usable][..., None]], axis=-1)
         solved = np.linalg.solve(square, both)
         quotient[usable] = solved[..., -1]
         condition = (

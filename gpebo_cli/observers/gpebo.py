@@ -115,7 +115,7 @@ class ObserverMatrices:
     @property
     def outputs(self) -> int:
         """Number of outputs r."""
-        return self.algebraic.shape[1] - self.split.equations.shape[1]
+        return int(self.algebraic.shape[1] - self.split.equations.shape[1])
 
     @property
     def projector(self) -> Array:
@@ -166,10 +166,8 @@ def observer_matrices(
         return matrix[:1] if name in constant else matrix
 
     E, A, B, F, C = map(value, "EABFC")
-    if like is not None:
-        rows = like.rows
-    else:
-        rows = row_sizes(E) if normalise else np.ones(system.n)
+    rows = row_sizes(E) if normalise else np.ones(system.n)
+    rows = rows if like is None else like.rows
     if (rows != 1.0).any():
         E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
     if like is None:
@@ -314,7 +312,7 @@ def _eliminate(
     size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), _TINY)
     n_b = kernel.shape[2]
     if n_b == 0:
-        return on_kernel, np.broadcast_to(kernel, (1, *kernel.shape[1:])), np.full(len(size), np.inf)
+        return on_kernel, kernel[:1], np.full(len(size), np.inf)
     Q1, R1 = np.linalg.qr(on_kernel)
     try:
         inverse = np.asarray(np.linalg.inv(R1), dtype=np.float64)
@@ -412,8 +410,10 @@ def observe(
     latest: list[_Assembled] = []
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-        flat = [extra.reshape(extra.shape[0] * extra.shape[1], *extra.shape[2:]) for extra in extras]
-        z = values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
+        z, *flat = (
+            signal.reshape(signal.shape[0] * signal.shape[1], *signal.shape[2:])
+            for signal in (values, *extras)
+        )
         assembled = regression_signals(z, q, basis, *flat)
         latest[:] = [assembled]
         return [

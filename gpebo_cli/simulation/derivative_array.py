@@ -310,10 +310,10 @@ def _all_levels(
     N = N[:, reference.rows]
     bounds = np.full((len(t), 3), np.inf)
     try:
-        inverse = np.linalg.inv(M[:, :r, :r])
+        inverse = np.asarray(np.linalg.inv(M[:, :r, :r]), dtype=np.float64)
         X = M[:, r:, :r] @ inverse
         whole = np.concatenate([reference.Z1.T @ e[0], N[:, r:] - X @ N[:, :r]], axis=1)
-        determined = _norm(np.linalg.inv(whole))
+        determined = _norm(np.asarray(np.linalg.inv(whole), dtype=np.float64))
         size = _array_size(_norm(M), aa)
         left = _norm(M[:, r:, r:] - X @ M[:, :r, r:])
         if r:
@@ -491,7 +491,7 @@ def _inverse(whole: Array) -> tuple[Array, BoolArray]:
         for k, one in enumerate(whole):
             with suppress(np.linalg.LinAlgError):
                 inverse[k] = np.linalg.inv(one)
-    return inverse, ~np.isfinite(inverse).all(axis=(1, 2))
+    return inverse, np.asarray(~np.isfinite(inverse).all(axis=(1, 2)))
 
 
 def _by_elimination(
@@ -499,8 +499,8 @@ def _by_elimination(
 ) -> tuple[Array, Array, Array, Array, Array, BoolArray]:
     """Z1 (1, n, d), Â2 (N, a, n), f2 (N, a, 1) on the reference pivots, [Z1ᵀE; Â2]⁻¹.
 
-    Before the inverse, the size of the terms of [Â2 | f2] at ``some`` times; the last one says where the
-    pivots will not do.
+    Before the inverse, the size of the terms of [Â2 | f2] at ``some`` times; the last one says
+    where the pivots will not do.
     """
     count, n, r = len(M), E.shape[1], pivots.rank
     right = np.concatenate([N, g], axis=2)[:, pivots.rows]
@@ -516,7 +516,8 @@ def _by_elimination(
             everywhere = np.ones(count, dtype=bool)
             left = right[:, r:]
             size = np.abs(left[some])
-            return pivots.Z1[None], left[:, :, :n], left[:, :, n:], size, np.zeros_like(E), everywhere
+            A2, f2 = left[:, :, :n], left[:, :, n:]
+            return pivots.Z1[None], A2, f2, size, np.zeros_like(E), everywhere
         residual = _norm(M[:, r:, r:] - X @ M[:, :r, r:])
         poor = (residual > _RESIDUAL * _norm(M)) | (_norm(X) > _MAX_GROWTH)
         constraints = right[:, r:] - X @ right[:, :r]
