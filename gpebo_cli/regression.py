@@ -57,10 +57,7 @@ class LinearRegression:
 
 
 def outer_products(psi: Array, Y: Array) -> Array:
-    """[ψᵀψ | ψᵀY] of shape (..., p, p + c) from ψ (..., rows, p) and Y (..., rows) or (..., rows, c).
-
-    Without the axis c is 1.
-    """
+    """[ψᵀψ | ψᵀY] of shape (..., p, p + c) from ψ (..., rows, p) and Y (..., rows[, c])."""
     both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
     return np.asarray(np.swapaxes(psi, -1, -2) @ both)
 
