@@ -19,6 +19,7 @@ from gpebo_cli.excitation import assess
 from gpebo_cli.measurement import check_samples, measure, noise_levels
 from gpebo_cli.metrics import settling_time, time_rms
 from gpebo_cli.observers import Observation, observe
+from gpebo_cli.realisations import check_seeds, over_seeds
 from gpebo_cli.result import (
     EstimationResult,
     Excitation,
@@ -85,6 +86,7 @@ def run_experiment(
         check_samples(
             settings.time.horizon, settings.noise.sample_time, settings.solver.max_elements
         )
+    check_seeds(settings.noise, levels, settings.observer.name)
 
     clock.stage("simulate")
     t = np.linspace(
@@ -130,6 +132,11 @@ def run_experiment(
     estimation, metrics = _estimate(
         settings, observation.estimator or estimator, observation, system, signals.states, t
     )
+    noise = None
+    if settings.noise.seeds > 1:
+        clock.stage("seeds")
+        truth = estimation.true_parameters[-1]
+        noise = over_seeds(observation, signals, estimator, truth, settings.noise, levels)
     clock.stage("")
     return RunResult(
         settings=settings, system=system, simulation=simulated, regression=sampled,
@@ -139,6 +146,7 @@ def run_experiment(
         ),
         timings=clock.seconds,
         verdict=_verdict(excitation, estimation, metrics),
+        noise=noise,
     )
 
 

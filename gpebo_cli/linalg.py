@@ -31,13 +31,13 @@ def orthonormal_complement(basis: Array) -> Array:
 
 
 def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Array, Array]:
-    """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p), singular Ω included.
+    """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p) or (..., p, c), singular Ω too.
 
     With Ω = U Σ Vᵀ, adj(Ω) = det(U) det(V) V diag(∏_{j≠i} σ_j) Uᵀ. The usual det(Ω)·inv(Ω) is
     rejected: it is undefined at the start, where every extension begins at Ω = 0.
 
     Returns:
-        det(Ω) of shape (...,), adj(Ω) b of shape (..., p), and the reciprocal condition number
+        det(Ω) of shape (...,), adj(Ω) b of the shape of b, and the reciprocal condition number
         σ_min/σ_max of shape (...,), zero where Ω = 0.
     """
     p = omega.shape[-1]
@@ -48,8 +48,9 @@ def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Ar
     before = np.concatenate([ones, np.cumprod(sigma[..., :-1], axis=-1)], axis=-1)
     after = np.concatenate([np.cumprod(sigma[..., :0:-1], axis=-1)[..., ::-1], ones], axis=-1)
     determinant = sign * before[..., p - 1] * sigma[..., p - 1]
-    coordinates = np.einsum("...ji,...j->...i", u, rhs) * before * after
-    action = sign[..., None] * np.einsum("...ji,...j->...i", vt, coordinates)
+    columns = rhs if rhs.ndim == omega.ndim else rhs[..., None]
+    coordinates = (transpose(u) @ columns) * (before * after)[..., None]
+    action = (sign[..., None, None] * (transpose(vt) @ coordinates)).reshape(rhs.shape)
     largest = sigma[..., 0]
     reciprocal = np.divide(sigma[..., -1], largest, out=np.zeros_like(largest), where=largest > 0)
     return determinant, action, reciprocal

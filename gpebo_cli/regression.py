@@ -20,6 +20,9 @@ class LinearRegression:
 
     ``scale`` is the size of the terms ψ was formed from, before they cancelled: a regressor of
     1e-16 beside a scale of 1 is zero, whatever its eigenvalues say.
+
+    Y may have a second axis, (rows, c): c realisations of its noise over one ψ, which noise does
+    not reach. All estimators are affine in Y and carry the axis through to their estimates.
     """
 
     Y: Trajectory
@@ -33,25 +36,35 @@ class LinearRegression:
         return self.psi.mesh
 
     @property
+    def realisations(self) -> tuple[int, ...]:
+        """(c,) if Y has that axis, else ()."""
+        return self.Y.values.shape[3:]
+
+    @property
     def p(self) -> int:
         """Number of parameters."""
         return len(self.parameters)
 
     @cached_property
     def outer(self) -> Trajectory:
-        """[ψᵀψ | ψᵀY], shape (p, p + 1): everything an estimator needs of the regression."""
+        """[ψᵀψ | ψᵀY], shape (p, p + c): everything an estimator needs of the regression."""
         return Trajectory(self.mesh, outer_products(self.psi.values, self.Y.values))
 
     @cached_property
     def gram(self) -> Trajectory:
-        """[G | h] with G(t) = ∫ψᵀψ, h(t) = ∫ψᵀY from the start, shape (p, p + 1)."""
+        """[G | h] with G(t) = ∫ψᵀψ, h(t) = ∫ψᵀY from the start, shape (p, p + c)."""
         return self.outer.integral()
 
 
 def outer_products(psi: Array, Y: Array) -> Array:
-    """[ψᵀψ | ψᵀY] of shape (..., p, p + 1) from ψ (..., rows, p) and Y (..., rows)."""
-    both = np.concatenate([psi, Y[..., None]], axis=-1)
+    """[ψᵀψ | ψᵀY] of shape (..., p, p + c) from ψ (..., rows, p) and Y (..., rows[, c])."""
+    both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
     return np.asarray(np.swapaxes(psi, -1, -2) @ both)
+
+
+def with_realisations(psi: Array, Y: Array) -> Array:
+    """Y (..., rows, c), with c = 1 where it has one realisation only."""
+    return Y if Y.ndim == psi.ndim else Y[..., None]
 
 
 class Estimates(Protocol):
@@ -67,7 +80,7 @@ class Estimates(Protocol):
         ...
 
     def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases at the times, shape (g, M, p)."""
+        """η̂ of some cases at the times, shape (g, M, p), or (g, M, p, c) as Y has it."""
         ...
 
 

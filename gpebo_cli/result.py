@@ -124,6 +124,19 @@ class Metrics:
 
 
 @dataclass(frozen=True)
+class NoiseStatistics:
+    """Errors of the estimates at the horizon over many seeds of the noise."""
+
+    seeds: int
+    t: float
+    names: tuple[str, ...]  # (p,)
+    truth: Array  # (p,)
+    bias: Array  # (G, p) mean error
+    deviation: Array  # (G, p) standard deviation, from the mean over the seeds
+    rms: Array  # (G, p) root mean square error
+
+
+@dataclass(frozen=True)
 class Assumption:
     """One of the paper's assumptions (or a prerequisite), with its evidence."""
 
@@ -147,3 +160,4 @@ class RunResult:
     assumptions: tuple[Assumption, ...]
     timings: Mapping[str, float]  # stage -> seconds
     verdict: str  # the last line a person reads
+    noise: NoiseStatistics | None = None  # where more than one seed was asked for

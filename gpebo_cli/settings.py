@@ -48,6 +48,8 @@ class ObserverSettings:
     output: str | None = None
     L_w: str | list[str] = "diagonal"
     r0: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    # How much each output counts, by order or name (absent: 1); only ratios matter. None: equally.
+    weights: Mapping[str, float] | list[float] | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ class NoiseSettings:
     # Between samples: the last one, or the one signal without frequencies above 1/(2 sample_time).
     shape: Literal["hold", "band_limited"] = "hold"
     seed: int = 0
+    seeds: int = 1  # more than one: statistics of the estimates over seed, seed + 1, …
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,7 @@ _RANGES = {
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),
     "noise.seed": (0, math.inf),
+    "noise.seeds": (1, 1_000_000),
 }
 _POSITIVE = ("time.horizon", "excitation.rho", "excitation.window", "noise.sample_time")
 

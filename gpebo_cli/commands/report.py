@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
-    from gpebo_cli.result import RunResult
+    from gpebo_cli.result import NoiseStatistics, RunResult
 
 _DELAY = 1.0  # seconds: what is quicker than this needs no progress
 _SHOWN_CASES = 12
@@ -90,6 +90,20 @@ def case_table(rows: Sequence[Mapping[str, float]], gains: Sequence[str]) -> lis
     return lines
 
 
+def noise_table(noise: NoiseStatistics) -> list[str]:
+    """Errors over the seeds, one row per case and parameter; of many cases the first ones."""
+    cases = range(min(len(noise.bias), _SHOWN_CASES // max(1, len(noise.names)) or 1))
+    numbers = (noise.bias, noise.deviation, noise.rms)
+    body = [
+        [str(case), name, *(f"{values[case, i]:.2e}" for values in numbers)]
+        for case in cases
+        for i, name in enumerate(noise.names)
+    ]
+    head = ["case", f"over {noise.seeds} seeds", "bias", "deviation", "rms error"]
+    more = len(noise.bias) - len(cases)
+    return columns([head, *body]) + ([f"… {more} more cases in noise.csv"] if more else [])
+
+
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Rows of text as lines with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -111,6 +125,8 @@ def run_lines(result: RunResult, folder: str = "") -> list[str]:
     lines: list[str] = []
     if rows and result.estimation is not None:
         lines += case_table(rows, list(result.estimation.cases[0]))
+    if result.noise is not None:
+        lines += noise_table(result.noise)
     moved = ", ".join(f"{m.state} {m.given:g} → {m.used:g}" for m in result.simulation.moved)
     if moved:
         lines.append(f"consistent initial state: {moved}")

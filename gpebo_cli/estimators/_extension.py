@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli.collocation.mesh import Trajectory, unresolved
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import LinearRegression, with_realisations
 from gpebo_cli.systems.descriptor import Array
 
 _TOLERANCE = 1e-11
@@ -13,7 +13,7 @@ _ROUNDS = 30
 
 
 def kreisselmeier(regression: LinearRegression, rates: Array) -> Trajectory:
-    """[Ω | 𝒴] of shape (p, p + 1) with Ω' = −Λ(Ω − ψᵀψ), 𝒴' = −Λ(𝒴 − ψᵀY), zero start.
+    """[Ω | 𝒴] of shape (p, p + c) with Ω' = −Λ(Ω − ψᵀψ), 𝒴' = −Λ(𝒴 − ψᵀY), zero start.
 
     Λ = diag(``rates``): one filter λ_i/(p + λ_i) per row, as in the paper (Section V); all rates
     equal is the classical extension. Since Λ multiplies rows, Ω η = 𝒴 holds for any rates.
@@ -42,11 +42,12 @@ def resolved_low_pass(signal: Trajectory, rate: Array) -> Trajectory:
 
 
 def lion(regression: LinearRegression, rates: Array) -> Trajectory:
-    """[Ω | 𝒴] of shape (p, p + 1), row i being λ_i/(p + λ_i) of one row of [ψ | Y].
+    """[Ω | 𝒴] of shape (p, p + c), row i being λ_i/(p + λ_i) of one row of [ψ | Y].
 
     Row i takes row i mod r of the regression: with one output every row is a filtered copy of the
     same ψ, and rates must differ for Ω to be invertible.
     """
-    both = np.concatenate([regression.psi.values, regression.Y.values[..., None]], axis=-1)
+    psi = regression.psi.values
+    both = np.concatenate([psi, with_realisations(psi, regression.Y.values)], axis=-1)
     rows = np.arange(regression.p) % both.shape[2]
     return resolved_low_pass(Trajectory(regression.mesh, both[:, :, rows]), rates[:, None])

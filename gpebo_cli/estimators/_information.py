@@ -19,6 +19,7 @@ import numpy as np
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import SolverError
 from gpebo_cli.estimators._extension import resolved_low_pass
+from gpebo_cli.linalg import transpose
 from gpebo_cli.regression import LinearRegression
 from gpebo_cli.systems.descriptor import Array
 
@@ -29,15 +30,16 @@ _PICARD_ROUNDS = 200
 class Information:
     """G_z and h_z with their memory z, on a mesh."""
 
-    gram: Trajectory  # [G_z | h_z], shape (p, p + 1)
+    gram: Trajectory  # [G_z | h_z], shape (p, p + c)
     memory: Trajectory  # z, scalar
 
     def spectrum(self, t: Array, inside: Array | None = None) -> Spectrum:
         """G_z = V diag(λ) Vᵀ at the times t (M,)."""
         sampler = self.gram.mesh.sampler(t, inside)
         values = sampler(self.gram.values)
-        eigenvalues, vectors = np.linalg.eigh(values[..., :-1])
-        rotated = np.einsum("...ji,...j->...i", vectors, values[..., -1])
+        p = values.shape[-2]
+        eigenvalues, vectors = np.linalg.eigh(values[..., :p])
+        rotated = transpose(vectors) @ values[..., p:]
         return Spectrum(np.maximum(eigenvalues, 0.0), vectors, rotated, sampler(self.memory.values))
 
 
@@ -47,7 +49,7 @@ class Spectrum:
 
     eigenvalues: Array  # (M, p) ascending
     vectors: Array  # (M, p, p)
-    rotated: Array  # (M, p) Vᵀ h_z
+    rotated: Array  # (M, p, c) Vᵀ h_z
     memory: Array  # (M,) z
 
 

@@ -55,6 +55,7 @@ def estimate_mixed(
         start=per_parameter(settings.initial, names, "estimator.initial"),
         gains=gain_matrix(settings.gamma, names, "estimator.gamma"),
         condition="Δ not in L2",
+        realisations=regression.realisations,
     )
 
 
@@ -77,7 +78,8 @@ class MixedSettings(Protocol):
         ...
 
 
-Transform = Callable[[Array, Array], Array]  # (η̂ (g, M, p), γ∫Δ² (g, M, p or 1)) -> estimates
+# (η̂ (g, M, P), γ∫Δ² (g, M, P or 1), η̂ at the start (P,)) -> estimates
+Transform = Callable[[Array, Array, Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,7 @@ class MixedEstimates:
     needed: float = ONE_PERCENT  # of γ∫Δ²
     needed_for: str = "1 % of the initial error"
     transform: Transform | None = None
+    realisations: tuple[int, ...] = ()
 
     def delta(self, t: Array) -> Array:
         """Δ at the times t (M,), one row if it is the same for every case, else one per case."""
@@ -118,15 +121,19 @@ class MixedEstimates:
         )
 
     def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases, shape (g, M, p)."""
-        g = len(self.gains)
+        """η̂ of some cases, shape (g, M, p) or (g, M, p, c)."""
+        g, c = len(self.gains), self.groups[0].quotient.shape[-1] // len(self.start)
+        start = np.repeat(self.start, c)
         first, last, _ = cases.indices(g * len(self.groups))
         pieces = []
         for group in range(first // g, (max(last, 1) - 1) // g + 1):
             path = self.groups[group]
             gains = self.gains[max(first - group * g, 0) : min(last - group * g, g)]
-            eta = scalar_law(path, self.start, gains)
+            if gains.shape[1] > 1:  # one for each parameter, and for each of its realisations
+                gains = np.repeat(gains, c, axis=1)
+            eta = scalar_law(path, start, gains)
             if self.transform is not None:
-                eta = self.transform(eta, gains[:, None, :] * path.energy_at_t[:, None])
+                eta = self.transform(eta, gains[:, None, :] * path.energy_at_t[:, None], start)
             pieces.append(eta)
-        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+        estimates = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+        return estimates.reshape(*estimates.shape[:2], len(self.start), *self.realisations)

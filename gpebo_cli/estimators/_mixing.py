@@ -15,40 +15,46 @@ SINGULAR = 1e-14
 
 
 def mix(extended: Trajectory, t: Array) -> ScalarPath:
-    """Mix [Ω | 𝒴] (p, p + 1): the path that the scalar law takes, reported at the times t (M,)."""
+    """Mix [Ω | 𝒴] (p, p + c): the path that the scalar law takes, reported at the times t (M,).
+
+    Realisations are so many parameters more to the law: p·c of them, in the order of (p, c).
+    """
+    p = extended.values.shape[-2]
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array]:
         values = extended(t, inside)
-        return determinant_and_adjugate_action(values[..., :-1], values[..., -1])[:2]
+        delta, Y, _ = determinant_and_adjugate_action(values[..., :p], values[..., p:])
+        return delta, Y.reshape(len(t), -1)
 
     def determinant(t: Array) -> Array:
-        return np.asarray(np.linalg.det(extended(t)[..., :-1]))
+        return np.asarray(np.linalg.det(extended(t)[..., :p]))
 
     delta, quotient, usable = determinant_and_quotient(
-        extended.values[..., :-1], extended.values[..., -1]
+        extended.values[..., :p], extended.values[..., p:]
     )
+    quotient = quotient.reshape(*delta.shape, -1)
     return scalar_path(
         extended.mesh, signals, delta, filled(quotient, usable), t, determinant
     )
 
 
 def determinant_and_quotient(omega: Array, rhs: Array) -> tuple[Array, Array, BoolArray]:
-    """Δ = det Ω, η̄ = 𝐘/Δ, and where η̄ is more than rounding; Ω (..., p, p), 𝒴 (..., p).
+    """Δ = det Ω, η̄ = 𝐘/Δ, and where η̄ is more than rounding; Ω (..., p, p), 𝒴 (..., p, c).
 
     𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
     """
     delta = np.asarray(np.linalg.det(omega), dtype=np.float64)
     usable = delta != 0.0  # by elimination, an exact zero is a pivot that is zero
-    quotient = np.zeros_like(rhs)
+    quotient, p = np.zeros_like(rhs), omega.shape[-1]
     if usable.any():
         # Ω⁻¹ beside Ω⁻¹𝒴: ‖Ω‖ ‖Ω⁻¹‖ is at most p times the condition number.
         square = omega[usable]
-        unit = np.broadcast_to(np.eye(omega.shape[-1]), square.shape)
-        both = np.concatenate([unit, rhs[usable][..., None]], axis=-1)
+        unit = np.broadcast_to(np.eye(p), square.shape)
+        both = np.concatenate([unit, rhs[usable]], axis=-1)
         solved = np.linalg.solve(square, both)
-        quotient[usable] = solved[..., -1]
+        quotient[usable] = solved[..., p:]
         condition = (
-            np.linalg.norm(square, axis=(-2, -1)) * np.linalg.norm(solved[..., :-1], axis=(-2, -1))
+            np.linalg.norm(square, axis=(-2, -1)) * np.linalg.norm(solved[..., :p], axis=(-2, -1))
         )
         usable[usable] = condition * SINGULAR < 1.0  # False for nan, too
     return delta, quotient, usable

@@ -9,6 +9,7 @@ import numpy as np
 
 from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
 from gpebo_cli.collocation.mesh import Trajectory
+from gpebo_cli.regression import with_realisations
 from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
@@ -19,14 +20,14 @@ _ROUNDING = 1e-13  # smaller steps between elements are no jumps
 
 @dataclass(frozen=True, eq=False)
 class VectorLaw:
-    """The signals M (k, p), N (k, p) and b (k,) of a law, packed as [Mᵀ ; N ; b] on one mesh."""
+    """The signals M (k, p), N (k, p) and b (k,) or (k, c) of a law on one mesh."""
 
     M: Trajectory
     N: Trajectory
     b: Trajectory
 
     def solve(self, gains: Array, start: Array) -> Trajectory:
-        """η̂ (p,) for one gain vector Γ = diag(``gains``), shape (p,).
+        """η̂ (p, c) for one gain vector Γ = diag(``gains``), shape (p,).
 
         The residual ν = b − N η̂ is an unknown of its own:
 
@@ -41,8 +42,12 @@ class VectorLaw:
         k = self.b.values.shape[2]
         packed = Trajectory(
             mesh,
-            np.concatenate([self.M.values, self.N.values, self.b.values[..., None]], axis=-1),
+            np.concatenate(
+                [self.M.values, self.N.values, with_realisations(self.M.values, self.b.values)],
+                axis=-1,
+            ),
         )
+        c = packed.values.shape[-1] - 2 * p
         E = np.zeros((1, p + k, p + k))
         E[0, :p, :p] = np.eye(p)
 
@@ -52,21 +57,20 @@ class VectorLaw:
             A[:, :p, p:] = gains[:, None] * np.swapaxes(signals[:, :, :p], 1, 2)
             A[:, p:, :p] = -signals[:, :, p : 2 * p]
             A[:, p:, p:] = -np.eye(k)
-            f = np.zeros((len(t), p + k, 1))
-            f[:, p:, 0] = signals[:, :, -1]
+            f = np.zeros((len(t), p + k, c))
+            f[:, p:] = signals[:, :, 2 * p :]
             return Coefficients(E, A, f)
 
         first = packed.values[0, 0]
-        residual = first[:, -1] - first[:, p : 2 * p] @ start
-        problem = LinearProblem(
-            coefficients, np.concatenate([start, residual])[:, None], name="estimator"
-        )
+        residual = first[:, 2 * p :] - (first[:, p : 2 * p] @ start)[:, None]
+        starts = np.concatenate([np.broadcast_to(start[:, None], (p, c)), residual])
+        problem = LinearProblem(coefficients, starts, name="estimator")
         solution = solve(
             problem, mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
             restarts=_residual_restarts(packed, p),
         )
         trajectory = solution.trajectory
-        return Trajectory(trajectory.mesh, trajectory.values[:, :, :p, 0])
+        return Trajectory(trajectory.mesh, trajectory.values[:, :, :p])
 
 
 def _residual_restarts(packed: Trajectory, p: int) -> dict[float, Callable[[Array], Array]]:
@@ -77,7 +81,7 @@ def _residual_restarts(packed: Trajectory, p: int) -> dict[float, Callable[[Arra
 
     def restart(k: int) -> Callable[[Array], Array]:
         def after_jump(state: Array) -> Array:
-            residual = after[k][:, -1:] - after[k][:, p : 2 * p] @ state[:p]
+            residual = after[k][:, 2 * p :] - after[k][:, p : 2 * p] @ state[:p]
             return np.concatenate([state[:p], residual])
 
         return after_jump
@@ -94,15 +98,17 @@ class VectorEstimates:
     gains: Array  # (cases, p or 1)
     t: Array  # (M,)
     requirement: Requirement
+    realisations: tuple[int, ...] = ()
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
         """Nothing is mixed."""
         return
 
     def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases, shape (g, M, p)."""
+        """η̂ of some cases, shape (g, M, p) or (g, M, p, c)."""
         p = len(self.start)
-        return np.array([
+        eta = np.array([
             self.law.solve(np.broadcast_to(gain, (p,)), self.start)(self.t)
             for gain in self.gains[cases]
         ])
+        return eta.reshape(*eta.shape[:3], *self.realisations)

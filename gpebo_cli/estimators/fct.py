@@ -57,9 +57,9 @@ class FiniteTime:
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
         """The inner estimates with the correction on top."""
         inner = self.inner.estimate(regression, t)
-        mu, start = float(self.mu), inner.start
+        mu = float(self.mu)
 
-        def correct(eta: Array, energy: Array) -> Array:
+        def correct(eta: Array, energy: Array, start: Array) -> Array:
             w_c = np.minimum(np.exp(-energy), 1.0 - mu)
             return np.asarray((eta - w_c * start) / (1.0 - w_c))
 

@@ -43,6 +43,7 @@ class Gradient:
             start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
             gains=gains,
             t=np.asarray(t),
+            realisations=regression.realisations,
             requirement=persistent(information, float(gains.min())),
         )
 

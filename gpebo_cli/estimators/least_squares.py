@@ -83,6 +83,7 @@ class LeastSquares:
             self.cases,
             self.spectra(regression, t),
             per_parameter(self.initial, regression.parameters, "estimator.initial"),
+            regression.realisations,
         )
 
 
@@ -93,6 +94,7 @@ class LeastSquaresEstimates:
     cases: tuple[Mapping[str, float], ...]
     spectra: list[Spectrum]
     start: Array  # (p,)
+    realisations: tuple[int, ...] = ()
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
         """Nothing is mixed."""
@@ -116,19 +118,21 @@ class LeastSquaresEstimates:
         )
 
     def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases, shape (g, M, p)."""
-        return np.array([
+        """η̂ of some cases, shape (g, M, p) or (g, M, p, c)."""
+        eta = np.array([
             solution(spectrum, case["alpha"], case["f0"], self.start)
             for case, spectrum in zip(self.cases[cases], self.spectra[cases], strict=True)
         ])
+        return eta.reshape(*eta.shape[:3], *self.realisations)
 
 
 def solution(s: Spectrum, alpha: float, f0: float, start: Array) -> Array:
-    """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z) from the spectrum, shape (M, p)."""
-    weight = (s.memory * f0)[:, None]
-    rotated_start = np.einsum("mji,j->mi", s.vectors, start)
-    coordinates = (weight * rotated_start + alpha * s.rotated) / (weight + alpha * s.eigenvalues)
-    return np.asarray(np.einsum("mij,mj->mi", s.vectors, coordinates))
+    """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z) from the spectrum, shape (M, p, c)."""
+    weight = (s.memory * f0)[:, None, None]
+    rotated_start = np.einsum("mji,j->mi", s.vectors, start)[..., None]
+    slowness = weight + alpha * s.eigenvalues[..., None]
+    coordinates = (weight * rotated_start + alpha * s.rotated) / slowness
+    return np.asarray(s.vectors @ coordinates)
 
 
 ESTIMATOR = LeastSquares

@@ -71,6 +71,7 @@ class LsDrem:
             start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
             gains=gain_matrix(self.gamma, regression.parameters, "estimator.gamma"),
             condition="IE",
+            realisations=regression.realisations,
         )
 
 
@@ -91,15 +92,16 @@ def mix_least_squares(
             [np.prod(np.delete(shares, i, axis=1), axis=1) for i in range(shares.shape[1])], axis=1
         )
         covariance = alpha / (alpha * s.eigenvalues + (s.memory * f0)[:, None])
-        Y = np.einsum("mij,mj->mi", s.vectors, others * covariance * s.rotated)
-        return np.prod(shares, axis=1), Y
+        Y = s.vectors @ ((others * covariance)[..., None] * s.rotated)
+        return np.prod(shares, axis=1), Y.reshape(len(t), -1)
 
     s = info.spectrum(mesh.points.ravel(), mesh.inside.ravel())
     usable: BoolArray = np.asarray(s.eigenvalues[:, 0] > SINGULAR * s.eigenvalues[:, -1])
     inverse = np.divide(
-        s.rotated, s.eigenvalues, out=np.zeros_like(s.rotated), where=usable[:, None]
+        s.rotated, s.eigenvalues[..., None], out=np.zeros_like(s.rotated),
+        where=usable[:, None, None],
     )
-    quotient = np.einsum("mij,mj->mi", s.vectors, inverse)  # 𝐘/Δ = G_z⁻¹ h_z
+    quotient = s.vectors @ inverse  # 𝐘/Δ = G_z⁻¹ h_z
     delta = np.prod(_shares(s, alpha, f0), axis=1)
     shape = mesh.points.shape
     quotient = filled(quotient.reshape(*shape, -1), usable.reshape(shape))

@@ -56,11 +56,12 @@ class MemoryExtension:
             law=VectorLaw(
                 M=Trajectory(mesh, identity),
                 N=omega,
-                b=Trajectory(mesh, values[..., p]),
+                b=Trajectory(mesh, values[..., p:]),
             ),
             start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
             gains=gains,
             t=np.asarray(t),
+            realisations=regression.realisations,
             requirement=persistent(omega, float(gains.min())),
         )
 

@@ -29,7 +29,7 @@ from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.expressions import parse, taylor
-from gpebo_cli.observers.extension import initial_extension
+from gpebo_cli.observers.extension import initial_extension, output_scale
 from gpebo_cli.observers.observation import InitialError, Observation, Reconstruction
 from gpebo_cli.reading import nearest
 from gpebo_cli.regression import LinearRegression, outer_products
@@ -112,6 +112,7 @@ def observe(
     """
     mesh = inputs.mesh
     blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())
+    scale = output_scale(settings, system)
     n_a, q = blocks.A_a.shape[1], system.q
     n_b = system.n - n_a
     suitable = _outputs_without_zb(system, blocks, n_a)
@@ -132,7 +133,8 @@ def observe(
         seen = C @ values  # C_k [ξ_a, ξ_b, Φ_a]
         psi = seen[..., 1:]
         psi[..., q:] *= -1.0
-        return y - seen[..., 0], psi
+        weight = scale[suitable]  # √w of each output
+        return weight * (y - seen[..., 0]), weight[:, None] * psi
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
         Y, psi = regress(values, *extras)

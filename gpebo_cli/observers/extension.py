@@ -1,4 +1,4 @@
-"""Where the dynamic extension starts."""
+"""What every observer is told: where its extension starts, and how much each output counts."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.measurement import per_signal
 from gpebo_cli.reading import nearest
 from gpebo_cli.settings import ObserverSettings
 from gpebo_cli.systems.descriptor import Array, DescriptorSystem
@@ -50,3 +51,17 @@ def initial_extension(
     if not np.isfinite(out).all():
         raise ConfigError(f"{where}: every value must be a finite number, got {values}")
     return out
+
+
+def output_scale(settings: ObserverSettings, system: DescriptorSystem) -> Array:
+    """√(w/max w) of the weights w, shape (r,): exactly one for outputs that count equally.
+
+    Raises:
+        ConfigError: the wrong number of weights, an unknown output, or no positive one.
+    """
+    if settings.weights is None:
+        return np.ones(system.r)
+    weights = per_signal(settings.weights, system.outputs, "output", "observer.weights", 1.0)
+    if not weights.any():
+        raise ConfigError("observer.weights: at least one output must have a positive weight")
+    return np.asarray(np.sqrt(weights / weights.max()))

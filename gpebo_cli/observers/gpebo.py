@@ -15,6 +15,10 @@ eliminating v is the regression:
 
     Y = R (𝒜 ξ_a + g_y),   ψ = [ −R (𝒜 ξ_b + G),  R 𝒜 Φ ],   R = I − 𝒜 Q K,   Y = ψ η.
 
+With weights w of the outputs, rows of C and y are multiplied by √w: K and R become the weighted
+elimination K = (W^½ 𝒜 Q)⁺ W^½ and the weighted residual, whose squares ψᵀψ and ψᵀY hold. An output
+with noise of variance σ² is worth w = 1/σ².
+
 Only known functions of time are differentiated (Ė); no signal ever is. For E = diag(I, 0) this is
 the paper's observer exactly, except that R keeps all rows of the residual: the paper keeps the
 last r, which loses everything in its own circuit (``regression: paper`` shows it).
@@ -22,15 +26,16 @@ last r, which loses everything in its own circuit (``regression: paper`` shows i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.linalg import joined, orthonormal_complement, transpose
-from gpebo_cli.observers.extension import initial_extension
+from gpebo_cli.observers.extension import initial_extension, output_scale
 from gpebo_cli.observers.observation import AffineStateMap, InitialError, Observation
 from gpebo_cli.regression import LinearRegression, outer_products
 from gpebo_cli.result import Assumption
@@ -41,6 +46,7 @@ from gpebo_cli.systems.descriptor import Array, DescriptorSystem, IntArray
 _TURNED = 8 * float(np.finfo(float).eps)  # of E outside the frame, relative: rounding
 _PROJECTOR_TURNED = 1e-13
 _TINY = float(np.finfo(float).tiny)
+_RESPONSE = 1e-6  # error of the response to noise, which is known to no more digits than that
 _VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
 
 
@@ -78,6 +84,7 @@ class ObserverMatrices:
 
     split: Split
     rows: Array  # (n,) constants by which the equations were divided
+    output_scale: Array  # (r,) √w, by which rows of C and y were multiplied
     dynamics: Array  # (N, k, k) BᵀA_0 B
     from_unknowns: Array  # (N, k, q) BᵀD_0
     from_signals: Array  # (N, k, m + r) Bᵀb_0 = from_signals [u; y]
@@ -141,6 +148,7 @@ def row_sizes(E: Array) -> Array:
 def observer_matrices(
     system: DescriptorSystem, t: Array, inside: Array, rank_tol: float,
     like: ObserverMatrices | None = None, *, normalise: bool = False,
+    output_scale: Array | None = None,
 ) -> ObserverMatrices:
     """Evaluate the observer's matrices at the times t (N,).
 
@@ -151,6 +159,7 @@ def observer_matrices(
         rank_tol: singular values below this, relative, are zero.
         like: those of other times, whose basis and scaling of the equations are kept.
         normalise: divide the equations by their sizes first, see :func:`row_sizes`.
+        output_scale: √w (r,) of the outputs' weights; default: that of ``like``, else ones.
 
     Raises:
         ModelError: the rank of E is not constant, or Assumption 1 fails; names the time and the
@@ -170,6 +179,10 @@ def observer_matrices(
     rows = rows if like is None else like.rows
     if (rows != 1.0).any():
         E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
+    scale = output_scale
+    if scale is None:
+        scale = np.ones(r) if like is None else like.output_scale
+    C = scale[:, None] * C
     if like is None:
         split = _constant_split(E, system.states, rank_tol)
     else:
@@ -185,7 +198,7 @@ def observer_matrices(
     algebraic = joined(L @ A, C, axis=1)  # 𝒜 = [Π A; C]
     e = L.shape[1]
     of_y = np.zeros((1, e + r, r))
-    of_y[0, e:] = -np.eye(r)
+    of_y[0, e:] = -np.diag(scale)
     below = np.zeros((1, r, m + q))
     of_u_theta = joined(joined(L @ B, L @ F, axis=2), below, axis=1)
     # g_y = [Π B u; −y] and G = [Π F; 0]
@@ -203,6 +216,7 @@ def observer_matrices(
     return ObserverMatrices(
         split=split,
         rows=rows,
+        output_scale=scale,
         dynamics=dynamics[:1] if {"E", "A", "C"} <= constant else dynamics,
         from_unknowns=whole[:, :, k : k + q],
         from_signals=whole[:, :, k + q :],
@@ -380,7 +394,10 @@ def observe(
         )
     mesh = inputs.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
-    first = observer_matrices(system, t, inside, solver.rank_tol, normalise=True)
+    first = observer_matrices(
+        system, t, inside, solver.rank_tol, normalise=True,
+        output_scale=output_scale(settings, system),
+    )
     split, rank = first.split, first.split.rank
     V1, names = initial_basis(split.projector[0], rank, system.states)
     # Where the kernel of E rotates, w is integrated in all n coordinates; else in its own n_a.
@@ -435,6 +452,10 @@ def observe(
     final = latest[0]
     kept = final.kept_rows(system, settings.regression)
     smallest, weakest = _weakest(final.injectivity, final.elimination)
+
+    def matrices(t: Array, inside: Array) -> ObserverMatrices:
+        return observer_matrices(system, t, inside, solver.rank_tol, first)
+
     return Observation(
         regression=LinearRegression(
             Y=on_mesh(final.Y[:, kept]),
@@ -460,7 +481,50 @@ def observe(
             ),
         ),
         growth=float(np.abs(values[..., 1 + q :]).max(initial=0.0)),
+        respond=lambda e_u, e_y: respond(mesh, matrices, kept, e_u, e_y),
     )
+
+
+def respond(
+    mesh: Mesh, matrices: Callable[[Array, Array], ObserverMatrices], kept: IntArray,
+    e_u: Array, e_y: Array,
+) -> Array:
+    """What errors of the signals add to Y, all columns in one solve on the mesh as it is.
+
+        ζ' = A_0 ζ + b_0(e_u, e_y),  ζ(start) = 0,      δY = R (𝒜 ζ + g_y(e_u, e_y))
+
+    Args:
+        mesh: of the regression; errors are smooth within its elements.
+        matrices: of the observer at times.
+        kept: rows of the residual that are the regression.
+        e_u: of the inputs at the points of the mesh, (K, s + 1, m, c).
+        e_y: of the outputs, (K, s + 1, r, c).
+
+    Returns:
+        δY (K, s + 1, rows, c).
+
+    Raises:
+        SolverError: the mesh does not resolve the response.
+    """
+    errors = Trajectory(mesh, np.concatenate([e_u, e_y], axis=2))
+
+    def coefficients(t: Array, inside: Array) -> Coefficients:
+        o, e = matrices(t, inside), errors(t, inside)
+        R = o.residual[:, kept]
+        seen = (R @ o.algebraic @ o.split.basis, (R @ o.g_signals) @ e)
+        return Coefficients(None, o.dynamics, o.from_signals @ e, seen)
+
+    size = matrices(mesh.edges[:1], mesh.inside[0, :1]).split.basis.shape[1]
+    start = np.zeros((size, e_y.shape[-1]))
+    problem = LinearProblem(coefficients, start, name="response to noise")
+    solution = solve(problem, mesh, tol=np.inf, max_elements=mesh.size)
+    if solution.error_estimate > _RESPONSE:
+        raise SolverError(
+            f"noise.seeds: the response to noise is resolved to {solution.error_estimate:.1e} only;"
+            " lower noise.sample_time or solver.tol"
+        )
+    algebraic, direct = solution.extras
+    return np.asarray(algebraic @ solution.trajectory.values + direct)
 
 
 @dataclass(frozen=True, eq=False)

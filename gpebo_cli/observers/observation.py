@@ -17,6 +17,11 @@ from gpebo_cli.systems.descriptor import Array
 Reconstruction = Callable[[Array], Array]
 
 
+# Further errors of inputs (K, s + 1, m, c) and outputs (K, s + 1, r, c) at the points of the
+# regression's mesh -> what they add to Y (K, s + 1, rows, c). Y is affine in the signals.
+Response = Callable[[Array, Array], Array]
+
+
 class StateMap(Protocol):
     """From parameter estimates to state estimates."""
 
@@ -115,6 +120,7 @@ class Observation:
     growth: float  # largest ‖Φ(t)‖ entry
     estimator: Estimator | None = None
     names: tuple[str, ...] | None = None
+    respond: Response | None = None  # None: the observer cannot tell
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from gpebo_cli.outputs.summary import summary_text
 from gpebo_cli.result import RunResult
 
 TABLES = ("signals.csv", "regression.csv", "excitation.csv", "estimates.csv", "cases.csv")
+NOISE_TABLE = "noise.csv"  # only where more than one seed was asked for
 
 
 def write_run(
@@ -51,6 +52,8 @@ def write_run(
         tables.write_estimates(folder / "estimates.csv", result.system.states, estimation)
     if estimation is not None and result.metrics is not None:
         tables.write_cases(folder / "cases.csv", estimation, result.metrics)
+    if estimation is not None and result.noise is not None:
+        tables.write_noise(folder / NOISE_TABLE, estimation, result.noise)
     for name, figure in figures:
         make_folder(folder / "figures")
         save(figure, folder / "figures" / f"{name}.png")
@@ -59,5 +62,5 @@ def write_run(
 
 def _remove_earlier(folder: Path) -> None:
     """Remove what an earlier run left, by name: a folder may hold files that are not ours."""
-    remove_files([folder / "summary.json", *(folder / name for name in TABLES)])
+    remove_files(folder / name for name in ("summary.json", *TABLES, NOISE_TABLE))
     remove_files(folder / "figures" / f"{name}.png" for name in FIGURES)

@@ -20,6 +20,7 @@ from gpebo_cli.result import (
     EstimationResult,
     Excitation,
     Metrics,
+    NoiseStatistics,
     RegressionResult,
     SimulationResult,
 )
@@ -132,6 +133,20 @@ def cases_table(estimation: EstimationResult, metrics: Metrics) -> Table:
         *(getattr(metrics, name) for name in names),
     ]
     return Table([*gains, *names], np.column_stack(columns))
+
+
+def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics) -> None:
+    """Write one row per case and parameter: its gains, the truth, and errors over the seeds."""
+    gains = gain_names(estimation)
+    lines = [_header(["case", *gains, "parameter", "truth", "bias", "deviation", "rms", "seeds"])]
+    for case, values in enumerate(estimation.cases):
+        own = ["" if gain not in values else f"{values[gain]:.17g}" for gain in gains]
+        for i, name in enumerate(noise.names):
+            numbers = (noise.truth[i], noise.bias[case, i], noise.deviation[case, i],
+                       noise.rms[case, i])
+            cells = [str(case), *own, name, *(f"{x:.17g}" for x in numbers), str(noise.seeds)]
+            lines.append(",".join(cells).encode() + b"\n")
+    write_file(path, lines)
 
 
 def gain_names(estimation: EstimationResult) -> list[str]:

@@ -1,0 +1,147 @@
+"""Regenerate the table and the figures of ``docs/howto/noise.md``: ``python docs/noise.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from gpebo_cli.commands.locations import conf_folder
+from gpebo_cli.experiment import run_experiment
+from gpebo_cli.outputs.figures import describe
+from gpebo_cli.outputs.files import make_folder, write_text
+from gpebo_cli.outputs.style import Axis, Curve, Panel, compose, line, save
+from gpebo_cli.result import RunResult
+from gpebo_cli.settings import NoiseSettings, Settings, TimeSettings
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+from gpebo_cli.systems.plant import plant_from_mapping
+
+HERE = Path(__file__).parent
+PAGE = HERE / "howto" / "noise.md"
+IMAGES = HERE / "img"
+BEGIN, END = "<!-- table: begin, by docs/noise.py -->\n", "<!-- table: end -->\n"
+
+LEVELS = (1e-4, 1e-3, 1e-2, 1e-1)
+SEEDS, SAMPLE_TIME = 200, 0.02
+
+# The default gains, but those of drem and fct on the descriptor plant, where Δ is small.
+ESTIMATORS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
+    "circuit": {
+        "gradient": {"gamma": 10.0},
+        "least_squares": {},
+        "drem": {"gamma": 1e10},
+        "ls_drem": {"gamma": 10.0},
+        "fct": {"gamma": 1e10},
+    },
+    "descriptor": {
+        "gradient": {"gamma": 10.0},
+        "least_squares": {},
+        "drem": {"gamma": 1e14},
+        "ls_drem": {"gamma": 10.0},
+        "fct": {"gamma": 1e14},
+    },
+}
+
+
+def plant(name: str, **changes: object) -> DescriptorSystem:
+    """A shipped plant, with some of its keys replaced."""
+    text = (Path(conf_folder()) / "plant" / f"{name}.yaml").read_text(encoding="utf-8")
+    return plant_from_mapping({**yaml.safe_load(text), **changes}, f"{name}.yaml")
+
+
+def run(system: DescriptorSystem, estimator: Mapping[str, object], level: float) -> RunResult:
+    """One run; over all seeds where there is noise."""
+    noise = NoiseSettings(
+        name="gaussian", outputs=level, sample_time=SAMPLE_TIME, seeds=SEEDS if level else 1
+    )
+    settings = Settings(
+        plant={}, estimator=estimator, time=TimeSettings(samples=51), noise=noise
+    )
+    return run_experiment(settings, system)
+
+
+def rms(result: RunResult, chosen: list[int]) -> float:
+    """√E‖error‖² of the chosen parameters at the horizon."""
+    if result.noise is not None:
+        return float(np.linalg.norm(result.noise.rms[0, chosen]))
+    estimation = result.estimation
+    if estimation is None:
+        raise RuntimeError("nothing was estimated")
+    error = estimation.parameters[0, -1] - estimation.true_parameters[-1]
+    return float(np.linalg.norm(error[chosen]))
+
+
+def errors() -> dict[str, dict[str, Array]]:
+    """RMS errors by plant and estimator, shape (1 + levels,): without noise first."""
+    found: dict[str, dict[str, Array]] = {}
+    for name, estimators in ESTIMATORS.items():
+        system = plant(name)
+        chosen = list(range(system.q)) if system.q else [0, 1, 2]
+        found[name] = {
+            label: np.array([
+                rms(run(system, {"name": label, **gains}, level), chosen)
+                for level in (0.0, *LEVELS)
+            ])
+            for label, gains in estimators.items()
+        }
+    return found
+
+
+def table(found: Mapping[str, Mapping[str, Array]]) -> str:
+    """The table of the page, in Markdown."""
+    lines = []
+    for name, rows in found.items():
+        what = "e₀ (3 parameters)" if name == "circuit" else "θ (2 parameters)"
+        heads = ["0", *(f"{level:g}" for level in LEVELS)]
+        lines += [
+            f"`plant={name}`: error of {what} at 20 s, by standard deviation σ of the output", "",
+            "| estimator | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|",
+        ]
+        for label, values in rows.items():
+            gains = ", ".join(f"γ = {g:g}" for g in ESTIMATORS[name][label].values())
+            title = f"{label}, {gains}" if gains else label
+            lines.append(f"| {title} | " + " | ".join(f"{v:.1e}" for v in values) + " |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def level_figure(found: Mapping[str, Mapping[str, Array]], path: Path) -> None:
+    """RMS error over the noise level, a panel per plant."""
+    x = np.array(LEVELS)
+    axis = Axis("sigma", "standard deviation σ of the output", log=True)
+    panels = [
+        Panel(
+            "error of e₀" if name == "circuit" else "error of θ",
+            tuple(Curve(x, v[1:], label, line(k)) for k, (label, v) in enumerate(rows.items())),
+            log=True, axis=axis, legend=number == 0,
+        )
+        for number, (name, rows) in enumerate(found.items())
+    ]
+    save(compose(panels), path)
+
+
+def step_figure(path: Path) -> None:
+    """The recipe theta_step: estimates of an unknown that steps."""
+    recipe = yaml.safe_load(
+        (Path(conf_folder()) / "experiment" / "theta_step.yaml").read_text(encoding="utf-8")
+    )
+    settings = Settings(
+        plant={}, estimator={"name": "least_squares", **recipe["estimator"]},
+        time=TimeSettings(horizon=float(recipe["time"]["horizon"])),
+        noise=NoiseSettings(name="gaussian", outputs=0.01),
+    )
+    system = plant("descriptor", **recipe["plant"])
+    [(_, panels)] = describe(run_experiment(settings, system), ["parameters"])
+    save(compose(panels), path)
+
+
+if __name__ == "__main__":
+    make_folder(IMAGES)
+    step_figure(IMAGES / "theta_step.png")
+    results = errors()
+    level_figure(results, IMAGES / "noise_levels.png")
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    _, _, after = rest.partition(END)
+    write_text(PAGE, before + BEGIN + "\n" + table(results) + "\n" + END + after)
