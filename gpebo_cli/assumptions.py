@@ -123,7 +123,7 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
 def of_observation(observation: Observation, excitation: Excitation) -> list[Assumption]:
     """The observer's own assumptions, excitation, and the growth of Φ."""
     number = 5 if any(a.name == "Assumption 3" for a in observation.assumptions) else 2
-    return [
+    found = [
         *observation.assumptions,
         Assumption(
             f"Assumption {number}",
@@ -137,10 +137,14 @@ def of_observation(observation: Observation, excitation: Excitation) -> list[Ass
                 "weakest_direction": str(excitation.weakest_direction),
             },
         ),
-        Assumption(
-            "Growth of Φ",
-            "Φ stays bounded, so that θ̂ → θ implies x̂ → x",
-            observation.growth < _GROWTH,
-            {"largest_entry": observation.growth},
-        ),
     ]
+    if observation.growth is not None:
+        found.append(
+            Assumption(
+                "Growth of Φ",
+                "Φ stays bounded, so that θ̂ → θ implies x̂ → x",
+                observation.growth < _GROWTH,
+                {"largest_entry": observation.growth},
+            )
+        )
+    return found

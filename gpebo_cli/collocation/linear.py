@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -50,6 +50,18 @@ _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are no
 _ROUNDING = 64 * np.finfo(float).eps
 
 
+class Renewal(Protocol):
+    """At every edge, an equivalent value to go on with: a basis whose columns grow is changed."""
+
+    def state(self, reached: Array) -> Array:
+        """What (n, columns) replaces the limit from the left."""
+        ...
+
+    def error(self, reached: Array, error: Array) -> Array:
+        """What becomes of small errors (e, n, columns) of that limit."""
+        ...
+
+
 @dataclass(frozen=True)
 class LinearProblem:
     """The equation, and which other signals of the solution have to be resolved by the mesh.
@@ -65,6 +77,7 @@ class LinearProblem:
     monitor: Monitor | None = None
     name: str = "equation"
     floor: float = 0.0  # size below which the solution itself is rounding
+    renewal: Renewal | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +124,7 @@ def solve(
     floor = np.zeros(mesh.size)  # the tail of the parent, to notice that cutting no longer helps
     rounds = 1
     while True:
-        values, propagated = _chain(maps, problem.start, mesh, restarts or {})
+        values, propagated = _chain(maps, problem, mesh, restarts or {})
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values).all(axis=(1, 2, 3))))
             raise SolverError(
@@ -293,7 +306,7 @@ def _solve_equal_elements(
 
 def _chain(
     maps: _ElementMaps,
-    start: Array,
+    problem: LinearProblem,
     mesh: Mesh,
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, float]:
@@ -303,27 +316,32 @@ def _chain(
     it decays where the system forgets and grows where it does not.
     """
     size, s, n = maps.homogeneous.shape[:3]
-    columns = start.shape[1]
+    columns = problem.start.shape[1]
+    renewal = problem.renewal
     last_h, last_p = maps.homogeneous[:, -1], maps.particular[:, -1]
     jump = [restarts.get(float(edge)) for edge in mesh.edges[:-1]] if restarts else [None] * size
     left = np.empty((size, n, columns))
-    state = start
+    state = problem.start
     values = np.empty((size, s + 1, n, columns))
     with np.errstate(over="ignore", invalid="ignore"):  # the caller reports what is not finite
         for k in range(size):
             restart = jump[k]
             if restart is not None and k > 0:
                 state = restart(state)
+            if renewal is not None and k > 0 and np.isfinite(state).all():
+                state = renewal.state(state)
             left[k] = state
             state = last_h[k] @ state + last_p[k]
         values[:, 0] = left
         values[:, 1:] = maps.homogeneous @ left[:, None] + maps.particular
     if not np.isfinite(values).all():
         return values, np.inf
-    return values, _propagated_error(last_h, values, mesh)
+    return values, _propagated_error(last_h, values, mesh, renewal)
 
 
-def _propagated_error(last_h: Array, values: Array, mesh: Mesh) -> float:
+def _propagated_error(
+    last_h: Array, values: Array, mesh: Mesh, renewal: Renewal | None
+) -> float:
     """Largest accumulated end-point error, relative to each component's size.
 
     The local error of an end point is superconvergent (order 2s − 1 against s + 1 inside): with
@@ -347,4 +365,6 @@ def _propagated_error(last_h: Array, values: Array, mesh: Mesh) -> float:
         error = last_h[k] @ error + signs * local[k]
         signs[1] *= -1.0
         worst = np.maximum(worst, np.abs(error).max(axis=0))
+        if renewal is not None:
+            error = renewal.error(values[k, -1], error)
     return float((worst.ravel() / scale).max(initial=0.0))

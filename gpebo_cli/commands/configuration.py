@@ -46,6 +46,7 @@ _RANGES = {
     "solver.max_strangeness_index": (0, 20),
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),
+    "observer.regularisation": (1e-6, 1.0),
 }
 _POSITIVE = ("time.horizon", "excitation.rho", "excitation.window")
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.observers import canonical, gpebo
+from gpebo_cli.observers import canonical, gpebo, kalman_bucy
+from gpebo_cli.observers.kalman_bucy import SignalNoise
 from gpebo_cli.observers.observation import Observation, StateMap
 from gpebo_cli.settings import ObserverSettings, SolverSettings
 from gpebo_cli.systems.descriptor import DescriptorSystem
 
-__all__ = ["Observation", "StateMap", "observe"]
+__all__ = ["Observation", "SignalNoise", "StateMap", "observe"]
 
 _OBSERVERS = {"gpebo": gpebo.observe, "canonical": canonical.observe}
 
@@ -19,12 +20,17 @@ def observe(
     outputs: Trajectory,
     settings: ObserverSettings,
     solver: SolverSettings,
+    noise: SignalNoise,
 ) -> Observation:
     """Run the observer that ``settings.name`` asks for on the signals u and y of one mesh.
+
+    What is known of their ``noise`` is for an observer that weighs them by it.
 
     Raises:
         ModelError: an assumption of the observer fails; names the time and the evidence.
         ConfigError: settings that do not fit the plant.
         SolverError: the tolerance cannot be reached.
     """
+    if settings.name == "kalman_bucy":
+        return kalman_bucy.observe(system, inputs, outputs, settings, solver, noise)
     return _OBSERVERS[settings.name](system, inputs, outputs, settings, solver)

@@ -56,6 +56,7 @@ class ObserverMatrices:
     G: Array  # (N, n + r, q)
     X_w: Array  # (N, n, n)
     K: Array  # (N, n, n + r)
+    complement: Array  # (N, n, n) Π
     rank: int  # n_a
     smallest_singular_value: Array  # (N,) of 𝒜 on ker E, relative to ‖𝒜‖; inf if n_b = 0
 
@@ -135,6 +136,7 @@ def observer_matrices(
         G=G,
         X_w=X_w,
         K=K,
+        complement=Pi,
         rank=n_a,
         smallest_singular_value=smallest,
     )
@@ -212,7 +214,7 @@ def observe(
     starts, inside = mesh.points[:, 0], mesh.inside[:, 0]
     rows = row_sizes(system, starts, inside)
     first = observer_matrices(system, starts, inside, solver.rank_tol, rows)
-    constant_basis = _is_constant(first.projector)
+    constant_basis = is_constant(first.projector)
     V1, names = initial_basis(first.projector[0], first.rank, system.states)
     # Where the kernel of E rotates, w is integrated in all n coordinates; else in its own n_a.
     basis = V1 if constant_basis else np.eye(system.n)
@@ -354,7 +356,7 @@ def regression_signals(
     )
 
 
-def _is_constant(projector: Array) -> bool:
+def is_constant(projector: Array) -> bool:
     return bool(np.abs(projector - projector[0]).max(initial=0.0) < 1e-13)
 
 

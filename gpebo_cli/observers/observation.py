@@ -96,7 +96,7 @@ class Observation:
     truth: Truth
     error_estimate: float
     assumptions: tuple[Assumption, ...]  # of this observer, with their evidence
-    growth: float  # largest ‖Φ(t)‖ entry
+    growth: float | None  # largest ‖Φ(t)‖ entry; None: the states do not rest on Φ
     estimator: Estimator | None = None
     names: tuple[str, ...] | None = None
 
