@@ -10,7 +10,8 @@ import numpy as np
 
 from gpebo_cli.errors import GpeboError, ModelError
 from gpebo_cli.excitation import assess
-from gpebo_cli.observers import Observation, observe
+from gpebo_cli.measurement import noise_levels
+from gpebo_cli.observers import Observation, observe, signal_noise
 from gpebo_cli.result import Assumption, Excitation
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Simulation, simulate
@@ -20,7 +21,11 @@ _GROWTH = 1e6  # of Φ: above it, the state loses six digits of what the paramet
 
 
 def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...]:
-    """All assumptions of the plant and the observer of ``settings``; never raises ModelError."""
+    """All assumptions of the plant and the observer of ``settings``; never raises ModelError.
+
+    They are about ψ, which noise does not reach: signals are taken without it.
+    """
+    levels = noise_levels(settings.noise, system)
     found: list[Assumption] = []
     try:
         simulation = simulate(system, settings.time, settings.solver)
@@ -37,7 +42,8 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
     signals = simulation.signals
     try:
         observation = observe(
-            system, signals.inputs, signals.outputs, settings.observer, settings.solver
+            system, signals.inputs, signals.outputs, settings.observer, settings.solver,
+            signal_noise(settings.noise, levels),
         )
     except ModelError as error:
         found.append(

@@ -6,7 +6,7 @@ system → simulate → signals → observer → regression → estimator → es
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
@@ -16,8 +16,9 @@ from gpebo_cli.assumptions import of_observation, of_simulation
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.excitation import assess
+from gpebo_cli.measurement import check_samples, measure, noise_levels
 from gpebo_cli.metrics import settling_time, time_rms
-from gpebo_cli.observers import Observation, observe
+from gpebo_cli.observers import Observation, observe, signal_noise
 from gpebo_cli.result import (
     EstimationResult,
     Excitation,
@@ -74,13 +75,27 @@ def run_experiment(
     clock = _Clock(progress)
     observed = settings.observer.name != "none"
     estimator = estimators.build(settings.estimator) if observed else None
+    levels = noise_levels(settings.noise, system)
+    if not levels.silent:
+        check_samples(
+            settings.time.horizon, settings.noise.sample_time, settings.solver.max_elements
+        )
 
     clock.stage("simulate")
     t = np.linspace(
         settings.time.start, settings.time.start + settings.time.horizon, settings.time.samples
     )
     simulation = simulate(system, settings.time, settings.solver)
+    signals = simulation.signals
+    measured = measure(signals, settings.noise, levels)
     simulated = _sample_simulation(system, simulation, t)
+    if not levels.silent:
+        simulated = replace(
+            simulated,
+            # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
+            measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
+            measured_outputs=np.where(levels.noisy_outputs, measured.outputs(t), simulated.outputs),
+        )
     if estimator is None:
         clock.stage("")
         return RunResult(
@@ -92,10 +107,13 @@ def run_experiment(
 
     clock.stage("observe")
     _refuse_impulses(system, simulated)
-    signals = simulation.signals
     observation = observe(
-        system, signals.inputs, signals.outputs, settings.observer, settings.solver
+        system, measured.inputs, measured.outputs, settings.observer, settings.solver,
+        signal_noise(settings.noise, levels),
     )
+    if observation.estimator is not None:
+        # What the result is labelled with is what estimated.
+        settings = replace(settings, estimator={"name": settings.observer.name})
     regression = observation.regression
     sampler = regression.mesh.sampler(t)
     sampled = RegressionResult(
@@ -109,7 +127,7 @@ def run_experiment(
     excitation = assess(regression, t, settings.excitation)
     clock.stage("estimate")
     estimation, metrics = _estimate(
-        settings, observation.estimator or estimator, observation, system.theta, signals.states, t
+        settings, observation.estimator or estimator, observation, system, signals.states, t
     )
     clock.stage("")
     return RunResult(
@@ -119,7 +137,7 @@ def run_experiment(
             *of_simulation(system, simulation), *of_observation(observation, excitation)
         ),
         timings=clock.seconds,
-        verdict=_verdict(excitation, estimation, metrics),
+        verdict=_verdict(excitation, estimation, metrics) + observation.note,
     )
 
 
@@ -192,7 +210,7 @@ def _estimate(
     settings: Settings,
     estimator: estimators.Estimator,
     observation: Observation,
-    theta: Array,
+    system: DescriptorSystem,
     states: Trajectory,
     t: Array,
 ) -> tuple[EstimationResult, Metrics]:
@@ -206,8 +224,10 @@ def _estimate(
 
     reconstruct = state_map.at(grid)
     x = states(grid)
-    truth = observation.truth(grid, np.broadcast_to(theta, (len(grid), len(theta))), states)
+    truth = observation.truth(grid, system.theta_at(grid), states)
     size, p, n = len(cases), truth.shape[1], x.shape[1]
+    # Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts.
+    judged = slice(system.q if system.theta_varies else p)
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
     numbers = np.empty((5, size))
     batch = max(1, _BATCH // (len(grid) * (2 * p + n)))
@@ -216,7 +236,7 @@ def _estimate(
         eta = estimates.parameters(part)
         x_hat = reconstruct(eta)
         parameters[part], estimated[part] = eta[:, chosen], x_hat[:, chosen]
-        numbers[:, part] = _measure(grid, eta - truth, x_hat - x)
+        numbers[:, part] = _measure(grid, (eta - truth)[..., judged], x_hat - x)
     result = EstimationResult(
         cases=cases,
         t=kept,

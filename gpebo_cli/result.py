@@ -41,6 +41,8 @@ class SimulationResult:
     impulses: tuple[tuple[float, str], ...]  # (time, state) where a jump puts a Dirac impulse
     error_estimate: float  # relative to each state's own size
     elements: int
+    measured_inputs: Array | None = None  # (N, m) what the observer saw; None: the same
+    measured_outputs: Array | None = None  # (N, r)
 
 
 @dataclass(frozen=True)

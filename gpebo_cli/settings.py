@@ -59,6 +59,22 @@ class ObserverSettings:
 
 
 @dataclass(frozen=True)
+class NoiseSettings:
+    """Sampled noise on what the observer sees; the plant does not feel it."""
+
+    name: str = "none"
+    sample_time: float = 0.01  # seconds; elements end at the sample instants
+    # Standard deviation of every sample: one for all, by order, or by name (absent: zero).
+    outputs: float | list[float] | Mapping[str, float] = 0.0
+    inputs: float | list[float] | Mapping[str, float] = 0.0
+    # Step to which a noisy output is rounded, likewise; zero: not rounded.
+    quantisation: float | list[float] | Mapping[str, float] = 0.0
+    # Between samples: the last one, or the one signal without frequencies above 1/(2 sample_time).
+    shape: Literal["hold", "band_limited"] = "hold"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class ExcitationSettings:
     """Level and window of the excitation evidence."""
 
@@ -85,3 +101,4 @@ class Settings:
     observer: ObserverSettings = field(default_factory=ObserverSettings)
     excitation: ExcitationSettings = field(default_factory=ExcitationSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
+    noise: NoiseSettings = field(default_factory=NoiseSettings)

@@ -75,7 +75,7 @@ def test_version(tmp_path, words):
 def test_run_help_lists_every_choice(tmp_path):
     done = gpebo("run", "--help", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    for group in ("plant", "observer", "estimator", "solver", "experiment"):
+    for group in ("plant", "observer", "estimator", "solver", "noise", "experiment"):
         for path in (ROOT / "conf" / group).glob("*.yaml"):
             assert path.stem in done.stdout
 
@@ -84,7 +84,7 @@ def test_run_help_names_the_real_defaults(tmp_path):
     defaults = yaml.safe_load((ROOT / "conf" / "gpebo.yaml").read_text())["defaults"]
     chosen = {k: v for entry in defaults if isinstance(entry, dict) for k, v in entry.items()}
     text = gpebo("run", "--help", cwd=tmp_path).stdout
-    for group in ("plant", "observer", "estimator", "solver"):
+    for group in ("plant", "observer", "estimator", "solver", "noise"):
         line = next(x for x in text.splitlines() if x.strip().startswith(f"{group}="))
         assert line.split("=", 1)[1].split()[0] == chosen[group]
 
@@ -142,7 +142,7 @@ def test_list_names_and_titles(tmp_path, mine):
 
 
 def test_every_file_of_a_group_has_a_title():
-    for group in ("plant", "observer", "estimator", "solver", "experiment"):
+    for group in ("plant", "observer", "estimator", "solver", "noise", "experiment"):
         for path in (ROOT / "conf" / group).glob("*.yaml"):
             assert yaml.safe_load(path.read_text())["title"], path
 

@@ -97,7 +97,7 @@ def test_circuit_names_and_values() -> None:
     assert system.units["e2"] == system.units["V"] == "V"
     assert system.units["il"] == system.units["y"] == "A"
     assert system.observer_defaults == {"xi_a0": {"e1": 1, "e2": 0, "il": 0}}
-    assert system.coefficients.constant == {"B", "C", "F"}
+    assert system.coefficients.constant == {"B", "C", "F", "theta"}
     assert "2407.14373" in system.reference
 
 
@@ -167,6 +167,7 @@ def test_shapes_and_broadcast_constants() -> None:
     source: CoefficientSource = system.coefficients
     c = source.taylor(TIMES, 3)
     shapes = {"E": (2, 2), "A": (2, 2), "B": (2, 2), "F": (2, 1), "C": (1, 2), "u": (2,)}
+    shapes["theta"] = (1,)
     for key in MATRIX_NAMES:
         assert getattr(c, key).shape == (4, 5, *shapes[key])
     assert source.constant == {"E", "F", "C"}
@@ -306,7 +307,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "matrix of an input": (lambda: mine(A=[[0, "V"], [0, 1]]), "A[0][1] = 'V': V is an input"),
     "matrix of an unknown": (lambda: mine(A=[[0, 1], ["theta", 1]]), "theta is an unknown"),
     "input of an input": (lambda: mine(inputs={"V": 1, "I": "V"}), "inputs.I = 'V': V is an input"),
-    "unknown of time": (lambda: mine(unknowns={"a": "t"}), "unknowns.a = 't' must not depend on t"),
+    "unknown of a state": (lambda: mine(unknowns={"a": "t + x1"}), "x1 is a state"),
     "no E": (lambda: without("E"), "E is missing; there are 2 states (x1, x2)"),
     "no A": (lambda: without("A"), "A is missing"),
     "no B": (lambda: without("B"), "B is missing; there are 2 inputs (V, I), so it needs 2 rows"),

@@ -16,6 +16,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import convert, nearest, read, shown
 from gpebo_cli.settings import (
     ExcitationSettings,
+    NoiseSettings,
     ObserverSettings,
     OutputSettings,
     Settings,
@@ -28,6 +29,7 @@ _KEYS = (
     "observer",
     "estimator",
     "solver",
+    "noise",
     "time",
     "excitation",
     "figures",
@@ -36,6 +38,7 @@ _KEYS = (
     "reference",
 )
 _DESCRIPTIVE = ("title", "reference")  # of files in the groups; for people
+_FOLDER = "estimator"  # of an observer that estimates by itself; its runs are called after it
 
 # Accepted ranges, ends included. What a type cannot say; beyond them nothing sensible happens.
 _RANGES = {
@@ -47,8 +50,9 @@ _RANGES = {
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),
     "observer.regularisation": (1e-6, 1.0),
+    "noise.seed": (0, math.inf),
 }
-_POSITIVE = ("time.horizon", "excitation.rho", "excitation.window")
+_POSITIVE = ("time.horizon", "excitation.rho", "excitation.window", "noise.sample_time")
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -106,12 +110,27 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         estimator=_group(config, "estimator"),
         time=read(TimeSettings, _group(config, "time"), "time"),
         solver=read(SolverSettings, _group(config, "solver"), "solver"),
-        observer=read(ObserverSettings, _group(config, "observer"), "observer"),
+        observer=read(
+            ObserverSettings,
+            {k: v for k, v in _group(config, "observer").items() if k != _FOLDER},
+            "observer",
+        ),
         excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
         output=_output(config, draw=draw),
+        noise=read(NoiseSettings, _group(config, "noise"), "noise"),
     )
     _check_ranges(built)
+    _check_no_noise(built.noise)
     return built
+
+
+def _check_no_noise(noise: NoiseSettings) -> None:
+    """A recipe may set levels of a file that the command line then replaces by none."""
+    if noise.name == "none" and noise != NoiseSettings():
+        keys = [key for key, value in vars(noise).items() if value != getattr(NoiseSettings, key)]
+        raise ConfigError(
+            f"noise.{keys[0]}: noise=none has no noise; leave it out, or choose noise=gaussian"
+        )
 
 
 def _group(config: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -143,6 +143,7 @@ examples:
   gpebo run -m estimator.gamma=1e6,1e8 solver=collocation,ivp
   gpebo run -m 'time.horizon=10,20' 'estimator.gamma=logspace(6,10,5)' launcher=joblib
   gpebo run experiment=paper_circuit
+  gpebo run noise=gaussian noise.outputs=0.01 noise.seed=1
   gpebo run observer=none plant=circuit              # simulate only
   gpebo run --config-dir outputs/runs/FOLDER --config-name config    # repeat a run
 """
@@ -161,5 +162,11 @@ def run_help() -> str:
 
 
 # As in conf/gpebo.yaml, which is not read: a YAML parser costs more than all the rest of this.
-_DEFAULTS = {"plant": "circuit", "observer": "gpebo", "estimator": "drem", "solver": "collocation"}
+_DEFAULTS = {
+    "plant": "circuit",
+    "observer": "gpebo",
+    "estimator": "drem",
+    "solver": "collocation",
+    "noise": "none",
+}
 _NOTES = {"experiment": "   (a recipe; none by default)"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from gpebo_cli.systems.descriptor import Array
 
 _MAX_ELEMENTS = 200_000
 _TOLERANCE = 1e-11
+_ROUNDING = 1e-13  # smaller steps between elements are no jumps
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,8 @@ class VectorLaw:
 
         Eliminating it puts γ MᵀN into the matrix, whose rounding errors then drive the slow
         directions: at γ = 1e14 nothing would be left of them. In this form the limit γ → ∞ is an
-        ordinary differential-algebraic equation.
+        ordinary differential-algebraic equation. Where b jumps (a sample, a step of the input), ν
+        does, and starts anew; η̂ does not.
         """
         mesh, p = self.M.mesh, len(start)
         k = self.b.values.shape[2]
@@ -58,9 +61,28 @@ class VectorLaw:
         problem = LinearProblem(
             coefficients, np.concatenate([start, residual])[:, None], name="estimator"
         )
-        solution = solve(problem, mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS)
+        solution = solve(
+            problem, mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
+            restarts=_residual_restarts(packed, p),
+        )
         trajectory = solution.trajectory
         return Trajectory(trajectory.mesh, trajectory.values[:, :, :p, 0])
+
+
+def _residual_restarts(packed: Trajectory, p: int) -> dict[float, Callable[[Array], Array]]:
+    """At the edges where the signals [M ; N ; b] jump: (η̂, ν before) -> (η̂, ν after)."""
+    before, after = packed.values[:-1, -1], packed.values[1:, 0]
+    size = np.abs(packed.values).max(axis=(0, 1))
+    jumps = (np.abs(after - before) > _ROUNDING * size).any(axis=(1, 2))
+
+    def restart(k: int) -> Callable[[Array], Array]:
+        def after_jump(state: Array) -> Array:
+            residual = after[k][:, -1:] - after[k][:, p : 2 * p] @ state[:p]
+            return np.concatenate([state[:p], residual])
+
+        return after_jump
+
+    return {float(packed.mesh.edges[k + 1]): restart(int(k)) for k in np.flatnonzero(jumps)}
 
 
 @dataclass(frozen=True, eq=False)

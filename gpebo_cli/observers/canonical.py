@@ -169,7 +169,9 @@ def observe(
             zb=zb,
             n_b=n_b,
         ),
-        truth=InitialError(np.eye(system.n)[:, :n_a], xi_a0),
+        truth=InitialError(
+            np.eye(system.n)[:, :n_a], xi_a0, np.eye(system.n)[:, :n_a], solution.trajectory
+        ),
         error_estimate=solution.error_estimate,
         assumptions=(
             Assumption(

@@ -263,7 +263,7 @@ def observe(
             scale=final.psi_scale,
         ),
         state_map=AffineStateMap(on_mesh(final.offset), on_mesh(final.gain)),
-        truth=InitialError(V1, xi_a0),
+        truth=InitialError(V1, xi_a0, basis, solution.trajectory),
         error_estimate=solution.error_estimate,
         assumptions=(
             Assumption(

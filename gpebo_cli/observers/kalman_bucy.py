@@ -261,6 +261,16 @@ def observe(
         growth=None,
         estimator=KalmanBucy(filtered, observability),
         names=names,
+        note=_note(model_noise, settings.regularisation),
+    )
+
+
+def _note(model: NoiseModel, regularisation: float) -> str:
+    if not model.rows.any():
+        return ""
+    return (
+        f"; measurement noise regularised: {regularisation:g} of each equation's size "
+        "(observer.regularisation)"
     )
 
 

@@ -71,15 +71,31 @@ class Truth(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class InitialError:
-    """η = (θ, e₀) with e₀ = ξ_a0 − V1ᵀ P x(start) = ξ_a0 − V1ᵀ x(start)."""
+    """η = (θ, e₀) with e₀ = ξ_a0 − V1ᵀ P x(start) = ξ_a0 − V1ᵀ x(start).
+
+    If θ varies, no constant e₀ makes w = ξ_a + ξ_b θ − Φ e₀ true, but this one does, and with it
+    Y = ψη still holds at every time:
+
+        e₀(t) = Φ⁺ (ξ_a + ξ_b θ(t) − w),      e₀' = Φ⁺ ξ_b θ'.
+    """
 
     initial_basis: Array  # (n, n_a) V1, orthonormal basis of range P(start)
     xi_a0: Array  # (n_a,)
+    basis: Array  # (n, k) in whose coordinates the extension is integrated, k = n_a or n
+    extension: Trajectory  # [ξ_a | ξ_b | Φ], shape (k, 1 + p)
 
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
-        """η at the times t (M,), shape (M, p): e₀ is the same at all of them."""
-        e0 = self.xi_a0 - self.initial_basis.T @ states.values[0, 0]
-        return np.concatenate([theta, np.broadcast_to(e0, (len(t), len(e0)))], axis=1)
+        """η at the times t (M,), shape (M, p)."""
+        if not (np.diff(theta, axis=0) != 0.0).any() or np.isnan(theta).any():
+            e0 = self.xi_a0 - self.initial_basis.T @ states.values[0, 0]
+            return np.concatenate([theta, np.broadcast_to(e0, (len(t), len(e0)))], axis=1)
+        q = theta.shape[1]
+        W = self.extension(t)
+        xi_a, xi_b, Phi = W[..., 0], W[..., 1 : 1 + q], W[..., 1 + q :]
+        # Φᵀ x = Φᵀ w, because the columns of Φ lie in the range of the projector P.
+        distance = xi_a + np.einsum("mij,mj->mi", xi_b, theta) - states(t) @ self.basis
+        e0 = np.einsum("mij,mj->mi", np.linalg.pinv(Phi, rcond=0.0), distance)
+        return np.concatenate([theta, e0], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +115,7 @@ class Observation:
     growth: float | None  # largest ‖Φ(t)‖ entry; None: the states do not rest on Φ
     estimator: Estimator | None = None
     names: tuple[str, ...] | None = None
+    note: str = ""  # what the last line of a run has to say of it, from "; " on
 
     @property
     def parameters(self) -> tuple[str, ...]:

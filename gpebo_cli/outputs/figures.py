@@ -47,11 +47,11 @@ def states(result: RunResult) -> list[Panel]:
 
 
 def signals(result: RunResult) -> list[Panel]:
-    """Inputs and outputs over time: all an observer gets to see."""
-    simulation, system = result.simulation, result.system
+    """Inputs and outputs over time: all an observer gets to see, beside the truth if it differs."""
+    s, system = result.simulation, result.system
     return [
-        *_by_unit(result, "inputs", system.inputs, simulation.t, simulation.inputs),
-        *_by_unit(result, "outputs", system.outputs, simulation.t, simulation.outputs),
+        *_by_unit(result, "inputs", system.inputs, s.t, s.inputs, s.measured_inputs),
+        *_by_unit(result, "outputs", system.outputs, s.t, s.outputs, s.measured_outputs),
     ]
 
 
@@ -93,8 +93,41 @@ def estimates_b(result: RunResult) -> list[Panel]:
     return _estimates(result, other) if differential else []
 
 
+def parameters(result: RunResult) -> list[Panel]:
+    """Estimates of the parameters over time, with the truth dashed, where the truth varies.
+
+    The components of e₀ are left out: where θ varies they are what makes up for it, of any size.
+    """
+    estimation = result.estimation
+    if estimation is None or not result.system.theta_varies:
+        return []
+    shown = _shown_cases(estimation)
+    labels = _case_labels(result, estimation, shown)
+    panels = []
+    for i, name in enumerate(result.system.unknowns):
+        truth = estimation.true_parameters[:, i]
+        curves = [
+            Curve(estimation.t, estimation.parameters[case, :, i], label, line(k))
+            for k, (case, label) in enumerate(zip(shown, labels, strict=True))
+        ]
+        curves.append(Curve(estimation.t, truth, "true", style.VARYING))
+        panels.append(
+            Panel(
+                with_unit(name, _parameter_unit(result, name)),
+                tuple(curves),
+                limits=_estimate_limits(truth, estimation.parameters[shown, :, i]),
+                legend=i == 0,
+                note=_note(estimation, shown) if i == 0 else "",
+            )
+        )
+    return panels
+
+
 def parameter_error(result: RunResult) -> list[Panel]:
-    """Fig. 6: error of every parameter (for the circuit, the initial conditions), logarithmic."""
+    """Fig. 6: error of every parameter (for the circuit, the initial conditions), logarithmic.
+
+    Where θ varies, of the unknowns only, as in ``parameters``.
+    """
     estimation = result.estimation
     if estimation is None:
         return []
@@ -109,6 +142,7 @@ def parameter_error(result: RunResult) -> list[Panel]:
             float(size[i]) or largest,
         )
         for i, name in enumerate(estimation.names)
+        if not result.system.theta_varies or name in result.system.unknowns
     ]
     return _errors(result, estimation, curves)
 
@@ -221,6 +255,7 @@ FIGURES: dict[str, FigureFunction] = {
         estimates,
         estimates_a,
         estimates_b,
+        parameters,
         parameter_error,
         state_error,
         state_error_a,
@@ -251,13 +286,16 @@ def describe(
 ) -> Iterator[tuple[str, list[Panel]]]:
     """Panels of the figures called ``names``; those the run has nothing for are left out.
 
-    With ``None``, all; ``signals`` only if there was no observer, for the paper has no such figure.
+    With ``None``, all; ``signals``, which the paper does not have, only if there was no observer or
+    it saw something else than the truth.
 
     Raises:
         ConfigError: a name is unknown; at once, not at the first figure.
     """
     if names is None:
-        names = [name for name in FIGURES if name != "signals" or result.estimation is None]
+        noisy = result.simulation.measured_outputs is not None
+        plain = result.estimation is None or noisy
+        names = [name for name in FIGURES if name != "signals" or plain]
     wanted = list(dict.fromkeys(names))
     check_names(wanted)
     described = ((name, FIGURES[name](result)) for name in wanted)
@@ -290,16 +328,26 @@ def _parameter_unit(result: RunResult, parameter: str) -> str:
 
 
 def _by_unit(
-    result: RunResult, kind: str, names: Sequence[str], t: Array, values: Array
+    result: RunResult, kind: str, names: Sequence[str], t: Array, values: Array,
+    measured: Array | None = None,
 ) -> list[Panel]:
-    """One panel per unit, in the order in which the units appear."""
+    """One panel per unit, in the order in which the units appear; what was measured behind."""
     units = [result.system.units.get(name, "") for name in names]
     panels = []
     for unit in dict.fromkeys(units):
         members = [i for i, other in enumerate(units) if other == unit]
         label = names[members[0]] if len(members) == 1 else kind
         curves = tuple(Curve(t, values[:, i], names[i], line(k)) for k, i in enumerate(members))
-        panels.append(Panel(with_unit(label, unit), curves, legend=len(members) > 1))
+        if measured is not None:
+            curves = (
+                *(
+                    Curve(t, measured[:, i], f"{names[i]} measured", style.MEASURED)
+                    for i in members
+                    if np.any(measured[:, i] != values[:, i])
+                ),
+                *curves,
+            )
+        panels.append(Panel(with_unit(label, unit), curves, legend=len(curves) > 1))
     return panels
 
 

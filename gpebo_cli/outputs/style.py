@@ -112,6 +112,8 @@ LINES = (
     Line("#56B4E9", (5, 1.3, 1.2, 1.3, 1.2, 1.3)),
 )
 TRUTH = Line("#B4B4B4", (), 2.6)  # wide and pale: an estimate that has converged lies on it
+MEASURED = Line("#9A9A9A", (), 0.5)  # thin and pale: noise fills an area
+VARYING = Line("#000000", (4, 2), 0.9)  # a truth that varies, over what follows it
 LIMIT = Line("#000000", (1.0, 1.5), 0.9)  # a level
 INSTANT = Line("#777777", (), 0.8)  # a time
 

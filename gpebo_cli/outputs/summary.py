@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "reference": system.reference,
         "observer": result.settings.observer.name,
         "estimator": dict(result.settings.estimator) if estimation else None,
+        "noise": asdict(result.settings.noise) if simulation.measured_outputs is not None else None,
         "index": simulation.index,
         "strangeness_index": simulation.strangeness_index,
         "differential": simulation.differential,

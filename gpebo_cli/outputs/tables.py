@@ -29,12 +29,17 @@ _CHUNK_ROWS = 2048  # large enough to amortise the call, small enough to stay in
 
 
 def write_signals(path: Path, system: DescriptorSystem, simulation: SimulationResult) -> None:
-    """Write ``t``, inputs, outputs and true states, by name."""
+    """Write ``t``, inputs, outputs and true states, by name; what was measured, if it differs."""
     header = ["t", *system.inputs, *system.outputs, *system.states]
-    table = np.column_stack(
-        [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
-    )
-    write_file(path, _lines(header, table))
+    columns = [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
+    for names, seen in (
+        (system.inputs, simulation.measured_inputs),
+        (system.outputs, simulation.measured_outputs),
+    ):
+        if seen is not None:
+            header += [f"{name}_measured" for name in names]
+            columns.append(seen)
+    write_file(path, _lines(header, np.column_stack(columns)))
 
 
 def write_regression(path: Path, regression: RegressionResult) -> None:
@@ -61,12 +66,15 @@ def write_estimates(
 ) -> None:
     """Write the long table ``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, checks.
 
+    Then ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value.
+
     Columns of states the observer does not see are empty.
     """
     header = ["case", "t", *(f"{name}_hat" for name in (*estimation.names, *states))]
     if estimation.delta is not None:
         header.append("delta")
     header += estimation.checks
+    header += [f"{name}_true" for name, _ in varying_truth(estimation)]
     write_file(path, _estimate_chunks(header, estimation))
 
 
@@ -88,6 +96,16 @@ def gain_names(estimation: EstimationResult) -> list[str]:
     return list(dict.fromkeys(name for case in estimation.cases for name in case))
 
 
+def varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
+    """What is estimated and is not the same at all times, with its true values (M,)."""
+    truth = estimation.true_parameters
+    return [
+        (name, truth[:, i])
+        for i, name in enumerate(estimation.names)
+        if not np.isnan(truth[:, i]).any() and np.any(truth[:, i] != truth[:1, i])
+    ]
+
+
 def _estimate_chunks(header: Sequence[str], estimation: EstimationResult) -> Iterator[bytes]:
     yield _header(header)
     delta = estimation.delta
@@ -96,6 +114,7 @@ def _estimate_chunks(header: Sequence[str], estimation: EstimationResult) -> Ite
         if delta is not None:
             columns.append(delta[case if len(delta) > 1 else 0])
         columns += [check[case] for check in estimation.checks.values()]
+        columns += [values for _, values in varying_truth(estimation)]
         yield from _rows(np.column_stack(columns), prefix=f"{case},")
 
 

@@ -53,8 +53,7 @@ class Jump:
 
 
 def jump(
-    system: DescriptorSystem, structure: Structure, t: float, width: float, before: Array,
-    theta: Array,
+    system: DescriptorSystem, structure: Structure, t: float, width: float, before: Array
 ) -> Jump:
     """The state just after time t, given the limit from the left.
 
@@ -74,7 +73,7 @@ def jump(
     mu, n = structure.mu, system.n
     now = np.array([t])
     after = system.coefficients.taylor(now, max(mu, 1), now + width)
-    reduced = reduce(system, structure, now, now + width, theta)
+    reduced = reduce(system, structure, now, now + width)
     levels = mu + 1
     blocks = np.zeros((levels, n, levels, n))
     for j in range(levels):

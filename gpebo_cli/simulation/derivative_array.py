@@ -102,12 +102,13 @@ class StrangenessFree:
         return E, A, np.concatenate([self.f1, self.f2], axis=1)
 
 
-def forcing(c: Coefficients, theta: Array) -> Array:
+def forcing(c: Coefficients) -> Array:
     """Taylor coefficients of f = B u + F θ, shape (K + 1, N, n)."""
     orders = len(c.E)
-    f = c.F @ theta
+    f = np.zeros(c.E.shape[:3])
     for k in range(orders):
         for i in range(k + 1):
+            f[k] += np.einsum("nij,nj->ni", c.F[i], c.theta[k - i])
             f[k] += np.einsum("nij,nj->ni", c.B[i], c.u[k - i])
     return np.asarray(f)
 
@@ -346,7 +347,7 @@ _RESIDUAL = 1e-13  # rows that should vanish after elimination, relative to the 
 
 
 def reduce(
-    system: DescriptorSystem, structure: Structure, t: Array, inside: Array, theta: Array
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array
 ) -> StrangenessFree:
     """The strangeness-free equations at the times t (N,), one sweep over all of them.
 
@@ -358,10 +359,10 @@ def reduce(
     """
     mu, scaling = structure.mu, structure.scaling
     c = system.coefficients.taylor(t, mu, inside)
-    f = forcing(c, theta)
+    f = forcing(c)
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]
-    e, aa = scaled(Coefficients(E, A, c.B, c.F, c.C, c.u), scaling)
+    e, aa = scaled(Coefficients(E, A, c.B, c.F, c.C, c.u, c.theta), scaling)
     M, N = derivative_array(e, aa, mu)
     reference = structure.reference
     if isinstance(reference, Bases):

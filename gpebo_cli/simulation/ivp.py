@@ -22,7 +22,7 @@ _MAX_ROUNDS = 12
 
 
 def underlying_ode(
-    system: DescriptorSystem, structure: Structure, t: Array, inside: Array, theta: Array
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array
 ) -> tuple[Array, Array]:
     """x' = A x + f from one differentiation more than the strangeness index.
 
@@ -38,7 +38,7 @@ def underlying_ode(
     scaling = structure.scaling
     M, N = derivative_array(*scaled(c, scaling), mu)
     weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
-    g = np.moveaxis(forcing(c, theta) * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
+    g = np.moveaxis(forcing(c) * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
     inverse = np.linalg.pinv(M, rcond=structure.rank_tol)[:, :n]
     # Back from x̃ = x/columns and time t/τ.
     back = scaling.columns[:, None] / scaling.time

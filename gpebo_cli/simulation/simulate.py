@@ -66,7 +66,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         restarts[cut] = _restart(system, structure, cut, _width(mesh.edges, cut), happened)
 
     def coefficients(t: Array, inside: Array) -> Coefficients:
-        reduced = reduce(system, structure, t, inside, system.theta)
+        reduced = reduce(system, structure, t, inside)
         E, A, f = reduced.stacked()
         return Coefficients(E, A, f[:, :, None], (reduced.u, reduced.C))
 
@@ -102,7 +102,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
 
 def _initial_state(system: DescriptorSystem, structure: Structure, mesh: Mesh) -> Array:
     t, inside = mesh.points[:1, 0], mesh.inside[:1, 0]
-    reduced = reduce(system, structure, t, inside, system.theta)
+    reduced = reduce(system, structure, t, inside)
     E = system.coefficients.taylor(t, 0, inside).E[0, 0]
     x0 = consistent_state(E, reduced, system.initial_state)
     if not np.isfinite(x0).all():
@@ -121,7 +121,7 @@ def _restart(
     happened: dict[float, tuple[Array, Jump]],
 ) -> Callable[[Array], Array]:
     def restart(before: Array) -> Array:
-        what = jump(system, structure, t, width, before[:, 0], system.theta)
+        what = jump(system, structure, t, width, before[:, 0])
         happened[t] = (before[:, 0].copy(), what)
         return what.after[:, None]
 
@@ -140,7 +140,7 @@ def _integrate(
     """The independent path: the underlying ODE of the derivative array, by scipy."""
 
     def explicit(t: Array, inside: Array) -> Coefficients:
-        A, f = ivp.underlying_ode(system, structure, t, inside, system.theta)
+        A, f = ivp.underlying_ode(system, structure, t, inside)
         c = system.coefficients.taylor(t, 0, inside)
         return Coefficients(None, A, f[:, :, None], (c.u[0], c.C[0]))
 

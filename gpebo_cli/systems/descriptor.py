@@ -2,7 +2,8 @@
 
     E(t) x' = A(t) x + B(t) u(t) + F(t) θ,      y = C(t) x                (paper, eq. 1)
 
-with n states, m inputs, q unknown constant parameters and r outputs.
+with n states, m inputs, q unknown parameters and r outputs. θ is constant to whoever
+estimates it; in a simulation it may vary all the same.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-MATRIX_NAMES = ("E", "A", "B", "F", "C", "u")
+MATRIX_NAMES = ("E", "A", "B", "F", "C", "u", "theta")
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Coefficients:
     F: Array  # (K + 1, N, n, q)
     C: Array  # (K + 1, N, r, n)
     u: Array  # (K + 1, N, m)
+    theta: Array  # (K + 1, N, q) true values of the unknowns, for the simulation only
 
 
 class CoefficientSource(Protocol):
@@ -68,12 +70,24 @@ class DescriptorSystem:
     inputs: tuple[str, ...] = ()
     unknowns: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
-    theta: Array = field(default_factory=lambda: np.zeros(0))  # (q,) true values of the unknowns
+    # (q,) true values of the unknowns that are constant, NaN for one that varies; see theta_at
+    theta: Array = field(default_factory=lambda: np.zeros(0))
     title: str = ""
     reference: str = ""
     source: str = ""  # the file it came from, for messages
     units: dict[str, str] = field(default_factory=dict)  # by state, input, output or unknown
     observer_defaults: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def theta_varies(self) -> bool:
+        """Whether some unknown is not constant."""
+        return bool(np.isnan(self.theta).any())
+
+    def theta_at(self, t: Array) -> Array:
+        """True values of the unknowns at the times t (M,), shape (M, q); after a jump at one."""
+        if self.theta_varies:
+            return np.asarray(self.coefficients.taylor(t, 0).theta[0])
+        return np.broadcast_to(self.theta, (len(t), self.q))
 
     @property
     def n(self) -> int:

@@ -129,7 +129,7 @@ def system_from_functions(
     B: Entry | None = None,
     u: Entry | None = None,
     F: Entry | None = None,
-    theta: Array | Sequence[float] = (),
+    theta: Array | Sequence[float] | Function | Sequence[Function] = (),
     C: Entry | None = None,
     names: Names | None = None,
     radius: float = 0.1,
@@ -145,7 +145,7 @@ def system_from_functions(
         B: (n, m).
         u: (m,), functions return (N, m).
         F: (n, q).
-        theta: true values (q,) of the unknown parameters.
+        theta: true values (q,) of the unknown parameters; functions return (N, q).
         C: (r, n).
         names: of states, inputs, unknowns and outputs.
         radius: of the circle of complex times for derivatives that are not given; a tenth of the
@@ -156,18 +156,20 @@ def system_from_functions(
     """
     x0 = np.asarray(initial_state, dtype=np.float64)
     n = len(x0)
-    q, m, r = len(theta), _columns(B, "B"), _rows(C)
+    q, m, r = _rows(theta), _columns(B, "B"), _rows(C)
     if (u is None) != (B is None):
         raise ConfigError(f"plant {name}: B and u go together; one of them is missing")
     names = names or Names()
     shapes = {"E": (n, n), "A": (n, n), "B": (n, m), "F": (n, q), "C": (r, n), "u": (m,)}
+    shapes["theta"] = (q,)
     fixed: dict[str, Array] = {}
     functions: dict[str, tuple[Function, ...]] = {}
-    for key, entry in {"E": E, "A": A, "B": B, "F": F, "C": C, "u": u}.items():
+    entries = {"E": E, "A": A, "B": B, "F": F, "C": C, "u": u, "theta": theta}
+    for key, entry in entries.items():
         listed: list[Any] = list(entry) if isinstance(entry, list | tuple) else [entry]
         if entry is None:
             fixed[key] = np.zeros(shapes[key])
-        elif all(callable(item) for item in listed):
+        elif listed and all(callable(item) for item in listed):
             functions[key] = tuple(listed)
         else:
             value = np.asarray(entry, dtype=np.float64)
@@ -181,7 +183,7 @@ def system_from_functions(
         name=name,
         coefficients=FunctionCoefficients(shapes, fixed, functions, radius, name),
         initial_state=x0,
-        theta=np.asarray(theta, dtype=np.float64),
+        theta=fixed.get("theta", np.full(q, np.nan)),
         states=_labels(names.states, "x", n, name),
         inputs=_labels(names.inputs, "u", m, name),
         unknowns=_labels(names.unknowns, "theta", q, name),
@@ -193,7 +195,9 @@ def _first(entry: Entry | None) -> Any:
     """The entry's value at one time, to read its shape from."""
     if entry is None:
         return None
-    first = entry[0] if isinstance(entry, list | tuple) and callable(entry[0]) else entry
+    first: Any = entry
+    if isinstance(first, list | tuple) and len(first) and callable(first[0]):
+        first = first[0]
     return np.asarray(first(np.zeros(1)))[0] if callable(first) else np.asarray(first)
 
 

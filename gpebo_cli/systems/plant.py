@@ -167,7 +167,8 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
     signals = [read(value, f"inputs.{label}") for label, value in inputs.items()]
     entries["u"] = (len(inputs),), signals
 
-    theta = [read(value, f"unknowns.{label}").value for label, value in unknowns.items()]
+    theta = [read(value, f"unknowns.{label}") for label, value in unknowns.items()]
+    entries["theta"] = (len(unknowns),), theta
     given = _initial_values(plant, _required(mapping, "initial_state", plant), states)
     initial = [read(value, f"initial_state.{label}").value for label, value in given.items()]
     return DescriptorSystem(
@@ -178,7 +179,7 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
         inputs=tuple(inputs),
         unknowns=tuple(unknowns),
         outputs=outputs,
-        theta=np.array(theta),
+        theta=np.array([e.value if e.is_constant else np.nan for e in theta]),
         title=_line(plant, "title", mapping.get("title")),
         reference=_line(plant, "reference", mapping.get("reference")),
         source=source,
