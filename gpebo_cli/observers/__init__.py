@@ -29,11 +29,11 @@ def observe(
     outputs: Trajectory,
     settings: ObserverSettings,
     solver: SolverSettings,
-    noise: SignalNoise,
+    noise: SignalNoise | None = None,
 ) -> Observation:
     """Run the observer that ``settings.name`` asks for on the signals u and y of one mesh.
 
-    What is known of their ``noise`` is for an observer that weighs them by it.
+    What is known of their ``noise`` (None: there is none) is for an observer that weighs them by it.
 
     Raises:
         ModelError: an assumption of the observer fails; names the time and the evidence.
@@ -41,5 +41,7 @@ def observe(
         SolverError: the tolerance cannot be reached.
     """
     if settings.name == "kalman_bucy":
+        if noise is None:
+            noise = SignalNoise(np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time)
         return kalman_bucy.observe(system, inputs, outputs, settings, solver, noise)
     return _OBSERVERS[settings.name](system, inputs, outputs, settings, solver)

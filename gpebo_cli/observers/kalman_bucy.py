@@ -23,20 +23,19 @@ of the standard deviations of x̂; its correlation with ζ̂ (of order T_s) is n
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.errors import ConfigError
 from gpebo_cli.linalg import transpose
+from gpebo_cli.measurement import per_signal
 from gpebo_cli.observers import gpebo
 from gpebo_cli.observers.extension import initial_extension
 from gpebo_cli.observers.observability import WindowGramians, window_gramians
 from gpebo_cli.observers.observation import AffineStateMap, Observation, Reconstruction
 from gpebo_cli.observers.riccati import Filtered, StateSpace, run_filter
-from gpebo_cli.reading import nearest
 from gpebo_cli.regression import LinearRegression
 from gpebo_cli.result import Assumption, Requirement
 from gpebo_cli.settings import ObserverSettings, SolverSettings
@@ -211,7 +210,7 @@ def observe(
     w0 = basis.T @ V1 @ initial_extension(settings, system, gpebo_names(V1, labels, fixed))
     start = np.concatenate([np.zeros(q), w0])
     P0 = _initial_covariance(settings, names, q, basis.T @ V1)
-    process = _by_name(settings.process, names, "observer.process", 0.0)
+    process = per_signal(settings.process, names, "estimate", "observer.process")
     model_noise = noise_model(
         reduced(mesh.points.ravel(), mesh.inside.ravel()), noise, process, settings.regularisation
     )
@@ -285,41 +284,11 @@ def _initial_covariance(
     settings: ObserverSettings, names: tuple[str, ...], q: int, V: Array
 ) -> Array:
     """P(start) (n, n), within the range of the coordinates V (n_w, n_a) of V1."""
-    variances = _by_name(settings.P0, names, "observer.P0", _INITIAL_VARIANCE)
+    variances = per_signal(settings.P0, names, "estimate", "observer.P0", _INITIAL_VARIANCE)
     inside = np.zeros((len(names), len(names)))
     inside[:q, :q] = np.eye(q)
     inside[q:, q:] = V @ V.T
     return np.asarray((inside * variances) @ inside.T)
-
-
-def _by_name(
-    value: float | Sequence[float] | Mapping[str, float], names: tuple[str, ...], where: str,
-    absent: float,
-) -> Array:
-    """One number ≥ 0 for each name, from one for all, a list, or a mapping."""
-    listed = ", ".join(names)
-    if isinstance(value, Mapping):
-        for key in value:
-            if key not in names:
-                raise ConfigError(
-                    f"{where}: nothing estimated is called {key!r}; accepted: {listed}"
-                    + nearest(str(key), names)
-                )
-        numbers = np.array([float(value.get(name, absent)) for name in names])
-    elif isinstance(value, Sequence):
-        if len(value) != len(names):
-            raise ConfigError(
-                f"{where} has {len(value)} values but {len(names)} are estimated ({listed})"
-            )
-        numbers = np.array(value, dtype=np.float64)
-    else:
-        numbers = np.full(len(names), float(value))
-    if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
-        k = int(np.argmin(np.isfinite(numbers) & (numbers >= 0)))
-        raise ConfigError(
-            f"{where}: expected finite numbers, 0 or more, got {numbers[k]:g} for {names[k]}"
-        )
-    return numbers
 
 
 def _uniform_observability(
