@@ -36,18 +36,6 @@ from gpebo_cli.systems.plant import plant_from_mapping
 
 SOLVER = SolverSettings()
 
-# Seen for three seconds, and never again: exciting over the horizon, not uniformly observable.
-WINDOW: dict[str, Any] = {
-    "name": "window",
-    "parameters": {"seen": "1 - step(t - 3)"},
-    "states": ["x1", "x2"],
-    "outputs": ["y"],
-    "E": [[1, 0], [0, 1]],
-    "A": [[0, 1], [-1, 0]],
-    "C": [["seen", 0]],
-    "initial_state": {"x1": 1, "x2": -1},
-}
-
 
 def run(system: DescriptorSystem, horizon: float = 20.0, **more: Any) -> RunResult:
     noise = more.pop("noise", NoiseSettings())
@@ -82,7 +70,7 @@ def test_model_holds_on_the_true_state_whatever_the_noise(name):
     rng = np.random.default_rng(1)
     nu = rng.normal(size=(len(t), system.m + system.r))
     u, y = signals.inputs(t) + nu[:, : system.m], signals.outputs(t) + nu[:, system.m :]
-    s, basis, P = in_basis(system, t, t, u, y)
+    s, basis, _ = in_basis(system, t, t, u, y)
 
     def zeta(at: Array) -> Array:
         P_at = basis_observer.observer_matrices(system, at, at, 1e-10).projector
@@ -213,7 +201,7 @@ def test_quantisation_counts_as_noise():
 
 
 def test_window_is_exciting_but_not_uniformly_observable():
-    result = run(plant_from_mapping(WINDOW))
+    result = run(shipped("window"))
     assert result.excitation.is_ie
     requirement = result.estimation.requirement
     assert not requirement.holds

@@ -33,7 +33,7 @@ def observe(
 ) -> Observation:
     """Run the observer that ``settings.name`` asks for on the signals u and y of one mesh.
 
-    What is known of their ``noise`` (None: there is none) is for an observer that weighs them by it.
+    What is known of their ``noise`` (None: there is none) is for an observer that weighs by it.
 
     Raises:
         ModelError: an assumption of the observer fails; names the time and the evidence.

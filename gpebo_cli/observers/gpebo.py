@@ -357,6 +357,7 @@ def regression_signals(
 
 
 def is_constant(projector: Array) -> bool:
+    """Whether the projector P (N, n, n) is the same at all times: the kernel of E does not turn."""
     return bool(np.abs(projector - projector[0]).max(initial=0.0) < 1e-13)
 
 

@@ -29,7 +29,6 @@ class WindowGramians:
 
     starts: Array  # (W,)
     gramians: Array  # (W, n, n)
-    elements: Array  # (W,) the first element of each window
     window: float
 
 
@@ -99,4 +98,4 @@ def _sum_windows(mesh: Mesh, transition: Array, local: Array) -> WindowGramians:
         k = first[on] + step
         gramians[on] += transpose(reached[on]) @ local[k] @ reached[on]
         reached[on] = transition[k] @ reached[on]
-    return WindowGramians(edges[first], gramians, first, window)
+    return WindowGramians(edges[first], gramians, window)

@@ -33,7 +33,7 @@ from gpebo_cli.collocation.linear import Coefficients, LinearProblem, Monitor, s
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import SolverError
 from gpebo_cli.linalg import transpose
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.systems.descriptor import Array, BoolArray
 
 _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
 # Standard deviations below this share of the largest one, each relative to that at the start, are
@@ -75,7 +75,7 @@ def quotient(X: Array) -> tuple[Array, Array]:
     """P (…, n, n), symmetric, and ζ̂ (…, n, g) from the pair (…, 2n, n + g)."""
     n = X.shape[-2] // 2
     X1, X2 = X[..., :n, :n], X[..., n:, :n]
-    P = transpose(np.linalg.solve(transpose(X1), transpose(X2)))
+    P = transpose(np.asarray(np.linalg.solve(transpose(X1), transpose(X2)), dtype=np.float64))
     # Not P x₁: where X₁ is large in some rows, only the pair's own quotient is free of it.
     estimate = X[..., n:, n:] - X2 @ np.linalg.solve(X1, X[..., :n, n:])
     return 0.5 * (P + transpose(P)), estimate
@@ -105,7 +105,7 @@ class _Restart:
         return out
 
 
-def _in_front(lost: Array, found: list[tuple[Array, float]]) -> list[tuple[Array, float]]:
+def _in_front(lost: BoolArray, found: list[tuple[Array, float]]) -> list[tuple[Array, float]]:
     """The signals to resolve where elements that lose conditioning have to be cut first.
 
     What comes after such an element is rounding, and would be cut without end: it is left alone
@@ -177,7 +177,6 @@ def run_filter(
     Raises:
         SolverError: the tolerance cannot be reached, or P is not positive semidefinite.
     """
-
     unit = np.sqrt(np.diag(P0))
     unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
     unit /= unit.max()
@@ -231,5 +230,6 @@ def run_filter(
             "trace); lower observer.P0, or raise observer.regularisation"
         )
     return Filtered(
-        solution.trajectory, variance, solution.error_estimate, float(relative.min()), solution.extras
+        solution.trajectory, variance, solution.error_estimate, float(relative.min()),
+        solution.extras,
     )
