@@ -1,3 +1,70 @@
-"""gpebo: adaptive state observers for linear time-varying descriptor systems."""
+"""gpebo: adaptive state observers for linear time-varying descriptor systems.
 
-__version__ = "0.1.0"
+    from gpebo_cli import run
+
+    result = run("circuit", estimator="drem", gamma=[1e8, 1e10])
+    result["il"], result.estimates["il"]      # by name, (N,) and (cases, M)
+    result.to_pandas("cases")
+    result.plot()
+    result.save("first")                      # the folder that gpebo run writes
+
+Nothing is imported before it is used: ``gpebo --help`` loads no numbers.
+"""
+
+from gpebo_cli._version import __version__
+
+TYPE_CHECKING = False  # as typing has it; importing typing takes longer than all the rest here
+if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ below finds them
+    from gpebo_cli.api.calls import available, check, load_plant, run
+    from gpebo_cli.api.result import Result
+    from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
+    from gpebo_cli.observers import observe
+    from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
+    from gpebo_cli.simulation.simulate import simulate
+    from gpebo_cli.systems.descriptor import DescriptorSystem
+    from gpebo_cli.systems.functions import Names, system_from_functions
+
+__all__ = [
+    "ConfigError",
+    "DescriptorSystem",
+    "GpeboError",
+    "ModelError",
+    "Names",
+    "ObserverSettings",
+    "Result",
+    "SolverError",
+    "SolverSettings",
+    "TimeSettings",
+    "__version__",
+    "available",
+    "check",
+    "load_plant",
+    "observe",
+    "run",
+    "simulate",
+    "system_from_functions",
+]
+
+_HOMES = {
+    "api.calls": ("available", "check", "load_plant", "run"),
+    "api.result": ("Result",),
+    "errors": ("ConfigError", "GpeboError", "ModelError", "SolverError"),
+    "observers": ("observe",),
+    "settings": ("ObserverSettings", "SolverSettings", "TimeSettings"),
+    "simulation.simulate": ("simulate",),
+    "systems.descriptor": ("DescriptorSystem",),
+    "systems.functions": ("Names", "system_from_functions"),
+}
+
+
+def __getattr__(name: str) -> object:
+    from importlib import import_module
+
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -12,7 +12,16 @@ import sys
 
 from gpebo_cli.errors import ConfigError, GpeboError
 
-COMMANDS = ("run", "check", "compare", "figures", "list")
+COMMANDS = {
+    "run": "run",
+    "check": "check",
+    "compare": "compare",
+    "figures": "figures",
+    "list": "listing",
+    "new": "new",
+    "completion": "completion",
+}
+"""Commands, and the modules of ``gpebo_cli.commands`` whose ``main`` they are."""
 
 
 def main() -> int:
@@ -65,7 +74,7 @@ def _dispatch(words: list[str]) -> int:
         sys.stdout.write(HELP)
         return 0
     if command in ("--version", "-V"):
-        from gpebo_cli import __version__
+        from gpebo_cli._version import __version__
 
         sys.stdout.write(f"gpebo {__version__}\n")
         return 0
@@ -74,26 +83,14 @@ def _dispatch(words: list[str]) -> int:
 
         sys.stdout.write(run_help())
         return 0
-    if command == "run":
-        from gpebo_cli.commands import run
+    if command in COMMANDS:
+        from importlib import import_module
 
-        return run.main(rest)
-    if command == "figures":
-        from gpebo_cli.commands import figures
+        return int(import_module(f"gpebo_cli.commands.{COMMANDS[command]}").main(rest))
+    if command == "__complete":  # asked by the scripts that `gpebo completion` prints
+        from gpebo_cli.commands import completion
 
-        return figures.main(rest)
-    if command == "check":
-        from gpebo_cli.commands import check
-
-        return check.main(rest)
-    if command == "compare":
-        from gpebo_cli.commands import compare
-
-        return compare.main(rest)
-    if command == "list":
-        from gpebo_cli.commands import listing
-
-        return listing.main(rest)
+        return completion.answer(rest, list(COMMANDS))
     raise ConfigError(_unknown(command))
 
 

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.regression import LinearRegression
 from gpebo_cli.result import Direction, Excitation, Requirement
 from gpebo_cli.settings import ExcitationSettings
 from gpebo_cli.systems.descriptor import Array
 
 _RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
+_ROUNDS = 30
+_AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(10.0)])
 _WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -54,21 +56,28 @@ def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings)
 
 
 def _first_time(gram: Trajectory, rho: float) -> float | None:
-    """First time with λ_min(G) ≥ ρ: bracketed on the mesh (λ_min never falls), then bisected."""
-    t = gram.mesh.points.ravel()
-    p = gram.values.shape[-1]
-    level = np.linalg.eigvalsh(gram.values.reshape(-1, p, p))[:, 0]
-    reached = np.flatnonzero(level >= rho)
+    """First time with λ_min(G) ≥ ρ: bracketed on the mesh (λ_min never falls), then narrowed.
+
+    Each round looks where the secant points, and at distances around it that fall by fours.
+    """
+    mesh = gram.mesh
+    reached = np.flatnonzero(np.linalg.eigvalsh(gram.values[:, -1])[:, 0] >= rho)
     if rho <= 0 or len(reached) == 0:
         return None
     k = int(reached[0])
-    low, high = float(t[max(k - 1, 0)]), float(t[k])
-    for _ in range(8):  # each round divides the bracket by 16
-        grid = np.linspace(low, high, 17)
-        inside = np.linalg.eigvalsh(gram(grid))[:, 0] >= rho
-        inside[-1] = True
-        j = int(np.argmax(inside))
-        low, high = float(grid[max(j - 1, 0)]), float(grid[j])
+    points = mesh.points[k]
+    level = np.linalg.eigvalsh(gram.values[k])[:, 0] - rho
+    element = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
+    for _ in range(_ROUNDS):
+        j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
+        low, high = float(points[max(j - 1, 0)]), float(points[j])
+        if high - low <= 4.0 * np.spacing(abs(high)):
+            break
+        share = level[j - 1] / (level[j - 1] - level[j])
+        guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
+        points = np.unique(np.clip(guess + (high - low) * _AROUND, low, high))
+        level = np.linalg.eigvalsh(element(points))[:, 0] - rho
+        level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
     return high
 
 

@@ -58,6 +58,7 @@ def run_experiment(
     settings: Settings,
     system: DescriptorSystem,
     progress: Callable[[str], None] = lambda _stage: None,
+    estimator: estimators.Estimator | None = None,
 ) -> RunResult:
     """Simulate the plant, observe it, estimate, and collect the evidence.
 
@@ -65,6 +66,7 @@ def run_experiment(
         settings: what to do; ``settings.plant`` is not read, ``system`` is it.
         system: the plant.
         progress: called with the name of each stage as it starts.
+        estimator: used instead of the one that ``settings.estimator`` names.
 
     Raises:
         ConfigError: settings that do not fit the plant.
@@ -74,7 +76,10 @@ def run_experiment(
     _check_time(settings.time)
     clock = _Clock(progress)
     observed = settings.observer.name != "none"
-    estimator = estimators.build(settings.estimator) if observed else None
+    if not observed:
+        estimator = None
+    elif estimator is None:
+        estimator = estimators.build(settings.estimator)
     levels = noise_levels(settings.noise, system)
     if not levels.silent:
         check_samples(

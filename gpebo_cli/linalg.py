@@ -16,6 +16,15 @@ def transpose(a: Array) -> Array:
     return np.swapaxes(a, -1, -2)
 
 
+def joined(*parts: Array, axis: int) -> Array:
+    """Blocks of matrices side by side (axis 2) or stacked (axis 1); those of one time repeat."""
+    count = max(map(len, parts))
+    return np.concatenate(
+        [p if len(p) == count else np.broadcast_to(p, (count, *p.shape[1:])) for p in parts],
+        axis=axis,
+    )
+
+
 def orthonormal_complement(basis: Array) -> Array:
     """Projector onto the orthogonal complement of orthonormal columns, shape (..., n, n)."""
     return np.eye(basis.shape[-2]) - basis @ transpose(basis)

@@ -296,7 +296,7 @@ def test_a_file_in_the_place_of_the_folder(tmp_path: Path) -> None:
 
 
 def test_an_unknown_figure_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="'parameter_eror'; did you mean 'parameter_error'"):
+    with pytest.raises(ConfigError, match=r"'parameter_eror'; .*did you mean parameter_error\?"):
         write(make_result(samples=11), tmp_path / "run", figures=["states", "parameter_eror"])
     assert not (tmp_path / "run").exists()
 

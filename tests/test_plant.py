@@ -170,7 +170,7 @@ def test_shapes_and_broadcast_constants() -> None:
     shapes["theta"] = (1,)
     for key in MATRIX_NAMES:
         assert getattr(c, key).shape == (4, 5, *shapes[key])
-    assert source.constant == {"E", "F", "C"}
+    assert source.constant == {"E", "F", "C", "theta"}
     np.testing.assert_array_equal(c.C[:, 3], [[[1, 1.5]], [[0, 0]], [[0, 0]], [[0, 0]]])
     np.testing.assert_array_equal(c.B[:2, 2], [[[1, 0], [0, 1.7]], [[0, 0], [0, 1]]])
     np.testing.assert_allclose(c.A[0, :, 0, 0], -np.cos(TIMES), rtol=1e-15)

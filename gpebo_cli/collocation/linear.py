@@ -10,6 +10,10 @@ solves only the elements that are new.
 Stage equations at node i of an element of length h, with D = R⁻¹ the Radau differentiation:
 
     E_i (D X − (D𝟙) x_0)_i / h = A_i X_i + f_i
+
+Where constraints are given apart, X_i = T_i z_i + p_i satisfies them at every node and z is what
+is solved for: the same collocation with s·d unknowns instead of s·n. No derivative of T appears,
+so T need not be smooth in time.
 """
 
 from __future__ import annotations
@@ -25,20 +29,31 @@ from gpebo_cli.collocation.mesh import (
     Trajectory,
     legendre_tail,
     signal_scale,
-    unresolved,
+    unresolved_kinds,
 )
 from gpebo_cli.collocation.radau import RadauRule
 from gpebo_cli.errors import SolverError
 from gpebo_cli.systems.descriptor import Array, BoolArray, IntArray
 
 
-class Coefficients(NamedTuple):
-    """The equation at N times; a leading axis of 1 means constant in time."""
+class Constraints(NamedTuple):
+    """All X that satisfy the constraints at N times: X = T z + offset with any z."""
 
-    E: Array | None  # (N, n, n), None for the identity
-    A: Array  # (N, n, n)
-    f: Array  # (N, n, columns)
+    basis: Array  # (N, n, d) T
+    offset: Array  # (N, n, columns)
+
+
+class Coefficients(NamedTuple):
+    """The equation at N times; a leading axis of 1 means constant in time.
+
+    With ``constraints``, E, A and f are the d differential equations only.
+    """
+
+    E: Array | None  # (N, n or d, n), None for the identity
+    A: Array  # (N, n or d, n)
+    f: Array  # (N, n or d, columns)
     extras: tuple[Array, ...] = ()  # (N, ...) each: whatever the monitor needs at these times
+    constraints: Constraints | None = None
 
 
 # (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind
@@ -87,7 +102,7 @@ class LinearSolution:
     trajectory: Trajectory  # values (K, s + 1, n, columns)
     error_estimate: float  # relative to each signal's own size
     rounds: int
-    extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each
+    extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each, or (1, 1, ...)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +111,7 @@ class _ElementMaps:
 
     homogeneous: Array  # (K, s, n, n)
     particular: Array  # (K, s, n, columns)
-    extras: tuple[Array, ...]  # (K, s + 1, ...) each
+    extras: tuple[Array, ...]  # (K, s + 1, ...) each, or (1, 1, ...) if constant
 
 
 def solve(
@@ -106,6 +121,7 @@ def solve(
     tol: float,
     max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None,
+    known: Coefficients | None = None,
 ) -> LinearSolution:
     """Solve on ``mesh``, refined until every signal is resolved to ``tol``.
 
@@ -116,19 +132,21 @@ def solve(
             signal's own size.
         max_elements: refuse to go beyond.
         restarts: at these edges, the map from the limit from the left to the new start.
+        known: the coefficients at all points of ``mesh``, where they are at hand.
 
     Raises:
         SolverError: if ``max_elements`` do not reach ``tol``; names the time.
     """
-    maps = _element_maps(problem, mesh, np.ones(mesh.size, dtype=bool))
+    maps = _element_maps(problem, mesh, np.ones(mesh.size, dtype=bool), known)
     floor = np.zeros(mesh.size)  # the tail of the parent, to notice that cutting no longer helps
     rounds = 1
     while True:
-        values, propagated = _chain(maps, problem, mesh, restarts or {})
+        values = _chain(maps, problem, mesh, restarts or {})
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values).all(axis=(1, 2, 3))))
             raise SolverError(
-                f"the solution of the {problem.name} is not finite from t = {mesh.edges[k]:.6g} on"
+                f"the solution of the {problem.name} is not finite from t = {mesh.edges[k]:.6g} "
+                "on: it grows beyond all numbers; is a sign wrong? Else shorten time.horizon"
             )
         tail = unresolved_signals(problem, mesh, values, maps.extras)
         # Rounding floor: an element whose parent was already this good is not cut again.
@@ -147,6 +165,7 @@ def solve(
         maps = _merge(maps, new, kept, fresh)
         mesh, rounds = finer, rounds + 1
     noise = _visible_noise(values, mesh)
+    propagated = _propagated_error(maps.homogeneous[:, -1], values, mesh, problem.renewal)
     estimate = max(float(tail.max(initial=0.0)), noise, propagated, _ROUNDING)
     return LinearSolution(Trajectory(mesh, values), estimate, rounds, maps.extras)
 
@@ -154,12 +173,11 @@ def solve(
 def unresolved_signals(
     problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...]
 ) -> Array:
-    """:func:`unresolved` over the solution and everything computed from it, shape (K,)."""
-    tail = unresolved(values.reshape(*values.shape[:2], -1), mesh.rule, problem.floor)
+    """:func:`unresolved_kinds` over the solution and everything computed from it, shape (K,)."""
+    kinds = [(values.reshape(*values.shape[:2], -1), problem.floor)]
     if problem.monitor is not None:
-        for signals, floor in problem.monitor(values, extras):
-            tail = np.maximum(tail, unresolved(signals, mesh.rule, floor))
-    return tail
+        kinds += problem.monitor(values, extras)
+    return unresolved_kinds(kinds, mesh.rule)
 
 
 def _visible_noise(values: Array, mesh: Mesh) -> float:
@@ -202,28 +220,58 @@ def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArra
     return _ElementMaps(
         merged(old.homogeneous, new.homogeneous),
         merged(old.particular, new.particular),
-        tuple(merged(a, b) for a, b in zip(old.extras, new.extras, strict=True)),
+        tuple(
+            a if a.shape[:2] == (1, 1) else merged(a, b)
+            for a, b in zip(old.extras, new.extras, strict=True)
+        ),
     )
 
 
-def _element_maps(problem: LinearProblem, mesh: Mesh, elements: BoolArray) -> _ElementMaps:
-    """Solve the block systems of size s·n of some elements, in chunks of bounded memory."""
+def _element_maps(
+    problem: LinearProblem, mesh: Mesh, elements: BoolArray, known: Coefficients | None = None
+) -> _ElementMaps:
+    """Solve the block systems of some elements, in chunks of bounded memory."""
     n, columns = problem.start.shape
     s = mesh.rule.stages
     h, t, inside = mesh.steps[elements], mesh.points[elements], mesh.inside[elements]
     chunk = max(1, _CHUNK // (s * s * n * n + s * n * (n + columns)))
-    pieces = [
-        _solve_elements(problem, mesh.rule, h[i : i + chunk], t[i : i + chunk],
-                        inside[i : i + chunk])
-        for i in range(0, len(h), chunk)
-    ]
+    pieces = []
+    for i in range(0, len(h), chunk):
+        part = slice(i, i + chunk)
+        if known is None:
+            c = problem.coefficients(t[part].ravel(), inside[part].ravel())
+        else:
+            c = _at_points(known, slice(i * (s + 1), (i + chunk) * (s + 1)))
+        pieces.append(_solve_elements(problem, mesh.rule, h[part], t[part], c))
     if len(pieces) == 1:
         return pieces[0]
     return _ElementMaps(
         np.concatenate([p.homogeneous for p in pieces]),
         np.concatenate([p.particular for p in pieces]),
-        tuple(np.concatenate(parts) for parts in zip(*(p.extras for p in pieces), strict=True)),
+        tuple(
+            parts[0] if parts[0].shape[:2] == (1, 1) else np.concatenate(parts)
+            for parts in zip(*(p.extras for p in pieces), strict=True)
+        ),
     )
+
+
+def _at_points(c: Coefficients, part: slice) -> Coefficients:
+    """The coefficients at some of their times."""
+
+    def some(values: Array) -> Array:
+        return values if len(values) == 1 else values[part]
+
+    return Coefficients(
+        None if c.E is None else some(c.E), some(c.A), some(c.f), tuple(map(some, c.extras)),
+        None if c.constraints is None else Constraints(*map(some, c.constraints)),
+    )
+
+
+def at_points(values: Array, k: int, s: int) -> Array:
+    """(k (s + 1), ...) -> (k, s + 1, ...); (1, ...) -> (1, 1, ...)."""
+    if len(values) == 1:
+        return values[None]
+    return values.reshape(k, s + 1, *values.shape[1:])
 
 
 def _at_nodes(values: Array, k: int, s: int) -> Array:
@@ -234,72 +282,102 @@ def _at_nodes(values: Array, k: int, s: int) -> Array:
 
 
 def _solve_elements(
-    problem: LinearProblem, rule: RadauRule, h: Array, t: Array, inside: Array
+    problem: LinearProblem, rule: RadauRule, h: Array, t: Array, c: Coefficients
 ) -> _ElementMaps:
     k, s = len(h), rule.stages
-    n, columns = problem.start.shape
-    c = problem.coefficients(t.ravel(), inside.ravel())
-    extras = tuple(extra.reshape(k, s + 1, *extra.shape[1:]) for extra in c.extras)
-    constant = len(c.A) == 1 and (c.E is None or len(c.E) == 1)
-    if constant and k > 1:
-        solved = _solve_equal_elements(problem, rule, h, t, c)
-        return _ElementMaps(solved[..., :n], solved[..., n:], extras)
-    D_over_h = rule.differentiation / h[:, None, None]  # (k, s, s)
-    system = np.zeros((k, s, n, s, n))
-    right = np.empty((k, s, n, n + columns))
-    start = D_over_h.sum(axis=2)  # (D𝟙)_i / h
-    if c.E is None:
-        diagonal = np.arange(n)
-        system[:, :, diagonal, :, diagonal] = D_over_h
-        right[..., :n] = start[..., None, None] * np.eye(n)
-    else:
-        E = _at_nodes(c.E, k, s)
-        np.multiply(D_over_h[:, :, None, :, None], E[:, :, :, None, :], out=system)
-        right[..., :n] = start[..., None, None] * E
-    stage = np.arange(s)
-    system[:, stage, :, stage, :] -= np.swapaxes(_at_nodes(c.A, k, s), 0, 1)
-    right[..., n:] = _at_nodes(c.f, k, s)
+    n = len(problem.start)
+    extras = tuple(at_points(extra, k, s) for extra in c.extras)
+    matrices = [c.A] if c.E is None else [c.A, c.E]
+    if c.constraints is not None:
+        matrices.append(c.constraints.basis)
+    constant = k > 1 and all(len(matrix) == 1 for matrix in matrices)
     try:
-        stacked = np.linalg.solve(
-            system.reshape(k, s * n, s * n), right.reshape(k, s * n, n + columns)
-        )
+        solved = (_solve_equal_elements if constant else _solve_distinct_elements)(rule, h, c, n)
     except np.linalg.LinAlgError as error:
         raise SolverError(
             f"the {problem.name} has a singular collocation system between t = {t[0, 0]:.6g} "
-            f"and {t[-1, -1]:.6g}"
+            f"and {t[-1, -1]:.6g}; loosen solver.tol, or choose a horizon that avoids this time"
         ) from error
-    solved = np.asarray(stacked, dtype=np.float64).reshape(k, s, n, n + columns)
+    if c.constraints is not None:
+        solved = _at_nodes(c.constraints.basis, k, s) @ solved
+        solved[..., n:] += _at_nodes(c.constraints.offset, k, s)
     return _ElementMaps(solved[..., :n], solved[..., n:], extras)
 
 
-def _solve_equal_elements(
-    problem: LinearProblem, rule: RadauRule, h: Array, t: Array, c: Coefficients
-) -> Array:
-    """With constant E and A, elements of one length share one factorisation.
+def _forcing(rule: RadauRule, h: Array, c: Coefficients) -> Array:
+    """What drives z at the nodes, f + A p − E (D p)/h, shape (k, s, d, columns)."""
+    k, s = len(h), rule.stages
+    f = _at_nodes(c.f, k, s)
+    if c.constraints is None:
+        return f
+    p = _at_nodes(c.constraints.offset, k, s)
+    slope = np.matmul(rule.differentiation / h[:, None, None], p.reshape(k, s, -1))
+    slope = slope.reshape(p.shape)
+    if c.E is not None:
+        slope = _at_nodes(c.E, k, s) @ slope
+    return np.asarray(f + _at_nodes(c.A, k, s) @ p - slope)
 
-    Lengths that differ by rounding only (equal parts of an element) count as equal. Returns what
-    ``_solve_elements`` solves for, (k, s, n, n + columns).
+
+def _solve_distinct_elements(rule: RadauRule, h: Array, c: Coefficients, n: int) -> Array:
+    """Block systems (D_ij/h E_i T_j − δ_ij A_i T_i) z_j = …, one factorisation per element.
+
+    Returns:
+        [response to the left end | particular] of z at the nodes, (k, s, d, n + columns).
     """
     k, s = len(h), rule.stages
-    n, columns = problem.start.shape
-    E = np.eye(n) if c.E is None else c.E[0]
-    f = _at_nodes(c.f, k, s)
-    start = rule.differentiation.sum(axis=1)
-    out = np.empty((k, s, n, n + columns))
+    A, f = _at_nodes(c.A, k, s), _forcing(rule, h, c)
+    d, columns = f.shape[2:]
+    D_over_h = rule.differentiation / h[:, None, None]  # (k, s, s)
+    start = D_over_h.sum(axis=2)[..., None, None]  # (D𝟙)_i / h
+    right = np.empty((k, s, d, n + columns))
+    if c.E is None:
+        system = np.zeros((k, s, d, s, d))
+        diagonal = np.arange(d)
+        system[:, :, diagonal, :, diagonal] = D_over_h
+        right[..., :n] = start * np.eye(n)
+    else:
+        E = _at_nodes(c.E, k, s)
+        coupling = E[:, :, :, None, :]
+        if c.constraints is not None:
+            T = _at_nodes(c.constraints.basis, k, s)
+            all_nodes = np.swapaxes(T, 1, 2).reshape(k, n, s * d)
+            coupling = (E.reshape(k, s * d, n) @ all_nodes).reshape(k, s, d, s, d)
+            A = A @ T
+        system = coupling * D_over_h[:, :, None, :, None]
+        right[..., :n] = start * E
+    stage = np.arange(s)
+    system[:, stage, :, stage, :] -= np.swapaxes(A, 0, 1)
+    right[..., n:] = f
+    solved = np.linalg.solve(
+        system.reshape(k, s * d, s * d), right.reshape(k, s * d, n + columns)
+    )
+    return np.asarray(solved, dtype=np.float64).reshape(right.shape)
+
+
+def _solve_equal_elements(rule: RadauRule, h: Array, c: Coefficients, n: int) -> Array:
+    """With constant E, A and T, elements of one length share one factorisation.
+
+    Lengths that differ by rounding only (equal parts of an element) count as equal. Returns what
+    ``_solve_distinct_elements`` does.
+    """
+    k, s = len(h), rule.stages
+    f = _forcing(rule, h, c)
+    d, columns = f.shape[2:]
+    E, A = np.eye(n) if c.E is None else c.E[0], c.A[0]
+    T = np.eye(n) if c.constraints is None else c.constraints.basis[0]
+    start = rule.differentiation.sum(axis=1)[:, None, None]
+    out = np.empty((k, s, d, n + columns))
     for length in np.unique(np.round(h, 12 - int(np.floor(np.log10(h.max()))))):
         same = np.flatnonzero(np.abs(h - length) <= 1e-11 * h.max())
-        system = np.kron(rule.differentiation / h[same[0]], E) - np.kron(np.eye(s), c.A[0])
-        right = np.empty((s, n, n + len(same) * columns))
-        right[:, :, :n] = (start / h[same[0]])[:, None, None] * E
-        right[:, :, n:] = np.moveaxis(f[same], 0, 2).reshape(s, n, -1)
-        try:
-            solved = np.linalg.solve(system, right.reshape(s * n, -1)).reshape(s, n, -1)
-        except np.linalg.LinAlgError as error:
-            raise SolverError(
-                f"the {problem.name} has a singular collocation system near t = {t[0, 0]:.6g}"
-            ) from error
+        step = h[same[0]]
+        system = np.kron(rule.differentiation / step, E @ T) - np.kron(np.eye(s), A @ T)
+        right = np.empty((s, d, n + len(same) * columns))
+        right[:, :, :n] = start / step * E
+        right[:, :, n:] = np.moveaxis(f[same], 0, 2).reshape(s, d, len(same) * columns)
+        solved = np.linalg.solve(system, right.reshape(s * d, right.shape[2]))
+        solved = solved.reshape(right.shape)
         out[same, :, :, :n] = solved[:, :, :n]
-        particular = solved[:, :, n:].reshape(s, n, len(same), columns)
+        particular = solved[:, :, n:].reshape(s, d, len(same), columns)
         out[same, :, :, n:] = np.moveaxis(particular, 2, 0)
     return out
 
@@ -309,12 +387,8 @@ def _chain(
     problem: LinearProblem,
     mesh: Mesh,
     restarts: Mapping[float, Callable[[Array], Array]],
-) -> tuple[Array, float]:
-    """Point values (K, s + 1, n, columns), and the error that local errors add up to.
-
-    The error of an element's right end is carried through the same maps as the solution, so that
-    it decays where the system forgets and grows where it does not.
-    """
+) -> Array:
+    """Point values (K, s + 1, n, columns)."""
     size, s, n = maps.homogeneous.shape[:3]
     columns = problem.start.shape[1]
     renewal = problem.renewal
@@ -334,15 +408,16 @@ def _chain(
             state = last_h[k] @ state + last_p[k]
         values[:, 0] = left
         values[:, 1:] = maps.homogeneous @ left[:, None] + maps.particular
-    if not np.isfinite(values).all():
-        return values, np.inf
-    return values, _propagated_error(last_h, values, mesh, renewal)
+    return values
 
 
 def _propagated_error(
     last_h: Array, values: Array, mesh: Mesh, renewal: Renewal | None
 ) -> float:
     """Largest accumulated end-point error, relative to each component's size.
+
+    The error of an element's right end is carried through the same maps as the solution, so that
+    it decays where the system forgets and grows where it does not.
 
     The local error of an end point is superconvergent (order 2s − 1 against s + 1 inside): with
     ρ the decay per Legendre coefficient it is about ρ^(s−1) times the element's tail. Half that
@@ -358,13 +433,13 @@ def _propagated_error(
     local = (tail * decay ** (0.5 * (rule.stages - 1)) + rounding).reshape(-1, *values.shape[2:])
     # Local errors have signs that nobody knows: all equal, and alternating, so that neither kind
     # of system can cancel both. Absolute values of the maps were rejected: a rotation would grow.
-    error = np.zeros((2, *values.shape[2:]))
-    worst = np.zeros(values.shape[2:])
-    signs = np.array([1.0, 1.0])[:, None, None]
-    for k in range(len(last_h)):
-        error = last_h[k] @ error + signs * local[k]
-        signs[1] *= -1.0
-        worst = np.maximum(worst, np.abs(error).max(axis=0))
+    signs = np.ones((len(local), 2, 1, 1))
+    signs[1::2, 1] = -1.0
+    errors = signs * local[:, None]
+    for k in range(1, len(errors)):
+        carried = errors[k - 1]
         if renewal is not None:
-            error = renewal.error(values[k, -1], error)
+            carried = renewal.error(values[k - 1, -1], carried)
+        errors[k] += last_h[k] @ carried
+    worst = np.abs(errors).max(axis=(0, 1), initial=0.0)
     return float((worst.ravel() / scale).max(initial=0.0))

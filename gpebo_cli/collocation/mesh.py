@@ -18,6 +18,7 @@ from gpebo_cli.systems.descriptor import Array, IntArray
 _INSIDE = 1e-3
 _CHUNK = 1 << 22  # numbers gathered at once when sampling
 _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
+_KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -72,6 +73,21 @@ class Mesh:
         At an edge the element that contains ``inside`` is used; by default the one to the right.
         """
         t = np.asarray(t, dtype=np.float64)
+        for known, decided, sampler in self._samplers:
+            if _same(known, t) and _same(decided, inside):
+                return sampler
+        sampler = self._new_sampler(t, inside)
+        if t.size <= _KEPT_TIMES:
+            self._samplers.insert(0, (t.copy(), None if inside is None else inside.copy(), sampler))
+            del self._samplers[_KEPT_SAMPLERS:]
+        return sampler
+
+    @cached_property
+    def _samplers(self) -> list[tuple[Array, Array | None, Sampler]]:
+        """The last few samplers: all signals of a run are reported at the same few sets of times."""
+        return []
+
+    def _new_sampler(self, t: Array, inside: Array | None) -> Sampler:
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
         snap = 8.0 * np.finfo(float).eps * np.abs(t)
@@ -87,6 +103,12 @@ class Mesh:
         weights[hit] = exact[hit]
         weights /= weights.sum(axis=1, keepdims=True)
         return Sampler(element, weights)
+
+
+def _same(known: Array | None, asked: Array | None) -> bool:
+    if known is None or asked is None:
+        return known is asked
+    return np.array_equal(known, asked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,25 +175,44 @@ class Trajectory:
         shape = self.values.shape[2:]
         rates = np.broadcast_to(np.asarray(rate, dtype=np.float64), shape).ravel()
         flat = self.values.reshape(mesh.size, rule.stages + 1, -1)
+        distinct, which = np.unique(rates, return_inverse=True)
         out = np.empty_like(flat)
-        for value in np.unique(rates):
-            columns = np.flatnonzero(rates == value)
-            hl = (value * mesh.steps)[:, None, None]  # h λ
-            operator = rule.differentiation + hl * np.eye(rule.stages)
-            start_column = rule.differentiation.sum(axis=1)
-            right = np.empty((mesh.size, rule.stages, 1 + len(columns)))
-            right[:, :, 0] = start_column
-            right[:, :, 1:] = hl * flat[:, 1:, columns]
-            solved = np.linalg.solve(operator, right)
-            starts = affine_scan(
-                solved[:, -1, :1], solved[:, -1, 1:], np.zeros(len(columns))
-            )[:-1]
-            out[:, 0, columns] = starts
-            out[:, 1:, columns] = solved[:, :, :1] * starts[:, None] + solved[:, :, 1:]
+        batch = max(1, _CHUNK // (mesh.size * rule.stages**2))
+        for first in range(0, len(distinct), batch):
+            some = distinct[first : first + batch]
+            columns = [np.flatnonzero(which == first + i) for i in range(len(some))]
+            _filter(mesh, some, columns, flat, out)
         return Trajectory(mesh, out.reshape(self.values.shape))
 
 
+def _filter(
+    mesh: Mesh, rates: Array, columns: Sequence[IntArray], values: Array, out: Array
+) -> None:
+    """Z of Z' = −λ (Z − S), zero start, for the columns of S that each rate λ belongs to.
+
+    Columns that share a rate share a factorisation; all rates are solved in one batch.
+    """
+    rule = mesh.rule
+    hl = rates[:, None, None, None] * mesh.steps[:, None, None]  # h λ, (rates, K, 1, 1)
+    right = np.zeros((len(rates), mesh.size, rule.stages, 1 + max(map(len, columns))))
+    right[..., 0] = rule.differentiation.sum(axis=1)  # the response to the left end
+    for i, those in enumerate(columns):
+        right[i, :, :, 1 : 1 + len(those)] = hl[i] * values[:, 1:, those]
+    solved = np.linalg.solve(rule.differentiation + hl * np.eye(rule.stages), right)
+    last = np.moveaxis(solved[:, :, -1], 0, 1)  # (K, rates, 1 + columns)
+    starts = affine_scan(last[..., :1], last[..., 1:], np.zeros(()))[:-1]
+    for i, those in enumerate(columns):
+        left = starts[:, i, None, : len(those)]
+        out[:, :1, those] = left
+        out[:, 1:, those] = solved[i, :, :, :1] * left + solved[i, :, :, 1 : 1 + len(those)]
+
+
 def unresolved(values: Array, rule: RadauRule, floor: float = 0.0) -> Array:
+    """:func:`unresolved_kinds` of signals of one kind."""
+    return unresolved_kinds([(values, floor)], rule)
+
+
+def unresolved_kinds(kinds: Sequence[tuple[Array, float]], rule: RadauRule) -> Array:
     """How far each element is from resolving its signals, relative to the signals' own size.
 
     The first Legendre coefficient that an element leaves out (see :func:`legendre_tail`) against
@@ -179,17 +220,37 @@ def unresolved(values: Array, rule: RadauRule, floor: float = 0.0) -> Array:
     beside the end of the horizon is what the end is made of.
 
     Args:
-        values: point values (K, s + 1, c) of signals of one kind.
+        kinds: point values (K, s + 1, c) of signals of one kind each, and the size below which a
+            signal of that kind is rounding, see :func:`signal_scale`.
         rule: the mesh's rule.
-        floor: size below which a signal of this kind is rounding, see :func:`signal_scale`.
 
     Returns:
         shape (K,).
     """
-    if values.shape[2] == 0:
-        return np.zeros(len(values))
-    scale = scale_so_far(values, floor)
-    return np.asarray((legendre_tail(values, rule, scale) / scale).max(axis=1))
+    seen = [(values, floor) for values, floor in kinds if values.shape[2]]
+    if not seen:
+        return np.zeros(len(kinds[0][0]))
+    if len(seen) > 1 and sum(values.size for values, _ in seen) > _CHUNK:
+        return np.asarray(np.max([unresolved_kinds([kind], rule) for kind in seen], axis=0))
+    counts = np.array([values.shape[2] for values, _ in seen])
+    floors = np.maximum([floor for _, floor in seen], _TINY)
+    values = seen[0][0] if len(seen) == 1 else np.concatenate([v for v, _ in seen], axis=2)
+    scale = _scale_so_far(values, counts, floors)
+    ratio = np.abs(np.matmul(rule.to_legendre[-_used(rule) :], values))
+    # Powers are monotone: the worst component of each degree first, then its power.
+    worst = np.minimum((ratio / scale[:, None]).max(axis=2), 1.0)
+    return np.asarray((worst ** _to_next(rule)).max(axis=1))
+
+
+def _used(rule: RadauRule) -> int:
+    """How many of the last Legendre coefficients predict the next one."""
+    return min(_COEFFICIENTS, rule.stages - 1)
+
+
+def _to_next(rule: RadauRule) -> Array:
+    """(ρ^j)^this = ρ^(s + 1) for the degrees j that are used."""
+    s = rule.stages
+    return (s + 1.0) / np.arange(s + 1 - _used(rule), s + 1)
 
 
 def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
@@ -199,24 +260,23 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     scale ρ^(s+1); the largest prediction counts. Several, because single coefficients vanish by
     accident, two of them where the signal is odd or even.
     """
-    s = rule.stages
-    used = min(_COEFFICIENTS, s - 1)
-    last = np.abs(np.matmul(rule.to_legendre[-used:], values))  # degrees s + 1 − used … s
-    degrees = np.arange(s + 1 - used, s + 1)[:, None]
+    last = np.abs(np.matmul(rule.to_legendre[-_used(rule) :], values))  # degrees s + 1 − used … s
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
-    predicted = size * np.minimum(last / size, 1.0) ** ((s + 1) / degrees)
+    predicted = size * np.minimum(last / size, 1.0) ** _to_next(rule)[:, None]
     return np.asarray(predicted.max(axis=1))
 
 
-def scale_so_far(values: Array, floor: float = 0.0) -> Array:
+def _scale_so_far(values: Array, counts: IntArray, floors: Array) -> Array:
     """Size of each component up to each element, (K, c), floored as in :func:`signal_scale`.
 
-    Also floored at 1e-8 of the final size, so that the foot of a pulse costs nothing.
+    Also floored at 1e-8 of the final size, so that the foot of a pulse costs nothing. Components
+    of one kind, ``counts`` of them, stand together and share a floor.
     """
     size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
     size = np.maximum(size, 1e-8 * size[-1])
-    largest = 1e-3 * size.max(axis=1, initial=0.0, keepdims=True)
-    return np.asarray(np.maximum(size, np.maximum(largest, max(floor, _TINY))))
+    largest = np.maximum.reduceat(size, np.cumsum(counts) - counts, axis=1)
+    level = np.maximum(1e-3 * largest, floors)
+    return np.asarray(np.maximum(size, np.repeat(level, counts, axis=1)))
 
 
 def signal_scale(values: Array, floor: float = 0.0) -> Array:

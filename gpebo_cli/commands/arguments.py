@@ -32,10 +32,14 @@ _WITH_VALUE = {
     "-i": "--info",
 }
 _LONG = {long: long for long in (*_SWITCHES.values(), *_WITH_VALUE.values())}
-_VALUES = {
+OPTIONS = tuple(_LONG)
+"""Long names of all options of ``gpebo run``."""
+
+VALUES = {
     "--cfg": ("job", "hydra", "all"),
     "--info": ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
 }
+"""What an option that has few values accepts."""
 
 # Hydra takes name(…) for one of its own functions, unless it is quoted.
 _LOGSPACE = re.compile(r"^([^=]+)=(logspace\([^()'\"]*\))$")
@@ -204,7 +208,7 @@ def _fail_fast(given: str | None) -> str:
 
 
 def _checked(flag: str, value: str) -> str:
-    accepted = _VALUES.get(flag)
+    accepted = VALUES.get(flag)
     if accepted is not None and value not in accepted:
         got = f", got {shown(value)}" if value else ""
         raise ConfigError(f"{flag} needs one of {', '.join(accepted)}{got}")

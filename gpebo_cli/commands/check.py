@@ -18,6 +18,32 @@ if TYPE_CHECKING:
 
 _WIDTH = 100
 
+_ADVICE = {
+    "Solvability": "every state needs an equation of its own: look for a row that is missing, zero "
+    "or the same as another, and for a state that stands in no row; if the index is really that "
+    "high, raise solver.max_strangeness_index; if a rank changes at one time, choose a horizon "
+    "(time.start, time.horizon) without it",
+    "Regularity": "an equation is missing or stands twice: λE − A is singular for every λ",
+    "Rank condition D2": "add an output that sees the algebraic states, as a row of C",
+    "No impulses": "use a continuous input, for instance tanh(20*(t - 1)) instead of step(t - 1), "
+    "or simulate only, with observer=none",
+    "Rank of E": "choose a horizon in which no entry of E passes through zero; an E with a row of "
+    "zeros is fine as long as it stays one",
+    "Observer": "change the plant as said above, or use observer=gpebo",
+    "Assumption 1": "add an output (a row of C) that sees the algebraic states",
+    "Assumption 2": "the direction named is not visible in the outputs: change the input, so that "
+    "the regressor's columns differ, measure more, or lengthen time.horizon; an unknown that no "
+    "output depends on cannot be estimated",
+    "Assumption 3": "measure z_a alone with one output, or use observer=gpebo",
+    "Assumption 4": "choose a horizon without that zero, or use observer=gpebo",
+    "Assumption 5": "as for Assumption 2: change the input, measure more, or lengthen time.horizon",
+    "Assumption 6": "name an output that fits (observer.output), or use observer=gpebo",
+    "Assumption 7": "choose another gain (observer.L_w), or use observer=gpebo",
+    "Growth of Φ": "the observer's own dynamics are unstable over this horizon: shorten "
+    "time.horizon, or take outputs that see more of the state",
+}
+"""What to do about an assumption that fails, by its name."""
+
 
 def main(words: list[str]) -> int:
     """Print the table, or JSON; 0 if everything that is needed holds, else 1.
@@ -100,6 +126,8 @@ def _table(title: str, found: Sequence[Assumption]) -> str:
         lines.append(f"  {'holds' if a.holds else 'FAILS'}  {a.name:<{width}}  {a.statement}")
         evidence = ", ".join(f"{key} {_value(value)}" for key, value in a.evidence.items())
         lines += _wrapped(evidence, " " * (width + 11))
+        if not a.holds and a.name in _ADVICE:
+            lines += _wrapped(f"to do: {_ADVICE[a.name]}", " " * (width + 11))
     failed = [a.name for a in found if not a.holds]
     verdict = f"{', '.join(failed)} failed" if failed else "everything that is needed holds"
     return "\n".join([*lines, verdict]) + "\n"

@@ -1,16 +1,14 @@
-"""From Hydra's configuration to :class:`Settings`, and to the ``config.yaml`` of a run."""
+"""From plain data to :class:`Settings`, and to the ``config.yaml`` of a run. Knows no Hydra."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import yaml
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import convert, nearest, read, shown
@@ -55,45 +53,11 @@ _RANGES = {
 _POSITIVE = ("time.horizon", "excitation.rho", "excitation.window", "noise.sample_time")
 
 
-def plain(cfg: DictConfig) -> dict[str, Any]:
-    """The configuration as plain data, interpolations resolved, everywhere but in the plant.
-
-    A plant is text that may come from a stranger; an interpolation in it could read environment
-    variables or other parts of the configuration.
-
-    Raises:
-        ConfigError: an interpolation in the plant, or a value that is still missing (``???``).
-    """
-    plant = cfg.get("plant")
-    if not isinstance(plant, DictConfig):
-        raise ConfigError("plant is missing; choose one with plant=NAME (see gpebo list plants)")
-    _refuse_interpolations(OmegaConf.to_container(plant, resolve=False), "plant")
-    try:
-        missing = sorted(OmegaConf.missing_keys(cfg))
-        if missing:
-            raise ConfigError(f"{missing[0]} has no value yet (???); give it one")
-        return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"{error.full_key or 'configuration'}: {error.msg}") from error
-
-
-def _refuse_interpolations(value: object, where: str) -> None:
-    if isinstance(value, str) and "${" in value:
-        raise ConfigError(f"{where}: ${{…}} is not allowed in a plant; write the value")
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            _refuse_interpolations(key, where)
-            _refuse_interpolations(inner, f"{where}.{key}")
-    elif isinstance(value, Sequence) and not isinstance(value, str):
-        for position, inner in enumerate(value):
-            _refuse_interpolations(inner, f"{where}[{position}]")
-
-
 def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
     """The settings of one run.
 
     Args:
-        config: plain data, as :func:`plain` returns it.
+        config: plain data, as :func:`gpebo_cli.commands.composed.plain` returns it.
         draw: whether ``figures: null`` means all figures or none.
 
     Raises:
@@ -186,7 +150,17 @@ class RunPatterns:
     subdir: str
 
 
-def config_text(config: Mapping[str, Any], patterns: RunPatterns) -> str:
+def patterns(primary: Mapping[str, Any]) -> RunPatterns:
+    """The patterns in the ``hydra`` section of a primary configuration."""
+    run, sweep = primary["hydra"]["run"], primary["hydra"]["sweep"]
+    return RunPatterns(str(run["dir"]), str(sweep["dir"]), str(sweep["subdir"]))
+
+
+REPEATS = "Repeats the run: gpebo run --config-dir <this folder> --config-name config"
+"""What the first line of a ``config.yaml`` says."""
+
+
+def config_text(config: Mapping[str, Any], patterns: RunPatterns, head: str = REPEATS) -> str:
     """The ``config.yaml`` of a run: complete, and good to repeat it into a new folder."""
     hydra = {
         "output_subdir": None,
@@ -199,8 +173,7 @@ def config_text(config: Mapping[str, Any], patterns: RunPatterns) -> str:
         {"override hydra/job_logging": "none"},
         {"override hydra/hydra_logging": "none"},
     ]
-    head = "# Repeats the run: gpebo run --config-dir <this folder> --config-name config\n"
-    return head + yaml.dump(
+    return f"# {head}\n" + yaml.dump(
         {"defaults": defaults, **config, "hydra": hydra},
         Dumper=_Dumper,
         allow_unicode=True,
@@ -208,6 +181,49 @@ def config_text(config: Mapping[str, Any], patterns: RunPatterns) -> str:
         sort_keys=False,
         width=100,
     )
+
+
+def load(path: str) -> dict[str, Any]:
+    """The mapping in a YAML file, read as Hydra's loader reads it.
+
+    Raises:
+        ConfigError: the file cannot be read, is not YAML, has a key twice, or is no mapping.
+    """
+    try:
+        with open(path, encoding="utf-8") as stream:
+            content = yaml.load(stream, Loader=_Loader)  # noqa: S506  a SafeLoader
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not text in UTF-8") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(yaml_problem(error)) from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected a mapping of keys to values, got {shown(content)}")
+    return content
+
+
+def yaml_problem(error: yaml.YAMLError) -> str:
+    """File, line and problem of an error of PyYAML's, in one sentence."""
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None) or str(error)
+    where = "" if mark is None else f"{mark.name}, line {mark.line + 1}: "
+    return f"{where}not valid YAML: {problem}"
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads 1e9 as a number and refuses a key that stands twice, as OmegaConf's loader does."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
+        """Refuse what YAML would silently overwrite."""
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value} stands twice", key.start_mark
+                )
+            seen.add(key.value if isinstance(key.value, str) else None)
+        return super().construct_mapping(node, deep=deep)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -223,4 +239,9 @@ _Dumper.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.[\d_]+)(e[-+]?\d+)?$|[-+]?\.?(inf|nan)$", re.IGNORECASE),
     list("-+0123456789.inIN"),
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d[\d_]*\.?\d*|\.\d+)e[-+]?\d+$", re.IGNORECASE),
+    list("-+0123456789."),
 )

@@ -124,7 +124,7 @@ def _recipe(word: str) -> str:
 
 def _formats(text: str) -> list[str]:
     """``[png,pdf]`` or ``pdf``; PNG is always among them, for the page shows it."""
-    from gpebo_cli.outputs.style import FORMATS
+    from gpebo_cli.outputs.names import FORMATS
 
     given = [part.strip() for part in text.strip("[] ").split(",")]
     for name in given:
@@ -192,11 +192,11 @@ def _jobs(name: str) -> Iterator[tuple[str, DictConfig]]:
 
 
 def _run_job(cfg: DictConfig) -> RunResult:
-    from gpebo_cli.commands import configuration
+    from gpebo_cli.commands import composed, configuration
     from gpebo_cli.commands.report import Progress
     from gpebo_cli.experiment import run_experiment
     from gpebo_cli.systems.plant import plant_from_mapping
 
-    settings = configuration.settings(configuration.plain(cfg), draw=False)
+    settings = configuration.settings(composed.plain(cfg), draw=False)
     with Progress() as progress:
         return run_experiment(settings, plant_from_mapping(settings.plant), progress)

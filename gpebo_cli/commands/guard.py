@@ -61,7 +61,7 @@ def check_folder(folder: str, config_name: str) -> None:
             "its folder launcher, and set hydra.launcher.… on the command line"
         )
     for path, group in _files(folder, config_name):
-        _check_file(path, group, folder)
+        check_file(path, group, folder)
 
 
 def _files(folder: str, config_name: str) -> Iterator[tuple[str, str | None]]:
@@ -80,8 +80,12 @@ def _files(folder: str, config_name: str) -> Iterator[tuple[str, str | None]]:
                 yield os.path.join(parent, name), group
 
 
-def _check_file(path: str, group: str | None, folder: str) -> None:
-    """Check one file; ``group`` is None for a primary configuration."""
+def check_file(path: str, group: str | None, folder: str) -> None:
+    """Check one file; ``group`` is None for a primary configuration.
+
+    Raises:
+        ConfigError: it is too large, too deep, or asks for what its kind may not.
+    """
     text = _read(path)
     if text is None:
         return

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from gpebo_cli.commands.arguments import Arguments
+from gpebo_cli.commands.configuration import yaml_problem
 from gpebo_cli.commands.locations import GROUPS, choices
 from gpebo_cli.reading import nearest, shown
 
@@ -29,7 +30,7 @@ _LONGEST = 400
 def explain(error: BaseException, arguments: Arguments) -> str:
     """One sentence for an error of :data:`LIBRARY_ERRORS`: what was given, what is accepted."""
     if isinstance(error, yaml.YAMLError):
-        return _yaml(error)
+        return _one_line(yaml_problem(error))
     if isinstance(error, MissingConfigException):
         return _missing(error, arguments)
     if isinstance(error, OverrideParseException):
@@ -49,13 +50,6 @@ def explain(error: BaseException, arguments: Arguments) -> str:
     if isinstance(cause, OmegaConfBaseException):
         text = f"{text}: {cause.msg or cause}" if text else str(cause.msg or cause)
     return _one_line(text)
-
-
-def _yaml(error: yaml.YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None)
-    problem = getattr(error, "problem", None) or str(error)
-    where = "" if mark is None else f"{mark.name}, line {mark.line + 1}: "
-    return _one_line(f"{where}not valid YAML: {problem}")
 
 
 def _missing(error: MissingConfigException, arguments: Arguments) -> str:

@@ -6,11 +6,10 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from gpebo_cli.commands import configuration
+from gpebo_cli.commands import composed, configuration
 from gpebo_cli.commands.arguments import PRIMARY, Arguments
 from gpebo_cli.commands.locations import GROUPS, conf_folder
 from gpebo_cli.commands.report import Progress
@@ -76,7 +75,7 @@ def read_job(
     """
     choices = dict(HydraConfig.get().runtime.choices)
     _refuse_shadowed(choices, arguments)
-    config = configuration.plain(cfg)
+    config = composed.plain(cfg)
     settings = configuration.settings(config, draw=draw)
 
     from gpebo_cli.systems.plant import plant_from_mapping
@@ -122,7 +121,6 @@ def _patterns() -> configuration.RunPatterns:
         for section in (hydra.run, hydra.sweep)
     )
     if "${now:" not in str(run["dir"]) or "${now:" not in str(sweep["dir"]):
-        with open(os.path.join(conf_folder(), f"{PRIMARY}.yaml"), encoding="utf-8") as stream:
-            shipped = yaml.safe_load(stream)["hydra"]
-        run, sweep = shipped["run"], shipped["sweep"]
-    return configuration.RunPatterns(str(run["dir"]), str(sweep["dir"]), str(sweep["subdir"]))
+        path = os.path.join(conf_folder(), f"{PRIMARY}.yaml")
+        return configuration.patterns(configuration.load(path))
+    return configuration.patterns({"hydra": {"run": run, "sweep": sweep}})

@@ -69,13 +69,14 @@ def _lines(group: str, folders: list[str], indent: str) -> list[str]:
     for folder in folders:
         for name in choices(folder, group):
             # The first folder wins, as it does in Hydra's search path.
-            entries.setdefault(name, _description(os.path.join(folder, group, f"{name}.yaml")))
+            title, reference = described(os.path.join(folder, group, f"{name}.yaml"))
+            entries.setdefault(name, f"{title} [{reference}]" if reference else title)
     width = max(map(len, entries), default=0)
     return [f"{indent}{name:<{width}}  {text}".rstrip() + "\n" for name, text in entries.items()]
 
 
-def _description(path: str) -> str:
-    """``title [reference]`` from the top level of a YAML file, or nothing.
+def described(path: str) -> tuple[str, str]:
+    """Title and reference from the top level of a YAML file, empty where there is none.
 
     Reads lines, not YAML: a parser takes longer to import than everything else here takes, and
     a file that is hostile, or half-written, costs nothing.
@@ -83,17 +84,16 @@ def _description(path: str) -> str:
     found = {"title": "", "reference": ""}
     try:
         if not os.path.isfile(path):  # a pipe would block
-            return ""
+            return "", ""
         with open(path, encoding="utf-8", errors="replace") as stream:
             lines = stream.read(_HEAD).splitlines()
     except OSError as error:
-        return f"(cannot be read: {error.strerror})"
+        return f"(cannot be read: {error.strerror})", ""
     for line in lines:
         key, colon, value = line.partition(":")
         if colon and key in found and not found[key]:
             found[key] = _scalar(value)
-    reference = f" [{found['reference']}]" if found["reference"] else ""
-    return found["title"] + reference
+    return found["title"], found["reference"]
 
 
 def _scalar(text: str) -> str:
@@ -103,5 +103,7 @@ def _scalar(text: str) -> str:
         text = text[1 : text.find(quote, 1)]
     else:
         text = text.partition(" #")[0].rstrip()
+    if text in ("null", "~"):
+        return ""
     # Titles come from other people's files: nothing that a terminal would obey.
     return "".join(c if c.isprintable() else "?" for c in text)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from threading import Timer
 from time import monotonic
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
     from gpebo_cli.result import RunResult
@@ -105,13 +105,18 @@ def _cell(name: str, value: float) -> str:
     return f"{value:.2e}"
 
 
-def print_run(result: RunResult, folder: str) -> None:
-    """Table, folder and verdict to stdout, the verdict last."""
+def run_lines(result: RunResult, folder: str = "") -> list[str]:
+    """The lines that tell of a run: table, what moved, ``folder`` if given, and the verdict."""
     rows = case_rows(result)
-    lines: list[Any] = []
+    lines: list[str] = []
     if rows and result.estimation is not None:
         lines += case_table(rows, list(result.estimation.cases[0]))
     moved = ", ".join(f"{m.state} {m.given:g} → {m.used:g}" for m in result.simulation.moved)
     if moved:
         lines.append(f"consistent initial state: {moved}")
-    sys.stdout.write("".join(f"{line}\n" for line in [*lines, folder, result.verdict]))
+    return [*lines, *([folder] if folder else []), result.verdict]
+
+
+def print_run(result: RunResult, folder: str) -> None:
+    """Table, folder and verdict to stdout, the verdict last."""
+    sys.stdout.write("".join(f"{line}\n" for line in run_lines(result, folder)))

@@ -25,7 +25,7 @@ def main(words: list[str]) -> int:
     """
     arguments = command_line.parse(words)
     if "--version" in arguments.switches:
-        from gpebo_cli import __version__
+        from gpebo_cli._version import __version__
 
         sys.stdout.write(f"gpebo {__version__}\n")
         return 0

@@ -15,6 +15,8 @@ commands:
   compare DIR …       one table and figures over finished runs and sweeps
   figures [NAME …]    the paper's figures and tables, in outputs/paper
   list [KIND]         what there is: plants, observers, estimators, experiments
+  new plant NAME      a commented plant file of your own, which runs as it stands
+  completion SHELL    completion of commands, groups and names for bash, zsh or fish
 
 options:
   -h, --help          this text; gpebo run --help has groups, defaults and more examples
@@ -23,11 +25,12 @@ options:
 examples:
   gpebo run plant=circuit estimator=drem             # the paper's experiment
   gpebo run 'estimator.gamma=[1e8,1e10]'             # two gains in one run
-  gpebo run -m estimator.gamma=1e6,1e8,1e10          # a run for each, one results.csv
-  gpebo run --config-dir . plant=mine                # your plant, in ./plant/mine.yaml
-  gpebo check plant=canonical observer=canonical     # what holds, what does not, by how much
-  gpebo compare outputs/sweeps/FOLDER                # who was best, by which gain
-  gpebo figures                                      # the paper's figures, outputs/paper
+  gpebo run -m estimator.gamma=1e6,1e8 hydra.sweep.dir=gains     # a run for each, one results.csv
+  gpebo compare gains                                # who was best, by which gain
+  gpebo new plant tank                               # your plant, in ./plant/tank.yaml
+  gpebo check --config-dir . plant=tank              # what holds, what does not, by how much
+  gpebo run --config-dir . plant=tank
+  gpebo figures paper_circuit                        # the paper's figures, outputs/paper
   gpebo list plants
 
 exit codes: 0 done, 1 the run failed, 2 wrong usage or configuration, 130 interrupted
@@ -49,8 +52,8 @@ options:
 
 examples:
   gpebo figures
-  gpebo figures paper_circuit 'figures.formats=[png,pdf]'
-  gpebo figures --check tests/data/paper
+  gpebo figures paper_circuit 'figures.formats=[png,pdf]' --update tables
+  gpebo figures paper_circuit --check tables
 """
 
 COMPARE_HELP = """\
@@ -70,8 +73,9 @@ options:
   -h, --help          this text
 
 examples:
-  gpebo compare outputs/sweeps/FOLDER
-  gpebo compare outputs/runs/* --sort final_error_states --csv best.csv --no-figures
+  gpebo run -m estimator.gamma=1e6,1e8 estimator=drem,lion hydra.sweep.dir=gains
+  gpebo compare gains
+  gpebo compare gains/0 gains/1 --sort final_error_states --csv best.csv --no-figures
 """
 
 CHECK_HELP = """\
@@ -79,8 +83,8 @@ usage: gpebo check [OVERRIDES] [OPTIONS]
 
 Checks every assumption that a run with these OVERRIDES (those of gpebo run) would rest on:
 solvability and index, a consistent start, the rank of E, impulse observability, excitation, and
-those of the canonical form. Nothing is estimated or written. Exit code 1 if something that is
-needed does not hold.
+those of the canonical form. What fails comes with what to do about it. Nothing is estimated or
+written. Exit code 1 if something that is needed does not hold.
 
 options:
   --json              for a program instead of a person
@@ -91,7 +95,32 @@ examples:
   gpebo check plant=circuit
   gpebo check plant=circuit observer.regression=paper
   gpebo check plant=canonical observer=canonical --json
-  gpebo check --config-dir . plant=mine
+  gpebo new plant tank
+  gpebo check --config-dir . plant=tank
+"""
+
+NEW_HELP = """\
+usage: gpebo new plant NAME [--config-dir DIR]
+
+Writes DIR/plant/NAME.yaml, by default below the current folder: a plant with every key explained,
+which runs as it stands. Nothing that exists is overwritten.
+
+examples:
+  gpebo new plant tank
+  gpebo run --config-dir . plant=tank
+  gpebo new plant boiler --config-dir models
+  gpebo check --config-dir models plant=boiler
+"""
+
+COMPLETION_HELP = """\
+usage: gpebo completion bash|zsh|fish
+
+Prints a script that completes commands, options, groups and their values (yours, too, after
+--config-dir DIR), keys, figures and folders. Load it in the shell's start-up file:
+
+  ~/.bashrc                     eval "$(gpebo completion bash)"
+  ~/.zshrc, after compinit      eval "$(gpebo completion zsh)"
+  ~/.config/fish/config.fish    gpebo completion fish | source
 """
 
 LIST_HELP = """\
@@ -137,15 +166,12 @@ options:
 
 examples:
   gpebo run plant=circuit estimator=drem
-  gpebo run time.horizon=10 estimator.gamma=1e9 figures=[regressor]
-  gpebo run 'estimator.gamma=[1e8,1e10]'             # one run, a case for each gain
-  gpebo run 'estimator.gamma=logspace(6,12,1000)'
-  gpebo run -m estimator.gamma=1e6,1e8 solver=collocation,ivp
-  gpebo run -m 'time.horizon=10,20' 'estimator.gamma=logspace(6,10,5)' launcher=joblib
-  gpebo run experiment=paper_circuit
-  gpebo run noise=gaussian noise.outputs=0.01 noise.seed=1
-  gpebo run observer=none plant=circuit              # simulate only
-  gpebo run --config-dir outputs/runs/FOLDER --config-name config    # repeat a run
+  gpebo run 'estimator.gamma=logspace(6,12,100)' 'figures=[gains]'    # one run, 100 cases
+  gpebo run -m plant=circuit,descriptor estimator=drem,ls_drem        # a run for each of four
+  gpebo run noise=gaussian noise.outputs=0.01 noise.seed=1            # noisy outputs
+  gpebo run observer=none time.horizon=5                              # simulate only
+  gpebo run experiment=paper_circuit hydra.run.dir=paper              # a recipe, and where to
+  gpebo run --config-dir paper --config-name config                   # repeat that run
 """
 
 

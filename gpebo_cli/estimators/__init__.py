@@ -1,13 +1,16 @@
 """Estimators, found by name: a module here with a dataclass is an estimator.
 
 Adding one is one module (whose dataclass carries the settings and has ``cases`` and
-``estimate``), exported as ``ESTIMATOR``, and one config in ``conf/estimator``.
+``estimate``), exported as ``ESTIMATOR``, and one config in ``conf/estimator``. Another package adds
+one as an entry point in the group ``gpebo.estimators``, which names the dataclass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import cast
 
@@ -15,12 +18,24 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import nearest, read
 from gpebo_cli.regression import Estimates, Estimator
 
-__all__ = ["Estimates", "Estimator", "build", "names"]
+GROUP = "gpebo.estimators"
+"""The entry points under which other packages offer estimators."""
+
+__all__ = ["GROUP", "Estimates", "Estimator", "build", "names", "settings_of"]
 
 
 def names() -> list[str]:
-    """Every estimator there is."""
-    return sorted(p.stem for p in Path(__file__).parent.glob("*.py") if p.stem[0] != "_")
+    """Every estimator there is, those of other packages included."""
+    return sorted({*_ours(), *_theirs()})
+
+
+def _ours() -> list[str]:
+    return [p.stem for p in Path(__file__).parent.glob("*.py") if p.stem[0] != "_"]
+
+
+def _theirs() -> dict[str, EntryPoint]:
+    """Estimators that installed packages bring. A name of ours is ours."""
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
 def build(settings: Mapping[str, object]) -> Estimator:
@@ -29,14 +44,41 @@ def build(settings: Mapping[str, object]) -> Estimator:
     Raises:
         ConfigError: unknown name or key, with the nearest known one.
     """
-    name = settings.get("name")
-    if name not in names():
-        raise ConfigError(
-            f"estimator.name: {name!r} is not an estimator; known: {', '.join(names())}"
-            + nearest(str(name), names())
-        )
-    estimator = import_module(f"{__name__}.{name}").ESTIMATOR
+    estimator = _find(settings)
     rest = {k: v for k, v in settings.items() if k not in ("name", "title", "reference")}
     built = cast(Estimator, read(estimator, rest, "estimator"))
     _ = built.cases  # gains are read here, so that a wrong one is found before anything is run
     return built
+
+
+def settings_of(settings: Mapping[str, object]) -> list[str]:
+    """The settings that the estimator called ``settings["name"]`` has.
+
+    Raises:
+        ConfigError: unknown name, with the nearest known one.
+    """
+    return [field.metadata.get("key", field.name) for field in fields(_find(settings))]
+
+
+def _find(settings: Mapping[str, object]) -> type:
+    name = settings.get("name")
+    if name not in _ours() and name in (theirs := _theirs()):
+        return _load(theirs[str(name)])
+    if name not in _ours():
+        raise ConfigError(
+            f"estimator.name: {name!r} is not an estimator; known: {', '.join(names())}"
+            + nearest(str(name), names())
+        )
+    return cast("type", import_module(f"{__name__}.{name}").ESTIMATOR)
+
+
+def _load(entry: EntryPoint) -> type:
+    """The dataclass that another package's entry point names."""
+    where = f"estimator.name: {entry.name} of {entry.dist.name if entry.dist else entry.value}"
+    try:
+        found = entry.load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{where} cannot be imported: {error}") from error
+    if not (isinstance(found, type) and is_dataclass(found)):
+        raise ConfigError(f"{where} is not a dataclass; {entry.value} must name one")
+    return found

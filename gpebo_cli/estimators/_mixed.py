@@ -94,7 +94,7 @@ class MixedEstimates:
 
     def delta(self, t: Array) -> Array:
         """Δ at the times t (M,), one row if it is the same for every case, else one per case."""
-        rows = [path.signals(t, t)[0] for path in self.groups]
+        rows = [path.delta(t) for path in self.groups]
         return np.array(rows) if len(rows) == 1 else np.repeat(rows, len(self.gains), axis=0)
 
     @property

@@ -21,12 +21,38 @@ def mix(extended: Trajectory, t: Array) -> ScalarPath:
         values = extended(t, inside)
         return determinant_and_adjugate_action(values[..., :-1], values[..., -1])[:2]
 
-    values = extended.values
-    delta, Y, reciprocal = determinant_and_adjugate_action(values[..., :-1], values[..., -1])
-    usable = (reciprocal > SINGULAR) & (delta != 0.0)
-    quotient = np.divide(Y, delta[..., None], out=np.zeros_like(Y), where=usable[..., None])
-    quotient = filled(quotient, usable)
-    return scalar_path(extended.mesh, signals, delta, quotient, t)
+    def determinant(t: Array) -> Array:
+        return np.asarray(np.linalg.det(extended(t)[..., :-1]))
+
+    delta, quotient, usable = determinant_and_quotient(
+        extended.values[..., :-1], extended.values[..., -1]
+    )
+    return scalar_path(
+        extended.mesh, signals, delta, filled(quotient, usable), t, determinant
+    )
+
+
+def determinant_and_quotient(omega: Array, rhs: Array) -> tuple[Array, Array, BoolArray]:
+    """Δ = det Ω, η̄ = 𝐘/Δ, and where η̄ is more than rounding; Ω (..., p, p), 𝒴 (..., p).
+
+    𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
+    """
+    delta = np.asarray(np.linalg.det(omega), dtype=np.float64)
+    usable = delta != 0.0  # by elimination, an exact zero is a pivot that is zero
+    quotient = np.zeros_like(rhs)
+    if usable.any():
+        # Ω⁻¹ beside Ω⁻¹𝒴: ‖Ω‖ ‖Ω⁻¹‖ is at most p times the condition number.
+        square = omega[usable]
+        both = np.concatenate(
+            [np.broadcast_to(np.eye(omega.shape[-1]), square.shape), rhs[usable][..., None]], axis=-1
+        )
+        solved = np.linalg.solve(square, both)
+        quotient[usable] = solved[..., -1]
+        condition = (
+            np.linalg.norm(square, axis=(-2, -1)) * np.linalg.norm(solved[..., :-1], axis=(-2, -1))
+        )
+        usable[usable] = condition * SINGULAR < 1.0  # False for nan, too
+    return delta, quotient, usable
 
 
 def filled(quotient: Array, usable: BoolArray) -> Array:

@@ -37,6 +37,7 @@ class ScalarPath:
 
     mesh: Mesh
     signals: MixedSignals
+    delta: Callable[[Array], Array]  # times (N,) -> Δ (N,)
     quotient: Array  # (K, s + 1, p) η̄, usable everywhere
     energy: Array  # (K, s + 1) I
     t: Array  # (M,)
@@ -163,10 +164,18 @@ def _solve_batch(mesh: Mesh, delta: Array, Y: Array, start: Array, gains: Array)
     return values.reshape(mesh.size, rule.stages + 1, g, p)
 
 
-def scalar_path(mesh: Mesh, signals: MixedSignals, delta: Array, quotient: Array, t: Array
-                ) -> ScalarPath:
-    """Prepare the law for Δ (K, s + 1) and η̄ (K, s + 1, p), reported at the times t (M,)."""
+def scalar_path(
+    mesh: Mesh, signals: MixedSignals, delta: Array, quotient: Array, t: Array,
+    determinant: Callable[[Array], Array] | None = None,
+) -> ScalarPath:
+    """Prepare the law for Δ (K, s + 1) and η̄ (K, s + 1, p), reported at the times t (M,).
+
+    ``determinant`` gives Δ at any times, where that is cheaper than ``signals``.
+    """
     energy = np.maximum.accumulate(Trajectory(mesh, delta**2).integral().values.ravel())
     energy = energy.reshape(delta.shape)
     at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
-    return ScalarPath(mesh, signals, quotient, energy, t, at_t)
+    if determinant is None:
+        def determinant(t: Array) -> Array:
+            return signals(t, t)[0]
+    return ScalarPath(mesh, signals, determinant, quotient, energy, t, at_t)

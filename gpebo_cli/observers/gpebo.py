@@ -29,7 +29,7 @@ import numpy as np
 from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError, ModelError
-from gpebo_cli.linalg import orthonormal_complement, transpose
+from gpebo_cli.linalg import joined, orthonormal_complement, transpose
 from gpebo_cli.observers.extension import initial_extension
 from gpebo_cli.observers.observation import AffineStateMap, InitialError, Observation
 from gpebo_cli.regression import LinearRegression, outer_products
@@ -38,47 +38,109 @@ from gpebo_cli.settings import ObserverSettings, SolverSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.systems.descriptor import Array, DescriptorSystem, IntArray
 
+_TURNED = 8 * float(np.finfo(float).eps)  # of E outside the frame, relative: rounding
+_PROJECTOR_TURNED = 1e-13
+_TINY = float(np.finfo(float).tiny)
 _VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
 
 
 @dataclass(frozen=True, eq=False)
-class ObserverMatrices:
-    """Every matrix of the observer at N times, known functions of t only."""
+class Split:
+    """E⁺ and the subspaces of E at N times; a leading axis of 1 means constant in time."""
 
-    A0: Array  # (N, n, n)
-    D0: Array  # (N, n, q)
-    from_inputs: Array  # (N, n, m) b_0 = from_inputs u + from_outputs y
-    from_outputs: Array  # (N, n, r)
-    projector: Array  # (N, n, n) P
-    residual: Array  # (N, n + r, n + r) R
-    algebraic: Array  # (N, n + r, n) 𝒜
-    g_inputs: Array  # (N, n + r, m) g_y = g_inputs u − [0; y]
-    G: Array  # (N, n + r, q)
-    X_w: Array  # (N, n, n)
-    K: Array  # (N, n, n + r)
-    complement: Array  # (N, n, n) Π
     rank: int  # n_a
-    smallest_singular_value: Array  # (N,) of 𝒜 on ker E, relative to ‖𝒜‖; inf if n_b = 0
+    basis: Array  # (n, k) orthonormal B with w = B z: range P where that is constant, else I
+    pinv: Array  # (N, k, n) BᵀE⁺
+    turn: Array | None  # (N, k, n) BᵀṖ, None for zero
+    equations: Array  # (N, e, n) L: Π itself, or the e = n_b equations without derivatives
+    kernel: Array  # (N, n, n_b) orthonormal
+    projector: Array  # (N, n, n) P
+    frame: Frame | None  # None where kernel or range turn
 
-    def g_y(self, u: Array, y: Array) -> Array:
-        """g_y = [Π B u; −y] for u (N, m) and y (N, r), shape (N, n + r)."""
-        g = np.einsum("nij,nj->ni", self.g_inputs, u)
-        g[:, self.X_w.shape[1] :] -= y
-        return np.asarray(g)
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Kernel and range of an E(t) in which neither depends on time."""
+
+    domain: Array  # (n, n_a) orthonormal, of range P
+    range: Array  # (n, n_a) orthonormal, of range E
+    kernel: Array  # (n, n_b)
+    equations: Array  # (e, n)
 
 
-def row_sizes(system: DescriptorSystem, t: Array, inside: Array) -> Array:
-    """Size of each row of E over the times t, shape (n,), one for rows that are zero.
+@dataclass(frozen=True, eq=False)
+class ObserverMatrices:
+    """Every matrix of the observer at N times, known functions of t only.
+
+    With 𝒜 V2 = Q1 R1 (V2 spans the kernel of E), K = H Q1ᵀ with H = V2 R1⁻¹, and the projector
+    on the residual is I − Q1 Q1ᵀ. Matrices that do not depend on time have a leading axis of 1.
+    """
+
+    split: Split
+    rows: Array  # (n,) constants by which the equations were divided
+    dynamics: Array  # (N, k, k) BᵀA_0 B
+    from_unknowns: Array  # (N, k, q) BᵀD_0
+    from_signals: Array  # (N, k, m + r) Bᵀb_0 = from_signals [u; y]
+    algebraic: Array  # (N, e + r, n) 𝒜
+    g_signals: Array  # (N, e + r, m + r) g_y = g_signals [u; y]
+    G: Array  # (N, e + r, q)
+    range: Array  # (N, e + r, n_b) Q1
+    elimination: Array  # (N, n, n_b) H
+    # At most the smallest singular value of 𝒜 on ker E relative to ‖𝒜‖, at least 1/√n_b of it.
+    injectivity: Array  # (N,)
+
+    @property
+    def A0(self) -> Array:
+        """A_0 in all n coordinates, (N, n, n)."""
+        B = self.split.basis
+        return np.asarray(B @ self.dynamics @ B.T)
+
+    @property
+    def D0(self) -> Array:
+        """D_0, (N, n, q)."""
+        return np.asarray(self.split.basis @ self.from_unknowns)
+
+    @property
+    def from_inputs(self) -> Array:
+        """(N, n, m); b_0 = from_inputs u + from_outputs y."""
+        m = self.from_signals.shape[2] - self.outputs
+        return np.asarray(self.split.basis @ self.from_signals[:, :, :m])
+
+    @property
+    def from_outputs(self) -> Array:
+        """(N, n, r)."""
+        m = self.from_signals.shape[2] - self.outputs
+        return np.asarray(self.split.basis @ self.from_signals[:, :, m:])
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs r."""
+        return self.algebraic.shape[1] - self.split.equations.shape[1]
+
+    @property
+    def projector(self) -> Array:
+        """P = E⁺E, (N, n, n)."""
+        return self.split.projector
+
+    @property
+    def residual(self) -> Array:
+        """R = I − 𝒜 Q K, (N, e + r, e + r)."""
+        return orthonormal_complement(self.range)
+
+
+def row_sizes(E: Array) -> Array:
+    """Size of each row of E (N, n, n) over the times, shape (n,), one for rows that are zero.
 
     Dividing equations by constants changes nothing, but an equation in picofarads would else look
     like a rank deficiency of E. Powers of two: no rounding.
     """
-    size = np.abs(system.coefficients.taylor(t, 0, inside).E[0]).max(axis=(0, 2))
+    size = np.abs(E).max(axis=(0, 2))
     return np.asarray(np.exp2(np.rint(np.log2(np.where(size > 0, size, 1.0)))))
 
 
 def observer_matrices(
-    system: DescriptorSystem, t: Array, inside: Array, rank_tol: float, rows: Array | None = None
+    system: DescriptorSystem, t: Array, inside: Array, rank_tol: float,
+    like: ObserverMatrices | None = None, *, normalise: bool = False,
 ) -> ObserverMatrices:
     """Evaluate the observer's matrices at the times t (N,).
 
@@ -87,19 +149,127 @@ def observer_matrices(
         t: times.
         inside: where functions that jump are decided.
         rank_tol: singular values below this, relative, are zero.
-        rows: constants (n,) by which the equations are divided first, see :func:`row_sizes`.
+        like: those of other times, whose basis and scaling of the equations are kept.
+        normalise: divide the equations by their sizes first, see :func:`row_sizes`.
 
     Raises:
         ModelError: the rank of E is not constant, or Assumption 1 fails; names the time and the
             singular value.
     """
-    n, m, q, r = system.n, system.m, system.q, system.r
-    c = system.coefficients.taylor(t, 1, inside)
-    E, dE, A, B, F, C = c.E[0], c.E[1], c.A[0], c.B[0], c.F[0], c.C[0]
-    if rows is not None and (rows != 1.0).any():
-        E, dE, A, B, F = (matrix / rows[:, None] for matrix in (E, dE, A, B, F))
-    U, sigma, Vt = _svd(E, "E" in system.coefficients.constant)
-    size = np.maximum(sigma.max(initial=0.0), np.finfo(float).tiny)
+    m, q, r = system.m, system.q, system.r
+    turning = like is not None and like.split.frame is None
+    c = system.coefficients.taylor(t, 1 if turning else 0, inside)
+    constant = system.coefficients.constant
+
+    def value(name: str) -> Array:
+        matrix: Array = getattr(c, name)[0]
+        return matrix[:1] if name in constant else matrix
+
+    E, A, B, F, C = map(value, "EABFC")
+    if like is not None:
+        rows = like.rows
+    else:
+        rows = row_sizes(E) if normalise else np.ones(system.n)
+    if (rows != 1.0).any():
+        E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
+    frame = _frame(E, system.states, rank_tol) if like is None else like.split.frame
+    split = None if frame is None else _split_in_frame(E, frame, rank_tol)
+    if split is None:
+        slope = c if turning else system.coefficients.taylor(t, 1, inside)
+        dE = slope.E[1][: len(E)] / rows[:, None]
+        known = None if like is None else like.split.basis
+        split = _split_by_svd(system, E, dE, t, rank_tol, known)
+
+    L, pinv, basis = split.equations, split.pinv, split.basis
+    algebraic = joined(L @ A, C, axis=1)  # 𝒜 = [Π A; C]
+    e = L.shape[1]
+    of_y = np.zeros((1, e + r, r))
+    of_y[0, e:] = -np.eye(r)
+    below = np.zeros((1, r, m + q))
+    of_u_theta = joined(joined(L @ B, L @ F, axis=2), below, axis=1)
+    # g_y = [Π B u; −y] and G = [Π F; 0]
+    g_signals, G = joined(of_u_theta[:, :, :m], of_y, axis=2), of_u_theta[:, :, m:]
+    Q1, H, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
+    Lambda = pinv @ A if split.turn is None else pinv @ A + split.turn  # Λ = E⁺A + Ṗ
+    # [A_0 | D_0 | of u and y] = [Λ | E⁺F | E⁺B, 0] − Λ K [𝒜 | G | g_signals]
+    direct = joined(
+        Lambda @ basis, pinv @ F, pinv @ B, np.zeros((1, len(basis.T), r)), axis=2
+    )
+    through = joined(algebraic @ basis, G, g_signals, axis=2)
+    whole = direct - (Lambda @ H) @ (transpose(Q1) @ through)
+    k = basis.shape[1]
+    dynamics = whole[:, :, :k]
+    return ObserverMatrices(
+        split=split,
+        rows=rows,
+        dynamics=dynamics[:1] if {"E", "A", "C"} <= constant else dynamics,
+        from_unknowns=whole[:, :, k : k + q],
+        from_signals=whole[:, :, k + q :],
+        algebraic=algebraic,
+        g_signals=g_signals,
+        G=G,
+        range=Q1,
+        elimination=H,
+        injectivity=injectivity,
+    )
+
+
+def _frame(E: Array, states: tuple[str, ...], rank_tol: float) -> Frame | None:
+    """Kernel and range of E at the times (N, n, n), if they are the same at all of them.
+
+    Coordinate axes where columns and rows are exactly zero, as in E = diag(E_a(t), 0); else from
+    the singular vectors at the first time.
+    """
+    n = E.shape[1]
+    used = (E != 0.0).any(axis=0)
+    rows, columns = np.flatnonzero(used.any(axis=1)), np.flatnonzero(used.any(axis=0))
+    axes = np.eye(n)
+    if len(rows) == len(columns):
+        free = np.setdiff1d(np.arange(n), rows)
+        unused = np.setdiff1d(np.arange(n), columns)
+        frame = Frame(axes[:, columns], axes[:, rows], axes[:, unused], axes[free])
+        if _split_in_frame(E, frame, rank_tol) is not None:
+            return frame
+    U, sigma, Vt = np.linalg.svd(E[0])
+    rank = int((sigma > rank_tol * np.linalg.norm(E, axis=(1, 2)).max()).sum())
+    U1, V2 = U[:, :rank], Vt[rank:].T
+    domain, _ = initial_basis(Vt[:rank].T @ Vt[:rank], rank, states)
+    frame = Frame(domain, U1, V2, orthonormal_complement(U1))
+    return frame if _split_in_frame(E, frame, rank_tol) is not None else None
+
+
+def _split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
+    """E⁺ = B (UᵀE B)⁻¹ Uᵀ, or None where kernel, range or rank are not those of the frame."""
+    B, U = frame.domain, frame.range
+    rank = B.shape[1]
+    size = float(np.abs(E).max(initial=0.0))
+    outside = max(
+        float(np.abs(E @ frame.kernel).max(initial=0.0)),
+        float(np.abs(frame.equations @ E).max(initial=0.0)),
+    )
+    if outside > _TURNED * size:
+        return None
+    inner = U.T @ E @ B
+    try:
+        inverse = np.asarray(np.linalg.inv(inner), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    largest = float(np.linalg.norm(inner, axis=(1, 2)).max(initial=0.0))
+    smallest = 1.0 / max(float(np.linalg.norm(inverse, axis=(1, 2)).max(initial=0.0)), _TINY)
+    if not smallest > np.sqrt(max(rank, 1)) * rank_tol * largest:
+        return None  # too close to call without singular values
+    return Split(
+        rank=rank, basis=B, pinv=inverse @ U.T, turn=None, equations=frame.equations[None],
+        kernel=frame.kernel[None], projector=(B @ B.T)[None], frame=frame,
+    )
+
+
+def _split_by_svd(
+    system: DescriptorSystem, E: Array, dE: Array, t: Array, rank_tol: float, basis: Array | None
+) -> Split:
+    """The general case: singular vectors at every time, and Ṗ = S + Sᵀ with S = E⁺ Ė Q."""
+    U, sigma, Vt = np.linalg.svd(E)
+    size = np.maximum(sigma.max(initial=0.0), _TINY)
     ranks = (sigma > rank_tol * size).sum(axis=1)
     if (ranks != ranks[0]).any():
         k = int(np.argmax(ranks != ranks[0]))
@@ -112,77 +282,75 @@ def observer_matrices(
     n_a = int(ranks[0])
     U1, V1, V2 = U[:, :, :n_a], transpose(Vt)[:, :, :n_a], transpose(Vt)[:, :, n_a:]
     pinv_E = (V1 / sigma[:, None, :n_a]) @ transpose(U1)  # E⁺
-    Pi = orthonormal_complement(U1)  # Π = I − E E⁺
     P = V1 @ transpose(V1)
     S = pinv_E @ dE @ (V2 @ transpose(V2))  # E⁺ Ė Q
-    Lambda = pinv_E @ A + S + transpose(S)  # Λ = E⁺A + Ṗ
-
-    algebraic = np.concatenate([Pi @ A, C], axis=1)  # 𝒜 = [Π A; C]
-    g_inputs = np.concatenate([Pi @ B, np.zeros((len(t), r, m))], axis=1)
-    G = np.concatenate([Pi @ F, np.zeros((len(t), r, q))], axis=1)
-    K, residual, smallest = _eliminate(system, algebraic, V2, t, rank_tol)
-    X_w = np.eye(n) - K @ algebraic
-    X_theta = -K @ G
-    K_y = K[:, :, n:]  # x_y = −K g_y = −K g_inputs u + K_y y
-    return ObserverMatrices(
-        A0=Lambda @ X_w,
-        D0=Lambda @ X_theta + pinv_E @ F,
-        from_inputs=pinv_E @ B - Lambda @ (K @ g_inputs),
-        from_outputs=Lambda @ K_y,
-        projector=P,
-        residual=residual,
-        algebraic=algebraic,
-        g_inputs=g_inputs,
-        G=G,
-        X_w=X_w,
-        K=K,
-        complement=Pi,
-        rank=n_a,
-        smallest_singular_value=smallest,
+    turned = float(np.abs(P - P[0]).max(initial=0.0)) >= _PROJECTOR_TURNED
+    if basis is None:
+        basis = np.eye(system.n) if turned else initial_basis(P[0], n_a, system.states)[0]
+    elif basis.shape[1] < system.n:
+        off = np.abs(P - basis @ basis.T).max(axis=(1, 2))
+        if off.max() >= 10 * _PROJECTOR_TURNED:
+            raise ModelError(
+                f"plant {system.name}: the kernel of E turns near t = {t[int(np.argmax(off))]:.6g} "
+                "and nowhere else; start a run there, or make E smooth"
+            )
+    return Split(
+        rank=n_a, basis=basis, pinv=basis.T @ pinv_E, turn=basis.T @ (S + transpose(S)),
+        equations=orthonormal_complement(U1), kernel=V2, projector=P, frame=None,
     )
-
-
-def _svd(E: Array, constant: bool) -> tuple[Array, Array, Array]:
-    """Singular vectors of E at N times, computed once if E is constant."""
-    if constant:
-        U, sigma, Vt = np.linalg.svd(E[:1])
-        count = len(E)
-        return (
-            np.broadcast_to(U, (count, *U.shape[1:])),
-            np.broadcast_to(sigma, (count, sigma.shape[1])),
-            np.broadcast_to(Vt, (count, *Vt.shape[1:])),
-        )
-    return np.linalg.svd(E)
 
 
 def _eliminate(
     system: DescriptorSystem, algebraic: Array, kernel: Array, t: Array, rank_tol: float
 ) -> tuple[Array, Array, Array]:
-    """K = (𝒜 Q)⁺, R = I − 𝒜 Q K, and the singular value that Assumption 1 rests on.
+    """Q1 and H of K = (𝒜 Q)⁺ = H Q1ᵀ, and a bound of the singular value behind Assumption 1.
 
-    With Q = V2 V2ᵀ, (𝒜 Q)⁺ = V2 (𝒜 V2)⁺, a full-rank pseudoinverse.
+    With Q = V2 V2ᵀ and 𝒜 V2 = Q1 R1, (𝒜 Q)⁺ = V2 R1⁻¹ Q1ᵀ. σ_min(R1) is at least 1/‖R1⁻¹‖_F;
+    it is computed itself only where that bound leaves a doubt.
     """
-    count, rows = algebraic.shape[:2]
+    on_kernel = algebraic @ kernel
+    size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), _TINY)
     n_b = kernel.shape[2]
     if n_b == 0:
-        return (
-            np.zeros((count, system.n, rows)),
-            np.broadcast_to(np.eye(rows), (count, rows, rows)),
-            np.full(count, np.inf),
-        )
-    U, sigma, Vt = np.linalg.svd(algebraic @ kernel, full_matrices=False)
-    size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), np.finfo(float).tiny)
-    smallest = sigma[:, -1] / size
-    bad = smallest <= rank_tol
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise ModelError(
-            f"plant {system.name}: Assumption 1 (impulse observability) fails at t = {t[k]:.6g}: "
-            f"[ΠA; C] has singular value {smallest[k]:.1e} on the kernel of E; an output that "
-            f"sees the algebraic states is needed"
-        )
-    K = kernel @ (transpose(Vt) / sigma[:, None, :]) @ transpose(U)
-    return K, orthonormal_complement(U), smallest
+        return on_kernel, np.broadcast_to(kernel, (1, *kernel.shape[1:])), np.full(len(size), np.inf)
+    Q1, R1 = np.linalg.qr(on_kernel)
+    try:
+        inverse = np.asarray(np.linalg.inv(R1), dtype=np.float64)
+        bound = 1.0 / (np.linalg.norm(inverse, axis=(1, 2)) * size)
+    except np.linalg.LinAlgError:
+        inverse, bound = R1, np.zeros(len(R1))
+    doubtful = np.flatnonzero(~(bound > rank_tol))
+    if len(doubtful):
+        smallest = np.linalg.svd(R1[doubtful], compute_uv=False)[:, -1] / size[doubtful]
+        if (smallest <= rank_tol).any():
+            k = int(np.argmax(smallest <= rank_tol))
+            raise ModelError(
+                f"plant {system.name}: Assumption 1 (impulse observability) fails at "
+                f"t = {t[doubtful[k]]:.6g}: [ΠA; C] has singular value {smallest[k]:.1e} on the "
+                "kernel of E; an output that sees the algebraic states is needed"
+            )
+    return Q1, kernel @ inverse, bound
+
+
+def _weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
+    """The smallest singular value over all times, relative to ‖𝒜‖, and where it is.
+
+    ‖H‖_F took the place of ‖H‖_2 = 1/σ_min. Only times whose bound is below the true value at
+    the time of the smallest bound can be weaker.
+    """
+    if not np.isfinite(injectivity).all():
+        return float(np.inf), 0
+    H = elimination if len(elimination) > 1 else np.repeat(elimination, len(injectivity), axis=0)
+
+    def exact(which: IntArray) -> Array:
+        norms = np.linalg.norm(H[which], axis=(1, 2)) / np.linalg.norm(H[which], 2, axis=(1, 2))
+        return np.asarray(injectivity[which] * norms)
+
+    first = np.array([int(np.argmin(injectivity))])
+    candidates = np.flatnonzero(injectivity <= exact(first)[0])
+    values = exact(candidates)
+    k = int(np.argmin(values))
+    return float(values[k]), int(candidates[k])
 
 
 def observe(
@@ -211,42 +379,52 @@ def observe(
             f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
         )
     mesh = inputs.mesh
-    starts, inside = mesh.points[:, 0], mesh.inside[:, 0]
-    rows = row_sizes(system, starts, inside)
-    first = observer_matrices(system, starts, inside, solver.rank_tol, rows)
-    constant_basis = is_constant(first.projector)
-    V1, names = initial_basis(first.projector[0], first.rank, system.states)
+    t, inside = mesh.points.ravel(), mesh.inside.ravel()
+    first = observer_matrices(system, t, inside, solver.rank_tol, normalise=True)
+    split, rank = first.split, first.split.rank
+    V1, names = initial_basis(split.projector[0], rank, system.states)
     # Where the kernel of E rotates, w is integrated in all n coordinates; else in its own n_a.
-    basis = V1 if constant_basis else np.eye(system.n)
+    basis = split.basis
     xi_a0 = initial_extension(settings, system, names)
-    q, n_a = system.q, first.rank
+    q, n_a = system.q, rank
     start = np.concatenate(
         [(basis.T @ V1 @ xi_a0)[:, None], np.zeros((basis.shape[1], q)), basis.T @ V1], axis=1
     )
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
-        o = observer_matrices(system, t, inside, solver.rank_tol, rows)
-        u, y = inputs(t, inside), outputs(t, inside)
-        b_0 = np.einsum("nij,nj->ni", o.from_inputs, u) + np.einsum("nij,nj->ni", o.from_outputs, y)
-        f = np.concatenate([b_0[:, :, None], o.D0, np.zeros((len(t), system.n, n_a))], axis=2)
-        extras = (o.residual, o.algebraic, o.g_y(u, y), o.G, o.X_w, o.K, o.smallest_singular_value)
-        return Coefficients(None, basis.T @ o.A0 @ basis, basis.T @ f, extras)
+    def equations(o: ObserverMatrices, u: Array, y: Array) -> Coefficients:
+        signals = np.concatenate([u, y], axis=1)[:, :, None]
+        f = np.zeros((len(u), basis.shape[1], 1 + q + n_a))
+        f[:, :, :1] = o.from_signals @ signals
+        f[:, :, 1 : 1 + q] = o.from_unknowns
+        g_y = (o.g_signals @ signals)[:, :, 0]
+        seen = (o.algebraic @ basis, g_y, o.G, o.range, o.elimination, o.injectivity)
+        return Coefficients(None, o.dynamics, f, seen)
 
+    def coefficients(t: Array, inside: Array) -> Coefficients:
+        o = observer_matrices(system, t, inside, solver.rank_tol, first)
+        return equations(o, inputs(t, inside), outputs(t, inside))
+
+    known = equations(
+        first, inputs.values.reshape(len(t), -1), outputs.values.reshape(len(t), -1)
+    )
     latest: list[_Assembled] = []
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-        count = values.shape[0] * values.shape[1]
-        flat = [extra.reshape(count, *extra.shape[2:]) for extra in extras]
-        W = basis @ values.reshape(count, *values.shape[2:])
-        assembled = regression_signals(W, q, *flat)
+        flat = [extra.reshape(extra.shape[0] * extra.shape[1], *extra.shape[2:]) for extra in extras]
+        z = values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
+        assembled = regression_signals(z, q, basis, *flat)
         latest[:] = [assembled]
         return [
             (signal.reshape(*values.shape[:2], -1), floor) for signal, floor in assembled.kinds()
         ]
 
     problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
-    integrate = ivp.solve if solver.name == "ivp" else solve
-    solution = integrate(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
+    if solver.name == "ivp":
+        solution = ivp.solve(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
+    else:
+        solution = solve(
+            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
+        )
     mesh, values = solution.trajectory.mesh, solution.trajectory.values
 
     def on_mesh(signal: Array) -> Trajectory:
@@ -254,7 +432,7 @@ def observe(
 
     final = latest[0]
     kept = final.kept_rows(system, settings.regression)
-    weakest = int(np.argmin(final.smallest_singular_value))
+    smallest, weakest = _weakest(final.injectivity, final.elimination)
     return Observation(
         regression=LinearRegression(
             Y=on_mesh(final.Y[:, kept]),
@@ -274,7 +452,7 @@ def observe(
                 "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
                 True,
                 {
-                    "smallest_singular_value": float(final.smallest_singular_value[weakest]),
+                    "smallest_singular_value": smallest,
                     "at": float(mesh.points.ravel()[weakest]),
                 },
             ),
@@ -287,13 +465,14 @@ def observe(
 class _Assembled:
     """Everything algebraic in ξ_a, ξ_b, Φ, u and y at N times, all rows of the residual."""
 
-    Y: Array  # (N, n + r)
-    psi: Array  # (N, n + r, p)
+    Y: Array  # (N, e + r)
+    psi: Array  # (N, e + r, p)
     offset: Array  # (N, n)
     gain: Array  # (N, n, p)
     Y_scale: float  # size of the terms of Y and ψ before they cancel
     psi_scale: float
-    smallest_singular_value: Array  # (N,)
+    elimination: Array  # (N, n, n_b) and
+    injectivity: Array  # (N,) as in ``ObserverMatrices``
 
     def kinds(self) -> list[tuple[Array, float]]:
         """Everything the mesh has to resolve, with the size below which it is rounding."""
@@ -310,7 +489,8 @@ class _Assembled:
 
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
-        last = np.arange(system.n, system.n + system.r)
+        rows = self.Y.shape[1]
+        last = np.arange(rows - system.r, rows)
         if regression == "paper":  # eq. (regpsi)
             return last
         in_psi = np.abs(self.psi).max(axis=(0, 2)) > _VANISHING * self.psi_scale
@@ -320,45 +500,41 @@ class _Assembled:
 
 
 def regression_signals(
-    W: Array, q: int, residual: Array, algebraic: Array, g_y: Array, G: Array, X_w: Array, K: Array,
-    smallest_singular_value: Array,
+    z: Array, q: int, basis: Array, algebraic: Array, g_y: Array, G: Array, Q1: Array, H: Array,
+    injectivity: Array,
 ) -> _Assembled:
     """All rows of Y and ψ, and the state's offset and gain, at N times.
 
     Args:
-        W: [ξ_a | ξ_b | Φ] of shape (N, n, 1 + q + n_a).
+        z: [ξ_a | ξ_b | Φ] in the coordinates of ``basis``, (N, k, 1 + q + n_a).
         q: number of unknown parameters.
-        residual: R, and with the following as in ``ObserverMatrices``.
-        algebraic: 𝒜.
-        g_y: from the signals.
+        basis: B (n, k).
+        algebraic: 𝒜 B, and with the following as in ``ObserverMatrices``.
+        g_y: from the signals (N, e + r).
         G: of θ.
-        X_w: from w to x.
-        K: (𝒜 Q)⁺.
-        smallest_singular_value: passed on.
+        Q1: of K = H Q1ᵀ and R = I − Q1 Q1ᵀ.
+        H: likewise.
+        injectivity: passed on.
     """
-    signed = W.copy()
-    signed[:, :, 1 : 1 + q] *= -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
-    terms = algebraic @ signed  # [𝒜 ξ_a | −𝒜 ξ_b | 𝒜 Φ]
+    signs = np.ones(z.shape[2])
+    signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
+    signed = z * signs
+    terms = algebraic @ signed  # [𝒜 ξ_a + g_y | −𝒜 ξ_b − G | 𝒜 Φ]
     terms[:, :, 0] += g_y
     terms[:, :, 1 : 1 + q] -= G
-    left = residual @ terms  # R (…)
-    offset = (X_w @ W[:, :, :1])[:, :, 0] - np.einsum("nij,nj->ni", K, g_y)
-    gain = -(X_w @ signed[:, :, 1:])  # [X_w ξ_b | −X_w Φ]
-    gain[:, :, :q] -= K @ G
+    seen = transpose(Q1) @ terms
+    left = terms - Q1 @ seen  # R (…)
+    state = basis @ signed - H @ seen  # w − K (…): the state, signed likewise
     return _Assembled(
         Y=left[:, :, 0],
         psi=left[:, :, 1:],
-        offset=offset,
-        gain=gain,
+        offset=state[:, :, 0],
+        gain=-state[:, :, 1:],  # [X_w ξ_b + X_θ | −X_w Φ]
         Y_scale=float(np.abs(terms[:, :, 0]).max(initial=0.0)),
         psi_scale=float(np.abs(terms[:, :, 1:]).max(initial=0.0)),
-        smallest_singular_value=smallest_singular_value,
+        elimination=H,
+        injectivity=injectivity,
     )
-
-
-def is_constant(projector: Array) -> bool:
-    """Whether the projector P (N, n, n) is the same at all times: the kernel of E does not turn."""
-    return bool(np.abs(projector - projector[0]).max(initial=0.0) < 1e-13)
 
 
 def initial_basis(P: Array, rank: int, states: tuple[str, ...]) -> tuple[Array, tuple[str, ...]]:

@@ -63,60 +63,65 @@ class SignalNoise:
 class ReducedSystem:
     """The linear system above at N times, before its noise is known; ζ in coordinates of a basis.
 
-    ``measured`` and the noise's way into it are in all n + r rows of the residual; ``rows`` is Z.
+    c, g_y and the noise's way into them are in all e + r rows of the residual; ``rows`` is Z.
     """
 
     A: Array  # (N, n, n) of ζ
     b: Array  # (N, n)
-    c: Array  # (N, n_rows, n)
-    rows: Array  # (N, n_rows, r) Z
-    g_y: Array  # (N, n_rows)
+    c: Array  # (N, e + r, n)
+    rows: Array  # (N, e + r, r) Z
+    g_y: Array  # (N, e + r)
     from_noise: Array  # (N, n, m + r) Γ
-    in_measurement: Array  # (N, n_rows, m + r), D = Zᵀ that
+    in_measurement: Array  # (N, e + r, m + r), D = Zᵀ that
     offset: Array  # (N, states) x_y
     gain: Array  # (N, states, n) [X_θ, X_w]
     direct: Array  # (N, states, m + r) of ν in x_y
     projector: Array  # (N, states, states) P
 
 
-def reduced_system(
-    system: DescriptorSystem, basis: Array, o: gpebo.ObserverMatrices, u: Array, y: Array
-) -> ReducedSystem:
-    """The reduced system from the observer's matrices and signals, w in coordinates of ``basis``.
+def reduced_system(o: gpebo.ObserverMatrices, u: Array, y: Array) -> ReducedSystem:
+    """The reduced system from the observer's matrices and signals, w in coordinates of its basis.
 
     Args:
-        system: the model.
-        basis: (states, n_w), orthonormal, constant; all of the space where the kernel of E rotates.
         o: at N times.
         u: (N, m).
         y: (N, r).
     """
-    count, q, r, n_w = len(u), system.q, system.r, basis.shape[1]
-    n = q + n_w
-    A = np.zeros((count, n, n))
-    A[:, q:, :q], A[:, q:, q:] = basis.T @ o.D0, basis.T @ o.A0 @ basis
-    from_signals = np.concatenate([o.from_inputs, o.from_outputs], axis=2)
+    count, r, basis = len(u), y.shape[1], o.split.basis
+    q, k = o.from_unknowns.shape[2], basis.shape[1]
     signals = np.concatenate([u, y], axis=1)
-    inward = np.zeros((count, n, signals.shape[1]))
-    inward[:, q:] = basis.T @ from_signals
-    g = np.concatenate([o.g_inputs, np.zeros((count, system.n + r, r))], axis=2)
-    g[:, system.n :, system.m :] = -np.eye(r)  # g_y = g (u, y)
-    # The residual's r rows: R also leaves alone the directions of [range E; 0], where all is zero.
-    rows = o.residual.copy()
-    rows[:, : system.n, : system.n] += o.complement - np.eye(system.n)
+    A = np.zeros((count, q + k, q + k))
+    A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
+    inward = np.zeros((count, q + k, signals.shape[1]))
+    inward[:, q:] = o.from_signals
+    g = np.broadcast_to(o.g_signals, (count, *o.g_signals.shape[1:]))
+    algebraic = o.algebraic @ basis  # 𝒜 B
+    c = np.empty((count, g.shape[1], q + k))
+    c[:, :, :q], c[:, :, q:] = o.G, algebraic
+    K_g, K_c = (np.asarray(o.elimination @ (transpose(o.range) @ x)) for x in (g, c))
+    gain = -K_c  # [X_θ, X_w B] = [−K G, B − K 𝒜 B]
+    gain[:, :, q:] += basis
+    # The residual's r rows: of its n rows with Π, those in the range of E are zero.
+    L = o.split.equations
+    rows = -o.range @ transpose(o.range)
+    rows = np.broadcast_to(rows, (max(len(rows), len(L)), *rows.shape[1:])).copy()
+    e = L.shape[1]
+    rows[:, :e, :e] += L @ transpose(L)
+    rows[:, e:, e:] += np.eye(r)
     _, vectors = np.linalg.eigh(0.5 * (rows + transpose(rows)))
+    Z = vectors[:, :, e:]
     return ReducedSystem(
         A=A,
         b=np.einsum("nij,nj->ni", inward, signals),
-        c=np.concatenate([o.G, o.algebraic @ basis], axis=2),
-        rows=vectors[:, :, system.n :],
+        c=c,
+        rows=np.broadcast_to(Z, (count, *Z.shape[1:])),
         g_y=np.einsum("nij,nj->ni", g, signals),
         from_noise=-inward,
         in_measurement=-g,
-        offset=-np.einsum("nij,nj->ni", o.K @ g, signals),
-        gain=np.concatenate([-o.K @ o.G, o.X_w @ basis], axis=2),
-        direct=-o.K @ g,
-        projector=o.projector,
+        offset=-np.einsum("nij,nj->ni", K_g, signals),
+        gain=gain,
+        direct=-K_g,
+        projector=np.broadcast_to(o.projector, (count, *o.projector.shape[1:])),
     )
 
 
@@ -126,7 +131,7 @@ class NoiseModel:
 
     signals: Array  # (m + r,)
     process: Array  # (n,)
-    rows: Array  # (n_rows,) zero: V needs none
+    rows: Array  # (e + r,) zero: V needs none
 
     def state_space(self, s: ReducedSystem, q: int, basis: Array) -> StateSpace:
         """The model with its covariances, one column of signals."""
@@ -194,25 +199,26 @@ def observe(
     """
     evidence = gpebo.observe(system, inputs, outputs, settings, solver)
     mesh, q = inputs.mesh, system.q
-    left, left_inside = mesh.points[:, 0], mesh.inside[:, 0]
-    scaled = gpebo.row_sizes(system, left, left_inside)
+    points, points_inside = mesh.points.ravel(), mesh.inside.ravel()
+    first = gpebo.observer_matrices(
+        system, points, points_inside, solver.rank_tol, normalise=True
+    )
+    basis = first.split.basis
 
     def reduced(t: Array, inside: Array) -> ReducedSystem:
-        o = gpebo.observer_matrices(system, t, inside, solver.rank_tol, scaled)
-        return reduced_system(system, basis, o, inputs(t, inside), outputs(t, inside))
+        o = gpebo.observer_matrices(system, t, inside, solver.rank_tol, first)
+        return reduced_system(o, inputs(t, inside), outputs(t, inside))
 
-    first = gpebo.observer_matrices(system, left, left_inside, solver.rank_tol, scaled)
-    V1, labels = gpebo.initial_basis(first.projector[0], first.rank, system.states)
-    fixed = gpebo.is_constant(first.projector)
-    basis = V1 if fixed else np.eye(system.n)
-    labels = tuple(label.removeprefix("e0_") for label in labels) if fixed else system.states
+    V1, initial = gpebo.initial_basis(first.projector[0], first.split.rank, system.states)
+    fixed = basis.shape[1] == first.split.rank
+    labels = tuple(name.removeprefix("e0_") for name in initial) if fixed else system.states
     names = (*system.unknowns, *(f"w_{label}" for label in labels))
-    w0 = basis.T @ V1 @ initial_extension(settings, system, gpebo_names(V1, labels, fixed))
+    w0 = basis.T @ V1 @ initial_extension(settings, system, initial)
     start = np.concatenate([np.zeros(q), w0])
     P0 = _initial_covariance(settings, names, q, basis.T @ V1)
     process = per_signal(settings.process, names, "estimate", "observer.process")
     model_noise = noise_model(
-        reduced(mesh.points.ravel(), mesh.inside.ravel()), noise, process, settings.regularisation
+        reduced(points, points_inside), noise, process, settings.regularisation
     )
 
     def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
@@ -271,13 +277,6 @@ def _note(model: NoiseModel, regularisation: float) -> str:
         f"; measurement noise regularised: {regularisation:g} of each equation's size "
         "(observer.regularisation)"
     )
-
-
-def gpebo_names(V1: Array, labels: tuple[str, ...], fixed: bool) -> tuple[str, ...]:
-    """Names of the components of w in V1's coordinates, as the GPEBO observer calls them."""
-    if fixed:
-        return tuple(f"e0_{label}" for label in labels)
-    return tuple(f"e0_{i + 1}" for i in range(V1.shape[1]))
 
 
 def _initial_covariance(

@@ -8,7 +8,6 @@ module is cheap: matplotlib is loaded by the first picture.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -17,6 +16,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.outputs import style
+from gpebo_cli.outputs.names import FIGURE_NAMES
 from gpebo_cli.outputs.style import (
     Axis,
     Curve,
@@ -27,6 +27,7 @@ from gpebo_cli.outputs.style import (
     symbol,
     with_unit,
 )
+from gpebo_cli.reading import nearest, shown
 from gpebo_cli.result import EstimationResult, RunResult
 from gpebo_cli.systems.descriptor import Array
 
@@ -246,26 +247,7 @@ def overlay(results: Mapping[str, RunResult]) -> list[Panel]:
     return _norm_panels([(label, result, 0) for label, result in results.items()], "")
 
 
-FIGURES: dict[str, FigureFunction] = {
-    function.__name__: function
-    for function in (
-        signals,
-        regressor,
-        states,
-        estimates,
-        estimates_a,
-        estimates_b,
-        parameters,
-        parameter_error,
-        state_error,
-        state_error_a,
-        state_error_b,
-        gram,
-        delta,
-        gains,
-        error_norms,
-    )
-}
+FIGURES: dict[str, FigureFunction] = {name: globals()[name] for name in FIGURE_NAMES}
 
 
 def check_names(names: Iterable[str]) -> None:
@@ -276,9 +258,10 @@ def check_names(names: Iterable[str]) -> None:
     """
     for name in names:
         if name not in FIGURES:
-            close = difflib.get_close_matches(str(name), FIGURES, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else "there are: " + ", ".join(FIGURES)
-            raise ConfigError(f"figures: there is no figure {str(name)!r}; {hint}")
+            raise ConfigError(
+                f"figures: there is no figure {shown(name)}; known: {', '.join(FIGURES)}"
+                + nearest(str(name), FIGURES)
+            )
 
 
 def describe(
@@ -351,13 +334,13 @@ def _by_unit(
     return panels
 
 
-def _truth(result: RunResult, estimation: EstimationResult) -> Array:
-    """True states (M, n) at the times of the estimates, which are some of the output grid's."""
+def truth_at(result: RunResult, t: Array) -> Array:
+    """True states (M, n) at the times t (M,) of the estimates, which are some of the output's."""
     simulation = result.simulation
-    if len(estimation.t) == len(simulation.t):
+    if len(t) == len(simulation.t):
         return simulation.states
     # The middle between two neighbours: rounding of a time does not choose another row.
-    nearest = np.searchsorted(0.5 * (simulation.t[1:] + simulation.t[:-1]), estimation.t)
+    nearest = np.searchsorted(0.5 * (simulation.t[1:] + simulation.t[:-1]), t)
     states: Array = simulation.states[nearest]
     return states
 
@@ -412,7 +395,7 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]], note: str) -> list
             continue
         parameters = estimation.parameters[case] - estimation.true_parameters
         seen = _seen(result, range(len(result.system.states)))
-        states = (estimation.states[case] - _truth(result, estimation))[:, seen]
+        states = (estimation.states[case] - truth_at(result, estimation.t))[:, seen]
         of_parameters.append(
             Curve(estimation.t, np.linalg.norm(parameters, axis=1), label, line(k))
         )
@@ -507,7 +490,7 @@ def _state_errors(result: RunResult, members: Sequence[int]) -> list[Panel]:
     members = _seen(result, members)
     if estimation is None or not members:
         return []
-    truth = _truth(result, estimation)
+    truth = truth_at(result, estimation.t)
     names, units = result.system.states, result.system.units
     curves = [
         (

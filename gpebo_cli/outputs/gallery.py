@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 from gpebo_cli.outputs import circuit
 from gpebo_cli.outputs.figures import describe, overlay
 from gpebo_cli.outputs.files import make_folder, remove_files, write_text
+from gpebo_cli.outputs.names import FORMATS
 from gpebo_cli.outputs.page import Picture, Section, case_table
 from gpebo_cli.outputs.series import blocks, csv_text, differences, reference_text
 from gpebo_cli.outputs.studies import CAPTIONS, REFERENCE, STUDIES, Study, heading, stem
-from gpebo_cli.outputs.style import FORMATS, Panel, compose, save
+from gpebo_cli.outputs.style import Panel, compose, save
 from gpebo_cli.result import Metrics, RunResult
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def write_recipe(
         folder: of this recipe.
         recipe: what was run.
         figures: what :func:`figures_of` returned.
-        formats: some of :data:`gpebo_cli.outputs.style.FORMATS`, ``png`` among them.
+        formats: some of :data:`gpebo_cli.outputs.names.FORMATS`, ``png`` among them.
 
     Raises:
         GpeboError: a file cannot be written.

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
+from gpebo_cli.outputs.names import FORMATS
 from gpebo_cli.outputs.provenance import Provenance
-from gpebo_cli.outputs.style import FORMATS, number_text, symbol
+from gpebo_cli.outputs.style import number_text, symbol
 
 _STYLE = """
 :root { color-scheme: light; }

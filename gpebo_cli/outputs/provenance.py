@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-import gpebo_cli
+from gpebo_cli._version import __version__
 
 PACKAGES = ("numpy", "scipy", "pandas", "hydra-core", "omegaconf", "matplotlib")
 
@@ -32,13 +32,13 @@ class Provenance:
 
 def provenance() -> Provenance:
     """Collect both; takes some 10 ms, most of it git, and never fails."""
-    return Provenance(package_versions(), git_state(Path(gpebo_cli.__file__).parents[1]))
+    return Provenance(package_versions(), git_state(Path(__file__).parents[2]))
 
 
 def package_versions() -> dict[str, str | None]:
     """Version of this package, of Python and of each of :data:`PACKAGES`."""
     versions: dict[str, str | None] = {
-        "gpebo": gpebo_cli.__version__,
+        "gpebo": __version__,
         "python": platform.python_version(),
     }
     for name in PACKAGES:

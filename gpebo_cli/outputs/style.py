@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -397,7 +398,6 @@ def compose(panels: Sequence[Panel]) -> Figure:
     bottom says how many were left out.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
     shown = panels[:MAX_PANELS]
     panel_height = SINGLE_HEIGHT if len(shown) == 1 else PANEL_HEIGHT
@@ -421,7 +421,7 @@ def compose(panels: Sequence[Panel]) -> Figure:
     power = f"{power_of_ten(across.exponent)} " if across.exponent else ""
 
     with our_rc():
-        figure = Figure(figsize=(WIDTH, height), dpi=DPI)
+        figure = _figure_class()(figsize=(WIDTH, height), dpi=DPI)
         FigureCanvasAgg(figure)
         top = height - _EDGE
         for number, (panel, scale, name) in enumerate(zip(shown, scales, names, strict=True)):
@@ -457,7 +457,21 @@ def compose(panels: Sequence[Panel]) -> Figure:
     return figure
 
 
-FORMATS = ("png", "pdf", "svg")
+@cache
+def _figure_class() -> type[Figure]:
+    """matplotlib's figure, which in addition shows itself in a notebook, without pyplot."""
+    from matplotlib import figure
+
+    class Drawing(figure.Figure):
+        """A figure with its picture."""
+
+        def _repr_png_(self) -> bytes:
+            stream = BytesIO()
+            with our_rc():
+                self.savefig(stream, format="png")
+            return stream.getvalue()
+
+    return Drawing
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -467,7 +481,7 @@ def save(figure: Figure, path: Path) -> None:
 
     Args:
         figure: what :func:`compose` returned.
-        path: ends with one of :data:`FORMATS`.
+        path: ends with one of :data:`gpebo_cli.outputs.names.FORMATS`.
 
     Raises:
         GpeboError: the file cannot be written.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +28,16 @@ from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 _CHUNK_ROWS = 2048  # large enough to amortise the call, small enough to stay in cache
 
 
-def write_signals(path: Path, system: DescriptorSystem, simulation: SimulationResult) -> None:
-    """Write ``t``, inputs, outputs and true states, by name; what was measured, if it differs."""
+@dataclass(frozen=True)
+class Table:
+    """Names of columns and their values, (rows, columns)."""
+
+    header: list[str]
+    rows: Array
+
+
+def signals_table(system: DescriptorSystem, simulation: SimulationResult) -> Table:
+    """``t``, inputs, outputs and true states, by name; what was measured, if it differs."""
     header = ["t", *system.inputs, *system.outputs, *system.states]
     columns = [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
     for names, seen in (
@@ -39,56 +47,95 @@ def write_signals(path: Path, system: DescriptorSystem, simulation: SimulationRe
         if seen is not None:
             header += [f"{name}_measured" for name in names]
             columns.append(seen)
-    write_file(path, _lines(header, np.column_stack(columns)))
+    return Table(header, np.column_stack(columns))
 
 
-def write_regression(path: Path, regression: RegressionResult) -> None:
-    """Write ``t``, ``Y_1…``, then ``psi_<row>_<parameter>`` row by row."""
+def write_signals(path: Path, system: DescriptorSystem, simulation: SimulationResult) -> None:
+    """Write :func:`signals_table`."""
+    write_file(path, _lines(signals_table(system, simulation)))
+
+
+def regression_table(regression: RegressionResult) -> Table:
+    """``t``, ``Y_1…``, then ``psi_<row>_<parameter>`` row by row."""
     count = regression.Y.shape[1]
     rows = range(1, count + 1)
     header = ["t", *(f"Y_{i}" for i in rows)]
     header += [f"psi_{i}_{name}" for i in rows for name in regression.parameters]
     width = count * len(regression.parameters)  # spelled out: -1 is ambiguous if there are none
     psi = regression.psi.reshape(len(regression.t), width)
-    write_file(path, _lines(header, np.column_stack([regression.t, regression.Y, psi])))
+    return Table(header, np.column_stack([regression.t, regression.Y, psi]))
 
 
-def write_excitation(path: Path, excitation: Excitation) -> None:
-    """Write ``t``, the eigenvalues of the Gram matrix in ascending order, and ``pe_level``."""
+def write_regression(path: Path, regression: RegressionResult) -> None:
+    """Write :func:`regression_table`."""
+    write_file(path, _lines(regression_table(regression)))
+
+
+def excitation_table(excitation: Excitation) -> Table:
+    """``t``, the eigenvalues of the Gram matrix in ascending order, and ``pe_level``."""
     count = excitation.gram_eigenvalues.shape[1]
     header = ["t", *(f"gram_eig_{i}" for i in range(1, count + 1)), "pe_level"]
     table = np.column_stack([excitation.t, excitation.gram_eigenvalues, excitation.pe_level])
-    write_file(path, _lines(header, table))
+    return Table(header, table)
+
+
+def write_excitation(path: Path, excitation: Excitation) -> None:
+    """Write :func:`excitation_table`."""
+    write_file(path, _lines(excitation_table(excitation)))
+
+
+def estimates_header(states: Sequence[str], estimation: EstimationResult) -> list[str]:
+    """``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, checks.
+
+    Then ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value.
+    """
+    header = ["case", "t", *(f"{name}_hat" for name in (*estimation.names, *states))]
+    if estimation.delta is not None:
+        header.append("delta")
+    return [*header, *estimation.checks, *(f"{name}_true" for name, _ in varying_truth(estimation))]
+
+
+def case_values(estimation: EstimationResult, case: int) -> Array:
+    """The rows of one case, (M, columns), under :func:`estimates_header` without ``case``."""
+    delta = estimation.delta
+    columns = [estimation.t, estimation.parameters[case], estimation.states[case]]
+    if delta is not None:
+        columns.append(delta[case if len(delta) > 1 else 0])
+    columns += [check[case] for check in estimation.checks.values()]
+    columns += [values for _, values in varying_truth(estimation)]
+    return np.column_stack(columns)
 
 
 def write_estimates(
     path: Path, states: Sequence[str], estimation: EstimationResult
 ) -> None:
-    """Write the long table ``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, checks.
-
-    Then ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value.
+    """Write the long table of :func:`estimates_header`, case by case.
 
     Columns of states the observer does not see are empty.
     """
-    header = ["case", "t", *(f"{name}_hat" for name in (*estimation.names, *states))]
-    if estimation.delta is not None:
-        header.append("delta")
-    header += estimation.checks
-    header += [f"{name}_true" for name, _ in varying_truth(estimation)]
+    header = estimates_header(states, estimation)
     write_file(path, _estimate_chunks(header, estimation))
 
 
 def write_cases(path: Path, estimation: EstimationResult, metrics: Metrics) -> None:
     """Write one row per case: ``case``, its gains, its metrics; NaN is an empty cell."""
-    gains = gain_names(estimation)
-    names = [field.name for field in fields(Metrics)]
-    columns = [getattr(metrics, name) for name in names]
-    lines = [_header(["case", *gains, *names])]
-    for case, values in enumerate(estimation.cases):
-        numbers = [values.get(gain, np.nan) for gain in gains] + [col[case] for col in columns]
+    table = cases_table(estimation, metrics)
+    lines = [_header(["case", *table.header])]
+    for case, numbers in enumerate(table.rows):
         cells = ["" if np.isnan(number) else f"{number:.17g}" for number in numbers]
         lines.append(",".join([str(case), *cells]).encode() + b"\n")
     write_file(path, lines)
+
+
+def cases_table(estimation: EstimationResult, metrics: Metrics) -> Table:
+    """One row per case: its gains (NaN: it has no such gain), its metrics."""
+    gains = gain_names(estimation)
+    names = [field.name for field in fields(Metrics)]
+    columns = [
+        *([case.get(gain, np.nan) for case in estimation.cases] for gain in gains),
+        *(getattr(metrics, name) for name in names),
+    ]
+    return Table([*gains, *names], np.column_stack(columns))
 
 
 def gain_names(estimation: EstimationResult) -> list[str]:
@@ -108,19 +155,13 @@ def varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
 
 def _estimate_chunks(header: Sequence[str], estimation: EstimationResult) -> Iterator[bytes]:
     yield _header(header)
-    delta = estimation.delta
     for case in range(len(estimation.cases)):
-        columns = [estimation.t, estimation.parameters[case], estimation.states[case]]
-        if delta is not None:
-            columns.append(delta[case if len(delta) > 1 else 0])
-        columns += [check[case] for check in estimation.checks.values()]
-        columns += [values for _, values in varying_truth(estimation)]
-        yield from _rows(np.column_stack(columns), prefix=f"{case},")
+        yield from _rows(case_values(estimation, case), prefix=f"{case},")
 
 
-def _lines(header: Sequence[str], table: Array) -> Iterator[bytes]:
-    yield _header(header)
-    yield from _rows(table)
+def _lines(table: Table) -> Iterator[bytes]:
+    yield _header(table.header)
+    yield from _rows(table.rows)
 
 
 def _header(names: Sequence[str]) -> bytes:

@@ -19,18 +19,17 @@ from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 _IMPULSE = 1e-9  # impulses below this share of the state's size are rounding
 
 
-def consistent_state(E: Array, reduced: StrangenessFree, x0: Array) -> Array:
+def consistent_state(reduced: StrangenessFree, x0: Array) -> Array:
     """The consistent x nearest to x0 in its differential part, shape (n,).
 
     Minimises ‖E (x − x0)‖ subject to A2 x + f2 = 0. Unique, because E has full column rank on
     the kernel of A2.
 
     Args:
-        E: the model's E at the start (n, n).
-        reduced: the strangeness-free equations there (one time).
+        reduced: the strangeness-free equations at times of which the start is the first.
         x0: the state asked for (n,).
     """
-    A2, f2 = reduced.A2[0], reduced.f2[0]
+    E, A2, f2 = reduced.E[0], reduced.A2[0], reduced.f2[0]
     if len(A2) == 0:
         return x0.copy()
     U, sigma, Vt = np.linalg.svd(A2)
@@ -98,7 +97,8 @@ def jump(
     if residual.max(initial=0.0) > 1e-7 * scale:
         raise ModelError(
             f"plant {system.name}: the jump at t = {t:.6g} has no solution "
-            f"(residual {residual.max() / scale:.1e})"
+            f"(residual {residual.max() / scale:.1e}): no state after it satisfies the equations; "
+            "use an input without it, or a horizon that ends before"
         )
     w = w.reshape(levels, n)
     significant = np.abs(w[1:]) > _IMPULSE * scale

@@ -12,7 +12,8 @@ or M (x_1, …, x_{μ+1}) = N x_0 + g with M_ij = (j + 1) e_{i−j} − a_{i−j
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -47,9 +48,9 @@ class Pivots:
     with X = M[rest, columns] M[rows, columns]⁻¹ costs one LU where an SVD costs thirty.
     """
 
-    rows: IntArray  # (r,)
-    rest: IntArray  # (a,)
-    columns: IntArray  # (r,)
+    rank: int  # r
+    rows: IntArray  # all of them, the r pivots first
+    columns: IntArray  # likewise
     Z1: Array  # (n, d) orthonormal, completes the constraints at that time
 
 
@@ -84,7 +85,8 @@ class Structure:
 class StrangenessFree:
     """E1 x' = A1 x + f1 (d rows) and 0 = A2 x + f2 (a rows) at N times.
 
-    The matrices have a leading axis of 1 when E and A are constant.
+    Where there are constraints, the consistent states are x = T z + offset with z = E1 x. The
+    matrices have a leading axis of 1 when E and A are constant.
     """
 
     E1: Array
@@ -92,14 +94,11 @@ class StrangenessFree:
     f1: Array  # (N, d)
     A2: Array
     f2: Array  # (N, a)
+    basis: Array | None  # (N, n, d) T, of the kernel of A2, with E1 T = I; None if a = 0
+    offset: Array | None  # (N, n)
+    E: Array  # (N, n, n) the model's own
     u: Array  # (N, m) the inputs and
     C: Array  # (N, r, n) the output matrix at the same times
-
-    def stacked(self) -> tuple[Array, Array, Array]:
-        """Ê, Â of shape (N or 1, n, n) and f̂ (N, n) of Ê x' = Â x + f̂."""
-        E = np.concatenate([self.E1, np.zeros_like(self.A2)], axis=1)
-        A = np.concatenate([self.A1, self.A2], axis=1)
-        return E, A, np.concatenate([self.f1, self.f2], axis=1)
 
 
 def forcing(c: Coefficients) -> Array:
@@ -133,11 +132,10 @@ def derivative_array(e: Array, a: Array, mu: int) -> tuple[Array, Array]:
     return M.reshape(count, (mu + 1) * n, (mu + 1) * n), N
 
 
-def balance(system: DescriptorSystem, t: Array) -> Scaling:
+def balance(c: Coefficients) -> Scaling:
     """Scalings that bring the rows and columns of E/τ and A to comparable size over time."""
-    c = system.coefficients.taylor(t, 0)
     E, A = np.abs(c.E[0]).max(axis=0), np.abs(c.A[0]).max(axis=0)
-    rows, columns, tau = np.ones(system.n), np.ones(system.n), 1.0
+    rows, columns, tau = np.ones(len(E)), np.ones(len(E)), 1.0
     if not E.any() or not A.any():
         tau = 1.0
     for _ in range(4):
@@ -171,13 +169,25 @@ def analyse(
         ModelError: no μ ≤ ``max_mu`` does it, or a rank changes; names the time and the values.
     """
     t = _probe_times(system, start, stop)
-    scaling = balance(system, t)
+    c = system.coefficients.taylor(t, 0)
+    scaling = balance(c)
     invariant = {"E", "A"} <= system.coefficients.constant
     if invariant:
         t = t[:1]
+    middle = slice(len(t) // 2, len(t) // 2 + 1)
     reason = ""
     for mu in range(max_mu + 1):
-        levels = _levels(system, t, mu, scaling, rank_tol)
+        if mu:
+            c = system.coefficients.taylor(t, mu)
+        e, aa = scaled(c, scaling)
+        e, aa = e[:, : len(t)], aa[:, : len(t)]
+        # A μ that will not do fails at one time already.
+        one = _levels(t[middle], e[:, middle], aa[:, middle], mu, rank_tol)
+        if one.failure:
+            reason = one.failure
+            continue
+        reference = _reference(e[:, middle], aa[:, middle], mu, one, invariant)
+        levels = _all_levels(t, e, aa, mu, rank_tol, one, reference)
         if levels.failure:
             reason = levels.failure
             continue
@@ -185,14 +195,12 @@ def analyse(
             _follow_dips(system, t, levels, mu, scaling, rank_tol)
         return Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
-            smallest_singular_value=float(levels.smallest.min()), time_invariant=invariant,
-            reference=_reference(
-                system, t[len(t) // 2 : len(t) // 2 + 1], mu, levels.a, scaling, invariant
-            ),
+            smallest_singular_value=levels.least, time_invariant=invariant,
+            reference=reference,
         )
     raise ModelError(
         f"{_who(system)} is not uniquely solvable, or its index is above {max_mu + 1}: with "
-        f"{max_mu} differentiations {reason}"
+        f"{max_mu} differentiations {reason}; is an equation missing, or there twice?"
     )
 
 
@@ -214,23 +222,24 @@ class _Levels:
     """Singular values that must stay away from zero, or why this μ will not do."""
 
     a: int
-    smallest: Array  # (N, 3) of M, Â2 and E T2, relative to the size of their factors
+    smallest: Array  # (N, 3) of M, Â2 and E T2, relative to the size of their factors; or bounds
     failure: str
+    least: float = np.inf  # of those that were computed
+    Z2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, (μ+1) n, a)
+    T2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, n, d)
 
 
 def _levels(
-    system: DescriptorSystem, t: Array, mu: int, scaling: Scaling, rank_tol: float,
-    a: int | None = None,
+    t: Array, e: Array, aa: Array, mu: int, rank_tol: float, a: int | None = None
 ) -> _Levels:
-    """Ranks at the times t; with ``a`` given, the singular values that belong to that rank."""
-    n = system.n
-    e, aa = scaled(system.coefficients.taylor(t, mu), scaling)
+    """Ranks at the times t; with ``a`` given, the singular values that belong to that rank.
+
+    ``e`` and ``aa`` are the scaled Taylor coefficients of E and A, (μ + 1, N, n, n).
+    """
+    n = e.shape[-1]
     M, N = derivative_array(e, aa, mu)
     U, sigma, _ = np.linalg.svd(M)
-    size = sigma[:, :1]
-    # The size of what M was made from: with E = 0 the derivative array is still judged against A.
-    size = np.maximum(size, np.abs(aa).max(axis=(0, 2, 3))[:, None])
-    relative = sigma / size
+    relative = sigma / _array_size(sigma[:, 0], aa)[:, None]
     smallest = np.full((len(t), 3), np.inf)
     if a is None:
         ranks = (relative > rank_tol).sum(axis=1)
@@ -245,14 +254,15 @@ def _levels(
     r = M.shape[1] - a
     if r:
         smallest[:, 0] = relative[:, r - 1]
-    A2 = transpose(U[:, :, r:]) @ N
+    Z2 = U[:, :, r:]
+    A2 = transpose(Z2) @ N
     _, s2, V2 = np.linalg.svd(A2)
-    s2 = s2 / np.maximum(np.linalg.norm(N, axis=(1, 2)), np.finfo(float).tiny)[:, None]
+    s2 = s2 / _norm(N)[:, None]
     if a:
         smallest[:, 1] = s2[:, -1]
     T2 = transpose(V2)[:, :, a:]
     s3 = np.linalg.svd(e[0] @ T2, compute_uv=False)
-    s3 = s3 / np.maximum(np.linalg.norm(e[0], axis=(1, 2)), np.finfo(float).tiny)[:, None]
+    s3 = s3 / _norm(e[0])[:, None]
     if a < n:
         smallest[:, 2] = s3[:, -1]
     for column, what in ((1, "constraints are linearly dependent"),
@@ -263,7 +273,66 @@ def _levels(
             return _Levels(
                 a, smallest, f"{what} at t = {t[k]:.6g} (singular value {smallest[k, column]:.1e})"
             )
-    return _Levels(a, smallest, "")
+    return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)), Z2, T2)
+
+
+def _array_size(M: Array, aa: Array) -> Array:
+    """Size of what the derivative array was made from: with E = 0 it is still judged against A."""
+    size = np.maximum(M, np.abs(aa).max(axis=(0, 2, 3)))
+    return np.asarray(np.maximum(size, np.finfo(float).tiny))  # a plant of zeros has none
+
+
+_PLAIN = 1e-5  # bounds of singular values above this need no closer look
+
+
+def _all_levels(
+    t: Array, e: Array, aa: Array, mu: int, rank_tol: float, one: _Levels,
+    reference: Pivots | Bases,
+) -> _Levels:
+    """:func:`_levels` at all times t, given those of one time, ``one``.
+
+    Away from rank changes bounds serve as well as singular values, and QR on the pivots of the
+    reference gives them for a fraction of the price: with M[:, columns] = Q1 R, the rest Q2 of Q
+    spans the left null space of M if Q2ᵀM = 0, and σ_r(M) ≥ σ_min(R) ≥ 1/‖R⁻¹‖. Singular values
+    are computed where a bound is small, or smallest.
+    """
+    if isinstance(reference, Bases):
+        return one
+    n, a = e.shape[-1], one.a
+    M, N = derivative_array(e, aa, mu)
+    bounds = np.full((len(t), 3), np.inf)
+    try:
+        r = reference.rank
+        Q, R = np.linalg.qr(M[:, :, reference.columns[:r]], mode="complete")
+        Q2 = transpose(Q[:, :, r:])
+        size = _array_size(np.linalg.norm(M, axis=(1, 2)), aa)
+        bounds[:, 0] = _smallest_bound(R[:, :r]) / size
+        left = np.abs(Q2 @ M).max(axis=(1, 2), initial=0.0)
+        T, R = np.linalg.qr(transpose(Q2 @ N), mode="complete")
+        bounds[:, 1] = _smallest_bound(R[:, :a]) / _norm(N)
+        bounds[:, 2] = _smallest_bound(np.linalg.qr(e[0] @ T[:, :, a:], mode="r")) / _norm(e[0])
+        plain = (bounds > max(_PLAIN, 10.0 * rank_tol)).all(axis=1) & (left <= _RESIDUAL * size)
+    except np.linalg.LinAlgError:  # a pivot block that is exactly singular somewhere
+        plain = np.zeros(len(t), dtype=bool)
+    closer = ~plain
+    closer[np.argmin(bounds, axis=0)] = True
+    closer[len(t) // 2] = True  # of the reference, whose ranks the others must have
+    exact = _levels(t[closer], e[:, closer], aa[:, closer], mu, rank_tol)
+    bounds[closer] = exact.smallest
+    return _Levels(exact.a, bounds, exact.failure, float(exact.smallest.min()))
+
+
+def _smallest_bound(square: Array) -> Array:
+    """1/‖R⁻¹‖_F of square matrices (N, k, k): at most σ_min, at least σ_min/√k; inf for k = 0."""
+    if square.shape[-1] == 0:
+        return np.full(len(square), np.inf)
+    return np.asarray(1.0 / np.linalg.norm(np.linalg.inv(square), axis=(1, 2)))
+
+
+def _norm(matrix: Array) -> Array:
+    return np.asarray(
+        np.maximum(np.linalg.norm(matrix, axis=(1, 2)), np.finfo(float).tiny)
+    )
 
 
 def _changes(what: str, ranks: Array, k: int, t: Array, sigma: Array) -> str:
@@ -297,7 +366,8 @@ def _follow_dips(
             lowest, where = values[k], t[k]
             for _ in range(_DIP_ROUNDS):
                 grid = np.linspace(left, right, _DIP_POINTS)
-                found = _levels(system, grid, mu, scaling, rank_tol, levels.a)
+                e, aa = scaled(system.coefficients.taylor(grid, mu), scaling)
+                found = _levels(grid, e, aa, mu, rank_tol, levels.a)
                 line = found.smallest[:, column]
                 best = int(np.argmin(line))
                 shrinking = line[best] < 0.5 * lowest
@@ -313,33 +383,35 @@ def _follow_dips(
 
 
 def _reference(
-    system: DescriptorSystem, t: Array, mu: int, a: int, scaling: Scaling, invariant: bool
+    e: Array, aa: Array, mu: int, one: _Levels, invariant: bool
 ) -> Pivots | Bases:
-    e, aa = scaled(system.coefficients.taylor(t, mu), scaling)
-    M, N = derivative_array(e, aa, mu)
-    r = M.shape[1] - a
-    Z2 = np.linalg.svd(M[0])[0][:, r:]
-    T2 = np.linalg.svd(Z2.T @ N[0])[2][a:].T
-    Z1 = np.linalg.svd(e[0, 0] @ T2, full_matrices=False)[0]
+    """Where to start from at other times, from the coefficients and the levels of one."""
+    Z1 = np.linalg.svd(e[0, 0] @ one.T2[0], full_matrices=False)[0]
     if invariant:
-        return Bases(Z1[None], Z2[None])
-    rows = np.sort(_independent_rows(M[0], r))
-    columns = np.sort(_independent_rows(M[0, rows].T, r))
-    rest = np.setdiff1d(np.arange(len(M[0])), rows)
-    return Pivots(rows, rest, columns, Z1)
+        return Bases(Z1[None], one.Z2[:1])
+    M = derivative_array(e, aa, mu)[0][0]
+    r = len(M) - one.a
+    rows, columns = _independent(M, r)
+    every = np.arange(len(M))
+    return Pivots(
+        r,
+        np.concatenate([rows, np.setdiff1d(every, rows)]),
+        np.concatenate([columns, np.setdiff1d(every, columns)]),
+        Z1,
+    )
 
 
-def _independent_rows(matrix: Array, count: int) -> IntArray:
-    """Indices of ``count`` rows by QR with pivoting: each time the largest remaining row."""
+def _independent(matrix: Array, count: int) -> tuple[IntArray, IntArray]:
+    """Indices of ``count`` rows and columns that carry the rank: elimination, complete pivoting."""
     left = matrix.copy()
-    chosen = np.empty(count, dtype=np.intp)
+    chosen = np.empty((2, count), dtype=np.intp)
     for k in range(count):
-        sizes = np.einsum("ij,ij->i", left, left)
-        chosen[k] = np.argmax(sizes)
-        direction = left[chosen[k]] / np.sqrt(sizes[chosen[k]])
-        left = left - np.outer(left @ direction, direction)
-        left[chosen[: k + 1]] = 0.0
-    return chosen
+        i, j = divmod(int(np.argmax(np.abs(left))), left.shape[1])
+        chosen[:, k] = i, j
+        left -= left[:, j, None] * (left[i] / left[i, j])
+        left[i], left[:, j] = 0.0, 0.0
+    chosen.sort(axis=1)
+    return chosen[0], chosen[1]
 
 
 _MAX_GROWTH = 1e2  # of the elimination; beyond it singular vectors are computed instead
@@ -364,63 +436,96 @@ def reduce(
     E, A = c.E[:, count], c.A[:, count]
     e, aa = scaled(Coefficients(E, A, c.B, c.F, c.C, c.u, c.theta), scaling)
     M, N = derivative_array(e, aa, mu)
+    # [Â2 | f2] = Z2ᵀ [N | g] with g = (f_0, …, f_μ)
+    weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
+    g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
     reference = structure.reference
     if isinstance(reference, Bases):
-        Z1, Z2, poor = reference.Z1, reference.Z2, np.zeros(1, dtype=bool)
+        Z1 = reference.Z1
+        A2, f2 = transpose(reference.Z2) @ N, transpose(reference.Z2) @ g
+        inverse, poor = _inverse(np.concatenate([transpose(Z1) @ e[0], A2], axis=1))
     else:
-        Z1, Z2, poor = _by_elimination(structure, reference, e[0], M, N)
+        Z1, A2, f2, inverse, poor = _by_elimination(reference, e[0], M, N, g)
+        if poor.any():
+            Z1 = np.repeat(Z1, len(t), axis=0)
+            Z1[poor], Z2 = _by_singular_vectors(
+                system, structure, e[0][poor], M[poor], N[poor], t[poor]
+            )
+            A2[poor], f2[poor] = transpose(Z2) @ N[poor], transpose(Z2) @ g[poor]
+            whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
+            inverse[poor], poor[poor] = _inverse(whole)
     if poor.any():
-        Z1[poor], Z2[poor] = _by_singular_vectors(
-            system, structure, e[0][poor], M[poor], N[poor], t[count][poor]
+        raise ModelError(
+            f"{_who(system)}: the equations do not determine the state near "
+            f"t = {t[int(np.argmax(poor))]:.9g}"
         )
     # Back to the model's own states: only rows stay scaled, and row scalings do not matter.
     W1 = transpose(Z1) * scaling.rows
-    weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows  # of g = (f_0, …, f_mu)
-    g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1)
+    inverse = scaling.columns[:, None] * inverse
+    d = structure.d
     return StrangenessFree(
         E1=W1 @ E[0],
         A1=W1 @ A[0],
         f1=_apply(W1, f[0]),
-        A2=transpose(Z2) @ N / scaling.columns,
-        f2=_apply(transpose(Z2), g),
+        A2=A2 / scaling.columns,
+        f2=f2[:, :, 0],
+        basis=inverse[:, :, :d] / scaling.time if structure.a else None,  # the scaled E is E/τ
+        offset=-(inverse[:, :, d:] @ f2)[:, :, 0] if structure.a else None,
+        E=E[0],
         u=c.u[0],
         C=c.C[0],
     )
 
 
+def _inverse(whole: Array) -> tuple[Array, BoolArray]:
+    """Inverses, and where there is none."""
+    try:
+        inverse = np.asarray(np.linalg.inv(whole), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(whole, np.inf)
+        for k, one in enumerate(whole):
+            with suppress(np.linalg.LinAlgError):
+                inverse[k] = np.linalg.inv(one)
+    return inverse, ~np.isfinite(inverse).all(axis=(1, 2))
+
+
+def _largest(matrix: Array) -> Array:
+    """Largest entry in size of each matrix, (N,)."""
+    return np.asarray(np.abs(matrix).reshape(len(matrix), -1).max(axis=1, initial=0.0))
+
+
 def _by_elimination(
-    structure: Structure, pivots: Pivots, E: Array, M: Array, N: Array
-) -> tuple[Array, Array, BoolArray]:
-    """Z1 (N, n, d), Z2 (N, (μ+1) n, a) on the reference pivots, and where they will not do."""
-    count = len(M)
-    rows, rest, columns = pivots.rows, pivots.rest, pivots.columns
-    Z1 = np.repeat(pivots.Z1[None], count, axis=0)
-    Z2 = np.zeros((count, M.shape[1], structure.a))
-    if structure.a == 0:
-        return Z1, Z2, np.zeros(count, dtype=bool)
-    kept = M[:, rows]
-    try:
-        solved = np.asarray(
-            np.linalg.solve(transpose(kept[:, :, columns]), transpose(M[:, rest][:, :, columns])),
-            dtype=np.float64,
-        )
-    except np.linalg.LinAlgError:
-        return Z1, Z2, np.ones(count, dtype=bool)
-    X = transpose(solved)
-    Z2[:, rows] = -solved
-    Z2[:, rest] = np.eye(structure.a)
-    size = np.abs(M).max(axis=(1, 2), initial=0.0)
-    residual = np.abs(M[:, rest] - X @ kept).max(axis=(1, 2), initial=0.0)
-    whole = np.concatenate([transpose(Z1) @ E, transpose(Z2) @ N], axis=1)
-    scale = np.abs(whole).max(axis=2, keepdims=True)
-    whole = whole / np.maximum(scale, np.finfo(float).tiny)
-    try:
-        growth = np.abs(np.linalg.inv(whole)).max(axis=(1, 2))
-    except np.linalg.LinAlgError:
-        return Z1, Z2, np.ones(count, dtype=bool)
-    grows = np.abs(X).max(axis=(1, 2), initial=0.0)
-    poor = (residual > _RESIDUAL * size) | (grows > _MAX_GROWTH) | (growth > _MAX_GROWTH)
-    return Z1, Z2, poor | ~np.isfinite(growth)
+    pivots: Pivots, E: Array, M: Array, N: Array, g: Array
+) -> tuple[Array, Array, Array, Array, BoolArray]:
+    """Z1 (1, n, d), Â2 (N, a, n), f2 (N, a, 1) on the reference pivots, [Z1ᵀE; Â2]⁻¹.
+
+    The last one says where these will not do.
+    """
+    count, n, r = len(M), E.shape[1], pivots.rank
+    right = np.concatenate([N, g], axis=2)[:, pivots.rows]
+    poor = np.zeros(count, dtype=bool)
+    if r < len(pivots.rows):
+        M = M[:, pivots.rows[:, None], pivots.columns]
+        try:
+            X = transpose(np.asarray(
+                np.linalg.solve(transpose(M[:, :r, :r]), transpose(M[:, r:, :r])),
+                dtype=np.float64,
+            ))
+        except np.linalg.LinAlgError:
+            everywhere = np.ones(count, dtype=bool)
+            left = right[:, r:]
+            return pivots.Z1[None], left[:, :, :n], left[:, :, n:], np.zeros_like(E), everywhere
+        residual = _largest(M[:, r:, r:] - X @ M[:, :r, r:])
+        poor = (residual > _RESIDUAL * _largest(M)) | (_largest(X) > _MAX_GROWTH)
+        constraints = right[:, r:] - X @ right[:, :r]
+    else:
+        constraints = right[:, r:]
+    A2 = constraints[:, :, :n]
+    whole = np.concatenate([pivots.Z1.T @ E, A2], axis=1)
+    scale = np.maximum(np.abs(whole).max(axis=2), np.finfo(float).tiny)
+    inverse, singular = _inverse(whole / scale[:, :, None])
+    poor |= singular | (_largest(inverse) > _MAX_GROWTH)
+    return pivots.Z1[None], A2, constraints[:, :, n:], inverse / scale[:, None, :], poor
 
 
 def _by_singular_vectors(
@@ -445,7 +550,7 @@ def _check_gap(
     system: DescriptorSystem, structure: Structure, sigma: Array, r: int, t: Array
 ) -> None:
     size = sigma[:, 0]
-    zero = sigma[:, r] > 1e3 * structure.rank_tol * size
+    zero = sigma[:, r:].max(axis=1, initial=0.0) > 1e3 * structure.rank_tol * size
     lost = sigma[:, r - 1] <= structure.rank_tol * size if r else np.zeros(len(sigma), bool)
     bad = zero | lost
     if bad.any():
@@ -453,5 +558,5 @@ def _check_gap(
         value = sigma[k, r] if zero[k] else sigma[k, r - 1]
         raise ModelError(
             f"{_who(system)}: the rank of the derivative array changes near t = {t[k]:.9g} "
-            f"(singular value {value / size[k]:.1e})"
+            f"(singular value {value / size[k]:.1e}); choose a horizon that avoids this time"
         )

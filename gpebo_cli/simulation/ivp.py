@@ -12,7 +12,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import LinearProblem, LinearSolution, unresolved_signals
+from gpebo_cli.collocation.linear import (
+    LinearProblem,
+    LinearSolution,
+    at_points,
+    unresolved_signals,
+)
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import SolverError
 from gpebo_cli.simulation.derivative_array import Structure, derivative_array, forcing, scaled
@@ -61,7 +66,7 @@ def solve(
     for rounds in range(1, _MAX_ROUNDS + 1):
         values = _sample(problem, mesh, max(tol, 1e-13), restarts or {})
         extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
-        extras = tuple(e.reshape(*mesh.points.shape, *e.shape[1:]) for e in extras)
+        extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in extras)
         tail = unresolved_signals(problem, mesh, values, extras)
         poor = tail > 1e3 * tol  # its dense output is of lower order than its steps
         if not poor.any():

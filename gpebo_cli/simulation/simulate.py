@@ -7,14 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, LinearSolution, solve
+from gpebo_cli.collocation.linear import (
+    Coefficients,
+    Constraints,
+    LinearProblem,
+    LinearSolution,
+    solve,
+)
 from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ModelError
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.consistency import Jump, consistent_state, jump
-from gpebo_cli.simulation.derivative_array import Structure, analyse, reduce
+from gpebo_cli.simulation.derivative_array import StrangenessFree, Structure, analyse, reduce
 from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 _FIRST_ELEMENTS = 24  # of the first mesh: enough nodes to notice a pulse, few enough to be free
@@ -58,7 +64,8 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     )
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
-    x0 = _initial_state(system, structure, mesh)
+    first = reduce(system, structure, mesh.points.ravel(), mesh.inside.ravel())
+    x0 = _initial_state(system, first)
 
     happened: dict[float, tuple[Array, Jump]] = {}
     restarts: dict[float, Callable[[Array], Array]] = {}
@@ -66,9 +73,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         restarts[cut] = _restart(system, structure, cut, _width(mesh.edges, cut), happened)
 
     def coefficients(t: Array, inside: Array) -> Coefficients:
-        reduced = reduce(system, structure, t, inside)
-        E, A, f = reduced.stacked()
-        return Coefficients(E, A, f[:, :, None], (reduced.u, reduced.C))
+        return _equations(reduce(system, structure, t, inside))
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
         u, C = extras
@@ -85,7 +90,8 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         solution = _integrate(system, structure, problem, mesh, solver, restarts)
     else:
         solution = solve(
-            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, restarts=restarts
+            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, restarts=restarts,
+            known=_equations(first),
         )
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
@@ -100,13 +106,24 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     )
 
 
-def _initial_state(system: DescriptorSystem, structure: Structure, mesh: Mesh) -> Array:
-    t, inside = mesh.points[:1, 0], mesh.inside[:1, 0]
-    reduced = reduce(system, structure, t, inside)
-    E = system.coefficients.taylor(t, 0, inside).E[0, 0]
-    x0 = consistent_state(E, reduced, system.initial_state)
+def _equations(reduced: StrangenessFree) -> Coefficients:
+    """The strangeness-free equations in the form that the collocation takes."""
+    extras = (reduced.u, reduced.C)
+    f1 = reduced.f1[:, :, None]
+    if reduced.basis is None or reduced.offset is None:
+        return Coefficients(reduced.E1, reduced.A1, f1, extras)
+    constraints = Constraints(reduced.basis, reduced.offset[:, :, None])
+    return Coefficients(reduced.E1, reduced.A1, f1, extras, constraints)
+
+
+def _initial_state(system: DescriptorSystem, reduced: StrangenessFree) -> Array:
+    """The consistent state at the start, from the equations at times of which it is the first."""
+    x0 = consistent_state(reduced, system.initial_state)
     if not np.isfinite(x0).all():
-        raise ModelError(f"plant {system.name}: no finite consistent state at t = {t[0]:.6g}")
+        raise ModelError(
+            f"plant {system.name}: no finite consistent state at the start; look for entries that "
+            "are huge or infinite there"
+        )
     return x0
 
 

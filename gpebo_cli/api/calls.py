@@ -1,0 +1,234 @@
+"""``run``, ``check``, ``load_plant`` and ``available``: the command line's work, from Python."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from typing import Any, cast
+
+from gpebo_cli import assumptions
+from gpebo_cli.api.choice import choose, plain, primary
+from gpebo_cli.api.result import Result
+from gpebo_cli.commands import configuration
+from gpebo_cli.commands.locations import DATA_GROUPS, GROUPS, choices, conf_folder
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators import Estimator, settings_of
+from gpebo_cli.experiment import run_experiment
+from gpebo_cli.reading import nearest, shown
+from gpebo_cli.result import Assumption
+from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings, SolverSettings
+from gpebo_cli.systems.descriptor import DescriptorSystem
+from gpebo_cli.systems.plant import plant_from_mapping
+
+Plant = str | os.PathLike[str] | Mapping[str, object] | DescriptorSystem
+Choice = str | Mapping[str, object]
+EstimatorChoice = Choice | Estimator
+Folder = str | os.PathLike[str]
+
+_SECTIONS = ("time", "excitation")
+_CHOSEN = tuple(group for group in DATA_GROUPS if group != "plant")
+
+
+def run(
+    plant: Plant | None = None,
+    *,
+    estimator: EstimatorChoice | None = None,
+    observer: Choice | None = None,
+    solver: Choice | None = None,
+    noise: Choice | None = None,
+    time: Mapping[str, object] | None = None,
+    excitation: Mapping[str, object] | None = None,
+    config_dir: Folder | None = None,
+    progress: Callable[[str], None] = lambda _stage: None,
+    **gains: object,
+) -> Result:
+    """Simulate a plant, observe it, estimate its parameters and state, collect the evidence.
+
+    What ``gpebo run`` does, without writing anything; what is left out has the same default, from
+    the same files.
+
+    Args:
+        plant: a name (``gpebo list plants``), the path of a YAML file, the content of one, or a
+            system from :func:`system_from_functions` or :func:`load_plant`.
+        estimator: a name, a mapping with ``name`` and its settings, or an object of your own
+            with ``cases`` and ``estimate`` (see :class:`gpebo_cli.estimators.Estimator`).
+        observer: a name, or a mapping; ``"none"`` simulates only.
+        solver: a name, or a mapping such as ``{"tol": 1e-9}``.
+        noise: a name, or a mapping such as ``{"name": "gaussian", "outputs": 0.01, "seed": 1}``.
+        time: ``start`` and ``horizon`` in seconds, ``samples`` of the output grid.
+        excitation: ``rho`` and ``window`` (seconds) of the evidence.
+        config_dir: a folder of yours, with ``plant/NAME.yaml``, ``estimator/NAME.yaml``, …
+        progress: called with the name of each stage as it begins.
+        gains: settings of the estimator, as in ``gamma=[1e8, 1e10]``; every combination of
+            lists is one case. ``lambda`` is a word of Python's: ``**{"lambda": 0.2}``.
+
+    Raises:
+        ConfigError: a wrong name, key, value or plant; the texts are the command line's.
+        ModelError: the plant cannot be simulated, or an assumption of the observer fails.
+        SolverError: a tolerance cannot be reached.
+
+    Examples:
+        >>> from gpebo_cli import run
+        >>> result = run("circuit", estimator="drem", gamma=[1e8, 1e10], time={"horizon": 8})
+        >>> result["il"].shape, result.estimates["il"].shape
+        ((1001,), (2, 1001))
+        >>> bool(abs(result.errors["il"][1, -1]) < 1e-6)
+        True
+    """
+    own = None if estimator is None or isinstance(estimator, str | Mapping) else _own(estimator)
+    sections: dict[str, object] = {
+        "observer": observer, "estimator": None if own else estimator, "solver": solver,
+        "noise": noise, "time": time, "excitation": excitation,
+    }
+    config, system, settings = _configure(plant, sections, {} if own else gains, config_dir)
+    if own is not None:
+        if gains:
+            raise ConfigError(
+                f"run: {', '.join(gains)} given beside an estimator object; give them to "
+                f"{type(own).__name__}(…)"
+            )
+        config["estimator"] = {"name": type(own).__name__}
+        settings = replace(settings, estimator=config["estimator"])
+    return Result(run_experiment(settings, system, progress, own), config)
+
+
+def check(
+    plant: Plant | None = None,
+    *,
+    observer: Choice | None = None,
+    solver: Choice | None = None,
+    noise: Choice | None = None,
+    time: Mapping[str, object] | None = None,
+    excitation: Mapping[str, object] | None = None,
+    config_dir: Folder | None = None,
+) -> tuple[Assumption, ...]:
+    """Every assumption that a run would rest on, with its evidence, as ``gpebo check`` has them.
+
+    Args:
+        plant: as in :func:`run`; the other arguments, too.
+        observer: a name or a mapping.
+        solver: a name or a mapping.
+        noise: a name or a mapping.
+        time: ``start`` and ``horizon`` in seconds.
+        excitation: ``rho`` and ``window`` (seconds).
+        config_dir: a folder of yours.
+
+    Raises:
+        ConfigError: a wrong name, key, value or plant.
+        SolverError: a tolerance cannot be reached.
+
+    Examples:
+        >>> from gpebo_cli import check
+        >>> [a.name for a in check("circuit", observer={"regression": "paper"}) if not a.holds]
+        ['Assumption 2']
+    """
+    sections: dict[str, object] = {
+        "observer": observer, "estimator": None, "solver": solver, "noise": noise,
+        "time": time, "excitation": excitation,
+    }
+    _, system, settings = _configure(plant, sections, {}, config_dir)
+    return assumptions.check(settings, system)
+
+
+def load_plant(plant: Plant, config_dir: Folder | None = None) -> DescriptorSystem:
+    """A plant by name, from the path of a YAML file, or from the content of one.
+
+    Raises:
+        ConfigError: there is none of that name, or something is wrong in it.
+
+    Examples:
+        >>> from gpebo_cli import load_plant
+        >>> load_plant("circuit").states
+        ('e1', 'e2', 'il', 'ir1', 'ir2', 'iv')
+    """
+    if isinstance(plant, DescriptorSystem):
+        return plant
+    content, source = choose("plant", plant, config_dir)
+    return plant_from_mapping(content, source)
+
+
+def available(group: str, config_dir: Folder | None = None) -> list[str]:
+    """Names that a group can have: ``plant``, ``observer``, ``estimator``, ``solver``, ….
+
+    Raises:
+        ConfigError: there is no such group.
+
+    Examples:
+        >>> from gpebo_cli import available
+        >>> "circuit" in available("plant")
+        True
+    """
+    if group not in GROUPS:
+        raise ConfigError(
+            f"available({shown(group)}): no such group; known: {', '.join(GROUPS)}"
+            + nearest(str(group), GROUPS)
+        )
+    folders = [conf_folder(), *([] if config_dir is None else [os.fspath(config_dir)])]
+    return sorted({name for folder in folders for name in choices(folder, group)})
+
+
+def _configure(
+    plant: Plant | None,
+    sections: Mapping[str, object],
+    gains: Mapping[str, object],
+    config_dir: Folder | None,
+) -> tuple[dict[str, Any], DescriptorSystem, Settings]:
+    """The configuration as ``config.yaml`` has it, the plant, and the settings."""
+    config = {k: v for k, v in primary().items() if k not in ("defaults", "hydra")}
+    for name in _SECTIONS:
+        given = sections[name]
+        if given is not None and not isinstance(given, Mapping):
+            raise ConfigError(
+                f"{name}: expected a mapping such as {_EXAMPLES[name]}, got {shown(given)}"
+            )
+        config[name] = {**config[name], **plain(given or {})}
+    if isinstance(plant, DescriptorSystem):
+        config["plant"], system = {}, plant
+    else:
+        content, source = choose("plant", plant, config_dir)
+        config["plant"], system = plain(content), plant_from_mapping(content, source)
+    for name in _CHOSEN:
+        config[name], _ = choose(name, sections[name], config_dir)
+    _check_gains(gains, config["estimator"])
+    config["estimator"] |= plain(gains)
+    return config, system, configuration.settings(config, draw=True)
+
+
+def _own(estimator: object) -> Estimator:
+    """An estimator that is an object of the caller's.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    if isinstance(estimator, type) or not all(hasattr(estimator, k) for k in ("cases", "estimate")):
+        raise ConfigError(
+            "estimator: expected a name, a mapping or an object with cases and estimate, got "
+            f"{shown(estimator)}"
+        )
+    return cast("Estimator", estimator)
+
+
+_EXAMPLES = {"time": '{"horizon": 10}', "excitation": '{"window": 1}'}
+
+
+def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -> None:
+    """Refuse a keyword that the estimator does not have, with where it may belong."""
+    known = settings_of(estimator)
+    words = (*_CHOSEN, *_SECTIONS, "config_dir", "progress")
+    for key in gains:
+        if key in known:
+            continue
+        sections = {
+            "time": tuple(primary()["time"]),
+            "excitation": tuple(primary()["excitation"]),
+            "solver": tuple(field.name for field in fields(SolverSettings)),
+            "observer": tuple(field.name for field in fields(ObserverSettings)),
+            "noise": tuple(field.name for field in fields(NoiseSettings)),
+        }
+        belongs = next((name for name, keys in sections.items() if key in keys), None)
+        hint = f'; did you mean {belongs}={{"{key}": …}}?' if belongs else ""
+        raise ConfigError(
+            f"run: no such keyword {key}; estimator {estimator['name']} has {', '.join(known)}"
+            + (hint or nearest(key, (*words, *known)))
+        )

@@ -1,0 +1,120 @@
+"""From what a caller gives to the configuration of one run, with the files' own defaults.
+
+``conf/gpebo.yaml`` and the files of its groups are read here as Hydra reads them for the command
+line, so that a default is written in one place.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli.commands import configuration
+from gpebo_cli.commands.guard import check_file
+from gpebo_cli.commands.locations import choices, conf_folder
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.reading import nearest, shown
+
+PRIMARY = "gpebo.yaml"
+
+
+def primary() -> dict[str, Any]:
+    """The primary configuration, ``conf/gpebo.yaml``."""
+    return configuration.load(os.path.join(conf_folder(), PRIMARY))
+
+
+def default(group: str) -> str:
+    """The file of ``group`` that is taken where nothing is chosen."""
+    entries = [entry for entry in primary()["defaults"] if isinstance(entry, Mapping)]
+    return str(next(entry[group] for entry in entries if group in entry))
+
+
+def choose(
+    group: str, given: object, config_dir: str | os.PathLike[str] | None
+) -> tuple[dict[str, Any], str]:
+    """The content of a group and the file that it is from.
+
+    Args:
+        group: ``plant``, ``observer``, ``estimator`` or ``solver``.
+        given: None (the default), the name of a file of the group, or a mapping: its ``name``
+            is that of a file, whose values hold where the mapping says nothing. Of a plant, a
+            path to a file or a mapping that is the whole of it.
+        config_dir: a folder of one's own with ``GROUP/NAME.yaml``.
+
+    Raises:
+        ConfigError: nothing has that name, or the file is wrong.
+    """
+    if group == "plant" and isinstance(given, Mapping):
+        return dict(given), ""
+    if isinstance(given, Mapping):
+        name = given.get("name", default(group))
+        base, source = choose(group, name, config_dir)
+        return {**base, **plain(given), "name": base.get("name", name)}, source
+    if given is None:
+        given = default(group)
+    if group == "plant" and (path := _as_path(given)) is not None:
+        return _load(path, group, os.path.dirname(os.path.abspath(path)))
+    if not isinstance(given, str):
+        wanted = "a name, a path, a mapping or a DescriptorSystem" if group == "plant" else (
+            "a name or a mapping"
+        )
+        raise ConfigError(f"{group}: expected {wanted}, got {shown(given)}")
+    return _named(group, given, config_dir)
+
+
+def plain(value: object) -> Any:
+    """``value`` with arrays, tuples, ranges and paths as the lists and texts of a YAML file."""
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [plain(inner) for inner in value]
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+def _as_path(given: object) -> str | None:
+    """``given`` as the path of a file, or None if it is no path."""
+    if isinstance(given, os.PathLike):
+        return str(os.fspath(given))
+    if isinstance(given, str) and (given.endswith((".yaml", ".yml")) or os.sep in given):
+        return given
+    return None
+
+
+def _named(
+    group: str, name: str, config_dir: str | os.PathLike[str] | None
+) -> tuple[dict[str, Any], str]:
+    folders = [conf_folder()]
+    if config_dir is not None:
+        mine = os.path.abspath(os.path.expanduser(os.fspath(config_dir)))
+        if not os.path.isdir(mine):
+            raise ConfigError(f"config_dir {config_dir}: there is no such folder")
+        folders.append(mine)
+    known = {folder: choices(folder, group) for folder in folders}
+    found = [folder for folder in folders if name in known[folder]]
+    if len(found) > 1:
+        mine = os.path.join(found[1], group, f"{name}.yaml")
+        raise ConfigError(
+            f"{mine} has the name of one that comes with gpebo and would be ignored; rename it"
+        )
+    if not found:
+        names = sorted(known_name for folder in folders for known_name in known[folder])
+        text = f"{group}={name}: there is no such {group}; known: {', '.join(names)}"
+        hint = nearest(name, names)
+        if not hint and config_dir is None:
+            hint = f" (yours: config_dir=DIR with DIR/{group}/{name}.yaml)"
+        raise ConfigError(text + hint)
+    return _load(os.path.join(found[0], group, f"{name}.yaml"), group, found[0])
+
+
+def _load(path: str, group: str, folder: str) -> tuple[dict[str, Any], str]:
+    path = os.path.expanduser(path)
+    if not Path(path).exists():
+        raise ConfigError(f"{path}: there is no such file")
+    check_file(path, group, folder)
+    return configuration.load(path), min(path, os.path.relpath(path), key=len)

@@ -1,0 +1,271 @@
+"""What a run gives back in Python: signals by name, tables, figures, and the folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpebo_cli import estimators
+from gpebo_cli.api.choice import primary
+from gpebo_cli.commands import configuration
+from gpebo_cli.commands.report import case_rows, run_lines
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.outputs import figures
+from gpebo_cli.outputs.figures import truth_at
+from gpebo_cli.outputs.folder import write_run
+from gpebo_cli.outputs.frames import frame
+from gpebo_cli.reading import nearest, shown
+from gpebo_cli.result import Assumption, Excitation, RunResult
+from gpebo_cli.systems.descriptor import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+_HAT = "_hat"  # of the names of estimates, as in estimates.csv
+
+
+class UnknownNameError(ConfigError, KeyError):
+    """A signal was asked for by a name that the run does not have."""
+
+    __str__ = Exception.__str__  # KeyError's quotes the whole sentence
+
+
+class Signals(Mapping[str, Array]):
+    """Arrays by name; an unknown name is answered with the nearest known one."""
+
+    def __init__(self, what: str, names: Sequence[str], values: Array) -> None:
+        self._what = what
+        self._values: dict[str, Array] = dict(zip(names, np.moveaxis(values, -1, 0), strict=True))
+        self._twice = {name for name in names if list(names).count(name) > 1}
+
+    def __getitem__(self, name: str) -> Array:
+        if name in self._twice:
+            raise UnknownNameError(f"{name} is both a parameter and a state; rename the state")
+        if name not in self._values:
+            known = ", ".join(self._values) or "none"
+            raise UnknownNameError(
+                f"{self._what} has no {shown(name)}; known: {known}"
+                + nearest(str(name), self._values)
+            )
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return f"<{self._what}: {', '.join(self._values) or 'none'}>"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One run. N output times, G cases (combinations of gains), M times of estimates.
+
+    ``result["il"]`` is a true signal (N,), ``result["il_hat"]`` its estimates (G, M).
+
+    Attributes:
+        details: everything, as arrays by position; see :class:`gpebo_cli.result.RunResult`.
+        config: the configuration, complete, as ``config.yaml`` has it.
+
+    Examples:
+        >>> from gpebo_cli import run
+        >>> result = run("descriptor", estimator="ls_drem", time={"horizon": 10})
+        >>> result.parameters["theta1"]
+        1.5
+        >>> round(float(result.estimates["theta1"][0, -1]), 6)
+        1.5
+        >>> list(result.to_pandas("estimates").columns[:2])
+        ['theta1_hat', 'theta2_hat']
+    """
+
+    details: RunResult
+    config: Mapping[str, Any]
+
+    @property
+    def t(self) -> Array:
+        """Output times in seconds, (N,)."""
+        return self.details.simulation.t
+
+    @cached_property
+    def inputs(self) -> Signals:
+        """Known inputs u by name, (N,) each."""
+        return Signals("inputs", self.details.system.inputs, self.details.simulation.inputs)
+
+    @cached_property
+    def outputs(self) -> Signals:
+        """Measured outputs y by name, (N,) each."""
+        return Signals("outputs", self.details.system.outputs, self.details.simulation.outputs)
+
+    @cached_property
+    def states(self) -> Signals:
+        """True states x by name, (N,) each."""
+        return Signals("states", self.details.system.states, self.details.simulation.states)
+
+    @property
+    def estimates_t(self) -> Array:
+        """Times of the estimates in seconds, (M,); M < N where cases are very many."""
+        estimation = self.details.estimation
+        return np.zeros(0) if estimation is None else estimation.t
+
+    @cached_property
+    def estimates(self) -> Signals:
+        """Estimates of parameters and states by name, (G, M) each; NaN: a state not seen.
+
+        Without an observer there are none.
+        """
+        estimation = self.details.estimation
+        if estimation is None:
+            return Signals("estimates", (), np.zeros((0, 0, 0)))
+        names = (*estimation.names, *self.details.system.states)
+        values = np.concatenate([estimation.parameters, estimation.states], axis=-1)
+        return Signals("estimates", names, values)
+
+    @cached_property
+    def errors(self) -> Signals:
+        """Estimate minus truth by name, (G, M) each."""
+        estimation = self.details.estimation
+        if estimation is None:
+            return Signals("errors", (), np.zeros((0, 0, 0)))
+        names = (*estimation.names, *self.details.system.states)
+        values = np.concatenate(
+            [
+                estimation.parameters - estimation.true_parameters,
+                estimation.states - truth_at(self.details, estimation.t),
+            ],
+            axis=-1,
+        )
+        return Signals("errors", names, values)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """True values of θ and e₀ by name, at the end; none without an observer."""
+        estimation = self.details.estimation
+        if estimation is None:
+            return {}
+        pairs = zip(estimation.names, estimation.true_parameters[-1], strict=True)
+        return {name: float(value) for name, value in pairs}
+
+    @property
+    def cases(self) -> list[dict[str, float]]:
+        """Gains and metrics of each case, as in ``cases.csv``; NaN: never."""
+        return case_rows(self.details)
+
+    @property
+    def excitation(self) -> Excitation | None:
+        """Evidence of excitation; None without an observer."""
+        return self.details.excitation
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What the run rests on, with evidence."""
+        return self.details.assumptions
+
+    @property
+    def verdict(self) -> str:
+        """The last line that ``gpebo run`` prints."""
+        return self.details.verdict
+
+    def __getitem__(self, name: str) -> Array:
+        """A signal by its name in the CSV files: ``t``, ``il``, ``il_hat``."""
+        if name == "t":
+            return self.t
+        everything: dict[str, Signals] = {}
+        for signals in (self.inputs, self.outputs, self.states):
+            everything |= dict.fromkeys(signals, signals)
+        if name in everything:
+            return everything[name][name]
+        hats = [estimate + _HAT for estimate in self.estimates]
+        if name in hats:
+            return self.estimates[name.removesuffix(_HAT)]
+        known = ["t", *everything, *hats]
+        raise UnknownNameError(
+            f"this run has no signal {shown(name)}; known: {', '.join(known)}"
+            + nearest(str(name), known)
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(run_lines(self.details))
+
+    def __repr__(self) -> str:
+        name, count = self.details.system.name, len(self.cases)
+        return f"<gpebo run of {name}, {count} case{'' if count == 1 else 's'}: {self.verdict}>"
+
+    def to_pandas(self, table: str = "signals") -> DataFrame:
+        """One of the run's tables as a data frame, with the names of the CSV files.
+
+        Args:
+            table: ``signals``, ``regression`` or ``excitation``, indexed by ``t`` in seconds;
+                ``estimates``, indexed by ``case`` and ``t``; ``cases``, one row each.
+
+        Raises:
+            ConfigError: no table has that name, or a run without an observer lacks it.
+        """
+        return frame(self.details, table)
+
+    @property
+    def figures(self) -> list[str]:
+        """Names of the figures that :meth:`plot` can draw of this run."""
+        return [name for name, _ in figures.describe(self.details, figures.FIGURES)]
+
+    def plot(self, figure: str | None = None) -> Figure:
+        """A figure of the run, as ``gpebo run`` draws it; a notebook shows it.
+
+        Args:
+            figure: one of :attr:`figures`; by default the states and their estimates.
+
+        Raises:
+            ConfigError: no figure has that name, or this run has nothing for it.
+        """
+        has = self.figures
+        if figure is None:
+            figure = next(n for n in ("estimates_a", "estimates", "states") if n in has)
+        drawn = dict(figures.draw(self.details, [figure]))
+        if figure not in drawn:
+            raise ConfigError(
+                f"figures: this run has nothing for {shown(figure)}; it has {', '.join(has)}"
+            )
+        return drawn[figure]
+
+    def save(
+        self, folder: str | os.PathLike[str], figures: bool | Sequence[str] = True
+    ) -> Path:
+        """Write the folder that ``gpebo run`` writes: tables, summary, configuration, figures.
+
+        Args:
+            folder: where to; it is created where needed.
+            figures: True for all, False for none, or names of some.
+
+        Returns:
+            The folder.
+
+        Raises:
+            ConfigError: a figure does not exist.
+            GpeboError: a file cannot be written.
+        """
+        chosen = figures if isinstance(figures, bool) else list(figures)
+        settings = self.details.settings
+        output = replace(settings.output, figures=chosen)
+        details = replace(self.details, settings=replace(settings, output=output))
+        word = (None if chosen else "none") if isinstance(chosen, bool) else chosen
+        name = str(self.config["estimator"]["name"])
+        repeats = bool(self.config["plant"]) and name in estimators.names()
+        head = configuration.REPEATS if repeats else _NOT_REPEATED
+        text = configuration.config_text(
+            {**self.config, "figures": word}, configuration.patterns(primary()), head
+        )
+        write_run(details, Path(folder), text)
+        return Path(folder)
+
+
+_NOT_REPEATED = (
+    "The plant or the estimator was given as a Python object; this file does not repeat the run"
+)

@@ -1,0 +1,406 @@
+"""The Python interface: the command line's numbers, defaults and messages, without Hydra."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+import gpebo_cli
+from gpebo_cli import (
+    ConfigError,
+    GpeboError,
+    ModelError,
+    Result,
+    available,
+    check,
+    load_plant,
+    run,
+    system_from_functions,
+)
+from gpebo_cli.api.choice import choose, default
+
+ROOT = Path(__file__).parents[1]
+
+MINE = """\
+name: mine
+states: [x]
+outputs: [y]
+E: [[1]]
+A: [[-1]]
+C: [[1]]
+initial_state: {x: 1}
+"""
+
+
+def gpebo(*words, cwd):
+    done = subprocess.run(
+        [sys.executable, "-m", "gpebo_cli", *map(str, words)], cwd=cwd, capture_output=True,
+        text=True, check=False, timeout=120,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
+    )
+    assert done.returncode in (0, 2), done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def circuit() -> Result:
+    return run("circuit", gamma=[1e8, 1e10], time={"horizon": 8, "samples": 201})
+
+
+def test_every_public_name_is_there():
+    assert set(gpebo_cli.__all__) == set(dir(gpebo_cli))
+    for name in gpebo_cli.__all__:
+        assert getattr(gpebo_cli, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'rnu'"):
+        _ = gpebo_cli.rnu
+
+
+def test_importing_the_package_loads_no_numbers_and_running_loads_no_hydra():
+    script = (
+        "import sys, gpebo_cli\n"
+        "assert not {'numpy', 'yaml', 'dataclasses'} & set(sys.modules)\n"
+        "result = gpebo_cli.run('descriptor', estimator='ls_drem', time={'samples': 11})\n"
+        "heavy = {'hydra', 'omegaconf', 'pandas', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", f"import sys; sys.path += {sys.path!r}\n{script}"],
+        env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_signals_by_name(circuit):
+    simulation, system = circuit.details.simulation, circuit.details.system
+    column = system.states.index("il")
+    np.testing.assert_array_equal(circuit["il"], simulation.states[:, column])
+    np.testing.assert_array_equal(circuit.states["il"], circuit["il"])
+    np.testing.assert_array_equal(circuit["V"], circuit.inputs["V"])
+    np.testing.assert_array_equal(circuit["y"], circuit.outputs["y"])
+    np.testing.assert_array_equal(circuit["t"], np.linspace(0, 8, 201))
+    # y = il + iv, whatever is called what
+    np.testing.assert_allclose(circuit["y"], circuit["il"] + circuit["iv"], atol=1e-12)
+
+
+def test_estimates_have_one_row_per_case_and_errors_are_estimate_minus_truth(circuit):
+    assert [case["gamma"] for case in circuit.cases] == [1e8, 1e10]
+    assert circuit.estimates["e0_il"].shape == (2, 201)
+    np.testing.assert_array_equal(circuit["il_hat"], circuit.estimates["il"])
+    np.testing.assert_allclose(circuit.errors["il"], circuit.estimates["il"] - circuit["il"])
+    truth = circuit.parameters["e0_il"]
+    np.testing.assert_allclose(circuit.errors["e0_il"], circuit.estimates["e0_il"] - truth)
+    assert np.abs(circuit.errors["il"][:, -1]).max() < 1e-9
+
+
+def test_a_name_that_is_not_there_is_a_key_error_with_the_nearest_one(circuit):
+    with pytest.raises(KeyError, match=r"no signal 'il_ha'.*did you mean il_hat"):
+        _ = circuit["il_ha"]
+    with pytest.raises(ConfigError, match="states has no 'V'"):
+        _ = circuit.states["V"]
+    assert "V" not in circuit.states
+    assert circuit.states.get("V") is None
+    assert list(circuit.states) == list(circuit.details.system.states)
+
+
+def test_a_name_that_is_parameter_and_state_is_refused_rather_than_guessed():
+    plant = {
+        "name": "clash", "states": ["T", "e0_T"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "A": [[-1, 0], [1, 1]], "C": [[1, 0]], "initial_state": [1, -1],
+    }
+    result = run(plant, time={"samples": 11})
+    with pytest.raises(KeyError, match="both a parameter and a state"):
+        _ = result.estimates["e0_T"]
+
+
+def test_what_is_printed_is_what_the_command_prints(circuit, tmp_path):
+    done = gpebo(
+        "run", "estimator.gamma=[1e8,1e10]", "time.horizon=8", "time.samples=201", "figures=none",
+        "hydra.run.dir=there", cwd=tmp_path,
+    )
+    lines = done.stdout.splitlines()
+    lines.remove("there")
+    assert str(circuit).splitlines() == lines
+    assert circuit.verdict in repr(circuit)
+
+
+def test_the_folder_is_the_command_lines_byte_for_byte(circuit, tmp_path):
+    circuit.save(tmp_path / "python", figures=["gram"])
+    gpebo(
+        "run", "estimator.gamma=[1e8,1e10]", "time.horizon=8", "time.samples=201", "figures=[gram]",
+        "hydra.run.dir=command", cwd=tmp_path,
+    )
+    tables = sorted(p.name for p in (tmp_path / "command").glob("*.csv"))
+    assert len(tables) == 5
+    for name in [*tables, "figures/gram.png"]:
+        one, other = (tmp_path / d / name for d in ("python", "command"))
+        assert one.read_bytes() == other.read_bytes(), name
+    one, other = (
+        yaml.safe_load((tmp_path / d / "config.yaml").read_text()) for d in ("python", "command")
+    )
+    assert list(one) == list(other)
+    # 8 is 8.0 for both; only the type of what was typed may differ
+    assert one == other
+
+
+def test_a_saved_folder_repeats_itself(tmp_path):
+    (tmp_path / "mine.yaml").write_text(MINE)
+    result = run(tmp_path / "mine.yaml", gamma=(1, 2.5), time={"samples": 51})
+    folder = result.save(tmp_path / "first", figures=False)
+    assert folder == tmp_path / "first"
+    words = ["--config-dir", folder, "--config-name", "config", "hydra.run.dir=again"]
+    assert gpebo("run", *words, cwd=tmp_path).stderr == ""
+    for name in ("signals.csv", "estimates.csv", "cases.csv"):
+        assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+
+
+def test_defaults_are_those_of_the_files():
+    entries = yaml.safe_load((ROOT / "conf" / "gpebo.yaml").read_text())["defaults"]
+    chosen = {k: v for entry in entries if isinstance(entry, dict) for k, v in entry.items()}
+    for group in ("plant", "observer", "estimator", "solver"):
+        assert default(group) == chosen[group]
+        content, source = choose(group, None, None)
+        assert content == OmegaConf.to_container(OmegaConf.load(source))  # Hydra's loader
+    settings = run("circuit", solver="ivp", observer="none", time={"horizon": 0.1}).details.settings
+    assert settings.solver.tol == OmegaConf.load(ROOT / "conf/solver/ivp.yaml").tol
+    # a mapping without a name changes the default, not something else
+    assert choose("solver", {"tol": 1e-9}, None)[0]["name"] == "collocation"
+
+
+def test_tables_are_the_files_tables(circuit, tmp_path):
+    folder = circuit.save(tmp_path, figures=False)
+    for name in ("signals", "regression", "excitation"):
+        frame = circuit.to_pandas(name)
+        read = pd.read_csv(folder / f"{name}.csv", index_col="t")
+        pd.testing.assert_frame_equal(frame, read, check_exact=True)
+    estimates = pd.read_csv(
+        folder / "estimates.csv", index_col=["case", "t"]
+    )
+    pd.testing.assert_frame_equal(circuit.to_pandas("estimates"), estimates, check_exact=True)
+    cases = pd.read_csv(folder / "cases.csv", index_col="case")
+    pd.testing.assert_frame_equal(
+        circuit.to_pandas("cases"), cases.astype(float), check_exact=True, check_index_type=False
+    )
+
+
+def test_figures(circuit):
+    assert "gains" not in circuit.figures
+    figure = circuit.plot()
+    assert len(figure.axes) == 3
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    with pytest.raises(ConfigError, match=r"did you mean gram\?"):
+        circuit.plot("grm")
+    with pytest.raises(ConfigError, match="has nothing for 'gains'"):
+        circuit.plot("gains")
+
+
+def test_without_an_observer_there_are_signals_only(tmp_path):
+    result = run("circuit", observer="none", time={"horizon": 1, "samples": 11})
+    assert result["il"].shape == (11,)
+    assert (len(result.estimates), len(result.errors), result.cases) == (0, 0, [])
+    assert (result.parameters, result.excitation, result.estimates_t.shape) == ({}, None, (0,))
+    with pytest.raises(ConfigError, match="made with observer=none"):
+        result.to_pandas("estimates")
+    assert len(result.plot().axes) >= 1
+    assert [p.name for p in result.save(tmp_path / "o", figures=False).glob("*.csv")] == [
+        "signals.csv"
+    ]
+
+
+def test_a_plant_from_functions_and_from_a_mapping(tmp_path):
+    system = system_from_functions(
+        "rc", E=[[1, 0], [0, 0]], A=[[-1, 1], [1, 2]], C=[[1, 0.5]], initial_state=[1, -0.5]
+    )
+    one = run(system, estimator="ls_drem", time={"samples": 51})
+    mapping = {
+        "name": "rc", "states": ["x1", "x2"], "outputs": ["y1"], "E": np.diag([1, 0]),
+        "A": ((-1, 1), (1, 2)), "C": [[1, 0.5]], "initial_state": np.array([1, -0.5]),
+    }
+    other = run(
+        {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in mapping.items()},
+        estimator="ls_drem", time={"samples": 51},
+    )
+    np.testing.assert_allclose(one["x2"], other["x2"], atol=1e-13)
+    np.testing.assert_allclose(one["x2"], -0.5 * one["x1"], atol=1e-12)
+    text = (one.save(tmp_path, figures=False) / "config.yaml").read_text()
+    assert text.startswith("# The plant or the estimator was given as a Python object")
+    assert load_plant(system) is system
+
+
+def test_arrays_are_gains_too():
+    gains = np.logspace(6, 8, 3)
+    result = run("circuit", gamma=gains, time={"horizon": 1, "samples": 11})
+    assert [case["gamma"] for case in result.cases] == gains.tolist()
+
+
+def test_a_folder_of_ones_own(tmp_path):
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "mine.yaml").write_text(MINE)
+    (tmp_path / "estimator").mkdir()
+    (tmp_path / "estimator" / "fast.yaml").write_text("name: drem\ngamma: 1e12\n")
+    assert "mine" in available("plant", tmp_path)
+    result = run("mine", estimator="fast", config_dir=tmp_path, time={"samples": 11})
+    assert result.cases[0]["gamma"] == 1e12
+    assert load_plant("mine", tmp_path).source.endswith("mine.yaml")
+
+
+def test_check_is_the_commands():
+    assert all(a.holds for a in check("circuit"))
+    failed = [a.name for a in check("circuit", observer={"regression": "paper"}) if not a.holds]
+    assert failed == ["Assumption 2"]
+
+
+WRONG = [
+    ({"gama": 1}, "run: no such keyword gama; estimator drem has gamma, lambda, initial; did you"),
+    ({"gama": 1}, "did you mean gamma?"),
+    ({"horizon": 3}, 'did you mean time={"horizon": …}?'),
+    ({"estimtor": "drem"}, "did you mean estimator?"),
+    ({"estimator": "drm"}, "estimator=drm: there is no such estimator"),
+    ({"estimator": {"name": "drem", "gama": 1}}, "estimator.gama: no such key"),
+    ({"plant": "circut"}, "did you mean circuit?"),
+    ({"plant": "nowhere.yaml"}, "nowhere.yaml: there is no such file"),
+    ({"plant": 3}, "plant: expected a name, a path, a mapping or a DescriptorSystem, got 3"),
+    ({"plant": {"name": "a"}}, "plant a: states is missing"),
+    ({"time": 3}, 'time: expected a mapping such as {"horizon": 10}, got 3'),
+    ({"time": {"horizn": 3}}, "did you mean horizon?"),
+    ({"time": {"samples": 1}}, "time.samples: expected 2 to"),
+    ({"solver": "euler"}, "solver=euler: there is no such solver"),
+    ({"solver": {"tol": 1}}, "solver.tol: expected 1e-15 to 0.1"),
+    ({"gamma": -1}, "estimator.gamma"),
+    ({"config_dir": "nowhere", "plant": "mine"}, "config_dir nowhere: there is no such folder"),
+]
+
+
+@pytest.mark.parametrize(("words", "expected"), WRONG)
+def test_wrong_usage_is_a_config_error_on_one_line(words, expected):
+    with pytest.raises(ConfigError) as caught:
+        run(**{"plant": "circuit", **words})
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("name: mine\nname: other\n", "the key name stands twice"),
+        ("name: [\n", "not valid YAML"),
+        ("- 1\n", "expected a mapping"),
+        (MINE + "title: ${oc.env:HOME}\n", "is not allowed in a plant"),
+        (MINE.replace("-1", "-z"), "the name 'z' is not defined"),
+    ],
+)
+def test_a_file_is_read_as_carefully_as_by_the_command(tmp_path, text, expected):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"mine\.yaml") as caught:
+        run(path)
+    assert expected in str(caught.value)
+
+
+def test_a_plant_with_a_shipped_name_is_refused(tmp_path):
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "circuit.yaml").write_text(MINE)
+    with pytest.raises(ConfigError, match="would be ignored; rename it"):
+        run("circuit", config_dir=tmp_path)
+
+
+def test_a_plant_that_cannot_be_used_is_a_model_error():
+    singular = {**yaml.safe_load(MINE), "E": [[0]], "A": [[0]]}
+    with pytest.raises(ModelError) as caught:
+        run(singular)
+    assert isinstance(caught.value, GpeboError)
+
+
+RIDGE = """\
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli.result import Requirement
+
+
+@dataclass(frozen=True)
+class Estimates:
+    values: Any
+    requirement: Requirement
+
+    def delta(self, t):
+        return None
+
+    def parameters(self, cases):
+        return self.values[cases]
+
+
+@dataclass(frozen=True)
+class Ridge:
+    f: float = 1e-9
+
+    @property
+    def cases(self):
+        return ({"f": self.f},)
+
+    def estimate(self, regression, t):
+        both = regression.gram(t)
+        G = both[..., :-1] + self.f * np.eye(regression.p)
+        values = np.linalg.solve(G, both[..., -1:])[None, ..., 0]
+        return Estimates(values, Requirement("IE", True, {}, "all data at once"))
+"""
+
+
+def test_an_estimator_of_ones_own(tmp_path):
+    names = {}
+    exec(RIDGE, names)  # noqa: S102  the text below is a package's
+    result = run("descriptor", estimator=names["Ridge"](1e-6), time={"horizon": 10})
+    assert result.cases[0]["f"] == 1e-6
+    assert abs(result.errors["theta1"][0, -1]) < 1e-5
+    text = (result.save(tmp_path, figures=["states"]) / "config.yaml").read_text()
+    assert "does not repeat the run" in text
+    with pytest.raises(ConfigError, match=r"gamma given beside an estimator object"):
+        run("descriptor", estimator=names["Ridge"](), gamma=1)
+    for wrong in (3, names["Ridge"]):
+        with pytest.raises(ConfigError, match="an object with cases and estimate"):
+            run("descriptor", estimator=wrong)
+
+
+def test_an_estimator_of_another_package(tmp_path):
+    """What `pip install` leaves of a package with an entry point, and a file with its settings."""
+    (tmp_path / "theirs.py").write_text(RIDGE)
+    info = tmp_path / "theirs-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[gpebo.estimators]\nridge = theirs:Ridge\nbroken = theirs:Gone\nodd = theirs:RIDGE\n"
+    )
+    (tmp_path / "theirs.py").write_text(RIDGE + "\n\nRIDGE = 3\n")
+    (tmp_path / "estimator").mkdir()
+    for name in ("ridge", "broken", "odd"):
+        (tmp_path / "estimator" / f"{name}.yaml").write_text(f"name: {name}\n")
+
+    def command(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "gpebo_cli", "run", "--config-dir", ".", "plant=descriptor",
+             "figures=none", "hydra.run.dir=out", *words],
+            cwd=tmp_path, env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"},
+            capture_output=True, text=True, check=False, timeout=120,
+        )
+
+    done = command("estimator=ridge", "+estimator.f=1e-6")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split()[0] == "f"
+    for words, expected in (
+        (["estimator=ridge", "+estimator.g=1"], "estimator.g: no such key; estimator has f"),
+        (["estimator=broken"], "estimator.name: broken of theirs cannot be imported"),
+        (["estimator=odd"], "estimator.name: odd of theirs is not a dataclass"),
+        (["estimator.name=ridgee"], "did you mean ridge?"),
+    ):
+        done = command(*words)
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert expected in done.stderr

@@ -1,0 +1,249 @@
+"""Completion as a shell asks for it, and in the shells themselves where they are installed."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import pytest
+
+from gpebo_cli.app import COMMANDS
+from gpebo_cli.commands.completion import SCRIPTS, candidates
+from gpebo_cli.commands.locations import GROUPS
+from gpebo_cli.outputs.figures import FIGURES
+from gpebo_cli.outputs.names import FIGURE_NAMES, METRICS
+from gpebo_cli.result import Metrics
+from gpebo_cli.settings import ObserverSettings
+
+ROOT = Path(__file__).parents[1]
+
+
+def names(*words):
+    return [line.partition("\t")[0] for line in candidates(words, list(COMMANDS))]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with a plant, and with `gpebo` on the PATH."""
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "mine.yaml").write_text("name: mine\ntitle: a decaying state\n")
+    (tmp_path / "bin").mkdir()
+    program = tmp_path / "bin" / "gpebo"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m gpebo_cli "$@"\n')
+    program.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    return tmp_path
+
+
+# Candidates -----------------------------------------------------------------------------------
+
+
+def test_commands():
+    assert set(COMMANDS) < set(names(""))
+    assert names("co") == ["compare", "completion"]
+    assert names("__c") == []
+
+
+def test_groups_and_their_values():
+    assert {f"{group}=" for group in (*GROUPS, "launcher")} < set(names("run", ""))
+    for group in GROUPS:
+        on_disk = {f"{group}={path.stem}" for path in (ROOT / "conf" / group).glob("*.yaml")}
+        assert set(names("run", f"{group}=")) == on_disk
+    assert names("check", "plant=cir") == ["plant=circuit"]
+    (line,) = candidates(["run", "plant=cir"], [])
+    assert line == "plant=circuit\telectrical circuit with time-varying elements, index 2"
+
+
+def test_values_of_ones_own_folder(here):
+    assert "plant=mine" not in names("run", "plant=")
+    for words in (["--config-dir", "."], ["--config-dir=."], ["-cd", str(here)]):
+        assert names("run", *words, "plant=mi") == ["plant=mine"]
+
+
+def test_several_values_of_a_sweep():
+    assert names("run", "-m", "estimator=drem,ls") == ["estimator=drem,ls_drem"]
+    assert "estimator=drem,drem" not in names("run", "-m", "estimator=drem,")
+
+
+def test_keys_are_those_of_the_chosen_file():
+    assert set(names("run", "time.")) == {"time.start=", "time.horizon=", "time.samples="}
+    assert "estimator.lambda=" in names("run", "estimator.")
+    assert "estimator.f0=" not in names("run", "estimator.")
+    assert "estimator.f0=" in names("run", "estimator=ls_drem", "estimator.")
+    assert "observer.output=" in names("run", "observer=canonical", "observer.")
+    assert "solver.tol=" in names("run", "solver.")
+
+
+def test_figures_list_topics_recipes_and_columns():
+    assert names("run", "figures=[gram,del") == ["figures=[gram,delta"]
+    assert set(names("run", "figures=[")) == {f"figures=[{name}" for name in FIGURES}
+    assert names("list", "e") == ["estimators", "experiments"]
+    assert "paper_circuit" in names("figures", "paper")
+    assert names("figures", "figures.formats=[png,p") == ["figures.formats=[png,pdf"]
+    assert names("compare", "--sort", "rms") == ["rms_error_states"]
+    assert names("new", "p") == ["plant"]
+    assert names("completion", "") == [*SCRIPTS, "--help"]
+    assert names("run", "--cfg", "j") == ["job"]
+
+
+def test_folders_are_left_to_the_shell():
+    assert names("run", "--config-dir", "x") == [":folders"]
+    assert names("run", "--config-dir=x") == [":folders--config-dir="]
+    assert names("run", "resume=x") == [":foldersresume="]
+    assert names("compare", "x") == [":folders"]
+
+
+def test_what_cannot_be_completed_is_nothing():
+    assert names("run", "time.horizon=") == []
+    assert names("rnu", "plant=") == []
+    assert names("run", "estimator=nothing", "estimator.") == []
+
+
+def test_names_that_are_written_twice_agree():
+    assert tuple(FIGURES) == FIGURE_NAMES
+    assert tuple(field.name for field in fields(Metrics)) == METRICS
+    regressions = get_args(get_type_hints(ObserverSettings)["regression"])
+    offered = set(names("run", "observer.regression="))
+    assert offered == {f"observer.regression={name}" for name in regressions}
+
+
+def test_answering_loads_no_numbers(here):
+    script = (
+        "import sys; sys.argv = ['gpebo', '__complete', 'run', 'plant=']; "
+        "from gpebo_cli.app import main; main(); "
+        "heavy = {'numpy', 'hydra', 'omegaconf', 'yaml', 'pandas'} & set(sys.modules); "
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", script], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "plant=circuit" in done.stdout
+
+
+# Shells ---------------------------------------------------------------------------------------
+
+LINES = [
+    ("gpebo com", {"compare", "completion"}),
+    ("gpebo run obs", {"observer=", "observer."}),
+    ("gpebo run plant=c", {"plant=circuit", "plant=canonical"}),
+    ("gpebo run --config-dir . plant=mi", {"plant=mine"}),
+    ("gpebo run time.h", {"time.horizon="}),
+    ("gpebo run -m estimator=drem,ls", {"estimator=drem,ls_drem"}),
+    ("gpebo list pl", {"plants"}),
+    ("gpebo run --config-dir pla", {"plant"}),
+]
+
+
+def pieces(line, breaks):
+    """The words of a line as bash cuts them, and what of the last one it keeps."""
+    *words, last = line.split()
+    cut = last.rfind("=") + 1 if "=" in breaks else 0
+    return [*words, *([last[: cut - 1], "=", last[cut:]] if cut else [last])], last[:cut]
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+@pytest.mark.parametrize("breaks", ["=:", ":"])
+def test_bash(here, breaks):
+    """The function is called as readline calls it, with words cut at COMP_WORDBREAKS."""
+    calls = "".join(
+        f"COMP_LINE='{line}'; COMP_POINT={len(line)}; COMP_WORDS=({' '.join(words)}); "
+        f'COMP_CWORD={len(words) - 1}; _gpebo; echo "${{COMPREPLY[*]}}"\n'
+        for line, words in ((line, pieces(line, breaks)[0]) for line, _ in LINES)
+    )
+    done = subprocess.run(
+        ["bash", "-c", f'eval "$(gpebo completion bash)"\n{calls}'], capture_output=True,
+        text=True, check=True, stdin=subprocess.DEVNULL,
+    )
+    for (line, expected), replies in zip(LINES, done.stdout.splitlines(), strict=True):
+        kept = pieces(line, breaks)[1]  # bash replaces the last piece only
+        assert {kept + reply for reply in replies.split()} == expected, line
+
+
+def typed(command, start, line, wait):
+    """What a shell's screen shows after ``line`` and a tab."""
+    child, terminal = pty.fork()
+    if child == 0:
+        os.environ["TERM"] = "dumb"
+        os.execvp(command[0], command)  # noqa: S606
+    screen = b""
+
+    def read(until, seconds=20.0):
+        nonlocal screen
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and until not in screen:
+            if select.select([terminal], [], [], 0.1)[0]:
+                try:
+                    screen += os.read(terminal, 4096).replace(b"\a", b"")
+                except OSError:
+                    break
+        return until in screen
+
+    try:
+        os.write(terminal, (start + "; echo rea''dy\n").encode())
+        assert read(b"ready"), screen
+        screen = b""
+        os.write(terminal, line.encode() + b"\t")
+        read(wait.encode())
+    finally:
+        os.write(terminal, b"\x03exit\n")
+        os.close(terminal)
+        os.waitpid(child, 0)
+    return screen.decode(errors="replace")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+def test_bash_at_a_terminal(here):
+    start = "PS1='> '; eval \"$(gpebo completion bash)\""
+    shell = ["bash", "--norc", "--noprofile", "-i"]
+    assert "plant=circuit" in typed(shell, start, "gpebo run plant=ci", "plant=circuit")
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("gpebo compl", "gpebo completion"),
+        ("gpebo run plant=ci", "plant=circuit"),
+        ("gpebo run --config-dir . plant=mi", "plant=mine"),
+        ("gpebo run --config-dir pla", "plant/"),
+        ("gpebo run resume=pla", "resume=plant/"),
+        ("gpebo run time.ho", "time.horizon="),
+    ],
+)
+def test_zsh_at_a_terminal(here, line, expected):
+    start = "PS1='> '; autoload -U compinit; compinit -u -D; eval \"$(gpebo completion zsh)\""
+    assert expected in typed(["zsh", "-f", "-i"], start, line, expected)
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")
+def test_fish(here):
+    asked = "".join(f"; complete -C '{line}'; echo ==" for line, _ in LINES)
+    done = subprocess.run(
+        ["fish", "--no-config", "-c", f"gpebo completion fish | source{asked}"],
+        capture_output=True, text=True, check=True,
+    )
+    answers = done.stdout.split("==\n")[:-1]
+    for (line, expected), replies in zip(LINES, answers, strict=True):
+        found = {reply.partition("\t")[0].rstrip("/") for reply in replies.splitlines()}
+        assert found == expected, line
+
+
+def test_an_unknown_shell_is_refused(here):
+    for words, expected in ((["bsh"], "did you mean bash?"), ([], "needs one of bash, zsh, fish")):
+        done = subprocess.run(
+            ["gpebo", "completion", *words], capture_output=True, text=True, check=False
+        )
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+        assert expected in done.stderr

@@ -1,0 +1,122 @@
+"""`gpebo new plant`, and what `gpebo check` says of the mistakes one then makes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gpebo_cli.commands.check import _ADVICE
+from gpebo_cli.commands.new import TEMPLATE
+from gpebo_cli.systems.plant import KEYS
+
+ROOT = Path(__file__).parents[1]
+
+
+def gpebo(*words, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "gpebo_cli", *map(str, words)], cwd=cwd, capture_output=True,
+        text=True, check=False, timeout=120, stdin=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
+    )
+
+
+def test_it_runs_as_it_stands_with_the_defaults_and_converges(tmp_path):
+    done = gpebo("new", "plant", "tank", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    path, run, check = done.stdout.splitlines()
+    assert path == "plant/tank.yaml"
+    words = run.partition("gpebo ")[2].split()
+    done = gpebo(*words, "figures=none", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "never" not in done.stdout
+    assert "not met" not in done.stdout
+    words = check.partition("gpebo ")[2].split()
+    done = gpebo(*words, cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout.endswith("everything that is needed holds\n")
+    assert "heated tank" in gpebo("list", "plants", "--config-dir", ".", cwd=tmp_path).stdout
+
+
+def test_it_can_be_written_elsewhere(tmp_path):
+    done = gpebo("new", "plant", "tank.yaml", "--config-dir", "my models", cwd=tmp_path)
+    assert done.returncode == 0
+    assert (tmp_path / "my models" / "plant" / "tank.yaml").is_file()
+    assert "--config-dir 'my models' plant=tank" in done.stdout
+
+
+def test_every_key_is_explained():
+    assert set(yaml.safe_load(TEMPLATE.format(name="a", folder="."))) == set(KEYS)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["plant", "tank"], "plant/tank.yaml exists already"),
+        (["plant", "circuit"], "circuit comes with gpebo"),
+        (["plant", "a b"], "'a b' cannot be a name"),
+        (["plant", "../a"], "'../a' cannot be a name"),
+        (["plant", "null"], "cannot be a name"),
+        (["plant", "2tanks"], "cannot be a name"),
+        (["plant"], "needs one name, as in gpebo new plant tank; got none"),
+        (["plant", "a", "b"], "got 'a', 'b'"),
+        (["plnt", "a"], "did you mean plant?"),
+        ([], "known: plant, as in gpebo new plant tank"),
+        (["plant", "a", "--confg-dir", "b"], "did you mean --config-dir?"),
+        (["plant", "a", "--config-dir"], "--config-dir needs a folder"),
+    ],
+)
+def test_what_it_refuses(tmp_path, words, expected):
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "tank.yaml").write_text("mine")
+    done = gpebo("new", *words, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert expected in done.stderr
+    assert [p.read_text() for p in tmp_path.rglob("*.yaml")] == ["mine"]
+
+
+# Mistakes: a line of the template is changed, and the answer says where and what -----------------
+
+MISTAKES = [
+    ("A:", "a:", 2, "unknown key 'a'; did you mean A?"),
+    ("[-k, -1]", "[-k, -1, 0]", 2, "A[0] has length 2, A[1] has length 3"),
+    ("[-k, -1]", "[-kk, -1]", 2, "A[1][0] = '-kk': the name 'kk' is not defined; did you mean k?"),
+    ("[-k, -1]", "[-k*T, -1]", 2, "T is a state and cannot be used here"),
+    ("0.5*sin(t/2)", "0.5*sin(t/2", 2, "parameters.Cap = '2 + 0.5*sin(t/2': it is not an expression"),
+    ("3 + 2*sin(t)", "3 + 2sin(t)", 2, "inputs.P = '3 + 2sin(t)'"),
+    ("3 + 2*sin(t)", "3 + t^2", 2, "write ** for powers"),
+    ("states: [T, q]", "states: [T, q, z]", 2, "E has 2 rows but there are 3 states (T, q, z)"),
+    ("unknowns:", "unknown:", 2, "did you mean unknowns?"),
+    ("  - [1, 0.5]", "  - [1]", 2, "C has 1 column but there are 2 states"),
+    ("  - [1, 0.5]", "  - [1, 0.5", 2, "tank.yaml, line"),
+    ("initial_state: {T: 1, q: 0}", "initial_state: {T: 1}", 2, "initial_state lacks q"),
+    ("{T: 0}", "{TT: 0}", 2, "'TT' is not a differential state; accepted: T; did you mean T?"),
+    ("[-k, -1]", "[0, 0]", 1, "to do: every state needs an equation of its own"),
+    ("  - [1, 0.5]", "  - [0, 1]", 0, "holds"),
+    ("  - [1, 0.5]", "  - [0, 0]", 1, "weakest_direction +1 loss to do: the direction"),
+    ("3 + 2*sin(t)", "3*step(t - 1)", 0, "everything that is needed holds"),
+]
+
+
+@pytest.mark.parametrize(("right", "wrong", "code", "expected"), MISTAKES)
+def test_check_says_what_to_fix(tmp_path, right, wrong, code, expected):
+    gpebo("new", "plant", "tank", cwd=tmp_path)
+    path = tmp_path / "plant" / "tank.yaml"
+    text = path.read_text()
+    assert right in text
+    path.write_text(text.replace(right, wrong, 1))
+    done = gpebo("check", "--config-dir", ".", "plant=tank", cwd=tmp_path)
+    said = " ".join((done.stdout + done.stderr).split())
+    assert (done.returncode, expected in said) == (code, True), said
+    assert done.stderr.count("\n") == (code == 2)
+
+
+def test_every_advice_is_for_an_assumption_there_is():
+    source = "".join(p.read_text() for p in (ROOT / "gpebo_cli").rglob("*.py") if p.stem != "check")
+    for name in _ADVICE:
+        number = name.removeprefix("Assumption ")
+        assert f'"{name}"' in source or number in ("2", "5"), name
