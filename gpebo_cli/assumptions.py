@@ -11,7 +11,7 @@ import numpy as np
 from gpebo_cli.errors import GpeboError, ModelError
 from gpebo_cli.excitation import assess
 from gpebo_cli.measurement import noise_levels
-from gpebo_cli.observers import Observation, observe
+from gpebo_cli.observers import Observation, observe, signal_noise
 from gpebo_cli.result import Assumption, Excitation
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Simulation, simulate
@@ -25,7 +25,7 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
 
     They are about ψ, which noise does not reach: signals are taken without it.
     """
-    noise_levels(settings.noise, system)
+    levels = noise_levels(settings.noise, system)
     found: list[Assumption] = []
     try:
         simulation = simulate(system, settings.time, settings.solver)
@@ -42,7 +42,8 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
     signals = simulation.signals
     try:
         observation = observe(
-            system, signals.inputs, signals.outputs, settings.observer, settings.solver
+            system, signals.inputs, signals.outputs, settings.observer, settings.solver,
+            signal_noise(settings.noise, levels),
         )
     except ModelError as error:
         found.append(
@@ -128,7 +129,7 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
 def of_observation(observation: Observation, excitation: Excitation) -> list[Assumption]:
     """The observer's own assumptions, excitation, and the growth of Φ."""
     number = 5 if any(a.name == "Assumption 3" for a in observation.assumptions) else 2
-    return [
+    found = [
         *observation.assumptions,
         Assumption(
             f"Assumption {number}",
@@ -142,10 +143,14 @@ def of_observation(observation: Observation, excitation: Excitation) -> list[Ass
                 "weakest_direction": str(excitation.weakest_direction),
             },
         ),
-        Assumption(
-            "Growth of Φ",
-            "Φ stays bounded, so that θ̂ → θ implies x̂ → x",
-            observation.growth < _GROWTH,
-            {"largest_entry": observation.growth},
-        ),
     ]
+    if observation.growth is not None:
+        found.append(
+            Assumption(
+                "Growth of Φ",
+                "Φ stays bounded, so that θ̂ → θ implies x̂ → x",
+                observation.growth < _GROWTH,
+                {"largest_entry": observation.growth},
+            )
+        )
+    return found

@@ -18,7 +18,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.excitation import assess
 from gpebo_cli.measurement import check_samples, measure, noise_levels
 from gpebo_cli.metrics import settling_time, time_rms
-from gpebo_cli.observers import Observation, observe
+from gpebo_cli.observers import Observation, observe, signal_noise
 from gpebo_cli.realisations import check_seeds, over_seeds
 from gpebo_cli.result import (
     EstimationResult,
@@ -115,8 +115,12 @@ def run_experiment(
     clock.stage("observe")
     _refuse_impulses(system, simulated)
     observation = observe(
-        system, measured.inputs, measured.outputs, settings.observer, settings.solver
+        system, measured.inputs, measured.outputs, settings.observer, settings.solver,
+        signal_noise(settings.noise, levels),
     )
+    if observation.estimator is not None:
+        # What the result is labelled with is what estimated.
+        settings = replace(settings, estimator={"name": settings.observer.name})
     regression = observation.regression
     sampler = regression.mesh.sampler(t)
     sampled = RegressionResult(
@@ -145,7 +149,7 @@ def run_experiment(
             *of_simulation(system, simulation), *of_observation(observation, excitation)
         ),
         timings=clock.seconds,
-        verdict=_verdict(excitation, estimation, metrics),
+        verdict=_verdict(excitation, estimation, metrics) + observation.note,
         noise=noise,
     )
 

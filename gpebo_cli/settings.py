@@ -37,7 +37,7 @@ class SolverSettings:
 class ObserverSettings:
     """Which observer, and what it is free to choose."""
 
-    name: Literal["gpebo", "canonical", "none"] = "gpebo"
+    name: Literal["gpebo", "canonical", "kalman_bucy", "none"] = "gpebo"
     # Where the dynamic extension starts: by state name, or a list of n_a numbers; None: what the
     # plant proposes, else zero.
     xi_a0: Mapping[str, float] | list[float] | None = None
@@ -50,6 +50,14 @@ class ObserverSettings:
     r0: list[float] = field(default_factory=lambda: [0.0, 0.0])
     # How much each output counts, by order or name (absent: 1); only ratios matter. None: equally.
     weights: Mapping[str, float] | list[float] | None = None
+    # kalman_bucy, of what is estimated, the unknowns and w_<state>: variance at the start, and
+    # intensity of the white noise that drives it (one number, a list, or by name; absent: the
+    # default of P0, no noise).
+    P0: float | list[float] | Mapping[str, float] = 10.0
+    process: float | list[float] | Mapping[str, float] = 0.0
+    # Where the noise leaves measurements exact: standard deviation of the noise assumed instead,
+    # relative to each one's own size, at the noise's sample time.
+    regularisation: float = 1e-3
 
 
 @dataclass(frozen=True)

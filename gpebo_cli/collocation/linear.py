@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -66,6 +66,18 @@ _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are no
 _ROUNDING = 64 * np.finfo(float).eps
 
 
+class Renewal(Protocol):
+    """At every edge, an equivalent value to go on with: a basis whose columns grow is changed."""
+
+    def state(self, reached: Array) -> Array:
+        """What (n, columns) replaces the limit from the left."""
+        ...
+
+    def error(self, reached: Array, error: Array) -> Array:
+        """What becomes of small errors (e, n, columns) of that limit."""
+        ...
+
+
 @dataclass(frozen=True)
 class LinearProblem:
     """The equation, and which other signals of the solution have to be resolved by the mesh.
@@ -83,6 +95,7 @@ class LinearProblem:
     floor: float = 0.0  # size below which the solution itself is rounding
     # (n, n + 1) by how much relative rounding of the components, and of 1, reaches each component
     amplification: Array | None = None
+    renewal: Renewal | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +144,7 @@ def solve(
     floor = np.zeros(mesh.size)  # the tail of the parent, to notice that cutting no longer helps
     rounds = 1
     while True:
-        values = _chain(maps, problem.start, mesh, restarts or {})
+        values = _chain(maps, problem, mesh, restarts or {})
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values).all(axis=(1, 2, 3))))
             raise SolverError(
@@ -152,10 +165,11 @@ def solve(
         floor = np.where(fresh, np.repeat(tail, parts), np.repeat(floor, parts))
         maps = _merge(maps, new, kept, fresh)
         mesh, rounds = finer, rounds + 1
+    propagated = _propagated_error(maps.homogeneous[:, -1], values, mesh, problem.renewal)
     estimate = max(
         float(tail.max(initial=0.0)),
         _visible_noise(values, mesh),
-        _propagated_error(maps.homogeneous[:, -1], values, mesh),
+        propagated,
         _rounding(problem, values),
     )
     return LinearSolution(Trajectory(mesh, values), estimate, rounds, maps.extras)
@@ -439,23 +453,26 @@ def solve_constant(rule: RadauRule, step: float, E: Array, A: Array, right: Arra
 
 def _chain(
     maps: _ElementMaps,
-    start: Array,
+    problem: LinearProblem,
     mesh: Mesh,
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> Array:
     """Point values (K, s + 1, n, columns)."""
     size, s, n = maps.homogeneous.shape[:3]
-    columns = start.shape[1]
+    columns = problem.start.shape[1]
+    renewal = problem.renewal
     last_h, last_p = maps.homogeneous[:, -1], maps.particular[:, -1]
     jump = [restarts.get(float(edge)) for edge in mesh.edges[:-1]] if restarts else [None] * size
     left = np.empty((size, n, columns))
-    state = start
+    state = problem.start
     values = np.empty((size, s + 1, n, columns))
     with np.errstate(over="ignore", invalid="ignore"):  # the caller reports what is not finite
         for k in range(size):
             restart = jump[k]
             if restart is not None and k > 0:
                 state = restart(state)
+            if renewal is not None and k > 0 and np.isfinite(state).all():
+                state = renewal.state(state)
             left[k] = state
             state = last_h[k] @ state + last_p[k]
         values[:, 0] = left
@@ -463,7 +480,9 @@ def _chain(
     return values
 
 
-def _propagated_error(last_h: Array, values: Array, mesh: Mesh) -> float:
+def _propagated_error(
+    last_h: Array, values: Array, mesh: Mesh, renewal: Renewal | None
+) -> float:
     """Largest accumulated end-point error, relative to each component's size.
 
     The error of an element's right end is carried through the same maps as the solution, so that
@@ -487,6 +506,9 @@ def _propagated_error(last_h: Array, values: Array, mesh: Mesh) -> float:
     signs[1::2, 1] = -1.0
     errors = signs * local[:, None]
     for k in range(1, len(errors)):
-        errors[k] += last_h[k] @ errors[k - 1]
+        carried = errors[k - 1]
+        if renewal is not None:
+            carried = renewal.error(values[k - 1, -1], carried)
+        errors[k] += last_h[k] @ carried
     worst = np.abs(errors).max(axis=(0, 1), initial=0.0)
     return float((worst.ravel() / scale).max(initial=0.0))

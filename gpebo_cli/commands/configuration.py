@@ -36,6 +36,7 @@ _KEYS = (
     "reference",
 )
 _DESCRIPTIVE = ("title", "reference")  # of files in the groups; for people
+_FOLDER = "estimator"  # of an observer that estimates by itself; its runs are called after it
 
 # Accepted ranges, ends included. What a type cannot say; beyond them nothing sensible happens.
 _RANGES = {
@@ -46,6 +47,7 @@ _RANGES = {
     "solver.max_strangeness_index": (0, 20),
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),
+    "observer.regularisation": (1e-6, 1.0),
     "noise.seed": (0, math.inf),
     "noise.seeds": (1, 1_000_000),
 }
@@ -73,7 +75,11 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         estimator=_group(config, "estimator"),
         time=read(TimeSettings, _group(config, "time"), "time"),
         solver=read(SolverSettings, _group(config, "solver"), "solver"),
-        observer=read(ObserverSettings, _group(config, "observer"), "observer"),
+        observer=read(
+            ObserverSettings,
+            {k: v for k, v in _group(config, "observer").items() if k != _FOLDER},
+            "observer",
+        ),
         excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
         output=_output(config, draw=draw),
         noise=read(NoiseSettings, _group(config, "noise"), "noise"),

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.observers import canonical, gpebo
+from gpebo_cli.measurement import NoiseLevels
+from gpebo_cli.observers import canonical, gpebo, kalman_bucy
+from gpebo_cli.observers.kalman_bucy import SignalNoise
 from gpebo_cli.observers.observation import Observation, StateMap
-from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.settings import NoiseSettings, ObserverSettings, SolverSettings
 from gpebo_cli.systems.descriptor import DescriptorSystem
 
-__all__ = ["Observation", "StateMap", "observe"]
+__all__ = ["Observation", "SignalNoise", "StateMap", "observe", "signal_noise"]
 
 _OBSERVERS = {"gpebo": gpebo.observe, "canonical": canonical.observe}
+
+
+def signal_noise(settings: NoiseSettings, levels: NoiseLevels) -> SignalNoise:
+    """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12."""
+    outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
+    return SignalNoise(levels.inputs, outputs, settings.sample_time)
 
 
 def observe(
@@ -19,12 +29,19 @@ def observe(
     outputs: Trajectory,
     settings: ObserverSettings,
     solver: SolverSettings,
+    noise: SignalNoise | None = None,
 ) -> Observation:
     """Run the observer that ``settings.name`` asks for on the signals u and y of one mesh.
+
+    What is known of their ``noise`` (None: there is none) is for an observer that weighs by it.
 
     Raises:
         ModelError: an assumption of the observer fails; names the time and the evidence.
         ConfigError: settings that do not fit the plant.
         SolverError: the tolerance cannot be reached.
     """
+    if settings.name == "kalman_bucy":
+        if noise is None:
+            noise = SignalNoise(np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time)
+        return kalman_bucy.observe(system, inputs, outputs, settings, solver, noise)
     return _OBSERVERS[settings.name](system, inputs, outputs, settings, solver)

@@ -117,10 +117,11 @@ class Observation:
     truth: Truth
     error_estimate: float
     assumptions: tuple[Assumption, ...]  # of this observer, with their evidence
-    growth: float  # largest ‖Φ(t)‖ entry
+    growth: float | None  # largest ‖Φ(t)‖ entry; None: the states do not rest on Φ
     estimator: Estimator | None = None
     names: tuple[str, ...] | None = None
     respond: Response | None = None  # None: the observer cannot tell
+    note: str = ""  # what the last line of a run has to say of it, from "; " on
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -450,6 +450,13 @@ def _estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
             Curve(estimation.t, estimation.states[case, :, i], label, line(k))
             for k, (case, label) in enumerate(zip(shown, labels, strict=True))
         ]
+        deviation = _deviation(estimation, name)
+        if deviation is not None:
+            middle = estimation.states[0, :, i]
+            curves += [
+                Curve(estimation.t, middle + 2 * deviation, "± 2σ", style.SPREAD),
+                Curve(estimation.t, middle - 2 * deviation, "", style.SPREAD),
+            ]
         panels.append(
             Panel(
                 with_unit(name, system.units.get(name, "")),
@@ -460,6 +467,12 @@ def _estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
             )
         )
     return panels
+
+
+def _deviation(estimation: EstimationResult, name: str) -> Array | None:
+    """The standard deviation (M,) that an estimator with one case states of an estimate."""
+    stated = estimation.checks.get(f"{name}_std")
+    return stated[0] if stated is not None and len(stated) == 1 else None
 
 
 def _estimate_limits(truth: Array, guesses: Array) -> tuple[float, float]:
@@ -499,17 +512,23 @@ def _errors(
     """One logarithmic panel per quantity: its name, unit, error (G, M) and size."""
     shown = _shown_cases(estimation)
     labels = _case_labels(result, estimation, shown)
-    return [
-        Panel(
-            with_unit(f"error of {name}", unit),
-            tuple(
-                Curve(estimation.t, np.abs(error[case]), label, line(k))
-                for k, (case, label) in enumerate(zip(shown, labels, strict=True))
-            ),
-            log=True,
-            size=size,
-            legend=number == 0,
-            note=_note(estimation, shown) if number == 0 else "",
+    panels = []
+    for number, (name, unit, error, size) in enumerate(quantities):
+        curves = [
+            Curve(estimation.t, np.abs(error[case]), label, line(k))
+            for k, (case, label) in enumerate(zip(shown, labels, strict=True))
+        ]
+        deviation = _deviation(estimation, name)
+        if deviation is not None:
+            curves.append(Curve(estimation.t, 2 * deviation, "2σ", style.SPREAD))
+        panels.append(
+            Panel(
+                with_unit(f"error of {name}", unit),
+                tuple(curves),
+                log=True,
+                size=size,
+                legend=number == 0,
+                note=_note(estimation, shown) if number == 0 else "",
+            )
         )
-        for number, (name, unit, error, size) in enumerate(quantities)
-    ]
+    return panels

@@ -109,7 +109,10 @@ def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
         names = [name.removesuffix("_hat") for name in columns if name.endswith("_hat")]
         # Parameters stand first; a state may have the name of one.
         states = [s for s in names[len(truth) :] if not np.isnan(columns[f"{s}_hat"]).all()]
-        of_parameters = [columns[f"{name}_hat"] - float(value) for name, value in truth.items()]
+        of_parameters = [
+            columns[f"{name}_hat"] - columns.get(f"{name}_true", value)
+            for name, value in truth.items()
+        ]
         true_states = [signals[name][nearest] for name in states]
         of_states = [
             columns[f"{s}_hat"] - true for s, true in zip(states, true_states, strict=True)

@@ -115,6 +115,7 @@ LINES = (
 TRUTH = Line("#B4B4B4", (), 2.6)  # wide and pale: an estimate that has converged lies on it
 MEASURED = Line("#9A9A9A", (), 0.5)  # thin and pale: noise fills an area
 VARYING = Line("#000000", (4, 2), 0.9)  # a truth that varies, over what follows it
+SPREAD = Line("#0072B2", (2.0, 1.5), 0.8)  # what an estimator says of its own error
 LIMIT = Line("#000000", (1.0, 1.5), 0.9)  # a level
 INSTANT = Line("#777777", (), 0.8)  # a time
 

@@ -86,11 +86,14 @@ def write_excitation(path: Path, excitation: Excitation) -> None:
 
 
 def estimates_header(states: Sequence[str], estimation: EstimationResult) -> list[str]:
-    """``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, checks."""
+    """``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, checks.
+
+    Then ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value.
+    """
     header = ["case", "t", *(f"{name}_hat" for name in (*estimation.names, *states))]
     if estimation.delta is not None:
         header.append("delta")
-    return [*header, *estimation.checks]
+    return [*header, *estimation.checks, *(f"{name}_true" for name, _ in varying_truth(estimation))]
 
 
 def case_values(estimation: EstimationResult, case: int) -> Array:
@@ -100,6 +103,7 @@ def case_values(estimation: EstimationResult, case: int) -> Array:
     if delta is not None:
         columns.append(delta[case if len(delta) > 1 else 0])
     columns += [check[case] for check in estimation.checks.values()]
+    columns += [values for _, values in varying_truth(estimation)]
     return np.column_stack(columns)
 
 
@@ -152,6 +156,16 @@ def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics
 def gain_names(estimation: EstimationResult) -> list[str]:
     """Names of the gains of all cases, in order of first appearance."""
     return list(dict.fromkeys(name for case in estimation.cases for name in case))
+
+
+def varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
+    """What is estimated and is not the same at all times, with its true values (M,)."""
+    truth = estimation.true_parameters
+    return [
+        (name, truth[:, i])
+        for i, name in enumerate(estimation.names)
+        if not np.isnan(truth[:, i]).any() and np.any(truth[:, i] != truth[:1, i])
+    ]
 
 
 def _estimate_chunks(header: Sequence[str], estimation: EstimationResult) -> Iterator[bytes]:

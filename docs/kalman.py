@@ -1,0 +1,153 @@
+"""Table and figure of ``docs/howto/kalman.md``: ``python docs/kalman.py``.
+
+GPEBO against the Kalman-Bucy filter, with and without noise, with uniform observability and
+without it. Errors are those of the differential states over the last quarter of the horizon, root
+mean square over time, states and seeds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gpebo_cli.commands.locations import conf_folder
+from gpebo_cli.experiment import run_experiment
+from gpebo_cli.outputs.files import write_text
+from gpebo_cli.outputs.style import Curve, Panel, compose, line, save
+from gpebo_cli.result import RunResult
+from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+from gpebo_cli.systems.plant import plant_from_mapping
+
+DOCS = Path(__file__).parent
+PAGE = DOCS / "howto" / "kalman.md"
+BEGIN, END = "<!-- table: python docs/kalman.py -->\n", "<!-- end of table -->\n"
+SEEDS = 20
+SAMPLE_TIME = 0.1
+
+
+@dataclass(frozen=True)
+class Method:
+    """A column of the table."""
+
+    label: str
+    observer: ObserverSettings
+    estimator: dict[str, Any]
+
+
+def methods(process: float) -> tuple[Method, ...]:
+    """GPEBO with two estimators, the filter without and with noise that drives what it estimates.
+
+    Least squares starts from the variance the filter starts from, α = 1/V apart; the filter with
+    V as the only noise is then the same estimate in other coordinates.
+    """
+    kalman = ObserverSettings(name="kalman_bucy")
+    driven = ObserverSettings(name="kalman_bucy", process=process)
+    return (
+        Method("gpebo, least_squares", ObserverSettings(), {"name": "least_squares", "f0": 1e-6}),
+        Method("gpebo, ls_drem", ObserverSettings(), {"name": "ls_drem", "gamma": 10}),
+        Method("kalman_bucy", kalman, {"name": "drem"}),
+        Method(f"kalman_bucy, process {process:g}", driven, {"name": "drem"}),
+    )
+
+
+def shipped(name: str) -> dict[str, Any]:
+    """A plant that comes with gpebo."""
+    text = (Path(conf_folder()) / "plant" / f"{name}.yaml").read_text(encoding="utf-8")
+    plant: dict[str, Any] = yaml.safe_load(text)
+    return plant
+
+
+def run(system: DescriptorSystem, method: Method, level: float, seed: int) -> RunResult:
+    """One run; ``level`` is the standard deviation of the outputs' noise."""
+    noise = NoiseSettings(sample_time=SAMPLE_TIME, outputs=level, seed=seed)
+    return run_experiment(
+        Settings(plant={}, estimator=method.estimator, observer=method.observer, noise=noise),
+        system,
+    )
+
+
+def errors(result: RunResult) -> tuple[Array, Array]:
+    """Errors (M, states) of the differential states, and the deviations stated, NaN if none."""
+    system, estimation = result.system, result.estimation
+    if estimation is None:
+        raise ValueError("a run without an observer has no errors")
+    E = system.coefficients.taylor(np.zeros(1), 0).E[0, 0]
+    chosen = np.flatnonzero(np.abs(E).max(axis=0) > 0)
+    error = estimation.states[0][:, chosen] - result.simulation.states[:, chosen]
+    nothing = np.full((1, len(estimation.t)), np.nan)
+    stated = [estimation.checks.get(f"{system.states[i]}_std", nothing)[0] for i in chosen]
+    return error, np.stack(stated, axis=1)
+
+
+def table(rows: list[tuple[str, dict[str, Any], float]]) -> str:
+    """Markdown: a row per plant and level of noise, RMS errors per method."""
+    head: list[str] = []
+    lines = []
+    for label, plant, process in rows:
+        system = plant_from_mapping(plant, "")
+        for level in (0.0, 0.05):
+            cells = [label, f"{level:g}"]
+            stated = np.nan
+            for method in methods(process):
+                results = [run(system, method, level, s) for s in range(SEEDS if level else 1)]
+                pairs = [errors(result) for result in results]
+                last = results[0].simulation.t >= 15.0
+                squares = [np.mean(error[last] ** 2) for error, _ in pairs]
+                cells.append(f"{np.sqrt(np.mean(squares)):.2g}")
+                if method.label == "kalman_bucy":
+                    requirement = results[0].estimation.requirement  # type: ignore[union-attr]
+                    observable = "yes" if requirement.holds else "no"
+                    stated = float(np.sqrt(np.mean([np.mean(s[last] ** 2) for _, s in pairs])))
+            cells += [f"{stated:.2g}", observable]
+            lines.append(cells)
+            print(cells, flush=True)  # noqa: T201  progress
+        head = ["plant", "σ of y", *(m.label.partition(", process")[0] for m in methods(process))]
+        head[-1] += ", driven"
+    head += ["stated σ of kalman_bucy", "uniformly observable"]
+    rule = ["---"] + ["---:"] * (len(head) - 2) + ["---"]
+    return "".join("| " + " | ".join(cells) + " |\n" for cells in [head, rule, *lines])
+
+
+def picture(path: Path) -> None:
+    """Errors on the oscillator that is seen for three seconds, without and with noise."""
+    system = plant_from_mapping(shipped("window"), "")
+    panels = []
+    for level in (0.0, 0.05):
+        curves = []
+        for k, method in enumerate(methods(1e-3)):
+            result = run(system, method, level, 1)
+            error, _ = errors(result)
+            label = method.label.replace(" 0.001", " 10⁻³")
+            curves.append(
+                Curve(result.simulation.t, np.linalg.norm(error, axis=1), label, line(k))
+            )
+        name = f"error, σ = {level:g}" if level else "error, no noise"
+        panels.append(Panel(name, tuple(curves), log=True, size=1.4, legend=not panels))
+    save(compose(panels), path)
+
+
+def main() -> None:
+    """Write the picture, and the table into the page."""
+    picture(DOCS / "img" / "kalman.png")
+    window = shipped("window")
+    text = table(
+        [
+            ("circuit", shipped("circuit"), 1e-4),
+            ("descriptor", shipped("descriptor"), 1e-4),
+            ("window", window, 1e-3),
+            ("window, growing", {**window, "A": [[0, 1], [-1, 0.3]]}, 1e-3),
+        ]
+    )
+    page = PAGE.read_text(encoding="utf-8")
+    before, _, rest = page.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    write_text(PAGE, before + BEGIN + text + END + after)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,432 @@
+"""The Kalman–Bucy filter on the reduced system of the GPEBO observer.
+
+With w = P x and everything else as in ``observers/gpebo.py``, the plant is the linear system
+
+    w' = A_0 w + b_0 + D_0 θ,   θ' = 0,      0 = R (𝒜 w + G θ + g_y)
+
+whose state ζ = (θ, w) a Kalman–Bucy filter estimates: unknown parameters are constant states. Of
+the residual's n + r rows r are independent; Z(t) is an orthonormal basis of them, and no result
+depends on which. An observer sees u + ν_u and y + ν_y, and both enter twice:
+
+    b_0 seen = b_0 + B_0 ν_u + B_y ν_y     so that   ζ' = 𝔸ζ + b_0 seen + Γν,  Γ = −[0; B_0  B_y]
+    z = −Zᵀg_y seen = c ζ + Dν,            c = Zᵀ[G  𝒜],     D = Zᵀ[−g_inputs  E_y]
+
+with g_y = g_inputs u − E_y y. Noise with standard deviation σ per sample of T_s seconds is, for a
+filter that is slow beside T_s, white with intensity σ²T_s; process and measurement noise are
+correlated. Where V = DSDᵀ is singular (a constraint that holds exactly, as e1 = −V in the circuit)
+the filter has no finite gain, and V is regularised: every equation of the residual gets independent
+noise, a share of its own size. The covariance that the filter states is then an upper bound.
+
+The state follows as x = X_w w + X_θ θ + x_y. What the signals' noise does to x_y directly is part
+of the standard deviations of x̂; its correlation with ζ̂ (of order T_s) is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.collocation.mesh import Trajectory
+from gpebo_cli.linalg import transpose
+from gpebo_cli.measurement import per_signal
+from gpebo_cli.observers import gpebo
+from gpebo_cli.observers.extension import initial_extension
+from gpebo_cli.observers.observability import WindowGramians, window_gramians
+from gpebo_cli.observers.observation import AffineStateMap, Observation, Reconstruction
+from gpebo_cli.observers.riccati import Filtered, StateSpace, run_filter
+from gpebo_cli.regression import LinearRegression
+from gpebo_cli.result import Assumption, Requirement
+from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+
+_LEVEL = 1e-8  # of M's largest eigenvalue over all windows, in units of P(0)⁻¹: below, no evidence
+_INITIAL_VARIANCE = 10.0  # of what observer.P0 leaves out
+
+
+@dataclass(frozen=True, eq=False)
+class SignalNoise:
+    """What is known of the noise on the observer's signals."""
+
+    inputs: Array  # (m,) standard deviation of every sample
+    outputs: Array  # (r,)
+    sample_time: float  # seconds
+
+    @property
+    def variances(self) -> Array:
+        """Of (ν_u, ν_y) at any time, (m + r,)."""
+        return np.concatenate([self.inputs, self.outputs]) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedSystem:
+    """The linear system above at N times, before its noise is known; ζ in coordinates of a basis.
+
+    c, g_y and the noise's way into them are in all e + r rows of the residual; ``rows`` is Z.
+    """
+
+    A: Array  # (N, n, n) of ζ
+    b: Array  # (N, n)
+    c: Array  # (N, e + r, n)
+    rows: Array  # (N, e + r, r) Z
+    g_y: Array  # (N, e + r)
+    from_noise: Array  # (N, n, m + r) Γ
+    in_measurement: Array  # (N, e + r, m + r), D = Zᵀ that
+    offset: Array  # (N, states) x_y
+    gain: Array  # (N, states, n) [X_θ, X_w]
+    direct: Array  # (N, states, m + r) of ν in x_y
+    projector: Array  # (N, states, states) P
+
+
+def reduced_system(o: gpebo.ObserverMatrices, u: Array, y: Array) -> ReducedSystem:
+    """The reduced system from the observer's matrices and signals, w in coordinates of its basis.
+
+    Args:
+        o: at N times.
+        u: (N, m).
+        y: (N, r).
+    """
+    count, r, basis = len(u), y.shape[1], o.split.basis
+    q, k = o.from_unknowns.shape[2], basis.shape[1]
+    signals = np.concatenate([u, y], axis=1)
+    A = np.zeros((count, q + k, q + k))
+    A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
+    inward = np.zeros((count, q + k, signals.shape[1]))
+    inward[:, q:] = o.from_signals
+    g = np.broadcast_to(o.g_signals, (count, *o.g_signals.shape[1:]))
+    algebraic = o.algebraic @ basis  # 𝒜 B
+    c = np.empty((count, g.shape[1], q + k))
+    c[:, :, :q], c[:, :, q:] = o.G, algebraic
+    K_g, K_c = (np.asarray(o.elimination @ (transpose(o.range) @ x)) for x in (g, c))
+    gain = -K_c  # [X_θ, X_w B] = [−K G, B − K 𝒜 B]
+    gain[:, :, q:] += basis
+    # The residual's r rows: of its n rows with Π, those in the range of E are zero.
+    L = o.split.equations
+    rows = -o.range @ transpose(o.range)
+    rows = np.broadcast_to(rows, (max(len(rows), len(L)), *rows.shape[1:])).copy()
+    e = L.shape[1]
+    rows[:, :e, :e] += L @ transpose(L)
+    rows[:, e:, e:] += np.eye(r)
+    _, vectors = np.linalg.eigh(0.5 * (rows + transpose(rows)))
+    Z = vectors[:, :, e:]
+    return ReducedSystem(
+        A=A,
+        b=np.einsum("nij,nj->ni", inward, signals),
+        c=c,
+        rows=np.broadcast_to(Z, (count, *Z.shape[1:])),
+        g_y=np.einsum("nij,nj->ni", g, signals),
+        from_noise=-inward,
+        in_measurement=-g,
+        offset=-np.einsum("nij,nj->ni", K_g, signals),
+        gain=gain,
+        direct=-K_g,
+        projector=np.broadcast_to(o.projector, (count, *o.projector.shape[1:])),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Intensities: of the signals' noise, of what drives ζ, and of what regularises V."""
+
+    signals: Array  # (m + r,)
+    process: Array  # (n,)
+    rows: Array  # (e + r,) zero: V needs none
+
+    def state_space(self, s: ReducedSystem, q: int, basis: Array) -> StateSpace:
+        """The model with its covariances, one column of signals."""
+        Zt = transpose(s.rows)
+        D = Zt @ s.in_measurement
+        weighted = s.from_noise * self.signals  # Γ S
+        Q = weighted @ transpose(s.from_noise)
+        if self.process.any():
+            # w stays in the range of P(t): so does what drives it.
+            inside = np.zeros_like(Q)
+            inside[:, :q, :q] = np.eye(q)
+            inside[:, q:, q:] = basis.T @ s.projector @ basis
+            Q = Q + (inside * self.process) @ transpose(inside)
+        return StateSpace(
+            A=s.A,
+            b=s.b[:, :, None],
+            c=Zt @ s.c,
+            z=-(Zt @ s.g_y[:, :, None]),
+            Q=Q,
+            N=weighted @ transpose(D),
+            V=(D * self.signals) @ transpose(D) + (Zt * self.rows) @ s.rows,
+        )
+
+
+def noise_model(
+    s: ReducedSystem, noise: SignalNoise, process: Array, regularisation: float
+) -> NoiseModel:
+    """Intensities; V is regularised if at some time it is below what regularises it.
+
+    Args:
+        s: at the times by which to judge.
+        noise: of the signals.
+        process: intensities (n,).
+        regularisation: standard deviation, relative to the size of each row.
+    """
+    size = np.abs(s.g_y).max(axis=0)
+    # A row without data, 0 = c ζ, is as exact as the largest one.
+    size = np.where(size > 0, size, size.max(initial=0.0) or 1.0)
+    rows = (regularisation * size) ** 2 * noise.sample_time
+    signals = noise.variances * noise.sample_time
+    Zt = transpose(s.rows)
+    D = Zt @ s.in_measurement
+    floor = (Zt * rows) @ s.rows
+    ratio = np.linalg.eigvals(np.linalg.solve(floor, (D * signals) @ transpose(D))).real
+    needed = bool(ratio.min(initial=np.inf) < 1.0)
+    return NoiseModel(signals, process, rows if needed else np.zeros_like(rows))
+
+
+def observe(
+    system: DescriptorSystem,
+    inputs: Trajectory,
+    outputs: Trajectory,
+    settings: ObserverSettings,
+    solver: SolverSettings,
+    noise: SignalNoise,
+) -> Observation:
+    """Run the filter on the signals u (m,) and y (r,), which share a mesh.
+
+    The regression is that of the GPEBO observer, as evidence of excitation.
+
+    Raises:
+        ModelError: as the GPEBO observer: rank of E not constant, Assumption 1 violated.
+        ConfigError: settings that do not fit the plant.
+        SolverError: the tolerance cannot be reached.
+    """
+    evidence = gpebo.observe(system, inputs, outputs, settings, solver)
+    mesh, q = inputs.mesh, system.q
+    points, points_inside = mesh.points.ravel(), mesh.inside.ravel()
+    first = gpebo.observer_matrices(
+        system, points, points_inside, solver.rank_tol, normalise=True
+    )
+    basis = first.split.basis
+
+    def reduced(t: Array, inside: Array) -> ReducedSystem:
+        o = gpebo.observer_matrices(system, t, inside, solver.rank_tol, first)
+        return reduced_system(o, inputs(t, inside), outputs(t, inside))
+
+    V1, initial = gpebo.initial_basis(first.projector[0], first.split.rank, system.states)
+    fixed = basis.shape[1] == first.split.rank
+    labels = tuple(name.removeprefix("e0_") for name in initial) if fixed else system.states
+    names = (*system.unknowns, *(f"w_{label}" for label in labels))
+    w0 = basis.T @ V1 @ initial_extension(settings, system, initial)
+    start = np.concatenate([np.zeros(q), w0])
+    P0 = _initial_covariance(settings, names, q, basis.T @ V1)
+    process = per_signal(settings.process, names, "estimate", "observer.process")
+    model_noise = noise_model(
+        reduced(points, points_inside), noise, process, settings.regularisation
+    )
+
+    def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
+        s = reduced(t, inside)
+        return model_noise.state_space(s, q, basis), (s.offset, s.gain, s.direct, s.projector)
+
+    def monitor(estimate: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+        offset, gain, *_ = extras
+        x = offset + np.einsum("ksij,ksj->ksi", gain, estimate[..., 0])
+        return [(x, 0.0), (gain.reshape(*gain.shape[:2], -1), 0.0)]
+
+    name = f"Kalman-Bucy filter of plant {system.name}"
+    filtered = run_filter(
+        model, start[:, None], P0, mesh, tol=solver.tol, max_elements=solver.max_elements,
+        monitor=monitor, name=name,
+    )
+    offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
+
+    def information(t: Array, inside: Array) -> tuple[Array, Array]:
+        m = model_noise.state_space(reduced(t, inside), q, basis)
+        return m.A, transpose(m.c) @ np.linalg.solve(m.V, m.c)
+
+    windows = window_gramians(
+        information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
+        max_elements=solver.max_elements,
+    )
+    observability = _uniform_observability(windows, P0, projector, basis, q)
+    spread = Spread(filtered, AffineStateMap(offset, gain), direct, noise.variances)
+    return Observation(
+        regression=evidence.regression,
+        state_map=FilterStateMap(spread, system.states, names),
+        truth=CurrentState(projector, basis),
+        error_estimate=max(evidence.error_estimate, filtered.error_estimate),
+        assumptions=(
+            *evidence.assumptions,
+            _measurement_noise(system, model_noise, noise, settings.regularisation),
+            Assumption(
+                observability.name,
+                "the observability Gramian over windows of a tenth of the horizon stays away from "
+                "singular",
+                observability.holds,
+                observability.evidence,
+            ),
+        ),
+        growth=None,
+        estimator=KalmanBucy(filtered, observability),
+        names=names,
+        note=_note(model_noise, settings.regularisation),
+    )
+
+
+def _note(model: NoiseModel, regularisation: float) -> str:
+    if not model.rows.any():
+        return ""
+    return (
+        f"; measurement noise regularised: {regularisation:g} of each equation's size "
+        "(observer.regularisation)"
+    )
+
+
+def _initial_covariance(
+    settings: ObserverSettings, names: tuple[str, ...], q: int, V: Array
+) -> Array:
+    """P(start) (n, n), within the range of the coordinates V (n_w, n_a) of V1."""
+    variances = per_signal(settings.P0, names, "estimate", "observer.P0", _INITIAL_VARIANCE)
+    inside = np.zeros((len(names), len(names)))
+    inside[:q, :q] = np.eye(q)
+    inside[q:, q:] = V @ V.T
+    return np.asarray((inside * variances) @ inside.T)
+
+
+def _uniform_observability(
+    windows: WindowGramians, P0: Array, projector: Trajectory, basis: Array, q: int
+) -> Requirement:
+    """λ_min of M over all windows, in units of P(0)⁻¹, in the directions that ζ has."""
+    P = projector(windows.starts)
+    n = len(P0)
+    inside = np.zeros((len(P), n, n))
+    inside[:, :q, :q] = np.eye(q)
+    inside[:, q:, q:] = basis.T @ P @ basis
+    scale = np.sqrt(np.diag(P0))
+    scale = np.where(scale > 0, scale, scale.max(initial=0.0) or 1.0)
+    M = scale[:, None] * (inside @ windows.gramians @ inside) * scale
+    values = np.linalg.eigvalsh(M)
+    rank = q + int(np.rint(np.trace(P[0])))
+    smallest = np.maximum(values[:, n - rank], 0.0)
+    k = int(np.argmin(smallest))
+    level, at, window = float(smallest[k]), float(windows.starts[k]), windows.window
+    needed = _LEVEL * float(values.max(initial=0.0))
+    return Requirement(
+        name="uniform observability",
+        holds=level >= needed > 0,
+        evidence={
+            "lambda_min": level, "window_start": at, "window": window,
+            "largest_lambda_min": float(smallest.max()), "needed": needed,
+        },
+        text=(
+            f"over windows of {window:.3g} s, λ_min of the observability Gramian falls to "
+            f"{level:.3g} of P0⁻¹ (from t = {at:.4g} s on; evidence needs {needed:.2g})"
+        ),
+    )
+
+
+def _measurement_noise(
+    system: DescriptorSystem, model: NoiseModel, noise: SignalNoise, regularisation: float
+) -> Assumption:
+    used: dict[str, float | int | str | None] = {
+        f"intensity_{name}": float(value)
+        for name, value in zip((*system.inputs, *system.outputs), model.signals, strict=True)
+    }
+    if model.rows.any():
+        used["regularised_with"] = (
+            f"noise of {regularisation:g} of each equation's size at {noise.sample_time:g} s"
+        )
+        used["largest_intensity_added"] = float(model.rows.max())
+    return Assumption(
+        "Measurement noise",
+        "its covariance V(t) is positive definite, regularised where the noise leaves it singular",
+        True,
+        used,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CurrentState:
+    """ζ = (θ, w) at every time, w = P x in the coordinates of the basis."""
+
+    projector: Trajectory  # (states, states)
+    basis: Array  # (states, n_w)
+
+    def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
+        """(θ, w) at the times t (M,), shape (M, n)."""
+        w = np.einsum("mij,mj->mi", self.projector(t), states(t)) @ self.basis
+        return np.concatenate([theta, w], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """What the filter's covariance means for the state."""
+
+    filtered: Filtered
+    state_map: AffineStateMap
+    direct: Trajectory  # (states, m + r)
+    variances: Array  # (m + r,) of ν
+
+    def deviations(self, t: Array) -> tuple[Array, Array]:
+        """Standard deviations of ζ̂ (M, n) and of x̂ (M, states)."""
+        P, _ = self.filtered.at(t)
+        gain, direct = self.state_map.gain(t), self.direct(t)
+        of_state = np.einsum("mij,mjk,mik->mi", gain, P, gain)
+        of_state += direct**2 @ self.variances
+        own = np.einsum("mii->mi", P)
+        return np.sqrt(np.maximum(own, 0.0)), np.sqrt(np.maximum(of_state, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class FilterStateMap:
+    """x̂ = offset + gain ζ̂, and the standard deviations that the filter states."""
+
+    spread: Spread
+    states: tuple[str, ...]
+    names: tuple[str, ...]
+
+    @property
+    def times(self) -> Array:
+        """The points of the filter's mesh: what it reached in between is part of its errors."""
+        return np.unique(self.spread.filtered.mesh.points)
+
+    def at(self, t: Array) -> Reconstruction:
+        """As any affine map."""
+        return self.spread.state_map.at(t)
+
+    def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
+        """Columns ``<name>_std`` of what is estimated, then of the states."""
+        own, of_state = self.spread.deviations(t)
+        columns = {f"{name}_std": own[None, :, i] for i, name in enumerate(self.names)}
+        columns |= {f"{name}_std": of_state[None, :, i] for i, name in enumerate(self.states)}
+        return columns
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanBucy:
+    """The filter as an estimator with one case; the regression tells it nothing new."""
+
+    filtered: Filtered
+    observability: Requirement
+
+    @property
+    def cases(self) -> tuple[Mapping[str, float], ...]:
+        """One, without gains."""
+        return ({},)
+
+    def estimate(self, regression: LinearRegression, t: Array) -> KalmanBucyEstimates:  # noqa: ARG002
+        """ζ̂ at the times t (M,)."""
+        return KalmanBucyEstimates(self.filtered.at(t)[1][None, :, :, 0], self.observability)
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanBucyEstimates:
+    """ζ̂ at fixed times."""
+
+    values: Array  # (1, M, n)
+    requirement: Requirement
+
+    def delta(self, t: Array) -> None:  # noqa: ARG002  protocol
+        """Nothing is mixed."""
+        return
+
+    def parameters(self, cases: slice) -> Array:
+        """ζ̂ of some cases, (g, M, n)."""
+        return self.values[cases]

@@ -1,0 +1,101 @@
+"""Uniform observability of a linear time-varying system, as evidence.
+
+    M(t) = ∫_t^{t+T} Ψ(τ,t)ᵀ W(τ) Ψ(τ,t) dτ,      Ψ' = A Ψ,  Ψ(t,t) = I,      W = cᵀV⁻¹c
+
+is what the measurements of one window tell about the state at its start, in units of P⁻¹. Kalman's
+uniform complete observability is a lower (and upper) bound on M(t) over all t; excitation (IE) is
+M > 0 for one window, the whole horizon. Windows are summed from elements, each of which starts
+with Ψ = I: nothing grows over the horizon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.linalg import transpose
+from gpebo_cli.systems.descriptor import Array
+
+_WINDOWS = 10  # to a horizon
+
+
+@dataclass(frozen=True, eq=False)
+class WindowGramians:
+    """M over windows that start at some edges of a mesh and last ``window`` seconds or more."""
+
+    starts: Array  # (W,)
+    gramians: Array  # (W, n, n)
+    window: float
+
+
+class _Identity:
+    """Ψ ← I at every edge."""
+
+    def state(self, reached: Array) -> Array:
+        return np.eye(len(reached))
+
+    def error(self, reached: Array, error: Array) -> Array:  # noqa: ARG002  protocol
+        return np.zeros_like(error)
+
+
+def window_gramians(
+    model: Callable[[Array, Array], tuple[Array, Array]],
+    n: int,
+    mesh: Mesh,
+    *,
+    tol: float,
+    max_elements: int,
+) -> WindowGramians:
+    """M over windows of a tenth of the horizon, from every edge that leaves room for one.
+
+    Args:
+        model: A (N, n, n) and W (N, n, n) at times (N,).
+        n: number of states.
+        mesh: where to start.
+        tol: relative to the size of Ψ and of what is integrated.
+        max_elements: refuse to go beyond.
+
+    Raises:
+        SolverError: the tolerance cannot be reached.
+    """
+
+    def coefficients(t: Array, inside: Array) -> Coefficients:
+        A, W = model(t, inside)
+        return Coefficients(None, A, np.zeros((len(A), n, n)), (W,))
+
+    def products(values: Array, extras: tuple[Array, ...]) -> Array:
+        return np.asarray(transpose(values) @ extras[0] @ values)
+
+    def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+        found = products(values, extras)
+        return [(found.reshape(*found.shape[:2], -1), 0.0)]
+
+    problem = LinearProblem(
+        coefficients, np.eye(n), monitor, "observability Gramian", renewal=_Identity()
+    )
+    solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
+    mesh, values = solution.trajectory.mesh, solution.trajectory.values
+    local = Trajectory(mesh, products(values, solution.extras)).local_integral().values[:, -1]
+    return _sum_windows(mesh, values[:, -1], local)
+
+
+def _sum_windows(mesh: Mesh, transition: Array, local: Array) -> WindowGramians:
+    """M of all windows from Ψ over each element and its own integral, (K, n, n) each."""
+    edges = mesh.edges
+    window = float(edges[-1] - edges[0]) / _WINDOWS
+    slack = 1e-9 * window
+    first = np.flatnonzero(edges[:-1] + window <= edges[-1] + slack)
+    after = np.searchsorted(edges, edges[first] + window - slack)  # the edge that ends the window
+    n = local.shape[-1]
+    gramians = np.zeros((len(first), n, n))
+    reached = np.broadcast_to(np.eye(n), gramians.shape).copy()
+    for step in range(int((after - first).max(initial=0))):
+        on = np.flatnonzero(first + step < after)
+        k = first[on] + step
+        gramians[on] += transpose(reached[on]) @ local[k] @ reached[on]
+        reached[on] = transition[k] @ reached[on]
+    return WindowGramians(edges[first], gramians, window)

@@ -1,0 +1,235 @@
+"""The Kalman–Bucy filter and its Riccati equation as one linear Hamiltonian system.
+
+    ζ' = A ζ + b + Γν,   z = c ζ + Dν,   ν white of intensity S
+    Q = Γ S Γᵀ,   N = Γ S Dᵀ,   V = D S Dᵀ > 0
+
+The noises of process and measurement are correlated (N); with Ā = A − N V⁻¹c, Q̄ = Q − N V⁻¹Nᵀ,
+b̄ = b + N V⁻¹z and W = cᵀV⁻¹c they no longer are, and the filter is
+
+    P' = ĀP + PĀᵀ + Q̄ − P W P,     ζ̂' = Āζ̂ + b̄ + P cᵀV⁻¹(z − cζ̂).
+
+The first equation is quadratic, the second one's gain P cᵀV⁻¹ stiff. Both follow from a linear
+equation (Reid; Bittanti, Laub & Willems, The Riccati Equation, 1991):
+
+    X₁' = −ĀᵀX₁ + W X₂,            x₁' = −Āᵀx₁ + W x₂ − cᵀV⁻¹z
+    X₂' =  Q̄ X₁ + Ā X₂,            x₂' =  Q̄ x₁ + Ā x₂ + b̄
+    P = X₂X₁⁻¹,   ζ̂ = x₂ − P x₁,   start (X₁, X₂ | x₁, x₂) = (I, P₀ | 0, ζ̂₀).
+
+Half of its solutions grow as fast as the filter forgets, so X₁ and X₂ soon differ by rounding only
+in the directions that do not. At every edge of the mesh the same P and ζ̂ therefore start anew from
+(I, P | 0, ζ̂). One batched solve gives the Hamiltonian's transition of every element; what is
+chained are linear-fractional maps P₊ = (Ψ₂₁ + Ψ₂₂P)(Ψ₁₁ + Ψ₁₂P)⁻¹.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, Monitor, solve
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.errors import SolverError
+from gpebo_cli.linalg import transpose
+from gpebo_cli.systems.descriptor import Array, BoolArray
+
+_INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
+# Standard deviations below this share of the largest one, each relative to that at the start, are
+# resolved less: P as a matrix does not hold them, for its rounding is that of its largest entry.
+_SMALLEST = 3e-5
+_GROWTH = 1e3  # of X₁ within an element: as many digits of P are lost
+
+
+class StateSpace(NamedTuple):
+    """The linear model and its noise at N times; ``g`` columns of signals share one P."""
+
+    A: Array  # (N, n, n)
+    b: Array  # (N, n, g)
+    c: Array  # (N, r, n)
+    z: Array  # (N, r, g)
+    Q: Array  # (N, n, n)
+    N: Array  # (N, n, r)
+    V: Array  # (N, r, r)
+
+
+def hamiltonian(model: StateSpace) -> tuple[Array, Array]:
+    """Matrix (N, 2n, 2n) and inhomogeneity (N, 2n, n + g) of the linear equation above."""
+    n, g = model.A.shape[-1], model.b.shape[-1]
+    weighted = np.linalg.solve(model.V, np.concatenate([model.c, model.z], axis=-1))
+    from_state, from_signal = weighted[..., :n], weighted[..., n:]  # V⁻¹c, V⁻¹z
+    A = model.A - model.N @ from_state
+    Q = model.Q - model.N @ np.linalg.solve(model.V, transpose(model.N))
+    W = transpose(model.c) @ from_state
+    H = np.empty((len(A), 2 * n, 2 * n))
+    H[:, :n, :n], H[:, :n, n:] = -transpose(A), 0.5 * (W + transpose(W))
+    H[:, n:, :n], H[:, n:, n:] = 0.5 * (Q + transpose(Q)), A
+    f = np.zeros((len(A), 2 * n, n + g))
+    f[:, :n, n:] = -transpose(model.c) @ from_signal
+    f[:, n:, n:] = model.b + model.N @ from_signal
+    return H, f
+
+
+def quotient(X: Array) -> tuple[Array, Array]:
+    """P (…, n, n), symmetric, and ζ̂ (…, n, g) from the pair (…, 2n, n + g)."""
+    n = X.shape[-2] // 2
+    X1, X2 = X[..., :n, :n], X[..., n:, :n]
+    P = transpose(np.asarray(np.linalg.solve(transpose(X1), transpose(X2)), dtype=np.float64))
+    # Not P x₁: where X₁ is large in some rows, only the pair's own quotient is free of it.
+    estimate = X[..., n:, n:] - X2 @ np.linalg.solve(X1, X[..., :n, n:])
+    return 0.5 * (P + transpose(P)), estimate
+
+
+def pair(P: Array, estimate: Array) -> Array:
+    """(I, P | 0, ζ̂), shape (2n, n + g), from P (n, n) and ζ̂ (n, g)."""
+    n, g = estimate.shape
+    return np.block([[np.eye(n), np.zeros((n, g))], [P, estimate]])
+
+
+class _Restart:
+    """(X₁, X₂ | x₁, x₂) ← (I, P | 0, ζ̂)."""
+
+    def state(self, reached: Array) -> Array:
+        return pair(*quotient(reached))
+
+    def error(self, reached: Array, error: Array) -> Array:
+        """δP = (δX₂ − P δX₁) X₁⁻¹ and δζ̂ = δx₂ − P δx₁ − δP x₁."""
+        n = len(reached) // 2
+        P, _ = quotient(reached)
+        rest = error[:, n:] - P @ error[:, :n]
+        dP = rest[..., :n] @ np.linalg.inv(reached[:n, :n])
+        out = np.zeros_like(error)
+        out[:, n:, :n] = dP
+        out[:, n:, n:] = rest[..., n:] - dP @ reached[:n, n:]
+        return out
+
+
+def _in_front(lost: BoolArray, found: list[tuple[Array, float]]) -> list[tuple[Array, float]]:
+    """The signals to resolve where elements that lose conditioning have to be cut first.
+
+    What comes after such an element is rounding, and would be cut without end: it is left alone
+    until the front has passed, a few elements at a time.
+
+    Args:
+        lost: which elements, (K,).
+        found: signals (K, s + 1, c) with their floors.
+    """
+    size = len(lost)
+    if not lost.any():
+        return found
+    judged = np.arange(size) <= int(np.argmax(lost)) + max(4, size // 8)
+    points = found[0][0].shape[1]
+    unresolved = np.zeros((size, points, 1))
+    unresolved[lost & judged] = np.resize([1.0, -1.0], points)[:, None]
+    return [
+        (unresolved, 0.0),
+        *((np.where(judged[:, None, None], signal, 0.0), floor) for signal, floor in found),
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """The filter's covariance and estimates on the mesh that resolves them."""
+
+    pair: Trajectory  # (2n, n + g), see the module, with P in units of ``variance``
+    variance: float
+    error_estimate: float  # relative to each signal's own size
+    smallest_eigenvalue: float  # of P over its trace, over all points: −rounding at least
+    extras: tuple[Array, ...]  # of the coefficients, (K, s + 1, …) each
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh; the filter starts anew at each of its edges."""
+        return self.pair.mesh
+
+    def at(self, t: Array) -> tuple[Array, Array]:
+        """P (M, n, n) and ζ̂ (M, n, g) at the times t (M,)."""
+        P, estimate = quotient(self.pair(t))
+        return self.variance * P, estimate
+
+
+def run_filter(
+    model: Callable[[Array, Array], tuple[StateSpace, tuple[Array, ...]]],
+    start: Array,
+    P0: Array,
+    mesh: Mesh,
+    *,
+    tol: float,
+    max_elements: int,
+    monitor: Monitor | None = None,
+    name: str = "Kalman-Bucy filter",
+) -> Filtered:
+    """Solve Riccati equation and filter on ``mesh``, refined until P and ζ̂ are resolved.
+
+    Args:
+        model: at times (N,), and where functions that jump are decided: the model, and whatever
+            ``monitor`` needs.
+        start: ζ̂ at the start, (n, g).
+        P0: its covariance, (n, n).
+        mesh: where to start; its edges stay edges.
+        tol: relative to each signal's own size; P relative to its own of each element, so that
+            it is as accurate where it has become small.
+        max_elements: refuse to go beyond.
+        monitor: further signals to resolve, from ζ̂ and the model's extras.
+        name: of the filter, for messages.
+
+    Raises:
+        SolverError: the tolerance cannot be reached, or P is not positive semidefinite.
+    """
+    unit = np.sqrt(np.diag(P0))
+    unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
+    unit /= unit.max()
+    # A common factor of all covariances changes nothing. It is chosen so that W is of order 1:
+    # entries of 1e7 would be taken as pivots, and mix the equations.
+    m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
+    W = unit[:, None] * (transpose(m.c) @ np.linalg.solve(m.V, m.c)) * unit
+    variance = 1.0 / max(float(np.abs(W).max(initial=0.0)), np.finfo(float).tiny)
+    if not np.isfinite(variance):
+        variance = 1.0
+
+    def coefficients(t: Array, inside: Array) -> Coefficients:
+        m, extras = model(t, inside)
+        scaled = m._replace(Q=m.Q / variance, N=m.N / variance, V=m.V / variance)
+        H, f = hamiltonian(scaled)
+        return Coefficients(None, H, f, extras)
+
+    def signals(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+        P, estimate = quotient(values)
+        d = np.sqrt(np.maximum(np.einsum("kjii->kji", P).max(axis=1), 0.0)) / unit  # (K, n)
+        d = unit * np.maximum(d, _SMALLEST * d.max(axis=1, initial=1e-100, keepdims=True))
+        own = P / (d[:, None, :, None] * d[:, None, None, :])
+        found = [(own.reshape(*own.shape[:2], -1), 0.0),
+                 (estimate.reshape(*estimate.shape[:2], -1), 0.0)]
+        if monitor is not None:
+            found += monitor(estimate, extras)
+        n = P.shape[-1]
+        X1 = unit[:, None] * values[..., :n, :n] / unit
+        return _in_front(np.abs(X1).max(axis=(1, 2, 3)) > _GROWTH, found)
+
+    problem = LinearProblem(
+        coefficients, pair(P0 / variance, start), signals, name, renewal=_Restart()
+    )
+    try:
+        solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
+        P, _ = quotient(solution.trajectory.values)
+    except np.linalg.LinAlgError as error:
+        raise SolverError(f"the Riccati equation of the {name} has no finite solution") from error
+    except SolverError as error:
+        raise SolverError(
+            f"{error}; the covariance may fall too fast from where it starts: lower observer.P0, "
+            "or raise observer.regularisation or the noise"
+        ) from error
+    size = np.maximum(np.einsum("kjii->kj", P), np.finfo(float).tiny)
+    relative = np.linalg.eigvalsh(P)[..., 0] / size
+    if relative.min() < -_INDEFINITE:
+        k = int(np.argmin(relative.min(axis=1)))
+        raise SolverError(
+            f"the covariance of the {name} is not positive semidefinite near "
+            f"t = {solution.trajectory.mesh.edges[k]:.6g} (eigenvalue {relative.min():.1e} of its "
+            "trace); lower observer.P0, or raise observer.regularisation"
+        )
+    return Filtered(
+        solution.trajectory, variance, solution.error_estimate, float(relative.min()),
+        solution.extras,
+    )

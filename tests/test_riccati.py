@@ -1,0 +1,242 @@
+"""Riccati equation and filter against scipy's integrator, its algebraic solution, and limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm, solve_continuous_are
+
+from gpebo_cli.collocation.mesh import initial_mesh
+from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli.errors import SolverError
+from gpebo_cli.linalg import transpose
+from gpebo_cli.observers.observability import window_gramians
+from gpebo_cli.observers.riccati import Filtered, StateSpace, pair, quotient, run_filter
+from gpebo_cli.systems.descriptor import Array
+
+Of = Callable[[float], Array]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A small system: functions of one time."""
+
+    A: Of
+    b: Of
+    c: Of
+    z: Of
+    into: Of  # Γ
+    D: Of
+    S: Array
+
+    def state_space(self, t: Array) -> StateSpace:
+        def at(function: Of) -> Array:
+            return np.array([function(float(s)) for s in t])
+
+        into, D = at(self.into), at(self.D)
+        return StateSpace(
+            at(self.A), at(self.b)[..., None], at(self.c), at(self.z)[..., None],
+            into @ self.S @ transpose(into), into @ self.S @ transpose(D),
+            D @ self.S @ transpose(D),
+        )
+
+    def filtered(
+        self, start: Array, P0: Array, horizon: float, elements: int = 20, tol: float = 1e-12
+    ) -> Filtered:
+        mesh = initial_mesh(0.0, horizon, [], elements, radau_rule(12))
+        return run_filter(
+            lambda t, inside: (self.state_space(t), ()), start[:, None], P0, mesh,
+            tol=tol, max_elements=20_000,
+        )
+
+    def by_scipy(self, start: Array, P0: Array, t: Array) -> tuple[Array, Array]:
+        """The equations as a textbook has them, N included, step by step."""
+        n = len(start)
+
+        def slope(s: float, v: Array) -> Array:
+            x, P = v[:n], v[n:].reshape(n, n)
+            A, c, into, D = self.A(s), self.c(s), self.into(s), self.D(s)
+            V = D @ self.S @ D.T
+            L = (P @ c.T + into @ self.S @ D.T) @ np.linalg.inv(V)
+            dP = A @ P + P @ A.T + into @ self.S @ into.T - L @ V @ L.T
+            return np.concatenate([A @ x + self.b(s) + L @ (self.z(s) - c @ x), dP.ravel()])
+
+        found = solve_ivp(
+            slope, (0.0, float(t[-1])), np.concatenate([start, P0.ravel()]), method="DOP853",
+            rtol=1e-12, atol=1e-14, t_eval=t,
+        )
+        return found.y[n:].T.reshape(-1, n, n), found.y[:n].T
+
+
+def varying(size: float = 1e-2) -> Case:
+    """Three states, one of them an unknown that drifts, one output, correlated noise."""
+    G = np.array([[0.1, -0.1, 0.6], [0.1, -0.5, 0.4], [1.3, 0.9, -0.7]])
+    return Case(
+        A=lambda t: np.array(
+            [[-0.5, 1 + 0.3 * np.sin(t), 0], [-1, -0.2, 0.5 * np.cos(t)], [0, 0, 0]]
+        ),
+        b=lambda t: np.array([np.sin(t), 0.0, 0.0]),
+        c=lambda t: np.array([[1.0, 0.5 * np.cos(2 * t), 0.2]]),
+        z=lambda t: np.array([np.cos(t) + 0.1 * t]),
+        into=lambda t: G * (1 + 0.2 * np.sin(t)),
+        D=lambda t: np.array([[0.3, 0.0, 1.0]]),
+        S=size * np.diag([1.0, 2.0, 1.0]),
+    )
+
+
+def constant(A: Array, c: Array, Q: Array, V: Array, N: Array) -> Case:
+    """Constant matrices; the joint covariance is S itself."""
+    n, r = len(A), len(c)
+    S = np.block([[Q, N], [N.T, V]])
+    into = np.concatenate([np.eye(n), np.zeros((n, r))], axis=1)
+    D = np.concatenate([np.zeros((r, n)), np.eye(r)], axis=1)
+    return Case(
+        lambda t: A, lambda t: np.zeros(n), lambda t: c, lambda t: np.full(r, np.sin(t)),
+        lambda t: into, lambda t: D, S,
+    )
+
+
+def relative(P: Array, expected: Array) -> float:
+    """Largest error in units of the standard deviations."""
+    d = np.sqrt(np.einsum("...ii->...i", expected))
+    return float(np.abs((P - expected) / (d[..., :, None] * d[..., None, :])).max())
+
+
+def test_time_varying_correlated_noise_against_scipy():
+    case, start, P0 = varying(), np.array([0.5, 0.0, -1.0]), np.diag([10.0, 5.0, 2.0])
+    t = np.linspace(0.0, 20.0, 41)
+    P, x = case.filtered(start, P0, 20.0).at(t)
+    expected_P, expected_x = case.by_scipy(start, P0, t)
+    assert relative(P, expected_P) < 1e-9
+    assert np.abs(x[..., 0] - expected_x).max() < 1e-10 * np.abs(expected_x).max()
+
+
+def test_steep_start_against_scipy():
+    """P(0) is 10⁷ times V: the covariance falls within microseconds."""
+    case, start, P0 = varying(1e-6), np.zeros(3), np.diag([10.0, 10.0, 10.0])
+    t = np.linspace(0.0, 4.0, 9)
+    P, x = case.filtered(start, P0, 4.0).at(t)
+    expected_P, expected_x = case.by_scipy(start, P0, t)
+    assert relative(P[1:], expected_P[1:]) < 1e-6  # scipy's own error is as large
+    assert np.abs(x[..., 0] - expected_x).max() < 1e-7 * np.abs(expected_x).max()
+
+
+def test_limit_is_the_algebraic_riccati_solution():
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(4, 4)) + 0.3 * np.eye(4)  # not stable
+    c = rng.normal(size=(2, 4))
+    root = rng.normal(size=(6, 8))
+    S = 0.01 * root @ root.T
+    Q, N, V = S[:4, :4], S[:4, 4:], S[4:, 4:]
+    case = constant(A, c, Q, V, N)
+    P, _ = case.filtered(np.zeros(4), np.eye(4), 60.0).at(np.array([60.0]))
+    expected = solve_continuous_are(A.T, c.T, Q, V, s=N)
+    assert relative(P[0], expected) < 1e-9
+
+
+def test_unstable_system_stays_accurate_to_40_seconds():
+    """Eigenvalues 0.64 ± 1.01i and 0.33: the state grows to 1e11; the estimate is right of it."""
+    A = np.zeros((4, 4))
+    A[:2, :2], A[2, 2] = [[0.64, 1.01], [-1.01, 0.64]], 0.33
+    A[:3, 3] = [0.5, -0.2, 0.3]  # an unknown constant drives it
+    c = np.array([[1.0, 0.3, 0.7, 0.0]])
+    truth = np.array([1.0, -0.5, 2.0, 0.8])
+    case = constant(A, c, np.zeros((4, 4)), np.array([[1e-4]]), np.zeros((4, 1)))
+    case = Case(
+        case.A, case.b, case.c, lambda t: c @ expm(A * t) @ truth, case.into, case.D, case.S
+    )
+    t = np.array([10.0, 20.0, 30.0, 40.0])
+    filtered = case.filtered(np.zeros(4), 10.0 * np.eye(4), 40.0)
+    P, x = filtered.at(t)
+    state = np.array([expm(A * s) @ truth for s in t])
+    size = np.linalg.norm(state[:, :3], axis=1)
+    error = np.linalg.norm((x[..., 0] - state)[:, :3], axis=1)
+    assert (error[1:] < 1e-9 * size[1:]).all()
+    assert np.isfinite(P).all()
+    assert filtered.smallest_eigenvalue > -1e-9
+    assert filtered.error_estimate < 1e-6
+
+
+def test_result_does_not_depend_on_the_restarts():
+    case, start, P0 = varying(), np.zeros(3), 10.0 * np.eye(3)
+    t = np.linspace(0.5, 20.0, 40)
+    coarse, fine = case.filtered(start, P0, 20.0, 10), case.filtered(start, P0, 20.0, 277)
+    assert fine.mesh.size > 1.5 * coarse.mesh.size
+    (P, x), (Q, y) = coarse.at(t), fine.at(t)
+    assert relative(P, Q) < 1e-9
+    assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
+
+
+def test_without_noise_on_the_state_it_is_recursive_least_squares():
+    """Q = 0: P⁻¹ = P₀⁻¹ + ∫cᵀV⁻¹c, ζ̂ = P (P₀⁻¹ζ̂₀ + ∫cᵀV⁻¹z) for constant ζ."""
+    case = Case(
+        A=lambda t: np.zeros((2, 2)), b=lambda t: np.zeros(2),
+        c=lambda t: np.array([[1.0, t]]), z=lambda t: np.array([2.0 - 3.0 * t + np.sin(t)]),
+        into=lambda t: np.zeros((2, 1)), D=lambda t: np.ones((1, 1)), S=np.array([[0.1]]),
+    )
+    T = 3.0
+    P0, start = np.diag([4.0, 9.0]), np.array([1.0, 1.0])
+    G = np.array([[T, T**2 / 2], [T**2 / 2, T**3 / 3]]) / 0.1
+    ends = [
+        2 * T - 1.5 * T**2 + 1 - np.cos(T), T**2 - T**3 + np.sin(T) - T * np.cos(T)
+    ]
+    information = np.linalg.inv(P0) + G
+    expected = np.linalg.solve(information, np.linalg.solve(P0, start) + np.array(ends) / 0.1)
+    P, x = case.filtered(start, P0, T).at(np.array([T]))
+    np.testing.assert_allclose(P[0], np.linalg.inv(information), rtol=1e-10)
+    np.testing.assert_allclose(x[0, :, 0], expected, rtol=1e-10)
+
+
+def test_known_states_stay_known():
+    """P(0) = 0 and no process noise: nothing is learnt, nothing is divided by zero."""
+    case, start = varying(), np.array([0.5, 0.0, -1.0])
+    case = Case(case.A, case.b, case.c, case.z, lambda t: np.zeros((3, 3)), case.D, case.S)
+    P, x = case.filtered(start, np.zeros((3, 3)), 5.0).at(np.array([5.0]))
+    free = solve_ivp(
+        lambda t, v: case.A(t) @ v + case.b(t), (0.0, 5.0), start, rtol=1e-11, atol=1e-13
+    )
+    assert not P.any()
+    np.testing.assert_allclose(x[0, :, 0], free.y[:, -1], rtol=1e-9)
+
+
+def test_pair_and_quotient_are_inverse():
+    P, x = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    mixed = pair(P, x) @ np.block([
+        [np.array([[1.0, 5.0], [2.0, -1.0]]), np.ones((2, 3))], [np.zeros((3, 2)), np.eye(3)]
+    ])
+    back, estimate = quotient(mixed)
+    np.testing.assert_allclose(back, P, rtol=1e-13)
+    np.testing.assert_allclose(estimate, x, rtol=1e-13)
+
+
+def test_a_covariance_that_cannot_be_resolved_is_refused_with_what_to_change():
+    case = varying(1e-12)
+    mesh = initial_mesh(0.0, 20.0, [], 20, radau_rule(12))
+    with pytest.raises(SolverError, match=r"lower observer\.P0, or raise observer\.regularisation"):
+        run_filter(
+            lambda t, inside: (case.state_space(t), ()), np.zeros((3, 1)), 1e6 * np.eye(3), mesh,
+            tol=1e-12, max_elements=100,
+        )
+
+
+def test_window_gramians_of_a_constant_system():
+    """M = ∫₀ᵀ e^{Aᵀs} cᵀc e^{As} ds, by the block exponential, for windows that start anywhere."""
+    A, c = np.array([[0.3, 1.0], [-2.0, 0.1]]), np.array([[1.0, 0.5]])
+    W = c.T @ c
+    mesh = initial_mesh(1.0, 21.0, [], 40, radau_rule(12))
+
+    def model(t: Array, inside: Array) -> tuple[Array, Array]:
+        return np.broadcast_to(A, (len(t), 2, 2)), np.broadcast_to(W, (len(t), 2, 2))
+
+    found = window_gramians(model, 2, mesh, tol=1e-11, max_elements=1000)
+    big = expm(np.block([[-A.T, W], [np.zeros((2, 2)), A]]) * found.window)
+    expected = big[2:, 2:].T @ big[:2, 2:]
+    assert found.window == pytest.approx(2.0)
+    assert found.starts[-1] == pytest.approx(19.0)
+    np.testing.assert_allclose(
+        found.gramians, np.broadcast_to(expected, found.gramians.shape), rtol=1e-9
+    )
