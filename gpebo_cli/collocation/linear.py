@@ -60,6 +60,7 @@ class Coefficients(NamedTuple):
 Monitor = Callable[[Array, tuple[Array, ...]], list[tuple[Array, float]]]
 
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
+_POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _MAX_PARTS = 8  # an element is cut into at most this many at once
 _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _ROUNDING = 64 * np.finfo(float).eps
@@ -221,7 +222,7 @@ def _element_maps(
     n, columns = problem.start.shape
     s = mesh.rule.stages
     h, t, inside = mesh.steps[elements], mesh.points[elements], mesh.inside[elements]
-    chunk = max(1, _CHUNK // (s * s * n * n + s * n * (n + columns)))
+    chunk = max(1, min(_CHUNK // (s * s * n * n + s * n * (n + columns)), _POINTS // (s + 1)))
     pieces = []
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)

@@ -190,6 +190,7 @@ def run_help() -> str:
 # As in conf/gpebo.yaml, which is not read: a YAML parser costs more than all the rest of this.
 _DEFAULTS = {
     "plant": "circuit",
+    "data": "none",
     "observer": "gpebo",
     "estimator": "drem",
     "solver": "collocation",

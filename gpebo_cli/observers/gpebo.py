@@ -173,7 +173,7 @@ def observer_matrices(
     if (rows != 1.0).any():
         E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
     frame = _frame(E, system.states, rank_tol) if like is None else like.split.frame
-    split = None if frame is None else _split_in_frame(E, frame, rank_tol)
+    split = None if frame is None else split_in_frame(E, frame, rank_tol)
     if split is None:
         slope = c if turning else system.coefficients.taylor(t, 1, inside)
         dE = slope.E[1][: len(E)] / rows[:, None]
@@ -228,17 +228,17 @@ def _frame(E: Array, states: tuple[str, ...], rank_tol: float) -> Frame | None:
         free = np.setdiff1d(np.arange(n), rows)
         unused = np.setdiff1d(np.arange(n), columns)
         frame = Frame(axes[:, columns], axes[:, rows], axes[:, unused], axes[free])
-        if _split_in_frame(E, frame, rank_tol) is not None:
+        if split_in_frame(E, frame, rank_tol) is not None:
             return frame
     U, sigma, Vt = np.linalg.svd(E[0])
     rank = int((sigma > rank_tol * np.linalg.norm(E, axis=(1, 2)).max()).sum())
     U1, V2 = U[:, :rank], Vt[rank:].T
     domain, _ = initial_basis(Vt[:rank].T @ Vt[:rank], rank, states)
     frame = Frame(domain, U1, V2, orthonormal_complement(U1))
-    return frame if _split_in_frame(E, frame, rank_tol) is not None else None
+    return frame if split_in_frame(E, frame, rank_tol) is not None else None
 
 
-def _split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
+def split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
     """E⁺ = B (UᵀE B)⁻¹ Uᵀ, or None where kernel, range or rank are not those of the frame."""
     B, U = frame.domain, frame.range
     rank = B.shape[1]
