@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.measurement import noise_levels
 from gpebo_cli.recordings.table import Samples
 from gpebo_cli.sampled import SampledRun
 from gpebo_cli.settings import Settings
@@ -22,6 +23,8 @@ class Stream:
         Raises:
             ConfigError: a setting that needs to know how a recording goes on.
         """
+        if not noise_levels(settings.noise, system).silent:
+            raise ConfigError("noise is for simulations; what is streamed has its own")
         if settings.data.hold == "cubic":
             raise ConfigError(
                 "data.hold=cubic needs to know the samples to come; a stream takes zoh or linear"
