@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,15 @@ from gpebo_cli.collocation.linear import LinearProblem, solve
 from gpebo_cli.collocation.mesh import Trajectory, initial_mesh
 from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.commands.locations import conf_folder
+from gpebo_cli.experiment import run_experiment
 from gpebo_cli.observers.canonical import (
     canonical_blocks,
     diagonalising_gain,
     unknown_input_matrices,
 )
 from gpebo_cli.outputs.files import make_folder
-from gpebo_cli.outputs.style import Curve, Panel, compose, line, save
+from gpebo_cli.outputs.style import Axis, Curve, Panel, compose, line, save
+from gpebo_cli.settings import ObserverSettings, Settings, TimeSettings
 from gpebo_cli.systems.descriptor import Array
 from gpebo_cli.systems.plant import plant_from_mapping
 
@@ -71,6 +74,34 @@ def errata_assumption7(path: Path) -> None:
     save(compose([Panel("‖Φ_w(t)‖", curves, log=True, legend=True)]), path)
 
 
+def sampled_orders(path: Path) -> None:
+    """Draw how far the circuit's observer at samples is from the one in continuous time."""
+    text = (Path(conf_folder()) / "plant" / "circuit.yaml").read_text(encoding="utf-8")
+    plant = plant_from_mapping(yaml.safe_load(text))
+    time = TimeSettings(0.0, HORIZON, 20_001)
+
+    def estimates(observer: ObserverSettings) -> tuple[Array, Array]:
+        settings = Settings({}, {"name": "ls_drem"}, time=time, observer=observer)
+        estimation = run_experiment(settings, plant).estimation
+        assert estimation is not None  # noqa: S101  an observer was asked for
+        return estimation.t, estimation.states[0]
+
+    t, continuous = estimates(ObserverSettings())
+    steps = np.array([0.2, 0.1, 0.05, 0.02, 0.01, 0.005])
+    curves = []
+    for k, hold in enumerate(("zoh", "linear")):
+        errors = []
+        for step in steps:
+            at, sampled = estimates(ObserverSettings(sample_time=float(step), hold=hold))
+            same = np.searchsorted(t, at - 1e-9)
+            errors.append(np.abs(sampled - continuous[same]).max())
+        curves.append(Curve(steps, np.array(errors), hold, replace(line(k), dots=True)))
+    axis = Axis("sample_time", "sample time (s)", log=True)
+    panel = Panel("largest difference of x̂", tuple(curves), log=True, axis=axis, legend=True)
+    save(compose([panel]), path)
+
+
 if __name__ == "__main__":
     make_folder(IMAGES)
     errata_assumption7(IMAGES / "errata_assumption7.png")
+    sampled_orders(IMAGES / "sampled.png")

@@ -6,12 +6,16 @@ first stage that cannot be carried out and reports that stage as the failed assu
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
+from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import GpeboError, ModelError
 from gpebo_cli.excitation import assess
-from gpebo_cli.measurement import noise_levels
-from gpebo_cli.observers import Observation, observe, signal_noise
+from gpebo_cli.measurement import NoiseLevels, noise_levels
+from gpebo_cli.observers import observe, signal_noise
+from gpebo_cli.recordings.load import load
 from gpebo_cli.result import Assumption, Excitation
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Simulation, simulate
@@ -26,6 +30,9 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
     They are about ψ, which noise does not reach: signals are taken without it.
     """
     levels = noise_levels(settings.noise, system)
+    if settings.data.name == "csv":
+        recording = load(system, settings.data, settings.time, settings.solver.tol)
+        return tuple(_of_observer(settings, system, recording.inputs, recording.outputs, levels))
     found: list[Assumption] = []
     try:
         simulation = simulate(system, settings.time, settings.solver)
@@ -40,19 +47,24 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
         )
         return tuple(found)
     signals = simulation.signals
+    return (*found, *_of_observer(settings, system, signals.inputs, signals.outputs, levels))
+
+
+def _of_observer(
+    settings: Settings, system: DescriptorSystem, inputs: Trajectory, outputs: Trajectory,
+    levels: NoiseLevels,
+) -> list[Assumption]:
+    """What the observer needs of the plant, and of the signals it gets to see."""
     try:
         observation = observe(
-            system, signals.inputs, signals.outputs, settings.observer, settings.solver,
+            system, inputs, outputs, settings.observer, settings.solver,
             signal_noise(settings.noise, levels),
         )
     except ModelError as error:
-        found.append(
-            Assumption(_named(error), "needed by the observer", False, {"found": str(error)})
-        )
-        return tuple(found)
-    t = np.linspace(signals.mesh.edges[0], signals.mesh.edges[-1], 101)
+        return [Assumption(_named(error), "needed by the observer", False, {"found": str(error)})]
+    t = np.linspace(inputs.mesh.edges[0], inputs.mesh.edges[-1], 101)
     excitation = assess(observation.regression, t, settings.excitation)
-    return (*found, *of_observation(observation, excitation))
+    return of_observation(observation, excitation)
 
 
 def _named(error: GpeboError) -> str:
@@ -126,7 +138,21 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
     ]
 
 
-def of_observation(observation: Observation, excitation: Excitation) -> list[Assumption]:
+class Observed(Protocol):
+    """What an observer says about itself, in continuous time or at samples."""
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """Of this observer, with their evidence."""
+        ...
+
+    @property
+    def growth(self) -> float | None:
+        """Largest entry of Φ; None: the states do not rest on it."""
+        ...
+
+
+def of_observation(observation: Observed, excitation: Excitation) -> list[Assumption]:
     """The observer's own assumptions, excitation, and the growth of Φ."""
     number = 5 if any(a.name == "Assumption 3" for a in observation.assumptions) else 2
     found = [

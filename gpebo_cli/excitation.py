@@ -9,15 +9,15 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import LinearRegression, SampledRegression
 from gpebo_cli.result import Direction, Excitation, Requirement
 from gpebo_cli.settings import ExcitationSettings
 from gpebo_cli.systems.descriptor import Array
 
-_RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
+RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(10.0)])
-_WINDOWS = 10  # default PE window: this many per horizon
+WINDOWS = 10  # default PE window: this many per horizon
 
 
 def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings) -> Excitation:
@@ -30,8 +30,8 @@ def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings)
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     rho = settings.rho
     if rho is None:
-        rho = _RELATIVE_LEVEL * regression.scale**2 * horizon
-    window = settings.window if settings.window is not None else horizon / _WINDOWS
+        rho = RELATIVE_LEVEL * regression.scale**2 * horizon
+    window = settings.window if settings.window is not None else horizon / WINDOWS
     gram = Trajectory(mesh, regression.gram.values[..., :p])
     eigenvalues = np.maximum(np.linalg.eigvalsh(gram(t)), 0.0)
     values, vectors = np.linalg.eigh(gram.final)
@@ -110,6 +110,24 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     return level
 
 
+def sampled_window_level(regression: SampledRegression, window: float) -> Array:
+    """λ_min of ∫ψᵀψ over the last ``window`` seconds at every sample (K,), to a sample's length.
+
+    NaN before the first whole window. Every window is summed afresh, as in :func:`window_level`.
+    """
+    t, p = regression.t, regression.p
+    level = np.full(len(t), np.nan)
+    slack = 1e-9 * window
+    whole = np.flatnonzero(t - window >= t[0] - slack)
+    rows = regression.weighted()[..., :p]
+    steps = np.concatenate([np.swapaxes(rows, 1, 2) @ rows, np.zeros((1, p, p))])
+    first = np.searchsorted(t, t[whole] - window + slack, side="right")
+    pairs = np.stack([first, whole + 1], axis=1).ravel()
+    sums = np.add.reduceat(steps, pairs, axis=0)[::2]
+    level[whole] = np.maximum(np.linalg.eigvalsh(sums)[:, 0], 0.0)
+    return level
+
+
 def persistent(outer: Trajectory, gain: float) -> Requirement:
     """Whether ψ keeps exciting, and whether that is enough at this gain.
 
@@ -122,10 +140,10 @@ def persistent(outer: Trajectory, gain: float) -> Requirement:
         gain: the smallest γ of the estimator.
     """
     mesh = outer.mesh
-    length = float(mesh.edges[-1] - mesh.edges[0]) / _WINDOWS
-    t = np.linspace(mesh.edges[0], mesh.edges[-1], 10 * _WINDOWS + 1)
+    length = float(mesh.edges[-1] - mesh.edges[0]) / WINDOWS
+    t = np.linspace(mesh.edges[0], mesh.edges[-1], 10 * WINDOWS + 1)
     level = float(np.nanmin(window_level(outer, t, length)))
-    needed = float(np.log(100.0)) / _WINDOWS
+    needed = float(np.log(100.0)) / WINDOWS
     return Requirement(
         name="PE",
         holds=gain * level >= needed,

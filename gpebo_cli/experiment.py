@@ -15,25 +15,34 @@ from gpebo_cli import estimators
 from gpebo_cli.assumptions import of_observation, of_simulation
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.excitation import assess
-from gpebo_cli.measurement import check_samples, measure, noise_levels
+from gpebo_cli.excitation import WINDOWS, assess, sampled_window_level
+from gpebo_cli.measurement import NoiseLevels, check_samples, measure, noise_levels
 from gpebo_cli.metrics import settling_time, time_rms
 from gpebo_cli.observers import Observation, observe, signal_noise
 from gpebo_cli.realisations import check_seeds, over_seeds
+from gpebo_cli.recordings.load import Recording, load
+from gpebo_cli.regression import SampledRegression
 from gpebo_cli.result import (
+    Assumption,
     EstimationResult,
     Excitation,
+    Fit,
     Metrics,
+    RecordingResult,
     RegressionResult,
     RunResult,
     SimulationResult,
     StateChange,
 )
+from gpebo_cli.sampled import SampledRun
 from gpebo_cli.settings import Settings, TimeSettings
-from gpebo_cli.simulation.simulate import Simulation, simulate
+from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
 from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 _MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
+_ROUNDING = 1e-12  # by which a sample may miss the end of the horizon
+_MAX_SAMPLES = 1_000_000
+_SAMPLES_AT_ONCE = 2048
 _BATCH = 1 << 19  # numbers held at once while cases are evaluated: what fits the cache
 
 
@@ -74,48 +83,39 @@ def run_experiment(
         ModelError: the plant cannot be simulated, or Assumption 1 fails.
         SolverError: a tolerance cannot be reached.
     """
-    _check_time(settings.time)
-    clock = _Clock(progress)
+    recorded = settings.data.name == "csv"
     observed = settings.observer.name != "none"
+    if recorded and not observed:
+        raise ConfigError(
+            "observer=none simulates the plant, and data=csv does not; choose one of them"
+        )
+    levels = noise_levels(settings.noise, system)
+    _check_noise(settings, levels)
+    if not recorded:
+        _check_time(settings.time)
+    clock = _Clock(progress)
     if not observed:
         estimator = None
     elif estimator is None:
         estimator = estimators.build(settings.estimator)
-    levels = noise_levels(settings.noise, system)
-    if not levels.silent:
-        check_samples(
-            settings.time.horizon, settings.noise.sample_time, settings.solver.max_elements
-        )
-    check_seeds(settings.noise, levels, settings.observer.name)
+    check_seeds(settings.noise, levels, settings.observer)
 
-    clock.stage("simulate")
-    t = np.linspace(
-        settings.time.start, settings.time.start + settings.time.horizon, settings.time.samples
-    )
-    simulation = simulate(system, settings.time, settings.solver)
-    signals = simulation.signals
-    measured = measure(signals, settings.noise, levels)
-    simulated = _sample_simulation(system, simulation, t)
-    if not levels.silent:
-        simulated = replace(
-            simulated,
-            # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
-            measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
-            measured_outputs=np.where(levels.noisy_outputs, measured.outputs(t), simulated.outputs),
-        )
+    clock.stage("read" if recorded else "simulate")
+    source = _recorded(settings, system) if recorded else _simulated(settings, system, levels)
     if estimator is None:
         clock.stage("")
         return RunResult(
-            settings=settings, system=system, simulation=simulated, regression=None,
-            excitation=None, estimation=None, metrics=None,
-            assumptions=tuple(of_simulation(system, simulation)), timings=clock.seconds,
-            verdict=_simulation_verdict(simulated),
+            settings=settings, system=system, simulation=source.simulation, regression=None,
+            excitation=None, estimation=None, metrics=None, assumptions=source.assumptions,
+            timings=clock.seconds, verdict=source.verdict,
         )
 
+    if settings.observer.sample_time is not None:
+        return _run_at_samples(settings, system, source, estimator, clock)
     clock.stage("observe")
-    _refuse_impulses(system, simulated)
+    t = source.t
     observation = observe(
-        system, measured.inputs, measured.outputs, settings.observer, settings.solver,
+        system, source.inputs, source.outputs, settings.observer, settings.solver,
         signal_noise(settings.noise, levels),
     )
     if observation.estimator is not None:
@@ -134,24 +134,207 @@ def run_experiment(
     excitation = assess(regression, t, settings.excitation)
     clock.stage("estimate")
     estimation, metrics = _estimate(
-        settings, observation.estimator or estimator, observation, system, signals.states, t
+        settings, observation.estimator or estimator, observation, source, t
     )
     noise = None
-    if settings.noise.seeds > 1:
+    if settings.noise.seeds > 1 and source.true is not None:
         clock.stage("seeds")
         truth = estimation.true_parameters[-1]
-        noise = over_seeds(observation, signals, estimator, truth, settings.noise, levels)
+        noise = over_seeds(observation, source.true, estimator, truth, settings.noise, levels)
+    fit = _fit(observation, estimation) if recorded else None
     clock.stage("")
     return RunResult(
-        settings=settings, system=system, simulation=simulated, regression=sampled,
+        settings=settings, system=system, simulation=source.simulation, regression=sampled,
         excitation=excitation, estimation=estimation, metrics=metrics,
-        assumptions=(
-            *of_simulation(system, simulation), *of_observation(observation, excitation)
-        ),
+        assumptions=(*source.assumptions, *of_observation(observation, excitation)),
         timings=clock.seconds,
-        verdict=_verdict(excitation, estimation, metrics) + observation.note,
+        verdict=_verdict(excitation, estimation, metrics, fit) + observation.note,
         noise=noise,
+        recording=source.recording,
+        fit=fit,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """What the observer gets to see, and what is known about it."""
+
+    t: Array  # (N,) the output grid
+    inputs: Trajectory  # (m,)
+    outputs: Trajectory  # (r,)
+    states: Trajectory  # (n,) the truth, NaN where nobody knows
+    theta: Callable[[Array], Array]  # times (M,) -> (M, q), likewise
+    judged: slice  # parameters that count when estimates are compared with the truth
+    assumptions: tuple[Assumption, ...]
+    verdict: str
+    true: Signals | None = None  # of a simulation, without noise
+    simulation: SimulationResult | None = None
+    recording: RecordingResult | None = None
+
+
+def _grid(settings: Settings, start: float, stop: float) -> Array:
+    """The output grid (N,): evenly spaced; of an observer at samples, some of those."""
+    if settings.observer.sample_time is None:
+        return np.linspace(start, stop, settings.time.samples)
+    t = _sample_times(settings.observer.sample_time, start, stop)
+    kept: Array = t[_kept_samples(1, len(t), settings.time.samples)]
+    return kept
+
+
+def _sample_times(step: float, start: float, stop: float) -> Array:
+    """start, start + T, … up to stop, (K,)."""
+    count = int(np.floor((stop - start) / step * (1.0 + _ROUNDING)))
+    if count < 1:
+        raise ConfigError(
+            f"observer.sample_time = {step:g} is longer than the horizon of {stop - start:g} s"
+        )
+    if count > _MAX_SAMPLES:
+        raise ConfigError(
+            f"observer.sample_time = {step:g} makes {count} samples; at most {_MAX_SAMPLES} fit in "
+            "one run"
+        )
+    return np.asarray(start + step * np.arange(count + 1), dtype=np.float64)
+
+
+def _simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) -> _Source:
+    """Signals of the plant."""
+    t = _grid(settings, settings.time.start, settings.time.start + settings.time.horizon)
+    simulation = simulate(system, settings.time, settings.solver)
+    measured = measure(simulation.signals, settings.noise, levels)
+    simulated = _sample_simulation(system, simulation, t)
+    if not levels.silent:
+        simulated = replace(
+            simulated,
+            # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
+            measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
+            measured_outputs=np.where(levels.noisy_outputs, measured.outputs(t), simulated.outputs),
+        )
+    if settings.observer.name != "none":
+        _refuse_impulses(system, simulated)
+    return _Source(
+        t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
+        theta=system.theta_at, judged=_judged(system),
+        assumptions=tuple(of_simulation(system, simulation)),
+        verdict=_simulation_verdict(simulated), true=simulation.signals, simulation=simulated,
+    )
+
+
+def _judged(system: DescriptorSystem) -> slice:
+    """Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts."""
+    return slice(system.q if system.theta_varies else None)
+
+
+def _recorded(settings: Settings, system: DescriptorSystem) -> _Source:
+    """Signals of a recording; nobody knows what θ was when it was made."""
+    recording = load(system, settings.data, settings.time, settings.solver.tol)
+    t = _grid(settings, *recording.span)
+    return _Source(
+        t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
+        theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
+        assumptions=(), verdict="",
+        recording=_sample_recording(system, recording, t),
+    )
+
+
+def _sample_recording(
+    system: DescriptorSystem, recording: Recording, t: Array
+) -> RecordingResult:
+    table, sampled = recording.table, recording.sampled(t)
+    return RecordingResult(
+        t=t,
+        inputs=sampled.inputs,
+        outputs=sampled.outputs,
+        states=sampled.states,
+        file=table.header.source,
+        sha256=table.sha256,
+        rows=len(table.samples.t),
+        hold=recording.hold,
+        first=float(table.samples.t[0]),
+        last=float(table.samples.t[-1]),
+        known_states=tuple(system.states[i] for i in table.header.known),
+        elements=recording.inputs.mesh.size,
+    )
+
+
+def _run_at_samples(
+    settings: Settings, system: DescriptorSystem, source: _Source,
+    estimator: estimators.Estimator, clock: _Clock,
+) -> RunResult:
+    """Observer and estimator at samples of the signals, ``observer.sample_time`` apart."""
+    observer, edges = settings.observer, source.inputs.mesh.edges
+    if observer.sample_time is None:
+        raise ValueError("the observer runs in continuous time")
+    clock.stage("observe and estimate")
+    run = SampledRun(settings, system, observer.hold, float(edges[0]), estimator)
+    t = _sample_times(observer.sample_time, float(edges[0]), float(edges[-1]))
+    sampled_u, sampled_y = source.inputs(t), source.outputs(t)
+    parts = [slice(i, i + _SAMPLES_AT_ONCE) for i in range(0, len(t), _SAMPLES_AT_ONCE)]
+    made = [run.feed(t[part], sampled_u[part], sampled_y[part]) for part in parts]
+    parameters = np.concatenate([part.parameters for part in made], axis=1)
+    states = np.concatenate([part.states for part in made], axis=1)
+    rows = np.concatenate([part.regression.rows[1:] for part in made])
+    eigenvalues = np.concatenate([part.gram_eigenvalues for part in made])
+    p = len(run.parameters)
+
+    x = source.states(t)
+    extension = np.concatenate([part.extension for part in made])
+    truth = run.truth(extension)(t, source.theta(t), source.states)
+    metrics = Metrics(*_measure(t, (parameters - truth)[..., source.judged], states - x))
+    chosen = _kept_samples(1, len(t), settings.time.samples)
+    kept = chosen[_kept_samples(len(run.cases), len(chosen), settings.output.max_rows)]
+    deltas = [part.delta for part in made if part.delta is not None]
+    estimation = EstimationResult(
+        cases=run.cases,
+        t=t[kept],
+        names=run.parameters,
+        parameters=parameters[:, kept],
+        true_parameters=truth[kept],
+        states=states[:, kept],
+        delta=np.concatenate(deltas, axis=1)[:, kept] if deltas else None,
+        checks={},
+        requirement=run.requirement,
+    )
+    clock.stage("excitation")
+    direction, smallest, largest = run.weakest_direction
+    reached = np.flatnonzero(eigenvalues[:, 0] >= run.rho) if p else np.zeros(0, dtype=np.intp)
+    window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
+    regression = SampledRegression(
+        t, np.diff(t, prepend=t[0]), np.concatenate([rows[:1], rows]), observer.hold
+    )
+    excitation = Excitation(
+        t=t[chosen],
+        gram_eigenvalues=eigenvalues[chosen],
+        pe_level=sampled_window_level(regression, window)[chosen],
+        window=window,
+        is_ie=len(reached) > 0,
+        t_c=float(t[reached[0]]) if len(reached) else None,
+        rho=run.rho,
+        lambda_min=smallest,
+        condition=largest / smallest if smallest > 0 else float("inf"),
+        weakest_direction=direction,
+    )
+    fit = run.fit(parameters[:, -1]) if source.recording is not None else None
+    clock.stage("")
+    return RunResult(
+        settings=settings, system=system, simulation=source.simulation,
+        regression=RegressionResult(
+            t[chosen], rows[chosen, :, p], rows[chosen, :, :p], run.parameters, run.error_estimate
+        ),
+        excitation=excitation, estimation=estimation, metrics=metrics,
+        assumptions=(*source.assumptions, *of_observation(run, excitation)),
+        timings=clock.seconds,
+        verdict=_verdict(excitation, estimation, metrics, fit),
+        recording=source.recording,
+        fit=fit,
+    )
+
+
+def _check_noise(settings: Settings, levels: NoiseLevels) -> None:
+    if levels.silent:
+        return
+    if settings.data.name == "csv":
+        raise ConfigError("noise is for simulations; a recording (data=csv) has its own")
+    check_samples(settings.time.horizon, settings.noise.sample_time, settings.solver.max_elements)
 
 
 def _check_time(time: TimeSettings) -> None:
@@ -223,8 +406,7 @@ def _estimate(
     settings: Settings,
     estimator: estimators.Estimator,
     observation: Observation,
-    system: DescriptorSystem,
-    states: Trajectory,
+    source: _Source,
     t: Array,
 ) -> tuple[EstimationResult, Metrics]:
     """Run every case on the mesh and the samples that are kept; measure on both."""
@@ -236,11 +418,9 @@ def _estimate(
     chosen = np.searchsorted(grid, kept)
 
     reconstruct = state_map.at(grid)
-    x = states(grid)
-    truth = observation.truth(grid, system.theta_at(grid), states)
+    x = source.states(grid)
+    truth = observation.truth(grid, source.theta(grid), source.states)
     size, p, n = len(cases), truth.shape[1], x.shape[1]
-    # Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts.
-    judged = slice(system.q if system.theta_varies else p)
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
     numbers = np.empty((5, size))
     batch = max(1, _BATCH // (len(grid) * (2 * p + n)))
@@ -249,7 +429,7 @@ def _estimate(
         eta = estimates.parameters(part)
         x_hat = reconstruct(eta)
         parameters[part], estimated[part] = eta[:, chosen], x_hat[:, chosen]
-        numbers[:, part] = _measure(grid, (eta - truth)[..., judged], x_hat - x)
+        numbers[:, part] = _measure(grid, (eta - truth)[..., source.judged], x_hat - x)
     result = EstimationResult(
         cases=cases,
         t=kept,
@@ -265,19 +445,37 @@ def _estimate(
 
 
 def _measure(grid: Array, parameter_error: Array, state_error: Array) -> Array:
-    """The five columns of ``cases.csv``, shape (5, g), over the states the observer sees."""
-    unseen = np.isnan(state_error[0, -1])
-    if unseen.any():
-        state_error = state_error[:, :, ~unseen]
-    parameter_norm = np.sqrt(np.einsum("gmi,gmi->gm", parameter_error, parameter_error))
-    state_norm = np.sqrt(np.einsum("gmi,gmi->gm", state_error, state_error))
-    return np.array([
-        settling_time(grid, parameter_norm),
-        settling_time(grid, state_norm),
-        np.abs(parameter_error[:, -1]).max(axis=1),
-        np.abs(state_error[:, -1]).max(axis=1),
-        time_rms(grid, state_norm),
-    ])
+    """The five columns of ``cases.csv``, shape (5, g).
+
+    Over what the observer sees and what is known of the truth; NaN where that is nothing.
+    """
+    out = np.full((5, len(parameter_error)), np.nan)
+    known = ~np.isnan(parameter_error[0, -1])
+    if known.any() or not known.size:
+        norm = np.linalg.norm(parameter_error[..., known], axis=2)
+        out[0] = settling_time(grid, norm)
+        out[2] = np.abs(parameter_error[:, -1, known]).max(axis=1, initial=0.0)
+    known = ~np.isnan(state_error[0, -1])
+    if known.any():
+        norm = np.linalg.norm(state_error[..., known], axis=2)
+        out[1], out[4] = settling_time(grid, norm), time_rms(grid, norm)
+        out[3] = np.abs(state_error[:, -1, known]).max(axis=1)
+    return out
+
+
+def _fit(observation: Observation, estimation: EstimationResult) -> Fit | None:
+    """Root mean squares over time of Y − ψη̂ with the final estimates, and of Y."""
+    regression = observation.regression
+    if estimation.names != regression.parameters:
+        return None
+    duration = float(regression.mesh.edges[-1] - regression.mesh.edges[0])
+
+    def rms(signal: Array) -> float:
+        square = Trajectory(regression.mesh, (signal**2).sum(axis=-1))
+        return float(np.sqrt(max(float(square.integral().final), 0.0) / duration))
+
+    Y, psi = regression.Y.values, regression.psi.values
+    return Fit(np.array([rms(Y - psi @ eta[-1]) for eta in estimation.parameters]), rms(Y))
 
 
 def _kept_samples(cases: int, samples: int, max_rows: int) -> Array:
@@ -294,8 +492,13 @@ def _simulation_verdict(simulated: SimulationResult) -> str:
     )
 
 
-def _verdict(excitation: Excitation, estimation: EstimationResult, metrics: Metrics) -> str:
-    """The last line: exciting or not and from when on, and how well the state is known."""
+def _verdict(
+    excitation: Excitation, estimation: EstimationResult, metrics: Metrics, fit: Fit | None = None
+) -> str:
+    """The last line: exciting or not and from when on, and how well the state is known.
+
+    Without true states: how well the estimates explain the data.
+    """
     if excitation.is_ie:
         first = (
             f"interval-exciting from t = {excitation.t_c:.4g} s on "
@@ -306,15 +509,23 @@ def _verdict(excitation: Excitation, estimation: EstimationResult, metrics: Metr
             f"NOT interval-exciting: λ_min(G) = {excitation.lambda_min:.3g} < ρ = "
             f"{excitation.rho:.2g}; not excited: {excitation.weakest_direction}"
         )
-    best = _best_case(metrics)
+    parts = [first]
+    if np.isfinite(metrics.final_error_states).any():
+        best = _best_case(metrics)
+        seconds = metrics.seconds_to_1pct_states[best]
+        reached = f"below 1 % after {seconds:.4g} s" if np.isfinite(seconds) else "never below 1 %"
+        parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end, {reached}")
+    elif fit is not None:
+        best = int(np.argmin(np.where(np.isfinite(fit.residual), fit.residual, np.inf)))
+    else:
+        best = 0
+    if fit is not None:
+        parts.append(
+            f"|Y − ψη̂| with the final estimates is {fit.residual[best]:.2g}, |Y| is "
+            f"{fit.size:.2g} (root mean squares)"
+        )
     label = _case_label(estimation.cases[best])
-    seconds = metrics.seconds_to_1pct_states[best]
-    reached = f"below 1 % after {seconds:.4g} s" if np.isfinite(seconds) else "never below 1 %"
-    second = (
-        f"state error {metrics.final_error_states[best]:.2g} at the end, {reached}"
-        + (f" ({label})" if label else "")
-    )
-    line = f"{first}; {second}"
+    line = "; ".join(parts) + (f" ({label})" if label else "")
     if not estimation.requirement.holds:
         line += f"; {estimation.requirement.name} not met: {estimation.requirement.text}"
     return line

@@ -23,14 +23,16 @@ from gpebo_cli.measurement import (
 from gpebo_cli.observers import Observation
 from gpebo_cli.regression import Estimator, LinearRegression
 from gpebo_cli.result import NoiseStatistics
-from gpebo_cli.settings import NoiseSettings
+from gpebo_cli.settings import NoiseSettings, ObserverSettings
 from gpebo_cli.simulation.simulate import Signals
 from gpebo_cli.systems.descriptor import Array
 
-_NUMBERS = 1 << 20  # in Y of one batch of seeds: estimators hold tens of times that, and more is slower
+_NUMBERS = 1 << 20  # in Y of one batch of seeds; estimators hold tens of times that
 
 
-def check_seeds(settings: NoiseSettings, levels: NoiseLevels, observer: str) -> None:
+def check_seeds(
+    settings: NoiseSettings, levels: NoiseLevels, observer: ObserverSettings
+) -> None:
     """Refuse many seeds of nothing, and observers that estimate in another way.
 
     Raises:
@@ -42,10 +44,11 @@ def check_seeds(settings: NoiseSettings, levels: NoiseLevels, observer: str) -> 
         return
     if levels.silent:
         raise ConfigError(f"noise.seeds = {settings.seeds}, but there is no noise; set its levels")
-    if observer != "gpebo":
+    if observer.name != "gpebo" or observer.sample_time is not None:
+        asked = observer.name if observer.sample_time is None else "one with a sample_time"
         raise ConfigError(
-            f"noise.seeds = {settings.seeds} needs observer=gpebo, not {observer}; with others, "
-            "run one job per seed: -m noise.seed=0,1,2"
+            f"noise.seeds = {settings.seeds} needs observer=gpebo in continuous time, not {asked}; "
+            "with others, run one job per seed: -m noise.seed=0,1,2"
         )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from gpebo_cli.settings import Settings
 from gpebo_cli.systems.descriptor import Array, DescriptorSystem
@@ -21,6 +22,60 @@ class StateChange:
     given: float
     used: float
     time: float
+
+
+class SignalsResult(Protocol):
+    """Signals on the output grid, wherever they are from."""
+
+    @property
+    def t(self) -> Array:
+        """Times, (N,)."""
+        ...
+
+    @property
+    def inputs(self) -> Array:
+        """u, (N, m)."""
+        ...
+
+    @property
+    def outputs(self) -> Array:
+        """y, (N, r)."""
+        ...
+
+    @property
+    def states(self) -> Array:
+        """True states, (N, n), NaN for one that nobody knows."""
+        ...
+
+    @property
+    def measured_inputs(self) -> Array | None:
+        """What the observer saw, (N, m); None: the same."""
+        ...
+
+    @property
+    def measured_outputs(self) -> Array | None:
+        """What the observer saw, (N, r); None: the same."""
+        ...
+
+
+@dataclass(frozen=True)
+class RecordingResult:
+    """Signals of a recording on the output grid, and which file they are from."""
+
+    t: Array  # (N,)
+    inputs: Array  # (N, m)
+    outputs: Array  # (N, r)
+    states: Array  # (N, n), NaN for a state that was not recorded
+    file: str
+    sha256: str
+    rows: int
+    hold: str
+    first: float  # times of its first and last sample
+    last: float
+    known_states: tuple[str, ...]
+    elements: int
+    measured_inputs: None = None  # a recording is what was measured
+    measured_outputs: None = None
 
 
 @dataclass(frozen=True)
@@ -137,6 +192,14 @@ class NoiseStatistics:
 
 
 @dataclass(frozen=True)
+class Fit:
+    """How well the final estimates explain all data: what is known without the truth."""
+
+    residual: Array  # (G,) root mean square over time of ‖Y − ψη̂(end)‖
+    size: float  # the same of ‖Y‖
+
+
+@dataclass(frozen=True)
 class Assumption:
     """One of the paper's assumptions (or a prerequisite), with its evidence."""
 
@@ -148,11 +211,14 @@ class Assumption:
 
 @dataclass(frozen=True)
 class RunResult:
-    """Everything one run produced; the later stages are None when ``observer=none``."""
+    """Everything one run produced; the later stages are None when ``observer=none``.
+
+    Signals are from a simulation or from a recording; the other one of the two is None.
+    """
 
     settings: Settings
     system: DescriptorSystem
-    simulation: SimulationResult
+    simulation: SimulationResult | None
     regression: RegressionResult | None
     excitation: Excitation | None
     estimation: EstimationResult | None
@@ -161,3 +227,17 @@ class RunResult:
     timings: Mapping[str, float]  # stage -> seconds
     verdict: str  # the last line a person reads
     noise: NoiseStatistics | None = None  # where more than one seed was asked for
+    recording: RecordingResult | None = None
+    fit: Fit | None = None  # of a recording
+
+    @property
+    def signals(self) -> SignalsResult:
+        """Inputs, outputs and what is known of the states, on the output grid.
+
+        Raises:
+            ValueError: the result has neither a simulation nor a recording.
+        """
+        signals = self.recording if self.simulation is None else self.simulation
+        if signals is None:
+            raise ValueError("a result needs a simulation or a recording")
+        return signals

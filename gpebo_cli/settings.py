@@ -14,11 +14,23 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class TimeSettings:
-    """The experiment runs on [start, start + horizon]; ``samples`` is the output grid only."""
+    """The experiment runs on [start, start + horizon]; ``samples`` is the output grid only.
+
+    With a recording, a start of −∞ is its first sample and a horizon of ∞ lasts to its last one.
+    """
 
     start: float = 0.0
     horizon: float = 20.0
     samples: int = 1001
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """Where u and y come from: the simulated plant, or a recording."""
+
+    name: Literal["none", "csv"] = "none"
+    file: str | None = None  # a CSV file; "-" is standard input
+    hold: Literal["zoh", "linear", "cubic"] = "linear"  # what is assumed between samples
 
 
 @dataclass(frozen=True)
@@ -58,6 +70,10 @@ class ObserverSettings:
     # Where the noise leaves measurements exact: standard deviation of the noise assumed instead,
     # relative to each one's own size, at the noise's sample time.
     regularisation: float = 1e-3
+    # Seconds between samples of an observer in discrete time, and what it assumes between them;
+    # None: continuous time.
+    sample_time: float | None = None
+    hold: Literal["zoh", "linear"] = "zoh"
 
 
 @dataclass(frozen=True)
@@ -105,3 +121,4 @@ class Settings:
     excitation: ExcitationSettings = field(default_factory=ExcitationSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
     noise: NoiseSettings = field(default_factory=NoiseSettings)
+    data: DataSettings = field(default_factory=DataSettings)

@@ -86,7 +86,10 @@ MISTAKES = [
     ("[-k, -1]", "[-k, -1, 0]", 2, "A[0] has length 2, A[1] has length 3"),
     ("[-k, -1]", "[-kk, -1]", 2, "A[1][0] = '-kk': the name 'kk' is not defined; did you mean k?"),
     ("[-k, -1]", "[-k*T, -1]", 2, "T is a state and cannot be used here"),
-    ("0.5*sin(t/2)", "0.5*sin(t/2", 2, "parameters.Cap = '2 + 0.5*sin(t/2': it is not an expression"),
+    (
+        "0.5*sin(t/2)", "0.5*sin(t/2", 2,
+        "parameters.Cap = '2 + 0.5*sin(t/2': it is not an expression",
+    ),
     ("3 + 2*sin(t)", "3 + 2sin(t)", 2, "inputs.P = '3 + 2sin(t)'"),
     ("3 + 2*sin(t)", "3 + t^2", 2, "write ** for powers"),
     ("states: [T, q]", "states: [T, q, z]", 2, "E has 2 rows but there are 3 states (T, q, z)"),

@@ -37,6 +37,7 @@ def run(
     observer: Choice | None = None,
     solver: Choice | None = None,
     noise: Choice | None = None,
+    data: Choice | os.PathLike[str] | None = None,
     time: Mapping[str, object] | None = None,
     excitation: Mapping[str, object] | None = None,
     config_dir: Folder | None = None,
@@ -56,6 +57,8 @@ def run(
         observer: a name, or a mapping; ``"none"`` simulates only.
         solver: a name, or a mapping such as ``{"tol": 1e-9}``.
         noise: a name, or a mapping such as ``{"name": "gaussian", "outputs": 0.01, "seed": 1}``.
+        data: the path of a recording (CSV), or a mapping with its ``file`` and ``hold``; by default
+            the plant is simulated.
         time: ``start`` and ``horizon`` in seconds, ``samples`` of the output grid.
         excitation: ``rho`` and ``window`` (seconds) of the evidence.
         config_dir: a folder of yours, with ``plant/NAME.yaml``, ``estimator/NAME.yaml``, …
@@ -79,7 +82,7 @@ def run(
     own = None if estimator is None or isinstance(estimator, str | Mapping) else _own(estimator)
     sections: dict[str, object] = {
         "observer": observer, "estimator": None if own else estimator, "solver": solver,
-        "noise": noise, "time": time, "excitation": excitation,
+        "noise": noise, "data": _recording(data), "time": time, "excitation": excitation,
     }
     config, system, settings = _configure(plant, sections, {} if own else gains, config_dir)
     if own is not None:
@@ -99,6 +102,7 @@ def check(
     observer: Choice | None = None,
     solver: Choice | None = None,
     noise: Choice | None = None,
+    data: Choice | os.PathLike[str] | None = None,
     time: Mapping[str, object] | None = None,
     excitation: Mapping[str, object] | None = None,
     config_dir: Folder | None = None,
@@ -110,6 +114,7 @@ def check(
         observer: a name or a mapping.
         solver: a name or a mapping.
         noise: a name or a mapping.
+        data: a recording, as in :func:`run`.
         time: ``start`` and ``horizon`` in seconds.
         excitation: ``rho`` and ``window`` (seconds).
         config_dir: a folder of yours.
@@ -125,7 +130,7 @@ def check(
     """
     sections: dict[str, object] = {
         "observer": observer, "estimator": None, "solver": solver, "noise": noise,
-        "time": time, "excitation": excitation,
+        "data": _recording(data), "time": time, "excitation": excitation,
     }
     _, system, settings = _configure(plant, sections, {}, config_dir)
     return assumptions.check(settings, system)
@@ -193,6 +198,15 @@ def _configure(
     _check_gains(gains, config["estimator"])
     config["estimator"] |= plain(gains)
     return config, system, configuration.settings(config, draw=True)
+
+
+def _recording(data: Choice | os.PathLike[str] | None) -> object:
+    """``data`` as the group has it: a path, or a mapping with a file, is a recording."""
+    if isinstance(data, Mapping):
+        return {"name": "csv", **data}
+    if data is None or data == "none":
+        return data
+    return {"name": "csv", "file": os.fspath(data)}
 
 
 def _own(estimator: object) -> Estimator:

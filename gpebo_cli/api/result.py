@@ -93,22 +93,22 @@ class Result:
     @property
     def t(self) -> Array:
         """Output times in seconds, (N,)."""
-        return self.details.simulation.t
+        return self.details.signals.t
 
     @cached_property
     def inputs(self) -> Signals:
         """Known inputs u by name, (N,) each."""
-        return Signals("inputs", self.details.system.inputs, self.details.simulation.inputs)
+        return Signals("inputs", self.details.system.inputs, self.details.signals.inputs)
 
     @cached_property
     def outputs(self) -> Signals:
         """Measured outputs y by name, (N,) each."""
-        return Signals("outputs", self.details.system.outputs, self.details.simulation.outputs)
+        return Signals("outputs", self.details.system.outputs, self.details.signals.outputs)
 
     @cached_property
     def states(self) -> Signals:
         """True states x by name, (N,) each."""
-        return Signals("states", self.details.system.states, self.details.simulation.states)
+        return Signals("states", self.details.system.states, self.details.signals.states)
 
     @property
     def estimates_t(self) -> Array:

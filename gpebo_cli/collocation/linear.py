@@ -61,6 +61,7 @@ Monitor = Callable[[Array, tuple[Array, ...]], list[tuple[Array, float]]]
 
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
+_POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _MAX_PARTS = 8  # an element is cut into at most this many at once
 _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _ROUNDING = 64 * np.finfo(float).eps
@@ -263,7 +264,7 @@ def _element_maps(
     numbers = s * n * (n + columns)
     if known is None or not _is_constant(known):
         numbers += s * s * n * n
-    chunk = max(1, _CHUNK // numbers)
+    chunk = max(1, min(_CHUNK // numbers, _POINTS // (s + 1)))
     pieces = []
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)

@@ -139,6 +139,7 @@ def parse(words: list[str]) -> Arguments:
         values[flag] = _checked(flag, value)
     config_dir = _config_dir(values.pop("--config-dir", None))
     config_name = _config_name(values.pop("--config-name", None), config_dir)
+    overrides = _with_data(overrides, config_name)
     options = tuple(item for pair in values.items() for item in pair)
     dry_run = "--dry-run" in switches
     switches.discard("--dry-run")
@@ -153,6 +154,14 @@ def parse(words: list[str]) -> Arguments:
         _fail_fast(sweep.get("fail_fast")),
         dry_run,
     )
+
+
+def _with_data(overrides: list[str], config_name: str) -> list[str]:
+    """``data.file=FILE`` says that there is a recording: no need to write ``data=csv``, too."""
+    given = any(word.startswith("data.file=") and word != "data.file=null" for word in overrides)
+    chosen = any(word.startswith("data=") for word in overrides)
+    missing = given and not chosen and config_name == PRIMARY
+    return ["data=csv", *overrides] if missing else overrides
 
 
 def quoted(text: str) -> str:

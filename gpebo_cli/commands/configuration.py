@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import yaml
@@ -13,6 +13,7 @@ import yaml
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import convert, nearest, read, shown
 from gpebo_cli.settings import (
+    DataSettings,
     ExcitationSettings,
     NoiseSettings,
     ObserverSettings,
@@ -24,6 +25,7 @@ from gpebo_cli.settings import (
 
 _KEYS = (
     "plant",
+    "data",
     "observer",
     "estimator",
     "solver",
@@ -51,7 +53,11 @@ _RANGES = {
     "noise.seed": (0, math.inf),
     "noise.seeds": (1, 1_000_000),
 }
-_POSITIVE = ("time.horizon", "excitation.rho", "excitation.window", "noise.sample_time")
+_OPEN = ("start", "horizon")  # of time: null where the data, or a default, decides
+_POSITIVE = (
+    "time.horizon", "observer.sample_time", "excitation.rho", "excitation.window",
+    "noise.sample_time",
+)
 
 
 def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
@@ -70,10 +76,12 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
                 f"{key}: no such key; the configuration has {', '.join(_KEYS)}"
                 + nearest(str(key), _KEYS)
             )
+    data = read(DataSettings, _group(config, "data"), "data")
     built = Settings(
         plant=config["plant"],
+        data=data,
         estimator=_group(config, "estimator"),
-        time=read(TimeSettings, _group(config, "time"), "time"),
+        time=_time(config, recorded=data.name == "csv"),
         solver=read(SolverSettings, _group(config, "solver"), "solver"),
         observer=read(
             ObserverSettings,
@@ -106,6 +114,20 @@ def _group(config: Mapping[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(section, Mapping):
         raise ConfigError(f"{name}: expected a mapping of keys to values, got {shown(section)}")
     return {str(k): v for k, v in section.items() if k not in _DESCRIPTIVE}
+
+
+def _time(config: Mapping[str, Any], *, recorded: bool) -> TimeSettings:
+    """The span of the experiment; ``null`` is the default, or where a recording begins or ends."""
+    section = {key: value for key, value in _group(config, "time").items()
+               if value is not None or key not in _OPEN}
+    time = read(TimeSettings, section, "time")
+    if not recorded:
+        return time
+    return replace(
+        time,
+        start=time.start if "start" in section else -math.inf,
+        horizon=time.horizon if "horizon" in section else math.inf,
+    )
 
 
 def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:

@@ -27,7 +27,9 @@ def output_folder() -> str:
 
 
 def remove_if_empty(folder: str) -> None:
-    """Remove the folder of a job that failed before it wrote anything."""
+    """Remove the folder of a job that wrote nothing, unless it is where the user stands."""
+    if os.path.realpath(folder) == os.path.realpath(os.curdir):
+        return
     try:
         os.rmdir(folder)
     except OSError:  # not empty: somebody's, or useful

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 
-GROUPS = ("plant", "observer", "estimator", "solver", "noise", "experiment")
+GROUPS = ("plant", "data", "observer", "estimator", "solver", "noise", "experiment")
 
-DATA_GROUPS = ("plant", "observer", "estimator", "solver", "noise")
+DATA_GROUPS = ("plant", "data", "observer", "estimator", "solver", "noise")
 """Groups whose files are values only; an experiment may choose from groups and set anything."""
 
 

@@ -69,7 +69,11 @@ _HEADINGS = {
     "final_error_parameters": "final error, parameters",
     "final_error_states": "final error, states",
 }
-_TIMES = ("seconds_to_1pct_parameters", "seconds_to_1pct_states")
+# Times, and the errors that are not numbers where the truth is not known.
+_TIMES = {
+    "seconds_to_1pct_parameters": "final_error_parameters",
+    "seconds_to_1pct_states": "final_error_states",
+}
 
 
 def case_table(rows: Sequence[Mapping[str, float]], gains: Sequence[str]) -> list[str]:
@@ -81,7 +85,7 @@ def case_table(rows: Sequence[Mapping[str, float]], gains: Sequence[str]) -> lis
         half = _SHOWN_CASES // 2
         chosen = [*range(half), *range(count - half, count)]
     body = [
-        [*(f"{rows[i][g]:g}" for g in gains), *(_cell(n, rows[i][n]) for n in _HEADINGS)]
+        [*(f"{rows[i][g]:g}" for g in gains), *(_cell(n, rows[i]) for n in _HEADINGS)]
         for i in chosen
     ]
     lines = columns([head, *body])
@@ -113,7 +117,10 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def _cell(name: str, value: float) -> str:
+def _cell(name: str, row: Mapping[str, float]) -> str:
+    value = row[name]
+    if math.isnan(row[_TIMES.get(name, name)]):
+        return "unknown"
     if name in _TIMES:
         return f"{value:.3f} s" if math.isfinite(value) else "never"
     return f"{value:.2e}"
@@ -127,7 +134,8 @@ def run_lines(result: RunResult, folder: str = "") -> list[str]:
         lines += case_table(rows, list(result.estimation.cases[0]))
     if result.noise is not None:
         lines += noise_table(result.noise)
-    moved = ", ".join(f"{m.state} {m.given:g} → {m.used:g}" for m in result.simulation.moved)
+    changes = result.simulation.moved if result.simulation else ()
+    moved = ", ".join(f"{m.state} {m.given:g} → {m.used:g}" for m in changes)
     if moved:
         lines.append(f"consistent initial state: {moved}")
     return [*lines, *([folder] if folder else []), result.verdict]

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from gpebo_cli.result import RunResult
+    from gpebo_cli.settings import Settings
+    from gpebo_cli.systems.descriptor import DescriptorSystem
+
+STDIN = "-"  # as data.file: rows are read from standard input, as they come
 
 
 def main(words: list[str]) -> int:
@@ -34,6 +38,8 @@ def main(words: list[str]) -> int:
 
         check_folder(arguments.config_dir, arguments.config_name)
     jobs = _Jobs(arguments)
+    if f"data.file={STDIN}" in arguments.overrides:  # no folder: its estimates go to stdout
+        arguments = arguments.with_override("hydra.run.dir=.")
     call_hydra(arguments, jobs)
     return jobs.finish()
 
@@ -104,9 +110,12 @@ class _Single:
         self._arguments = arguments
         self._error: Exception | None = None
         self._done: tuple[RunResult, str] | None = None
+        self._stream: tuple[Settings, DescriptorSystem] | None = None
 
     def __call__(self, cfg: DictConfig) -> None:
-        from gpebo_cli.commands.job import output_folder, remove_if_empty, run_job
+        from omegaconf import OmegaConf
+
+        from gpebo_cli.commands.job import output_folder, read_job, remove_if_empty, run_job
 
         folder = output_folder()
         if word := self._arguments.of_a_sweep:
@@ -117,6 +126,10 @@ class _Single:
             )
             return
         try:
+            if OmegaConf.select(cfg, "data.file") == STDIN:
+                remove_if_empty(folder)
+                self._stream = read_job(cfg, self._arguments, draw=False)[:2]
+                return
             self._done = run_job(cfg, self._arguments, folder, draw=True), folder
         except Exception as error:  # noqa: BLE001  raised again by finish()
             remove_if_empty(folder)
@@ -126,6 +139,10 @@ class _Single:
         """Print the result, or raise what went wrong."""
         if self._error is not None:
             raise self._error
+        if self._stream is not None:
+            from gpebo_cli.commands import stream
+
+            return stream.run(*self._stream)
         if self._done is not None:
             from gpebo_cli.commands.report import print_run
 

@@ -144,7 +144,10 @@ outputs/runs. OVERRIDES are Hydra's: group=choice, key.subkey=value, in any orde
 groups (the first is the default unless marked):
 {groups}
 other keys, with their defaults:
-  time.start=0 time.horizon=20 time.samples=1001     seconds; samples are the output grid only
+  time.start=null time.horizon=null                  seconds; null: 0 and 20, or the recording's
+  time.samples=1001                                  of the output grid only
+  data.file=FILE data.hold=linear                    a recording: zoh, linear or cubic; -: stdin
+  observer.sample_time=null                          seconds; null: continuous time
   excitation.rho=null excitation.window=null         null: chosen from the regressor, the horizon
   figures=null                                       all, none or [names]; null: none in a sweep
   output.max_rows=100000                             of estimates.csv
@@ -169,6 +172,8 @@ examples:
   gpebo run 'estimator.gamma=logspace(6,12,100)' 'figures=[gains]'    # one run, 100 cases
   gpebo run -m plant=circuit,descriptor estimator=drem,ls_drem        # a run for each of four
   gpebo run noise=gaussian noise.outputs=0.01 noise.seed=1            # noisy outputs
+  gpebo run data.file=rec.csv data.hold=cubic                         # measured, not simulated
+  logger | gpebo run data.file=- estimator=ls_drem                    # a row out for each row in
   gpebo run observer=none time.horizon=5                              # simulate only
   gpebo run experiment=paper_circuit hydra.run.dir=paper              # a recipe, and where to
   gpebo run --config-dir paper --config-name config                   # repeat that run
@@ -190,6 +195,7 @@ def run_help() -> str:
 # As in conf/gpebo.yaml, which is not read: a YAML parser costs more than all the rest of this.
 _DEFAULTS = {
     "plant": "circuit",
+    "data": "none",
     "observer": "gpebo",
     "estimator": "drem",
     "solver": "collocation",

@@ -7,7 +7,7 @@ one as an entry point in the group ``gpebo.estimators``, which names the datacla
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import import_module
@@ -16,13 +16,17 @@ from pathlib import Path
 from typing import cast
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators._recursive import InformationRoot, Recursion
 from gpebo_cli.reading import nearest, read
 from gpebo_cli.regression import Estimates, Estimator
 
 GROUP = "gpebo.estimators"
 """The entry points under which other packages offer estimators."""
 
-__all__ = ["GROUP", "Estimates", "Estimator", "build", "names", "settings_of"]
+__all__ = [
+    "GROUP", "Estimates", "Estimator", "InformationRoot", "Recursion", "build", "names",
+    "recursion", "settings_of",
+]
 
 
 def names() -> list[str]:
@@ -84,3 +88,22 @@ def _load(entry: EntryPoint) -> type:
     if not (isinstance(found, type) and is_dataclass(found)):
         raise ConfigError(f"{where} is not a dataclass; {entry.value} must name one")
     return found
+
+
+def recursion(estimator: Estimator, name: str, parameters: Sequence[str]) -> Recursion:
+    """The estimator called ``name`` at samples.
+
+    Raises:
+        ConfigError: there is it in continuous time only; names those that there are at samples.
+    """
+    make = getattr(estimator, "recursive", None)
+    if make is None:
+        there = [
+            other for other in sorted(_ours())
+            if hasattr(import_module(f"{__name__}.{other}").ESTIMATOR, "recursive")
+        ]
+        raise ConfigError(
+            f"estimator={name} works in continuous time only; at samples there are "
+            f"{', '.join(there)}"
+        )
+    return cast(Recursion, make(parameters))

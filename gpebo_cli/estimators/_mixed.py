@@ -78,6 +78,27 @@ class MixedSettings(Protocol):
         ...
 
 
+def energy_requirement(
+    condition: str, gain: float, energy: float, needed: float = ONE_PERCENT,
+    needed_for: str = "1 % of the initial error",
+) -> Requirement:
+    """Whether ∫Δ² is enough at the smallest gain: the error shrinks by e^{−γ∫Δ²}."""
+    reached = gain * energy
+    return Requirement(
+        name=condition,
+        holds=reached >= needed,
+        evidence={
+            "integral_delta_squared": energy,
+            "gamma_times_integral": reached,
+            "needed": needed,
+        },
+        text=(
+            f"γ∫Δ² = {reached:.3g} at the smallest gain {gain:.3g}; "
+            f"{needed_for} needs {needed:.3g}"
+        ),
+    )
+
+
 # (η̂ (g, M, P), γ∫Δ² (g, M, P or 1), η̂ at the start (P,)) -> estimates
 Transform = Callable[[Array, Array, Array], Array]
 
@@ -103,21 +124,9 @@ class MixedEstimates:
     @property
     def requirement(self) -> Requirement:
         """γ∫Δ² over the horizon: the error has shrunk by its exponential."""
-        gain = float(self.gains.min())
         energies = [float(path.energy_at_t[-1]) for path in self.groups]
-        reached = gain * min(energies)
-        return Requirement(
-            name=self.condition,
-            holds=reached >= self.needed,
-            evidence={
-                "integral_delta_squared": min(energies),
-                "gamma_times_integral": reached,
-                "needed": self.needed,
-            },
-            text=(
-                f"γ∫Δ² = {reached:.3g} at the smallest gain {gain:.3g}; "
-                f"{self.needed_for} needs {self.needed:.3g}"
-            ),
+        return energy_requirement(
+            self.condition, float(self.gains.min()), min(energies), self.needed, self.needed_for
         )
 
     def parameters(self, cases: slice) -> Array:

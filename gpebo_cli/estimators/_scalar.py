@@ -91,7 +91,7 @@ def _closed_form(
     jump[:, -1] = following - path.quotient[:, -1]
     left = path.quotient[:, :-1].reshape(-1, 1, p)
     change = change.reshape(-1, 1, p)
-    shift = -_mean_decay(x) * change - jump.reshape(-1, 1, p)
+    shift = -mean_decay(x) * change - jump.reshape(-1, 1, p)
     distance = affine_scan(np.exp(-x), shift, start - left[0])[:-1]  # at each left end
 
     sampler = path.mesh.sampler(path.t)
@@ -103,11 +103,11 @@ def _closed_form(
     partial = np.clip(path.energy_at_t - path.energy[element, index], 0.0, step)
     share = np.divide(partial, step, out=np.zeros_like(partial), where=step > 0)[:, None, None]
     x = gains * partial[:, None, None]
-    eta = left[n] + np.exp(-x) * distance[n] + share * (1.0 - _mean_decay(x)) * change[n]
+    eta = left[n] + np.exp(-x) * distance[n] + share * (1.0 - mean_decay(x)) * change[n]
     return np.ascontiguousarray(np.swapaxes(eta, 0, 1))
 
 
-def _mean_decay(x: Array) -> Array:
+def mean_decay(x: Array) -> Array:
     """(1 − e^{−x})/x and its limit 1."""
     return np.divide(-np.expm1(-x), x, out=np.ones_like(x), where=x > 0.0)
 

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from gpebo_cli.estimators._base import combinations
+from gpebo_cli.estimators._base import combinations, per_parameter
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import MixedEstimates, estimate_mixed, gain_axis
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.estimators._mixed import (
+    MixedEstimates,
+    energy_requirement,
+    estimate_mixed,
+    filter_rates,
+    gain_axis,
+    gain_matrix,
+)
+from gpebo_cli.estimators._recursive import (
+    KreisselmeierFilter,
+    SampledEstimates,
+    ScalarLaw,
+    mix_sampled,
+)
+from gpebo_cli.regression import LinearRegression, SampledRegression
+from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
 
@@ -36,9 +50,34 @@ class Drem:
         """One case per gain; a gain per parameter is one case."""
         return combinations(gain_axis(self.gamma, "estimator.gamma"))
 
+    def recursive(self, parameters: Sequence[str]) -> RecursiveDrem:
+        """The same at samples."""
+        return RecursiveDrem(self, parameters)
+
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
         """Extend, mix, and keep what the closed form needs at the times t (M,)."""
         return estimate_mixed(regression, t, kreisselmeier, self)
+
+
+class RecursiveDrem:
+    """DREM at samples: filters of held signals, mixing, a closed-form step of the scalar law."""
+
+    def __init__(self, settings: Drem, parameters: Sequence[str]) -> None:
+        names = tuple(parameters)
+        self._filter = KreisselmeierFilter(filter_rates(settings.rates, names))
+        self._gains = gain_matrix(settings.gamma, names, "estimator.gamma")
+        start = per_parameter(settings.initial, names, "estimator.initial")
+        self._law = ScalarLaw(start, self._gains, 1)
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each."""
+        return self._law.update(regression, *mix_sampled(self._filter.update(regression)))
+
+    @property
+    def requirement(self) -> Requirement:
+        """γ∫Δ² so far."""
+        energy = float(self._law.energy[0])
+        return energy_requirement("Δ not in L2", float(self._gains.min()), energy)
 
 
 ESTIMATOR = Drem

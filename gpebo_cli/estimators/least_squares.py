@@ -10,7 +10,8 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import axis, combinations, number, per_parameter
 from gpebo_cli.estimators._information import Spectrum, information
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.estimators._recursive import InformationRoot, SampledEstimates, spectrum
+from gpebo_cli.regression import LinearRegression, SampledRegression
 from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
@@ -77,6 +78,18 @@ class LeastSquares:
             out.append(made[key])
         return out
 
+    def recursive(self, parameters: Sequence[str]) -> RecursiveLeastSquares:
+        """The same at samples.
+
+        Raises:
+            ConfigError: forgetting with a bound, which there is in continuous time only.
+        """
+        if self.bound is not None:
+            raise ConfigError(
+                "estimator.bound works in continuous time only; at samples leave it null"
+            )
+        return RecursiveLeastSquares(self, parameters)
+
     def estimate(self, regression: LinearRegression, t: Array) -> LeastSquaresEstimates:
         """Everything but the gains, at the times t (M,)."""
         return LeastSquaresEstimates(
@@ -109,13 +122,7 @@ class LeastSquaresEstimates:
             else np.inf
             for case, s in zip(self.cases, self.spectra, strict=True)
         ]
-        reached = float(min(ratios))
-        return Requirement(
-            name="λ_min(G) → ∞",
-            holds=reached >= 99.0,
-            evidence={"alpha_lambda_min_over_f0": reached, "needed": 99.0},
-            text=f"α λ_min(G)/f₀ = {reached:.3g}; 1 % of the initial error needs 99",
-        )
+        return ratio_requirement(float(min(ratios)))
 
     def parameters(self, cases: slice) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c)."""
@@ -124,6 +131,51 @@ class LeastSquaresEstimates:
             for case, spectrum in zip(self.cases[cases], self.spectra[cases], strict=True)
         ])
         return eta.reshape(*eta.shape[:3], *self.realisations)
+
+
+def ratio_requirement(reached: float) -> Requirement:
+    """Whether α λ_min(G)/f₀ is enough."""
+    return Requirement(
+        name="λ_min(G) → ∞",
+        holds=reached >= 99.0,
+        evidence={"alpha_lambda_min_over_f0": reached, "needed": 99.0},
+        text=f"α λ_min(G)/f₀ = {reached:.3g}; 1 % of the initial error needs 99",
+    )
+
+
+class RecursiveLeastSquares:
+    """Least squares at samples, every case from one factor per forgetting rate."""
+
+    def __init__(self, settings: LeastSquares, parameters: Sequence[str]) -> None:
+        self._cases = settings.cases
+        self._start = per_parameter(settings.initial, parameters, "estimator.initial")
+        betas, self._which = np.unique([c["beta"] for c in self._cases], return_inverse=True)
+        self._root = InformationRoot(len(parameters), betas)
+        self._ratios = np.zeros(len(self._cases))
+
+    def spectra(self, regression: SampledRegression) -> list[Spectrum]:
+        """The spectrum of G_z at the samples, of every case."""
+        roots, memory = self._root.update(regression)
+        found = [spectrum(roots[:, d], memory[:, d]) for d in range(roots.shape[1])]
+        return [found[d] for d in self._which]
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each."""
+        spectra = self.spectra(regression)
+        self._ratios = np.array([
+            case["alpha"] * s.eigenvalues[-1].min(initial=np.inf) / (case["f0"] * s.memory[-1])
+            for case, s in zip(self._cases, spectra, strict=True)
+        ])
+        solved = [
+            solution(s, case["alpha"], case["f0"], self._start)
+            for case, s in zip(self._cases, spectra, strict=True)
+        ]
+        return SampledEstimates(np.array(solved), None)
+
+    @property
+    def requirement(self) -> Requirement:
+        """α λ_min(G)/f₀ so far."""
+        return ratio_requirement(float(self._ratios.min()))
 
 
 def solution(s: Spectrum, alpha: float, f0: float, start: Array) -> Array:

@@ -6,18 +6,25 @@ estimator that Proposition 1 needs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.estimators._base import combinations, per_parameter
 from gpebo_cli.estimators._information import Information, Spectrum, information
-from gpebo_cli.estimators._mixed import MixedEstimates, gain_axis, gain_matrix
+from gpebo_cli.estimators._mixed import (
+    MixedEstimates,
+    energy_requirement,
+    gain_axis,
+    gain_matrix,
+)
 from gpebo_cli.estimators._mixing import SINGULAR, filled
+from gpebo_cli.estimators._recursive import SampledEstimates, ScalarLaw, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import LinearRegression, SampledRegression
+from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array, BoolArray
 
 
@@ -54,6 +61,14 @@ class LsDrem:
             {**self.least_squares.axes(), **gain_axis(self.gamma, "estimator.gamma")}
         )
 
+    def recursive(self, parameters: Sequence[str]) -> RecursiveLsDrem:
+        """The same at samples.
+
+        Raises:
+            ConfigError: forgetting with a bound, which there is in continuous time only.
+        """
+        return RecursiveLsDrem(self, parameters)
+
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,)."""
         part = self.least_squares
@@ -73,6 +88,37 @@ class LsDrem:
             condition="IE",
             realisations=regression.realisations,
         )
+
+
+class RecursiveLsDrem:
+    """LS+DREM at samples: least squares, mixing, and a closed-form step of the scalar law."""
+
+    def __init__(self, settings: LsDrem, parameters: Sequence[str]) -> None:
+        part = settings.least_squares
+        self._part, self._cases = part.recursive(parameters), part.cases
+        self._gains = gain_matrix(settings.gamma, parameters, "estimator.gamma")
+        start = per_parameter(settings.initial, parameters, "estimator.initial")
+        self._law = ScalarLaw(start, self._gains, len(self._cases))
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each."""
+        spectra = self._part.spectra(regression)
+        delta = [
+            np.prod(_shares(s, case["alpha"], case["f0"]), axis=1)
+            for s, case in zip(spectra, self._cases, strict=True)
+        ]
+        found = [quotient_of(s) for s in spectra]
+        return self._law.update(
+            regression,
+            np.stack(delta, axis=1),
+            np.stack([quotient for quotient, _ in found], axis=1),
+            np.stack([usable for _, usable in found], axis=1),
+        )
+
+    @property
+    def requirement(self) -> Requirement:
+        """γ∫Δ² so far."""
+        return energy_requirement("IE", float(self._gains.min()), float(self._law.energy.min()))
 
 
 def mix_least_squares(

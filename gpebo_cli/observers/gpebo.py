@@ -187,7 +187,7 @@ def observer_matrices(
         split = _constant_split(E, system.states, rank_tol)
     else:
         frame = like.split.frame
-        split = None if frame is None else _split_in_frame(E, frame, rank_tol)
+        split = None if frame is None else split_in_frame(E, frame, rank_tol)
     if split is None:
         slope = c if turning else system.coefficients.taylor(t, 1, inside)
         dE = slope.E[1][: len(E)] / rows[:, None]
@@ -242,17 +242,17 @@ def _constant_split(E: Array, states: tuple[str, ...], rank_tol: float) -> Split
     if len(rows) == len(columns):
         free, unused = ~used.any(axis=1), ~used.any(axis=0)
         frame = Frame(axes[:, columns], axes[:, rows], axes[:, unused], axes[free])
-        split = _split_in_frame(E, frame, rank_tol)
+        split = split_in_frame(E, frame, rank_tol)
         if split is not None:
             return split
     U, sigma, Vt = np.linalg.svd(E[0])
     rank = int((sigma > rank_tol * np.linalg.norm(E, axis=(1, 2)).max()).sum())
     U1, V2 = U[:, :rank], Vt[rank:].T
     domain, _ = initial_basis(Vt[:rank].T @ Vt[:rank], rank, states)
-    return _split_in_frame(E, Frame(domain, U1, V2, orthonormal_complement(U1)), rank_tol)
+    return split_in_frame(E, Frame(domain, U1, V2, orthonormal_complement(U1)), rank_tol)
 
 
-def _split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
+def split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
     """E⁺ = B (UᵀE B)⁻¹ Uᵀ, or None where kernel, range or rank are not those of the frame."""
     B, U = frame.domain, frame.range
     rank = B.shape[1]

@@ -87,12 +87,15 @@ class InitialError:
     initial_basis: Array  # (n, n_a) V1, orthonormal basis of range P(start)
     xi_a0: Array  # (n_a,)
     basis: Array  # (n, k) in whose coordinates the extension is integrated, k = n_a or n
-    extension: Trajectory  # [ξ_a | ξ_b | Φ], shape (k, 1 + p)
+    extension: Callable[[Array], Array]  # times (M,) -> [ξ_a | ξ_b | Φ], (M, k, 1 + p)
 
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """η at the times t (M,), shape (M, p)."""
         if not (np.diff(theta, axis=0) != 0.0).any() or np.isnan(theta).any():
-            e0 = self.xi_a0 - self.initial_basis.T @ states.values[0, 0]
+            start = states.values[0, 0]
+            # A state that nobody knows (NaN) does not spoil components it has no part in.
+            parts = np.where(self.initial_basis == 0.0, 0.0, self.initial_basis * start[:, None])
+            e0 = self.xi_a0 - parts.sum(axis=0)
             return np.concatenate([theta, np.broadcast_to(e0, (len(t), len(e0)))], axis=1)
         q = theta.shape[1]
         W = self.extension(t)

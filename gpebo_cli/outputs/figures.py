@@ -43,13 +43,14 @@ MIN_GAINS = 3  # fewer points are not a curve over the gain
 
 def states(result: RunResult) -> list[Panel]:
     """Fig. 3: the true states over time, one panel per unit."""
-    simulation, names = result.simulation, result.system.states
-    return _by_unit(result, "states", names, simulation.t, simulation.states)
+    known, names = _known(result), result.system.states
+    shown = result.signals.states[:, known]
+    return _by_unit(result, "states", [names[i] for i in known], result.signals.t, shown)
 
 
 def signals(result: RunResult) -> list[Panel]:
     """Inputs and outputs over time: all an observer gets to see, beside the truth if it differs."""
-    s, system = result.simulation, result.system
+    s, system = result.signals, result.system
     return [
         *_by_unit(result, "inputs", system.inputs, s.t, s.inputs, s.measured_inputs),
         *_by_unit(result, "outputs", system.outputs, s.t, s.outputs, s.measured_outputs),
@@ -133,7 +134,8 @@ def parameter_error(result: RunResult) -> list[Panel]:
     if estimation is None:
         return []
     truth = estimation.true_parameters
-    size = np.max(np.abs(truth), axis=0)
+    known = np.flatnonzero(~np.isnan(truth).any(axis=0))
+    size = np.nan_to_num(np.max(np.abs(truth), axis=0))
     largest = float(np.max(size, initial=0.0))  # the measure of one that is zero
     curves = [
         (
@@ -143,7 +145,7 @@ def parameter_error(result: RunResult) -> list[Panel]:
             float(size[i]) or largest,
         )
         for i, name in enumerate(estimation.names)
-        if not result.system.theta_varies or name in result.system.unknowns
+        if i in known and (not result.system.theta_varies or name in result.system.unknowns)
     ]
     return _errors(result, estimation, curves)
 
@@ -221,6 +223,8 @@ def gains(result: RunResult) -> list[Panel]:
             for k, (label, column) in enumerate(pairs)
         )
 
+    if np.isnan(metrics.final_error_parameters).all() and not _known(result):
+        return []
     final = over_gain(metrics.final_error_parameters, metrics.final_error_states)
     seconds = over_gain(metrics.seconds_to_1pct_parameters, metrics.seconds_to_1pct_states)
     size = max(_parameter_size(result), _state_size(result))
@@ -276,7 +280,7 @@ def describe(
         ConfigError: a name is unknown; at once, not at the first figure.
     """
     if names is None:
-        noisy = result.simulation.measured_outputs is not None
+        noisy = result.signals.measured_outputs is not None
         plain = result.estimation is None or noisy
         names = [name for name in FIGURES if name != "signals" or plain]
     wanted = list(dict.fromkeys(names))
@@ -336,13 +340,19 @@ def _by_unit(
 
 def truth_at(result: RunResult, t: Array) -> Array:
     """True states (M, n) at the times t (M,) of the estimates, which are some of the output's."""
-    simulation = result.simulation
-    if len(t) == len(simulation.t):
-        return simulation.states
+    signals = result.signals
+    if len(t) == len(signals.t):
+        return signals.states
     # The middle between two neighbours: rounding of a time does not choose another row.
-    nearest = np.searchsorted(0.5 * (simulation.t[1:] + simulation.t[:-1]), t)
-    states: Array = simulation.states[nearest]
+    nearest = np.searchsorted(0.5 * (signals.t[1:] + signals.t[:-1]), t)
+    states: Array = signals.states[nearest]
     return states
+
+
+def _known(result: RunResult) -> list[int]:
+    """Those of the states whose truth is known: all but those a recording does not have."""
+    unknown = np.isnan(result.signals.states).all(axis=0)
+    return [int(i) for i in np.flatnonzero(~unknown)]
 
 
 def _shown_cases(estimation: EstimationResult) -> list[int]:
@@ -376,40 +386,39 @@ def _parameter_size(result: RunResult) -> float:
     if result.estimation is None:
         return 0.0
     truth = result.estimation.true_parameters
-    return float(np.max(np.linalg.norm(truth, axis=1), initial=0.0))
+    known = truth[:, ~np.isnan(truth).any(axis=0)]
+    return float(np.max(np.linalg.norm(known, axis=1), initial=0.0))
 
 
 def _state_size(result: RunResult) -> float:
     """The largest norm of the states that the observer sees."""
-    seen = result.simulation.states[:, _seen(result, range(len(result.system.states)))]
+    seen = result.signals.states[:, _seen(result, _known(result))]
     return float(np.max(np.linalg.norm(seen, axis=1), initial=0.0))
 
 
 def _norm_panels(named: Sequence[tuple[str, RunResult, int]], note: str) -> list[Panel]:
     """Norms of the errors of parameters and of states: a curve per label, run and case."""
-    of_parameters, of_states = [], []
+    of_parameters: list[Curve] = []
+    of_states: list[Curve] = []
     sizes = [0.0, 0.0]
     for k, (label, result, case) in enumerate(named):
         estimation = result.estimation
         if estimation is None:
             continue
         parameters = estimation.parameters[case] - estimation.true_parameters
-        seen = _seen(result, range(len(result.system.states)))
+        parameters = parameters[:, ~np.isnan(estimation.true_parameters).any(axis=0)]
+        seen = _seen(result, _known(result))
         states = (estimation.states[case] - truth_at(result, estimation.t))[:, seen]
-        of_parameters.append(
-            Curve(estimation.t, np.linalg.norm(parameters, axis=1), label, line(k))
-        )
-        of_states.append(Curve(estimation.t, np.linalg.norm(states, axis=1), label, line(k)))
+        for curves, errors in ((of_parameters, parameters), (of_states, states)):
+            if errors.shape[1]:
+                curves.append(Curve(estimation.t, np.linalg.norm(errors, axis=1), label, line(k)))
         sizes = [max(sizes[0], _parameter_size(result)), max(sizes[1], _state_size(result))]
-    if not of_parameters:
-        return []
-    return [
-        Panel(
-            "‖parameter error‖", tuple(of_parameters), log=True, size=sizes[0], legend=True,
-            note=note,
-        ),
+    panels = [
+        Panel("‖parameter error‖", tuple(of_parameters), log=True, size=sizes[0]),
         Panel("‖state error‖", tuple(of_states), log=True, size=sizes[1]),
     ]
+    panels = [panel for panel in panels if panel.curves]
+    return [replace(panel, legend=True, note=note) for panel in panels[:1]] + panels[1:]
 
 
 def _note(estimation: EstimationResult, shown: Sequence[int]) -> str:
@@ -438,14 +447,15 @@ def _estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
     members = _seen(result, members)
     if estimation is None or not members:
         return []
-    simulation, system = result.simulation, result.system
+    signals, system = result.signals, result.system
+    known = _known(result)
     shown = _shown_cases(estimation)
     labels = _case_labels(result, estimation, shown)
     panels = []
     for i in members:
-        truth = simulation.states[:, i]
+        truth = signals.states[:, i]
         name = system.states[i]
-        curves = [Curve(simulation.t, truth, "true", style.TRUTH)]
+        curves = [Curve(signals.t, truth, "true", style.TRUTH)] if i in known else []
         curves += [
             Curve(estimation.t, estimation.states[case, :, i], label, line(k))
             for k, (case, label) in enumerate(zip(shown, labels, strict=True))
@@ -461,7 +471,9 @@ def _estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
             Panel(
                 with_unit(name, system.units.get(name, "")),
                 tuple(curves),
-                limits=_estimate_limits(truth, estimation.states[shown, :, i]),
+                limits=(
+                    _estimate_limits(truth, estimation.states[shown, :, i]) if i in known else None
+                ),
                 legend=i == members[0],
                 note=_note(estimation, shown) if i == members[0] else "",
             )
@@ -486,8 +498,8 @@ def _estimate_limits(truth: Array, guesses: Array) -> tuple[float, float]:
 
 
 def _state_errors(result: RunResult, members: Sequence[int]) -> list[Panel]:
-    estimation = result.estimation
-    members = _seen(result, members)
+    estimation, known = result.estimation, _known(result)
+    members = [i for i in _seen(result, members) if i in known]
     if estimation is None or not members:
         return []
     truth = truth_at(result, estimation.t)

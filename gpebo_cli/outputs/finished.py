@@ -90,7 +90,7 @@ def read_errors(cases: Sequence[Case]) -> list[ErrorCurves]:
 
 
 def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
-    truth: Mapping[str, float] = _summary(folder).get("parameters") or {}
+    truth: Mapping[str, float | None] = _summary(folder).get("parameters") or {}
     path = folder / "estimates.csv"
     kept: dict[int, list[dict[str, str]]] = {number: [] for number in sorted(numbers)}
     for row in _rows(path):
@@ -108,10 +108,15 @@ def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
         nearest = np.searchsorted(middles, t)  # the estimates are on some of the signals' times
         names = [name.removesuffix("_hat") for name in columns if name.endswith("_hat")]
         # Parameters stand first; a state may have the name of one.
-        states = [s for s in names[len(truth) :] if not np.isnan(columns[f"{s}_hat"]).all()]
+        states = [
+            s for s in names[len(truth) :]
+            if s in signals and not np.isnan(columns[f"{s}_hat"]).all()
+        ]
+        # Of a recording, not every true value is known.
+        known = {name: float(value) for name, value in truth.items() if value is not None}
         of_parameters = [
             columns[f"{name}_hat"] - columns.get(f"{name}_true", value)
-            for name, value in truth.items()
+            for name, value in known.items()
         ]
         true_states = [signals[name][nearest] for name in states]
         of_states = [
@@ -121,7 +126,7 @@ def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
             t,
             _norm(of_parameters, len(t)),
             _norm(of_states, len(t)),
-            float(np.linalg.norm(list(truth.values()))),
+            float(np.linalg.norm(list(known.values()))),
             float(_norm(true_states, len(t)).max(initial=0.0)),
         )
     return out

@@ -42,7 +42,7 @@ def write_run(
     _remove_earlier(folder)
 
     write_text(folder / "config.yaml", config_text)
-    tables.write_signals(folder / "signals.csv", result.system, result.simulation)
+    tables.write_signals(folder / "signals.csv", result.system, result.signals)
     regression, estimation = result.regression, result.estimation
     if regression is not None:
         tables.write_regression(folder / "regression.csv", regression)

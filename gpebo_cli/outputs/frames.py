@@ -39,7 +39,7 @@ def frame(result: RunResult, name: str) -> DataFrame:
         )
     regression, estimation = result.regression, result.estimation
     builders: dict[str, Callable[[], DataFrame]] = {
-        "signals": lambda: _by_time(tables.signals_table(result.system, result.simulation))
+        "signals": lambda: _by_time(tables.signals_table(result.system, result.signals))
     }
     if regression is not None:
         builders["regression"] = lambda: _by_time(tables.regression_table(regression))

@@ -14,11 +14,15 @@ from gpebo_cli.outputs.provenance import Provenance
 from gpebo_cli.result import (
     EstimationResult,
     Excitation,
+    Fit,
     Metrics,
+    RecordingResult,
     Requirement,
     RunResult,
+    SimulationResult,
     StateChange,
 )
+from gpebo_cli.systems.descriptor import DescriptorSystem
 
 MAX_LISTED_CASES = 100  # beyond, cases.csv is the place to look and the summary gives ranges
 
@@ -41,21 +45,11 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "reference": system.reference,
         "observer": result.settings.observer.name,
         "estimator": dict(result.settings.estimator) if estimation else None,
-        "noise": asdict(result.settings.noise) if simulation.measured_outputs is not None else None,
-        "index": simulation.index,
-        "strangeness_index": simulation.strangeness_index,
-        "differential": simulation.differential,
-        "algebraic": simulation.algebraic,
-        "initial_state": {
-            "given": dict(zip(system.states, system.initial_state, strict=True)),
-            "used": dict(zip(system.states, simulation.initial_state, strict=True)),
-            "moved": {change.state: _change(change) for change in simulation.moved},
-        },
-        "jumps": [
-            {"time": change.time, "state": change.state, **_change(change)}
-            for change in simulation.jumps
-        ],
-        "impulses": [{"time": time, "state": state} for time, state in simulation.impulses],
+        "noise": (
+            asdict(result.settings.noise) if result.signals.measured_outputs is not None else None
+        ),
+        **_simulation(system, simulation),
+        "recording": _recording(result.recording),
         "parameters": _parameters(result.estimation),
         "assumptions": [
             {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
@@ -65,10 +59,11 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "estimator_requirement": _requirement(estimation),
         "cases": _cases(estimation, result.metrics),
         "error_estimate": {
-            "states": simulation.error_estimate,
+            "states": simulation.error_estimate if simulation else None,
             "regression": regression.error_estimate if regression else None,
         },
-        "elements": simulation.elements,
+        "fit": _fit(result.fit),
+        "elements": simulation.elements if simulation else None,
         "timings": dict(result.timings),
         "versions": made_by.versions,
         "git": {"commit": made_by.git.commit, "dirty": made_by.git.dirty} if made_by.git else None,
@@ -94,6 +89,51 @@ def plain(value: object) -> Any:
 
 def _change(change: StateChange) -> dict[str, float]:
     return {"from": change.given, "to": change.used, "change": change.used - change.given}
+
+
+def _simulation(
+    system: DescriptorSystem, simulation: SimulationResult | None
+) -> dict[str, Any]:
+    """Index, consistent start and jumps of the simulated plant; None for each of a recording."""
+    if simulation is None:
+        keys = ("index", "strangeness_index", "differential", "algebraic", "initial_state",
+                "jumps", "impulses")
+        return dict.fromkeys(keys)
+    return {
+        "index": simulation.index,
+        "strangeness_index": simulation.strangeness_index,
+        "differential": simulation.differential,
+        "algebraic": simulation.algebraic,
+        "initial_state": {
+            "given": dict(zip(system.states, system.initial_state, strict=True)),
+            "used": dict(zip(system.states, simulation.initial_state, strict=True)),
+            "moved": {change.state: _change(change) for change in simulation.moved},
+        },
+        "jumps": [
+            {"time": change.time, "state": change.state, **_change(change)}
+            for change in simulation.jumps
+        ],
+        "impulses": [{"time": time, "state": state} for time, state in simulation.impulses],
+    }
+
+
+def _recording(recording: RecordingResult | None) -> dict[str, Any] | None:
+    if recording is None:
+        return None
+    names = ("file", "sha256", "rows", "hold", "first", "last", "known_states", "elements")
+    return {name: getattr(recording, name) for name in names}
+
+
+def _fit(fit: Fit | None) -> dict[str, Any] | None:
+    if fit is None:
+        return None
+    listed = fit.residual if len(fit.residual) <= MAX_LISTED_CASES else None
+    finite = fit.residual[np.isfinite(fit.residual)]
+    return {
+        "rms_Y": fit.size,
+        "rms_residual": listed,
+        "least_rms_residual": finite.min() if finite.size else None,
+    }
 
 
 def _parameters(estimation: EstimationResult | None) -> dict[str, float] | None:

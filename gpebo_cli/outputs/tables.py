@@ -22,7 +22,7 @@ from gpebo_cli.result import (
     Metrics,
     NoiseStatistics,
     RegressionResult,
-    SimulationResult,
+    SignalsResult,
 )
 from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
@@ -37,13 +37,14 @@ class Table:
     rows: Array
 
 
-def signals_table(system: DescriptorSystem, simulation: SimulationResult) -> Table:
-    """``t``, inputs, outputs and true states, by name; what was measured, if it differs."""
-    header = ["t", *system.inputs, *system.outputs, *system.states]
-    columns = [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
+def signals_table(system: DescriptorSystem, signals: SignalsResult) -> Table:
+    """``t``, inputs, outputs and true states that are known; what was measured, if it differs."""
+    known = np.flatnonzero(~np.isnan(signals.states).all(axis=0))
+    header = ["t", *system.inputs, *system.outputs, *(system.states[i] for i in known)]
+    columns = [signals.t, signals.inputs, signals.outputs, signals.states[:, known]]
     for names, seen in (
-        (system.inputs, simulation.measured_inputs),
-        (system.outputs, simulation.measured_outputs),
+        (system.inputs, signals.measured_inputs),
+        (system.outputs, signals.measured_outputs),
     ):
         if seen is not None:
             header += [f"{name}_measured" for name in names]
@@ -51,9 +52,9 @@ def signals_table(system: DescriptorSystem, simulation: SimulationResult) -> Tab
     return Table(header, np.column_stack(columns))
 
 
-def write_signals(path: Path, system: DescriptorSystem, simulation: SimulationResult) -> None:
+def write_signals(path: Path, system: DescriptorSystem, signals: SignalsResult) -> None:
     """Write :func:`signals_table`."""
-    write_file(path, _lines(signals_table(system, simulation)))
+    write_file(path, _lines(signals_table(system, signals)))
 
 
 def regression_table(regression: RegressionResult) -> Table:

@@ -1,0 +1,177 @@
+"""Estimators in discrete time: one update per sample, memory that does not grow.
+
+Least squares is kept as a triangular factor S of [G_z | h_z] (square-root information form),
+
+    SᵀS = ∫ (z(t)/z(s)) [ψ | Y]ᵀ[ψ | Y] ds,
+
+updated by an orthogonal transformation of [√(z₊/z) S; √h [ψ | Y]]: no squares are formed, so G_z
+may have the square of the condition number that normal equations survive. All gains of least
+squares and of LS+DREM share S. The scalar law is a closed form over each sample, stable for any
+gain and any sample time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from gpebo_cli.estimators._information import Spectrum
+from gpebo_cli.estimators._scalar import mean_decay
+from gpebo_cli.linalg import affine_scan, determinant_and_adjugate_action
+from gpebo_cli.regression import SampledRegression, outer_products
+from gpebo_cli.result import Requirement
+from gpebo_cli.systems.descriptor import Array, BoolArray
+
+_SINGULAR = 1e-10  # below this ratio of singular values of S the quotient 𝐘/Δ is rounding
+_SINGULAR_FILTER = 1e-14  # the same for Ω, where squares have been formed
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledEstimates:
+    """η̂ of every case at K samples."""
+
+    parameters: Array  # (G, K, p)
+    delta: Array | None  # (1 or G, K), None where nothing is mixed
+
+
+class Recursion(Protocol):
+    """An estimator that takes samples as they come; it changes as it does so."""
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each."""
+        ...
+
+    @property
+    def requirement(self) -> Requirement:
+        """What the estimator needs of the regressor, and what it got so far."""
+        ...
+
+
+class InformationRoot:
+    """S, one for each forgetting rate β."""
+
+    def __init__(self, p: int, beta: Array) -> None:
+        self._beta = beta  # (D,)
+        self._root = np.zeros((len(beta), p + 1, p + 1))
+        self.memory = np.ones(len(beta))  # z
+
+    def update(self, regression: SampledRegression) -> tuple[Array, Array]:
+        """S (K, D, p + 1, p + 1) and z (K, D) at the samples."""
+        decay = np.exp(-0.5 * regression.steps[:, None] * self._beta)  # √(z₊/z)
+        rows = regression.weighted()
+        K, D = decay.shape
+        size = self._root.shape[-1]
+        out = np.empty((K, D, size, size))
+        stacked = np.empty((D, size + rows.shape[1], size))
+        for k in range(K):
+            stacked[:, :size] = decay[k][:, None, None] * self._root
+            stacked[:, size:] = rows[k]
+            out[k] = np.linalg.qr(stacked, mode="r")
+            self._root = out[k]
+        self._root = out[-1].copy()  # not a view that keeps all of them
+        memory = np.maximum(self.memory * np.cumprod(decay**2, axis=0), _TINY)
+        self.memory = memory[-1]
+        return out, memory
+
+
+def spectrum(root: Array, memory: Array) -> Spectrum:
+    """G_z = V diag(σ²) Vᵀ and Vᵀh_z = σ c from S = [U diag(σ) Vᵀ | U c], shape (K, …)."""
+    p = root.shape[-1] - 1
+    if p == 0:
+        none = np.zeros((len(root), 0))
+        return Spectrum(none, none[:, :, None], none, memory)
+    U, sigma, Vt = np.linalg.svd(root[..., :p, :p])
+    order = np.arange(p)[::-1]  # ascending, as of eigenvalues
+    U, sigma, Vt = U[..., order], sigma[..., order], Vt[..., order, :]
+    coordinates = np.einsum("...ji,...j->...i", U, root[..., :p, p])
+    return Spectrum(sigma**2, np.swapaxes(Vt, -1, -2), sigma * coordinates, memory)
+
+
+def quotient_of(s: Spectrum) -> tuple[Array, BoolArray]:
+    """𝐘/Δ = G_z⁻¹ h_z (K, p), and where it is more than rounding (K,)."""
+    largest = s.eigenvalues[:, -1:] if s.eigenvalues.shape[1] else np.zeros((len(s.memory), 1))
+    usable = (s.eigenvalues > _SINGULAR**2 * largest).all(axis=1) & (largest[:, 0] > 0.0)
+    inverse = np.divide(
+        s.rotated, s.eigenvalues, out=np.zeros_like(s.rotated), where=usable[:, None]
+    )
+    return np.einsum("mij,mj->mi", s.vectors, inverse), usable
+
+
+class ScalarLaw:
+    """η̂' = γΔ(𝐘 − Δη̂) over each sample, for D mixed regressions with g gains each."""
+
+    def __init__(self, start: Array, gains: Array, groups: int) -> None:
+        self._gains = gains  # (g, 1 or p)
+        self._eta = np.broadcast_to(start, (groups, len(gains), len(start))).copy()
+        self._delta = np.zeros((1, groups))
+        self._quotient: Array | None = None
+        self._usable = np.zeros((1, groups), dtype=bool)
+        self.energy = np.zeros(groups)  # ∫Δ² so far, (D,)
+
+    def update(
+        self, regression: SampledRegression, delta: Array, quotient: Array, usable: BoolArray
+    ) -> SampledEstimates:
+        """One closed-form step per sample.
+
+        Args:
+            regression: its steps and its hold rule.
+            delta: Δ (K, D).
+            quotient: η̄ = 𝐘/Δ (K, D, p).
+            usable: where η̄ is more than rounding (K, D); elsewhere its weight Δ² is nothing.
+        """
+        before = quotient[:1] if self._quotient is None else self._quotient
+        previous = np.concatenate([before, quotient[:-1]])
+        had = np.concatenate([self._usable, usable[:-1]])
+        earlier = np.concatenate([self._delta, delta[:-1]])
+        square = delta**2 if regression.hold == "zoh" else 0.5 * (delta**2 + earlier**2)
+        energy = np.where(usable, regression.steps[:, None] * square, 0.0)  # (K, D)
+        x = self._gains * energy[:, :, None, None]  # (K, D, g, 1 or p)
+        decay = np.exp(-x)
+        new, old = quotient[:, :, None], np.where(had[..., None], previous, quotient)[:, :, None]
+        if regression.hold == "zoh":
+            shift = -np.expm1(-x) * new
+        else:  # η̄ linear in ∫Δ² between the samples
+            mean = mean_decay(x)
+            shift = (1.0 - mean) * new + (mean - decay) * old
+        eta = affine_scan(decay, shift, self._eta)[1:]  # (K, D, g, p)
+        self._eta, self._delta = eta[-1], delta[-1:]
+        self._quotient, self._usable = quotient[-1:], usable[-1:]
+        self.energy = self.energy + energy.sum(axis=0)
+        K, D, g, p = eta.shape
+        parameters = np.moveaxis(eta.reshape(K, D * g, p), 0, 1)
+        shown = delta.T if D == 1 else np.repeat(delta.T, g, axis=0)
+        return SampledEstimates(parameters, shown)
+
+
+class KreisselmeierFilter:
+    """Ω' = −Λ(Ω − ψᵀψ) over each sample, exact for ψᵀψ as the hold rule has it between samples."""
+
+    def __init__(self, rates: Array) -> None:
+        self._rates = rates[:, None]  # one per row
+        self._value = np.zeros((len(rates), len(rates) + 1))
+
+    def update(self, regression: SampledRegression) -> Array:
+        """[Ω | 𝒴] (K, p, p + 1) at the samples."""
+        p = regression.p
+        outer = outer_products(regression.rows[..., :p], regression.rows[..., p])
+        x = self._rates * regression.steps[:, None, None]  # (K, p, 1)
+        decay = np.exp(-x)
+        if regression.hold == "zoh":
+            shift = -np.expm1(-x) * outer[1:]
+        else:
+            mean = mean_decay(x)
+            shift = (1.0 - mean) * outer[1:] + (mean - decay) * outer[:-1]
+        values = affine_scan(decay, shift, self._value)[1:]
+        self._value = values[-1]
+        return values
+
+
+def mix_sampled(extended: Array) -> tuple[Array, Array, BoolArray]:
+    """Δ (K, 1), η̄ (K, 1, p) and where it is usable (K, 1), from [Ω | 𝒴] (K, p, p + 1)."""
+    delta, Y, reciprocal = determinant_and_adjugate_action(extended[..., :-1], extended[..., -1])
+    usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))
+    quotient = np.divide(Y, delta[:, None], out=np.zeros_like(Y), where=usable[:, None])
+    return delta[:, None], quotient[:, None], usable[:, None]

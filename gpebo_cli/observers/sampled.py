@@ -1,0 +1,233 @@
+"""The GPEBO observer at samples, as a controller runs it: from one sample to the next.
+
+The state of the recursion is [ξ_a | ξ_b | Φ]. Between two samples u and y are what the hold rule
+makes of them, and the dynamic extension is carried over by the same collocation as in continuous
+time; ψ and Y are then those of the new sample. What remains is the error of the hold: order 1 in
+the time between samples for zoh, order 2 for linear. Nothing grows with the number of samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
+from gpebo_cli.collocation.mesh import Mesh
+from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.observers.extension import initial_extension
+from gpebo_cli.observers.gpebo import (
+    ObserverMatrices,
+    initial_basis,
+    observer_matrices,
+    regression_signals,
+    split_in_frame,
+)
+from gpebo_cli.recordings.hold import edges, held
+from gpebo_cli.regression import SampledRegression
+from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+
+_STAGES = 4  # per sample, order 7: beyond what any hold is good for
+_PROBED = np.linspace(0.0, 1.0, 17)  # seconds: what turns, does so by more than rounding in them
+_TOLERANCE = 1e-10  # where samples are far apart, steps are cut until this is reached
+
+
+@dataclass(frozen=True, eq=False)
+class SampledState:
+    """Where the recursion stands: the last sample, and all it has to remember of the past."""
+
+    t: float
+    u: Array  # (m,)
+    y: Array  # (r,)
+    extension: Array  # (k, 1 + q + n_a) [ξ_a | ξ_b | Φ] in the coordinates of the basis
+    row: Array  # (rows, p + 1) [ψ | Y]
+    scale: float  # largest term of ψ before cancellation so far
+    growth: float  # largest entry of Φ so far
+    injectivity: float  # bound of Assumption 1's singular value so far
+    error_estimate: float  # of the integration between samples, so far
+
+
+@dataclass(frozen=True, eq=False)
+class SampledBlock:
+    """The regression at K samples, and how parameters give the state there."""
+
+    regression: SampledRegression
+    offset: Array  # (K, n)
+    gain: Array  # (K, n, p) x = offset + gain η
+    extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
+
+
+@dataclass(frozen=True, eq=False)
+class SampledObserver:
+    """A plant's observer in discrete time; immutable, see :class:`SampledState`."""
+
+    system: DescriptorSystem
+    solver: SolverSettings
+    hold: str
+    regression: str  # projected or paper
+    like: ObserverMatrices  # those at the first sample, whose basis is kept
+    start: Array  # (k, 1 + q + n_a)
+    initial_basis: Array  # (n, n_a) V1
+    xi_a0: Array  # (n_a,)
+    parameters: tuple[str, ...]
+
+    @property
+    def basis(self) -> Array:
+        """In whose coordinates the extension is integrated, (n, k)."""
+        return self.like.split.basis
+
+    def advance(
+        self, state: SampledState | None, t: Array, u: Array, y: Array
+    ) -> tuple[SampledState, SampledBlock]:
+        """Carry the recursion over the samples at the times t (K,).
+
+        Args:
+            state: None before the first sample.
+            t: ascending, after ``state.t``.
+            u: (K, m).
+            y: (K, r).
+
+        Raises:
+            ModelError: the rank of E changes, or Assumption 1 fails.
+            SolverError: a step cannot be resolved.
+        """
+        if state is None:
+            first = self._block(self.start[None], t[:1], u[:1], y[:1], None)
+            if len(t) == 1:
+                return first
+            state, block = first
+            state, rest = self.advance(state, t[1:], u[1:], y[1:])
+            return state, _joined(block, rest)
+        times = np.concatenate([[state.t], t])
+        signals = np.concatenate([np.append(state.u, state.y)[None], np.hstack([u, y])])
+        signal = held(times, signals, self.hold)
+
+        def coefficients(at: Array, inside: Array) -> Coefficients:
+            o = self._matrices(at, inside)
+            f = np.zeros((len(at), *self.start.shape))
+            f[:, :, :1] = o.from_signals @ signal(at, inside)[:, :, None]
+            f[:, :, 1 : 1 + self.system.q] = o.from_unknowns
+            return Coefficients(None, o.dynamics, f)
+
+        cuts = self.system.coefficients.breakpoints(float(times[0]), float(times[-1]))
+        solution = solve(
+            LinearProblem(
+                coefficients, state.extension, name=f"observer of plant {self.system.name}"
+            ),
+            Mesh(edges(times, cuts), radau_rule(_STAGES)),
+            tol=max(self.solver.tol, _TOLERANCE),
+            max_elements=self.solver.max_elements,
+        )
+        mesh = solution.trajectory.mesh
+        ends = np.searchsorted(mesh.edges, t) - 1  # every sample is an edge
+        error = max(state.error_estimate, solution.error_estimate)
+        after = replace(state, error_estimate=error)
+        return self._block(solution.trajectory.values[ends, -1], t, u, y, after)
+
+    def _matrices(self, t: Array, inside: Array) -> ObserverMatrices:
+        o = observer_matrices(self.system, t, inside, self.solver.rank_tol, self.like)
+        rank = self.like.split.rank
+        if o.split.rank != rank:
+            raise ModelError(
+                f"plant {self.system.name}: the rank of E changes from {rank} to {o.split.rank} "
+                f"before t = {t[-1]:.6g}; the observer needs it constant"
+            )
+        return o
+
+    def _block(
+        self, z: Array, t: Array, u: Array, y: Array, before: SampledState | None
+    ) -> tuple[SampledState, SampledBlock]:
+        """Regression and state map from [ξ_a | ξ_b | Φ] at the samples, z (K, k, ·)."""
+        system = self.system
+        o = self._matrices(t, t)
+        g_y = (o.g_signals @ np.hstack([u, y])[:, :, None])[:, :, 0]
+        assembled = regression_signals(
+            z, system.q, self.basis, o.algebraic @ self.basis, g_y, o.G, o.range, o.elimination,
+            o.injectivity,
+        )
+        rows = np.concatenate([assembled.psi, assembled.Y[:, :, None]], axis=2)
+        if self.regression == "paper":
+            rows = rows[:, -system.r :]
+        previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
+        growth = float(np.abs(z[..., 1 + system.q :]).max(initial=0.0))
+        smallest = float(o.injectivity.min())
+        scale = assembled.psi_scale
+        if before is not None:
+            growth, scale = max(growth, before.growth), max(scale, before.scale)
+            smallest = min(smallest, before.injectivity)
+        state = SampledState(
+            float(t[-1]), u[-1], y[-1], z[-1], rows[-1], scale, growth, smallest,
+            0.0 if before is None else before.error_estimate,
+        )
+        regression = SampledRegression(
+            t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]), self.hold
+        )
+        return state, SampledBlock(regression, assembled.offset, assembled.gain, z)
+
+
+def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
+    """One block of the first sample and those after it."""
+    a, b = first.regression, rest.regression
+    return SampledBlock(
+        SampledRegression(
+            np.concatenate([a.t, b.t]),
+            np.concatenate([a.steps, b.steps]),
+            np.concatenate([a.rows[:1], b.rows]),
+            b.hold,
+        ),
+        np.concatenate([first.offset, rest.offset]),
+        np.concatenate([first.gain, rest.gain]),
+        np.concatenate([first.extension, rest.extension]),
+    )
+
+
+def sampled_observer(
+    system: DescriptorSystem, settings: ObserverSettings, solver: SolverSettings, hold: str,
+    start: float,
+) -> SampledObserver:
+    """The observer of ``settings`` in discrete time, whose first sample is at ``start``.
+
+    Raises:
+        ConfigError: an observer that there is in continuous time only, no outputs, or ``xi_a0``
+            that does not fit.
+        ModelError: Assumption 1 fails at the start.
+    """
+    if settings.name != "gpebo":
+        raise ConfigError(
+            f"observer={settings.name} runs in continuous time only; observer=gpebo runs at samples"
+        )
+    if system.r == 0:
+        raise ConfigError(
+            f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
+        )
+    t = np.array([start])
+    first = observer_matrices(system, t, t, solver.rank_tol, normalise=True)
+    if not _kernel_is_fixed(system, first, t + _PROBED, solver.rank_tol):
+        first = replace(first, split=replace(first.split, basis=np.eye(system.n), frame=None))
+    split = first.split
+    V1, names = initial_basis(split.projector[0], split.rank, system.states)
+    xi_a0 = initial_extension(settings, system, names)
+    in_basis = split.basis.T @ V1
+    zeros = np.zeros((len(in_basis), system.q))
+    return SampledObserver(
+        system=system, solver=solver, hold=hold, regression=settings.regression, like=first,
+        start=np.concatenate([(in_basis @ xi_a0)[:, None], zeros, in_basis], axis=1),
+        initial_basis=V1, xi_a0=xi_a0, parameters=(*system.unknowns, *names),
+    )
+
+
+def _kernel_is_fixed(
+    system: DescriptorSystem, first: ObserverMatrices, t: Array, rank_tol: float
+) -> bool:
+    """Whether kernel and range of E are at the times t (N,) what they are at the first sample.
+
+    If so the extension needs n_a coordinates, else all n. A kernel that starts to turn later on is
+    refused then.
+    """
+    frame = first.split.frame
+    if frame is None or "E" in system.coefficients.constant:
+        return frame is not None
+    E = system.coefficients.taylor(t, 0).E[0] / first.rows[:, None]
+    return split_in_frame(E, frame, rank_tol) is not None

@@ -1,0 +1,159 @@
+"""From samples to signals: what is assumed between samples, as piecewise polynomials on a mesh.
+
+* zoh: the last sample is held; order 1 in the time between samples. Right for what a digital
+  controller put out.
+* linear: straight lines between samples; order 2.
+* cubic: the C² spline through the samples (not-a-knot ends); order 4. Wrong for noise and jumps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gpebo_cli.collocation.mesh import (
+    Mesh,
+    Trajectory,
+    legendre_tail,
+    signal_scale,
+)
+from gpebo_cli.collocation.radau import RadauRule, radau_rule
+from gpebo_cli.systems.descriptor import Array, BoolArray, CoefficientSource
+
+# (times (N,), where it is decided which samples they are between (N,)) -> values (N, c)
+Held = Callable[[Array, Array], Array]
+
+_STAGES = (3, 4, 6, 9, 12, 16)  # candidates for the mesh of a recording
+_FIRST_ELEMENTS = 24  # at least this many, as for a simulation
+_PROBED = 64  # elements on which the plant's matrices are looked at
+_SAME = 1e-13  # slopes that differ by less than this share of the signal's size are the same
+_SMALLEST = 1e-9  # an edge nearer than this share of a step to a sample is that sample
+
+
+def held(t: Array, values: Array, hold: str) -> Held:
+    """The signals between the samples ``values`` (N, c) at the times ``t`` (N,)."""
+    if hold == "cubic":
+        from scipy.interpolate import CubicSpline  # a quarter of a second to import
+
+        spline = CubicSpline(t, values, axis=0)
+        return lambda at, _inside: np.asarray(spline(at), dtype=np.float64)
+    if hold == "zoh":
+        def last(_at: Array, inside: Array) -> Array:
+            return np.asarray(values[np.searchsorted(t, inside, side="right") - 1])
+
+        return last
+
+    slope = np.diff(values, axis=0) / np.diff(t)[:, None]
+
+    def line(at: Array, inside: Array) -> Array:
+        k = np.clip(np.searchsorted(t, inside, side="right") - 1, 0, len(t) - 2)
+        return np.asarray(values[k] + (at - t[k])[:, None] * slope[k])
+
+    return line
+
+
+def on_mesh(signal: Held, mesh: Mesh) -> Trajectory:
+    """A held signal at the points of a mesh that resolves it."""
+    values = signal(mesh.points.ravel(), mesh.inside.ravel())
+    return Trajectory(mesh, values.reshape(*mesh.points.shape, values.shape[1]))
+
+
+def edges(t: Array, cuts: Array) -> Array:
+    """Sample times ``t`` and ``cuts`` between them, in order; a cut on a sample is that sample."""
+    if len(cuts) == 0 or len(t) < 2:
+        return t
+    k = np.clip(np.searchsorted(t, cuts), 1, len(t) - 1)
+    near = np.minimum(cuts - t[k - 1], t[k] - cuts) <= _SMALLEST * (t[k] - t[k - 1])
+    return np.unique(np.concatenate([t, cuts[~near]]))
+
+
+def recording_mesh(
+    t: Array, values: Array, hold: str, span: tuple[float, float], source: CoefficientSource,
+    tol: float,
+) -> Mesh:
+    """A mesh on which the held samples and the plant's matrices are resolved, at least cost.
+
+    Every sample where the held signal is not smooth is an edge. Many samples make short elements
+    on which a few nodes do; few make long ones that want more: of several rules the one that
+    needs the fewest points in all is taken.
+
+    Args:
+        t: sample times (N,).
+        values: samples (N, c) of all signals.
+        hold: between samples.
+        span: start and end of the experiment, within the samples.
+        source: the plant's matrices; their jumps are edges too.
+        tol: of the solver.
+    """
+    start, stop = span
+    inner = (t > start) & (t < stop)
+    cuts = source.breakpoints(start, stop)
+    signal = held(t, values, hold)
+    candidates = []
+    for rule in map(radau_rule, _STAGES):
+        if hold == "cubic":
+            knots = _merged(signal, np.concatenate([[start], t[inner], [stop]]), rule, tol)
+        else:
+            knots = np.concatenate([[start], t[inner & _bends(t, values, hold)], [stop]])
+        coarse = Mesh(edges(knots, cuts), rule)
+        equal = np.rint(_FIRST_ELEMENTS * coarse.steps / (stop - start)).astype(np.intp)
+        mesh, _ = coarse.split(np.maximum(1, equal))
+        parts = _parts(source, signal, mesh, tol)
+        candidates.append((mesh.size * (rule.stages + 1) * parts, mesh))
+    return min(candidates, key=lambda candidate: candidate[0])[1]
+
+
+def _bends(t: Array, values: Array, hold: str) -> BoolArray:
+    """Samples at which the held signal jumps or has a kink, (N,)."""
+    change = np.diff(values, axis=0)
+    if hold == "linear":
+        step = np.diff(t)[:, None]
+        change = np.diff(change / step, axis=0) * np.minimum(step[1:], step[:-1])
+    size = np.maximum(np.abs(values).max(axis=0, initial=0.0), np.finfo(float).tiny)
+    bends = np.zeros(len(t), dtype=bool)
+    bends[1 : 1 + len(change)] = (np.abs(change) > _SAME * size).any(axis=1)
+    return bends
+
+
+def _merged(signal: Held, knots: Array, rule: RadauRule, tol: float) -> Array:
+    """Those of the spline's ``knots`` that have to be edges, for polynomials of degree s.
+
+    Over neighbouring samples that are close enough the spline is as good as one polynomial. Whole
+    blocks of 2^j samples are tried, the longest first.
+    """
+    count = len(knots) - 1
+    wanted = np.ones(count + 1, dtype=bool)
+    done = np.zeros(count, dtype=bool)  # samples whose block is decided
+    level = max(0, int(np.log2(max(count // _FIRST_ELEMENTS, 1))))
+    for length in 2 ** np.arange(level, 0, -1):
+        first = np.arange(0, count - length + 1, length)
+        first = first[~done[first]]
+        if len(first) == 0:
+            continue
+        left, right = knots[first], knots[first + length]
+        points = left[:, None] + (right - left)[:, None] * rule.points
+        values = signal(points.ravel(), points.ravel()).reshape(*points.shape, -1)
+        scale = signal_scale(values)
+        smooth = (legendre_tail(values, rule, scale) <= 0.1 * tol * scale).all(axis=1)
+        for k in first[smooth]:
+            wanted[k + 1 : k + length] = False
+            done[k : k + length] = True
+    return knots[wanted]
+
+
+def _parts(source: CoefficientSource, signal: Held, mesh: Mesh, tol: float) -> float:
+    """Into how many parts elements will be cut, as far as a few of them tell.
+
+    What has to be resolved are the plant's matrices, and products of two held signals, because
+    the observer makes products of everything with everything.
+    """
+    chosen = np.unique(np.linspace(0, mesh.size - 1, _PROBED).round().astype(np.intp))
+    t, inside = mesh.points[chosen], mesh.inside[chosen]
+    c = source.taylor(t.ravel(), 1, inside.ravel())
+    samples = signal(t.ravel(), inside.ravel())
+    kinds = (c.E[0], c.E[1], c.A[0], c.B[0], c.F[0], c.C[0], samples, samples**2)
+    values = np.concatenate([kind.reshape(*t.shape, -1) for kind in kinds], axis=2)
+    scale = signal_scale(values)
+    tail = float((legendre_tail(values, mesh.rule, scale) / scale).max(initial=0.0))
+    return max(1.0, float((tail / tol) ** (1.0 / (mesh.rule.stages + 1))))

@@ -1,0 +1,112 @@
+"""A recording as signals on the time span of an experiment."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.recordings.hold import held, on_mesh, recording_mesh
+from gpebo_cli.recordings.table import Samples, Table, read_table
+from gpebo_cli.settings import DataSettings, TimeSettings
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+
+_ROUNDING = 1e-12  # of the largest time: by how much a span may miss the samples
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Signals of a recording: inputs and outputs share a mesh, states are the truth if known."""
+
+    table: Table
+    hold: str
+    span: tuple[float, float]  # start and end of the experiment
+    inputs: Trajectory  # (m,)
+    outputs: Trajectory  # (r,)
+    states: Trajectory  # (n,), NaN for a state that was not recorded
+
+    def sampled(self, t: Array) -> Samples:
+        """All signals at the times t (N,) of the span.
+
+        A held input has at a sample the value of that sample, at the last one too; states are
+        never held but interpolated, since they are what estimates are compared with.
+        """
+        samples = self.table.samples
+        inputs = held(samples.t, samples.inputs, self.hold)(t, t)
+        outputs = held(samples.t, samples.outputs, self.hold)(t, t)
+        return Samples(t, inputs, outputs, self.states(t))
+
+
+def load(
+    system: DescriptorSystem, data: DataSettings, time: TimeSettings, tol: float
+) -> Recording:
+    """Read ``data.file`` and make signals of it on the time span asked for.
+
+    Args:
+        system: names of the columns, and matrices that the mesh has to resolve.
+        data: the file and the hold rule.
+        time: ``start`` −∞ is the first sample, ``horizon`` ∞ lasts to the last one.
+        tol: of the solver.
+
+    Raises:
+        ConfigError: the file is not a recording of this plant, or shorter than the span.
+    """
+    if data.file is None:
+        raise ConfigError("data=csv needs data.file=FILE, or data.file=- for standard input")
+    if data.file == "-":
+        raise ConfigError(
+            "data.file=-: standard input is for gpebo run, once and without a sweep; give a file"
+        )
+    table = read_table(data.file, system)
+    span = _span(data.file, table, time)
+    samples = table.samples
+    m = system.m
+    values = np.concatenate([samples.inputs, samples.outputs], axis=1)
+    mesh = recording_mesh(samples.t, values, data.hold, span, system.coefficients, tol)
+    both = on_mesh(held(samples.t, values, data.hold), mesh).values
+    return Recording(
+        table=table,
+        hold=data.hold,
+        span=span,
+        inputs=Trajectory(mesh, both[..., :m]),
+        outputs=Trajectory(mesh, both[..., m:]),
+        states=_states(samples, span, smooth=data.hold == "cubic"),
+    )
+
+
+def _span(path: str, table: Table, time: TimeSettings) -> tuple[float, float]:
+    """Start and end of the experiment, both within the recording."""
+    t = table.samples.t
+    first, last = float(t[0]), float(t[-1])
+    slack = _ROUNDING * max(abs(first), abs(last))
+    start = first if math.isinf(time.start) else time.start
+    stop = last if math.isinf(time.horizon) else start + time.horizon
+    whole = "time.start=null time.horizon=null take the whole file"
+    if not first - slack <= start < last:
+        raise ConfigError(
+            f"{path}, line {table.lines[0]}, column t: the recording is of t = {first:g} to "
+            f"{last:g}, which does not have time.start = {start:g}; {whole}"
+        )
+    if stop > last + slack:
+        raise ConfigError(
+            f"{path}, line {table.lines[1]}, column t: the recording ends at t = {last:g}, before "
+            f"time.start + time.horizon = {start:g} + {time.horizon:g}; {whole}"
+        )
+    return max(start, first), min(stop, last)
+
+
+def _states(samples: Samples, span: tuple[float, float], *, smooth: bool) -> Trajectory:
+    """True states between samples: a spline, or straight lines; NaN where nobody knows."""
+    t, states = samples.t, samples.states
+    known = ~np.isnan(states[0])
+    inner = t[(t > span[0]) & (t < span[1])] if known.any() else t[:0]
+    mesh = Mesh(np.concatenate([[span[0]], inner, [span[1]]]), radau_rule(3 if smooth else 2))
+    values = np.full((*mesh.points.shape, states.shape[1]), np.nan)
+    if known.any():
+        signal = held(t, states[:, known], "cubic" if smooth else "linear")
+        values[..., known] = on_mesh(signal, mesh).values
+    return Trajectory(mesh, values)

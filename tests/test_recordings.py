@@ -1,0 +1,341 @@
+"""Recordings: what is read, what is refused, and that a run's own signals give its estimates."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plants import shipped
+from test_cli import gpebo
+
+from gpebo_cli.collocation.mesh import Mesh
+from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.experiment import run_experiment
+from gpebo_cli.recordings.hold import edges, held, on_mesh, recording_mesh
+from gpebo_cli.recordings.load import load
+from gpebo_cli.recordings.table import LineReader, read_table
+from gpebo_cli.settings import DataSettings, ObserverSettings, Settings, TimeSettings
+
+WHOLE = TimeSettings(-np.inf, np.inf, 201)
+ESTIMATOR = {"name": "ls_drem"}
+
+
+def write(path, columns):
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        writer.writerows(zip(*(map(repr, map(float, c)) for c in columns.values()), strict=True))
+    return str(path)
+
+
+def signals_of(result):
+    signals, system = result.signals, result.system
+    names = ["t", *system.inputs, *system.outputs, *system.states]
+    table = [signals.t, *signals.inputs.T, *signals.outputs.T, *signals.states.T]
+    return dict(zip(names, table, strict=True))
+
+
+def simulated(name="circuit", samples=1001, horizon=20.0):
+    return run_experiment(
+        Settings(plant={}, estimator=ESTIMATOR, time=TimeSettings(0.0, horizon, samples)),
+        shipped(name),
+    )
+
+
+def recorded(path, name="circuit", hold="linear", time=WHOLE, **more):
+    data = DataSettings("csv", path, hold)
+    return run_experiment(
+        Settings(plant={}, estimator=ESTIMATOR, time=time, data=data, **more), shipped(name)
+    )
+
+
+# A run's own signals fed back ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("hold", "order"), [("zoh", 1), ("linear", 2), ("cubic", 4)])
+def test_estimates_converge_to_those_of_the_run_as_samples_get_finer(tmp_path, hold, order):
+    system = shipped("circuit")
+    errors = []
+    for samples in (201, 401, 801):
+        run = simulated(samples=samples, horizon=10.0)
+        result = recorded(
+            write(tmp_path / "r.csv", signals_of(run)), hold=hold,
+            time=TimeSettings(0.0, 10.0, samples),
+        )
+        difference = result.estimation.parameters[0, -1] - run.estimation.parameters[0, -1]
+        errors.append(np.abs(difference).max())
+        assert result.estimation.names == run.estimation.names
+    assert system.name == "circuit"
+    rates = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert abs(rates[-1] - order) < 0.35
+
+
+def test_a_cubic_recording_reproduces_the_estimates(tmp_path):
+    run = simulated()
+    columns = signals_of(run)
+    path = write(tmp_path / "r.csv", columns)
+    result = recorded(path, hold="cubic", time=TimeSettings(0.0, 20.0, 1001))
+    late = run.signals.t > 3.0
+    difference = np.abs(result.estimation.states - run.estimation.states)[0]
+    size = np.abs(run.signals.states).max(axis=0)
+    assert (difference / size)[late].max() < 1e-6
+    np.testing.assert_allclose(
+        result.estimation.true_parameters, run.estimation.true_parameters, atol=1e-12
+    )
+    assert result.metrics.final_error_states[0] < 1e-7 * size.max()
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_a_run_on_held_signals_is_reproduced_to_rounding(tmp_path, hold):
+    run = simulated(samples=201)
+    first = recorded(
+        write(tmp_path / "1.csv", signals_of(run)), hold=hold, time=TimeSettings(0.0, 20.0, 201)
+    )
+    again = recorded(
+        write(tmp_path / "2.csv", signals_of(first)), hold=hold, time=TimeSettings(0.0, 20.0, 201)
+    )
+    np.testing.assert_array_equal(again.signals.outputs, first.signals.outputs)
+    np.testing.assert_array_equal(again.estimation.parameters, first.estimation.parameters)
+    np.testing.assert_array_equal(again.estimation.states, first.estimation.states)
+
+
+def test_unknown_parameters_of_a_recording_are_estimated_and_their_truth_is_not_known(tmp_path):
+    run = simulated("descriptor")
+    result = recorded(write(tmp_path / "r.csv", signals_of(run)), "descriptor", "cubic")
+    truth = result.estimation.true_parameters
+    assert np.isnan(truth[:, :2]).all()
+    np.testing.assert_allclose(truth[:, 2:], [[-1.0, 1.0]] * len(truth), atol=1e-12)
+    np.testing.assert_allclose(result.estimation.parameters[0, -1, :2], [1.5, -0.8], atol=1e-5)
+    assert result.metrics.final_error_parameters[0] < 1e-5  # of those that are known
+    assert result.fit.residual[0] < 1e-5 * result.fit.size
+
+
+@pytest.mark.filterwarnings("error")
+def test_without_states_nothing_is_compared_and_the_fit_is_told(tmp_path):
+    columns = signals_of(simulated())
+    path = write(tmp_path / "r.csv", {k: columns[k] for k in ("V", "t", "y")})
+    result = recorded(path, hold="cubic")
+    for values in vars(result.metrics).values():
+        assert np.isnan(values).all()
+    assert np.isnan(result.estimation.true_parameters).all()
+    assert np.isfinite(result.estimation.states).all()
+    assert result.fit.residual[0] < 1e-7 * result.fit.size
+    assert "|Y − ψη̂|" in result.verdict
+    assert "state error" not in result.verdict
+
+
+def test_some_of_the_states_are_compared_where_some_are_recorded(tmp_path):
+    columns = signals_of(simulated())
+    path = write(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y", "e2")})
+    result = recorded(path, hold="cubic")
+    assert np.isfinite(result.metrics.final_error_states[0])
+    known = ~np.isnan(result.estimation.true_parameters[-1])
+    assert known.tolist() == [False, True, False]
+
+
+def test_the_span_may_be_a_part_of_the_recording(tmp_path):
+    path = write(tmp_path / "r.csv", signals_of(simulated()))
+    result = recorded(path, hold="cubic", time=TimeSettings(5.003, 10.0, 101))
+    assert result.signals.t[0] == 5.003
+    assert result.signals.t[-1] == pytest.approx(15.003)
+    assert result.metrics.final_error_states[0] < 1e-4
+
+
+# The mesh ------------------------------------------------------------------------------------
+
+
+def test_smooth_samples_share_elements_and_rough_ones_do_not():
+    source = shipped("circuit").coefficients
+    t = np.linspace(0.0, 20.0, 20001)
+    smooth, rough = np.sin(t)[:, None], np.random.default_rng(0).normal(size=(len(t), 1))
+    for values, few in ((smooth, True), (rough, False)):
+        mesh = recording_mesh(t, values, "cubic", (0.0, 20.0), source, 1e-12)
+        assert (mesh.size < 500) == few
+        signal = held(t, values, "cubic")
+        inner = np.linspace(0.1, 19.9, 997)
+        assert np.abs(on_mesh(signal, mesh)(inner) - signal(inner, inner)).max() < 1e-10
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_a_held_signal_is_exact_on_its_mesh_and_edges_are_where_it_bends(hold):
+    source = shipped("circuit").coefficients
+    t = np.array([0.0, 0.3, 0.5, 1.7, 2.0, 2.5])
+    values = np.array([[1.0], [1.0], [2.0], [3.0], [3.0], [0.0]])
+    mesh = recording_mesh(t, values, hold, (0.1, 2.4), source, 1e-9)
+    trajectory = on_mesh(held(t, values, hold), mesh)
+    at = np.linspace(0.11, 2.39, 101)
+    expected = (
+        values[np.searchsorted(t, at, side="right") - 1, 0]
+        if hold == "zoh" else np.interp(at, t, values[:, 0])
+    )
+    np.testing.assert_allclose(trajectory(at)[:, 0], expected, atol=1e-13)
+    bends = {"zoh": [0.5, 1.7], "linear": [0.3, 0.5, 1.7, 2.0]}[hold]
+    assert set(bends) <= set(mesh.edges.tolist())
+
+
+def test_a_cut_next_to_a_sample_is_that_sample():
+    t = np.array([0.0, 1.0, 2.0])
+    assert edges(t, np.array([1.0 + 1e-12, 1.5])).tolist() == [0.0, 1.0, 1.5, 2.0]
+    assert Mesh(edges(t, np.zeros(0)), radau_rule(2)).size == 2
+
+
+# What is refused -----------------------------------------------------------------------------
+
+GOOD = "t,V,y\n0,1,2\n0.5,1,3\n1,2,3\n"
+BAD = {
+    "a missing sample": ("t,V,y\n0,1,2\n1,,3\n", ["line 3", "column V", "missing"]),
+    "spaces only": ("t,V,y\n0,1,2\n1,  ,3\n", ["line 3", "column V", "missing"]),
+    "a repeated time": ("t,V,y\n0,1,2\n0,1,3\n", ["line 3", "column t", "repeats", "line 2"]),
+    "a decreasing time": ("t,V,y\n1,1,2\n0.5,1,3\n", ["line 3", "column t", "is before"]),
+    "a missing column": ("t,v,y\n0,1,2\n1,1,3\n", ["line 1", "no column V", "mean v?"]),
+    "a double column": ("t,V,y,y\n0,1,2,2\n", ["line 1", "column y", "2 times"]),
+    "nan": ("t,V,y\n0,1,2\n1,nan,3\n", ["line 3", "column V", "'nan'", "finite"]),
+    "inf": ("t,V,y\n0,1,2\n1,1,-inf\n", ["line 3", "column y", "finite"]),
+    "text": ("t,V,y\n0,1,2\n1,off,3\n", ["line 3", "column V", "'off'", "not a number"]),
+    "an underscore": ("t,V,y\n0,1,2\n1,1_0,3\n", ["line 3", "column V", "not a number"]),
+    "a short row": ("t,V,y\n0,1,2\n1,2\n", ["line 3", "2 cells", "header has 3"]),
+    "a long row": ("t,V,y\n0,1,2,3\n", ["line 2", "4 cells", "header has 3"]),
+    "an empty line": ("t,V,y\n0,1,2\n\n1,1,3\n", ["line 3", "is empty"]),
+    "semicolons": ("t;V;y\n0;1;2\n", ["line 1", "semicolons", "commas"]),
+    "tabs": ("t\tV\ty\n0\t1\t2\n", ["line 1", "tabs"]),
+    "nothing": ("", ["empty"]),
+    "a header only": (GOOD[:6], ["0 rows"]),
+    "one row": (GOOD[:12], ["1 rows"]),
+    "an open quote": ('t,V,y\n0,"1,2\n', ["line 2", "not CSV"]),
+}
+
+
+@pytest.mark.parametrize("mistake", BAD)
+def test_a_mistake_in_a_file_is_named_with_its_place(tmp_path, mistake):
+    text, parts = BAD[mistake]
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        read_table(str(path), shipped("circuit"))
+    message = str(caught.value)
+    assert str(path) in message
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize("mistake", [m for m in BAD if "line" in BAD[m][1][0]])
+def test_a_stream_says_the_same(mistake):
+    text, parts = BAD[mistake]
+    reader = LineReader("standard input", shipped("circuit"))
+    rows, message = reader.feed(text.encode(), last=True)
+    for part in parts:
+        assert part in message
+    assert len(rows) <= 1 + text.count("\n")
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+def test_rows_are_the_same_however_a_stream_is_cut(size):
+    reader = LineReader("standard input", shipped("circuit"))
+    content, rows = GOOD.replace("\n", "\r\n").encode(), []
+    for i in range(0, len(content), size):
+        more, message = reader.feed(content[i : i + size])
+        assert message == ""
+        rows += more
+    assert rows == [[0.0, 1.0, 2.0], [0.5, 1.0, 3.0], [1.0, 2.0, 3.0]]
+
+
+def test_files_that_are_not_text(tmp_path):
+    path = tmp_path / "r.csv"
+    for content, part in ((b"t,V,y\n0,1,\xff\n", "line 2"), (GOOD.encode("utf-16"), "UTF-16")):
+        path.write_bytes(content)
+        with pytest.raises(ConfigError, match=part):
+            read_table(str(path), shipped("circuit"))
+
+
+def test_a_byte_order_mark_quotes_and_other_columns_do_no_harm(tmp_path):
+    path = tmp_path / "r.csv"
+    content = b'\xef\xbb\xbf"t",note,y,V\r\n0,"a, b",2,1\r\n1,,3,"4"\r\n\r\n'
+    path.write_bytes(content)
+    table = read_table(str(path), shipped("circuit"))
+    assert table.samples.inputs.tolist() == [[1.0], [4.0]]
+    assert table.samples.outputs.tolist() == [[2.0], [3.0]]
+    assert table.lines == (2, 3)
+    assert table.sha256 == hashlib.sha256(content).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("time", "parts"),
+    [
+        (TimeSettings(0.0, 20.0, 11), ["line 4", "ends at t = 1", "0 + 20", "horizon=null"]),
+        (TimeSettings(-1.0, 1.0, 11), ["line 2", "0 to 1", "time.start = -1"]),
+        (TimeSettings(1.0, np.inf, 11), ["time.start = 1"]),
+    ],
+)
+def test_a_span_that_is_not_recorded(tmp_path, time, parts):
+    path = tmp_path / "r.csv"
+    path.write_text(GOOD)
+    with pytest.raises(ConfigError) as caught:
+        load(shipped("circuit"), DataSettings("csv", str(path)), time, 1e-12)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+def test_a_recording_without_an_observer_is_refused(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text(GOOD)
+    with pytest.raises(ConfigError, match="observer=none"):
+        recorded(str(path), observer=ObserverSettings(name="none"))
+
+
+# The command line ----------------------------------------------------------------------------
+
+
+def test_a_recording_from_the_command_line(tmp_path):
+    columns = signals_of(simulated("descriptor", 301, 10.0))
+    path = write(tmp_path / "rec.csv", {k: columns[k] for k in ("t", "u", "y")})
+    words = ["plant=descriptor", f"data.file={path}", "data.hold=cubic", "estimator=ls_drem"]
+    done = gpebo("run", *words, "hydra.run.dir=out", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "unknown" in done.stdout
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["recording"]["rows"] == 301
+    assert summary["recording"]["sha256"] == hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    assert summary["parameters"]["theta1"] is None
+    assert summary["cases"][0]["final_error_states"] is None
+    assert summary["fit"]["rms_residual"][0] < 1e-3 * summary["fit"]["rms_Y"]
+    header = (tmp_path / "out" / "signals.csv").read_text().partition("\n")[0]
+    assert header == "t,u,y"
+    again = gpebo(
+        "run", "--config-dir", "out", "--config-name", "config", "hydra.run.dir=again", cwd=tmp_path
+    )
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "again" / "estimates.csv").read_bytes() == (
+        tmp_path / "out" / "estimates.csv"
+    ).read_bytes()
+    compared = gpebo("compare", "out", "again", "--no-figures", cwd=tmp_path)
+    assert compared.returncode == 0, compared.stderr
+    checked = gpebo("check", *words, cwd=tmp_path)
+    assert checked.returncode == 0, checked.stderr
+    assert "interval excitation" in checked.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["data=csv"], "data.file"),
+        (["data.file=nowhere.csv"], "nowhere.csv cannot be read"),
+        (["data.file=."], "is a folder"),
+        (["data=cvs"], "did you mean csv?"),
+        (["data.file=bad.csv"], "bad.csv, line 3, column V"),
+        (["data.file=bad.csv", "data.hold=foh"], "zoh or linear or cubic"),
+    ],
+)
+def test_what_is_wrong_with_a_recording_is_one_line(tmp_path, words, part):
+    (tmp_path / "bad.csv").write_text(BAD["a missing sample"][0])
+    done = gpebo("run", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("gpebo: error: ")
+    assert done.stderr.count("\n") == 1
+    assert part in done.stderr

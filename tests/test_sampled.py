@@ -1,0 +1,447 @@
+"""Observer and estimators at samples: their order, their algebra, and streams."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from plants import shipped
+from test_cli import environment, gpebo
+from test_observer import ROTATING
+
+from gpebo_cli import estimators
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators import InformationRoot
+from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, quotient_of, spectrum
+from gpebo_cli.experiment import run_experiment
+from gpebo_cli.recordings.table import Samples
+from gpebo_cli.regression import SampledRegression, outer_products
+from gpebo_cli.sampled import SampledRun
+from gpebo_cli.settings import DataSettings, ObserverSettings, Settings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+from gpebo_cli.streaming import Stream
+from gpebo_cli.systems.plant import plant_from_mapping
+
+RNG = np.random.default_rng(7)
+
+
+def run(system, estimator, horizon=5.0, **observer):
+    settings = Settings(
+        plant={}, estimator=estimator, time=TimeSettings(0.0, horizon, 2001),
+        observer=ObserverSettings(**observer),
+    )
+    return run_experiment(settings, system)
+
+
+def signals(system, t):
+    found = simulate(system, TimeSettings(0.0, float(t[-1]), 11), Settings({}, {}).solver).signals
+    return found.inputs(t), found.outputs(t)
+
+
+def regression(K=40, r=2, p=3, hold="zoh", steps=None):
+    rows = RNG.normal(size=(K + 1, r, p + 1))
+    rows[0] = rows[1]
+    steps = RNG.uniform(0.1, 0.5, K) if steps is None else steps
+    steps[0] = 0.0
+    return SampledRegression(np.cumsum(steps), steps, rows, hold)
+
+
+# Against the observer in continuous time ------------------------------------------------------
+
+
+@pytest.mark.parametrize(("hold", "order"), [("zoh", 1), ("linear", 2)])
+@pytest.mark.parametrize(
+    ("plant", "estimator"),
+    [
+        ("circuit", {"name": "least_squares"}),
+        ("circuit", {"name": "ls_drem"}),
+        ("circuit", {"name": "ls_drem", "beta": 0.2}),
+        ("circuit", {"name": "drem"}),
+        ("descriptor", {"name": "ls_drem", "gamma": 5}),
+    ],
+)
+def test_estimates_converge_to_those_in_continuous_time(plant, estimator, hold, order):
+    system = shipped(plant)
+    # Early, while an estimate is still on its way: the whole path has to agree, not its end.
+    horizon = 5.0
+    reference = run(system, estimator, horizon).estimation
+    errors = []
+    for step in (0.04, 0.02, 0.01):
+        sampled = run(system, estimator, horizon, sample_time=step, hold=hold).estimation
+        rows = np.searchsorted(reference.t, sampled.t - 1e-9)
+        errors.append([
+            np.abs(sampled.parameters[0] - reference.parameters[0, rows])[len(rows) // 2 :].max(),
+            np.abs(sampled.states[0] - reference.states[0, rows])[len(rows) // 2 :].max(),
+        ])
+    rates = np.log2(np.array(errors)[1] / np.array(errors)[2])
+    assert np.all(np.abs(rates - order) < 0.3), errors
+
+
+def test_a_turning_kernel_of_e():
+    system = plant_from_mapping(ROTATING)
+    reference = run(system, {"name": "least_squares"}).estimation.parameters[0, -1]
+    errors = [
+        np.abs(
+            run(system, {"name": "least_squares"}, sample_time=step, hold="linear")
+            .estimation.parameters[0, -1] - reference
+        ).max()
+        for step in (0.02, 0.01)
+    ]
+    assert errors[1] < 0.35 * errors[0]
+
+
+def test_the_sampled_run_tells_what_the_continuous_one_tells():
+    system = shipped("circuit")
+    ours = run(system, {"name": "ls_drem"}, 20.0, sample_time=0.01, hold="linear")
+    theirs = run(system, {"name": "ls_drem"}, 20.0)
+    assert ours.excitation.is_ie
+    assert ours.excitation.t_c == pytest.approx(theirs.excitation.t_c, abs=0.011)
+    assert ours.excitation.lambda_min == pytest.approx(theirs.excitation.lambda_min, rel=1e-3)
+    rows = np.searchsorted(theirs.excitation.t, ours.excitation.t[::50] - 1e-9)
+    late = ours.excitation.t[::50] > 3.0
+    np.testing.assert_allclose(
+        ours.excitation.pe_level[::50][late], theirs.excitation.pe_level[rows][late], rtol=0.05
+    )
+    assert ours.metrics.seconds_to_1pct_states[0] == pytest.approx(
+        theirs.metrics.seconds_to_1pct_states[0], abs=0.02
+    )
+    np.testing.assert_array_equal(ours.signals.t, ours.estimation.t)
+    assert [a.name for a in ours.assumptions] == [a.name for a in theirs.assumptions]
+
+
+def test_at_most_as_many_samples_are_kept_as_are_asked_for():
+    system = shipped("circuit")
+    settings = Settings(
+        plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(0.0, 2.0, 21),
+        observer=ObserverSettings(sample_time=0.01),
+    )
+    few = run_experiment(settings, system)
+    many = run_experiment(replace(settings, time=TimeSettings(0.0, 2.0, 1001)), system)
+    assert (len(few.signals.t), len(many.signals.t)) == (21, 201)
+    np.testing.assert_array_equal(few.estimation.parameters, many.estimation.parameters[:, ::10])
+    assert few.metrics.final_error_states == many.metrics.final_error_states
+
+
+def test_it_does_not_matter_how_samples_are_grouped():
+    system = shipped("descriptor")
+    t = np.cumsum(RNG.uniform(0.005, 0.05, 60))  # steps may vary
+    u, y = signals(system, t)
+    for name in ("ls_drem", "least_squares", "drem"):
+        settings = Settings(plant={}, estimator={"name": name})
+        whole = SampledRun(settings, system, "linear", t[0]).feed(t, u, y)
+        parts = SampledRun(settings, system, "linear", t[0])
+        cuts = [0, 1, 2, 9, 40, 60]
+        made = [
+            parts.feed(t[a:b], u[a:b], y[a:b]) for a, b in pairwise(cuts)
+        ]
+        for field in ("parameters", "states"):
+            joined = np.concatenate([getattr(part, field) for part in made], axis=1)
+            np.testing.assert_allclose(joined, getattr(whole, field), rtol=1e-8, atol=1e-9)
+
+
+def test_what_is_remembered_does_not_grow():
+    system = shipped("circuit")
+    t = np.arange(0.0, 4.0, 0.01)
+    u, y = signals(system, t)
+    stream = SampledRun(Settings(plant={}, estimator={"name": "ls_drem"}), system, "zoh", 0.0)
+    sizes = []
+    for part in (slice(0, 100), slice(100, 200), slice(200, 400)):
+        stream.feed(t[part], u[part], y[part])
+        kept = {k: v for k, v in vars(stream).items() if k not in ("_system", "_observer")}
+        sizes.append(len(pickle.dumps(kept)))
+    assert max(sizes) < 1.1 * min(sizes)
+
+
+# The algebra ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_least_squares_at_samples_is_a_batch_solution(hold):
+    block = regression(hold=hold)
+    f0, alpha, beta = 0.3, 2.0, 0.4
+    settings = {"name": "least_squares", "f0": f0, "alpha": alpha, "beta": beta, "initial": 0.7}
+    recursion = estimators.recursion(estimators.build(settings), "least_squares", ["a", "b", "c"])
+    estimate = recursion.update(block).parameters[0, -1]
+    age = block.t[-1] - block.t
+    weight = np.exp(-beta * age)
+    rows = block.weighted() * np.sqrt(alpha * weight)[:, None, None]
+    prior = np.sqrt(f0 * np.exp(-beta * block.t[-1]))
+    left = np.concatenate([rows[..., :3].reshape(-1, 3), prior * np.eye(3)])
+    right = np.concatenate([rows[..., 3].ravel(), prior * np.full(3, 0.7)])
+    np.testing.assert_allclose(estimate, np.linalg.lstsq(left, right)[0], rtol=1e-11)
+
+
+def test_the_square_root_form_survives_what_normal_equations_do_not():
+    block = regression(K=30, r=1, p=2)
+    block.rows[..., 1] = block.rows[..., 0] * (1 + 1e-9 * RNG.normal(size=block.rows.shape[:2]))
+    eta = np.array([1.0, -2.0])
+    block.rows[..., 2] = block.rows[..., :2] @ eta
+    roots, memory = InformationRoot(2, np.zeros(1)).update(block)
+    quotient, usable = quotient_of(spectrum(roots[:, 0], memory[:, 0]))
+    assert usable[-1]
+    np.testing.assert_allclose(quotient[-1], eta, atol=1e-5)
+    rows = block.weighted().reshape(-1, 3)
+    normal = rows.T @ rows  # its condition is 1e18
+    assert np.linalg.eigvalsh(normal[:2, :2])[0] < 1e-15 * normal[0, 0]
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_the_factor_is_that_of_the_gram_matrix(hold):
+    block = regression(hold=hold)
+    roots, _ = InformationRoot(3, np.zeros(1)).update(block)
+    outer = outer_products(block.rows[..., :3], block.rows[..., 3])
+    mean = outer[1:] if hold == "zoh" else 0.5 * (outer[1:] + outer[:-1])
+    gram = np.cumsum(block.steps[:, None, None] * mean, axis=0)
+    S = roots[:, 0]
+    np.testing.assert_allclose(
+        np.swapaxes(S, 1, 2)[:, :3] @ S, gram, atol=1e-12 * np.abs(gram).max()
+    )
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_filters_of_a_constant_are_exact_at_any_steps(hold):
+    block = regression(K=20, hold=hold)
+    block.rows[:] = block.rows[:1]
+    rates = np.array([0.1, 1.0, 50.0])
+    values = KreisselmeierFilter(rates).update(block)
+    outer = outer_products(block.rows[1:, :, :3], block.rows[1:, :, 3])
+    expected = -np.expm1(-rates[:, None] * block.t[:, None, None]) * outer
+    np.testing.assert_allclose(values, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+@pytest.mark.parametrize("gain", [1e-3, 1.0, 1e6, 1e14])
+def test_the_scalar_law_is_stable_for_any_gain_and_any_sample_time(hold, gain):
+    block = regression(K=50, p=2, steps=RNG.uniform(0.5, 30.0, 50), hold=hold)
+    eta = np.array([3.0, -1.0])
+    delta = RNG.normal(size=(50, 1))
+    quotient = np.broadcast_to(eta, (50, 1, 2))
+    law = ScalarLaw(np.zeros(2), np.array([[gain]]), 1)
+    made = law.update(block, delta, quotient, np.ones((50, 1), dtype=bool)).parameters[0]
+    error = np.abs(made - eta) / np.abs(eta)
+    assert np.isfinite(made).all()
+    assert (np.diff(error, axis=0) <= 1e-15).all()  # it never grows
+    np.testing.assert_allclose(
+        error[-1], np.exp(-gain * law.energy[0]) * np.ones(2), rtol=1e-9, atol=1e-15
+    )
+
+
+def test_a_quotient_that_is_rounding_moves_nothing():
+    block = regression(K=3, p=1)
+    law = ScalarLaw(np.array([5.0]), np.array([[1e10]]), 1)
+    quotient = np.array([[[np.inf]], [[2.0]], [[2.0]]])
+    quotient[0] = 1e300
+    usable = np.array([[False], [True], [True]])
+    made = law.update(block, np.ones((3, 1)), quotient, usable).parameters[0, :, 0]
+    np.testing.assert_allclose(made, [5.0, 2.0, 2.0])
+
+
+# What there is not ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["gradient", "mre", "lion", "fct"])
+def test_estimators_of_continuous_time_say_what_there_is(name):
+    with pytest.raises(ConfigError, match="drem, least_squares, ls_drem"):
+        estimators.recursion(estimators.build({"name": name}), name, ["a"])
+
+
+def test_forgetting_with_a_bound_is_refused():
+    settings = {"name": "ls_drem", "beta": 1, "bound": 1e6}
+    with pytest.raises(ConfigError, match=r"estimator\.bound"):
+        estimators.recursion(estimators.build(settings), "ls_drem", ["a"])
+
+
+@pytest.mark.parametrize(
+    ("plant", "observer", "part"),
+    [
+        ("canonical", {"name": "canonical", "sample_time": 0.1}, "observer=canonical runs in"),
+        ("circuit", {"sample_time": 30.0}, "longer than the horizon"),
+        ("circuit", {"sample_time": 1e-9}, "at most"),
+    ],
+)
+def test_settings_that_make_no_samples(plant, observer, part):
+    with pytest.raises(ConfigError, match=part):
+        run(shipped(plant), {"name": "ls_drem"}, **observer)
+
+
+STREAM = Settings(
+    plant={}, estimator={"name": "ls_drem"}, data=DataSettings("csv", "-"),
+    time=TimeSettings(-np.inf, np.inf, 11),
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "part"),
+    [
+        ({"data": DataSettings("csv", "-", "cubic")}, "cubic"),
+        ({"observer": ObserverSettings(sample_time=0.1)}, "sample_time"),
+        ({"time": TimeSettings(0.0, 5.0, 11)}, "horizon"),
+    ],
+)
+def test_what_a_stream_cannot_do(changes, part):
+    with pytest.raises(ConfigError, match=part):
+        Stream(replace(STREAM, **changes), shipped("circuit"))
+
+
+def test_a_stream_has_one_case():
+    stream = Stream(replace(STREAM, estimator={"name": "drem", "gamma": [1, 2]}),
+                    shipped("circuit"))
+    row = Samples(np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 6)))
+    with pytest.raises(ConfigError, match="2 cases"):
+        stream.feed(row)
+
+
+# Streams as processes -------------------------------------------------------------------------
+
+COMMAND = [sys.executable, "-m", "gpebo_cli", "run", "data.file=-", "estimator=ls_drem"]
+
+
+@pytest.fixture(scope="module")
+def rows():
+    t = np.arange(0.0, 20.0, 0.01)
+    u, y = signals(shipped("circuit"), t)
+    table = np.column_stack([t, u, y]).tolist()
+    return ["t,V,y\n", *(",".join(map(repr, row)) + "\n" for row in table)]
+
+
+def started(cwd, words=(), **more):
+    return subprocess.Popen(
+        [*COMMAND, *words], cwd=cwd, env=environment(**more), text=True, bufsize=1,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )
+
+
+def test_every_row_is_answered_before_the_next_one_is_there(tmp_path, rows):
+    with started(tmp_path) as process:
+        process.stdin.write(rows[0] + rows[1])
+        process.stdin.flush()
+        header = process.stdout.readline().strip().split(",")
+        assert header == [
+            "t", "e0_e1_hat", "e0_e2_hat", "e0_il_hat",
+            *(f"{s}_hat" for s in ("e1", "e2", "il", "ir1", "ir2", "iv")), "lambda_min",
+        ]
+        assert process.stdout.readline().startswith("0,")
+        for row in rows[2:12]:
+            process.stdin.write(row)
+            process.stdin.flush()
+            answer = process.stdout.readline().split(",")  # would wait for ever if it were kept
+            assert float(answer[0]) == float(row.split(",")[0])
+            assert len(answer) == len(header)
+        process.stdin.close()
+        assert process.stdout.read() == ""
+        verdict = process.stderr.read()
+        assert "11 rows" in verdict
+        assert verdict.count("\n") == 1
+    assert process.returncode == 0
+    assert list(tmp_path.iterdir()) == []  # no folder
+
+
+def test_a_stream_gives_what_a_run_at_samples_gives(tmp_path, rows):
+    done = subprocess.run(
+        COMMAND, cwd=tmp_path, env=environment(), input="".join(rows), text=True,
+        capture_output=True, check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "interval-exciting" in done.stderr
+    table = np.array([line.split(",") for line in done.stdout.splitlines()[1:]], dtype=float)
+    assert len(table) == len(rows) - 1
+    ours = run(shipped("circuit"), {"name": "ls_drem"}, 19.99, sample_time=0.01, hold="linear")
+    np.testing.assert_allclose(table[:, 1:4], ours.estimation.parameters[0], atol=1e-8)
+    np.testing.assert_allclose(table[:, 4:10], ours.estimation.states[0], atol=1e-7)
+    np.testing.assert_allclose(
+        table[:, 10], ours.excitation.gram_eigenvalues[:, 0], rtol=1e-6, atol=1e-12
+    )
+
+
+def test_a_bad_row_ends_a_stream_after_the_rows_before_it(tmp_path, rows):
+    text = "".join(rows[:8]) + "0.5,,1\n" + rows[60]
+    done = subprocess.run(
+        COMMAND, cwd=tmp_path, env=environment(), input=text, text=True, capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "standard input, line 9, column V" in done.stderr
+    assert len(done.stdout.splitlines()) == 8
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [("", "is empty"), ("t,V,y\n", "no rows"), ("t,V\n", "no column y"), ("t;V;y\n", "semicolons")],
+)
+def test_a_stream_that_is_none(tmp_path, text, part):
+    done = subprocess.run(
+        COMMAND, cwd=tmp_path, env=environment(), input=text, text=True, capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert part in done.stderr
+
+
+def test_interrupting_a_stream_leaves_whole_rows(tmp_path, rows):
+    with started(tmp_path) as process:
+        process.stdin.write("".join(rows[:20]))
+        process.stdin.flush()
+        for _ in range(20):
+            assert process.stdout.readline().endswith("\n")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+        assert process.stdout.read() == ""
+        assert process.stderr.read() == "gpebo: error: interrupted\n"
+
+
+def test_a_reader_that_has_seen_enough_ends_a_stream_quietly(tmp_path, rows):
+    with started(tmp_path) as process:
+        process.stdin.write("".join(rows[:5]))
+        process.stdin.flush()
+        process.stdout.readline()
+        process.stdout.close()
+        try:
+            process.stdin.write("".join(rows[5:]))
+            process.stdin.close()
+        except BrokenPipeError:
+            pass
+        assert process.wait(60) == 0
+        assert process.stderr.read() == ""
+
+
+def test_the_memory_of_a_stream_does_not_grow(tmp_path):
+    script = (
+        "import sys\n"
+        "sys.argv = ['gpebo', 'run', 'data.file=-', 'estimator=least_squares']\n"
+        "from gpebo_cli.app import main\n"
+        "code = main()\n"
+        # Not ru_maxrss, which a process inherits from the one that started it.
+        "peak = [x for x in open('/proc/self/status') if x.startswith('VmHWM')][0].split()[1]\n"
+        "sys.stderr.write(peak)\n"
+        "sys.exit(code)\n"
+    )
+    if not os.path.exists("/proc/self/status"):
+        pytest.skip("needs /proc")
+    peak = []
+    for count in (2_000, 16_000):
+        t = 0.01 * np.arange(count)
+        table = np.column_stack([t, np.sin(t), np.cos(2 * t)]).tolist()
+        text = "t,V,y\n" + "".join(f"{a!r},{b!r},{c!r}\n" for a, b, c in table)
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", script], cwd=tmp_path, env=environment(),
+            input=text, text=True, capture_output=True, check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.count("\n") == count + 1
+        peak.append(int(done.stderr.splitlines()[-1]))
+    # As text alone 14,000 more rows are 800 kB, as estimates 2.5 MB: it would show in kB.
+    assert peak[1] - peak[0] < 1500, peak
+
+
+def test_a_sweep_cannot_read_standard_input(tmp_path):
+    done = gpebo("run", "-m", "data.file=-", "estimator.gamma=1,2", cwd=tmp_path)
+    assert done.returncode != 0
+    assert "standard input" in done.stdout + done.stderr
