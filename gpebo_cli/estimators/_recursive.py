@@ -82,12 +82,12 @@ def spectrum(root: Array, memory: Array) -> Spectrum:
     p = root.shape[-1] - 1
     if p == 0:
         none = np.zeros((len(root), 0))
-        return Spectrum(none, none[:, :, None], none, memory)
+        return Spectrum(none, none[:, :, None], none[:, :, None], memory)
     U, sigma, Vt = np.linalg.svd(root[..., :p, :p])
     order = np.arange(p)[::-1]  # ascending, as of eigenvalues
     U, sigma, Vt = U[..., order], sigma[..., order], Vt[..., order, :]
-    coordinates = np.einsum("...ji,...j->...i", U, root[..., :p, p])
-    return Spectrum(sigma**2, np.swapaxes(Vt, -1, -2), sigma * coordinates, memory)
+    coordinates = np.swapaxes(U, -1, -2) @ root[..., :p, p:]
+    return Spectrum(sigma**2, np.swapaxes(Vt, -1, -2), sigma[..., None] * coordinates, memory)
 
 
 def quotient_of(s: Spectrum) -> tuple[Array, BoolArray]:
@@ -95,9 +95,10 @@ def quotient_of(s: Spectrum) -> tuple[Array, BoolArray]:
     largest = s.eigenvalues[:, -1:] if s.eigenvalues.shape[1] else np.zeros((len(s.memory), 1))
     usable = (s.eigenvalues > _SINGULAR**2 * largest).all(axis=1) & (largest[:, 0] > 0.0)
     inverse = np.divide(
-        s.rotated, s.eigenvalues, out=np.zeros_like(s.rotated), where=usable[:, None]
+        s.rotated, s.eigenvalues[..., None], out=np.zeros_like(s.rotated),
+        where=usable[:, None, None],
     )
-    return np.einsum("mij,mj->mi", s.vectors, inverse), usable
+    return (s.vectors @ inverse)[..., 0], usable
 
 
 class ScalarLaw:

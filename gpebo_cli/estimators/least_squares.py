@@ -170,7 +170,7 @@ class RecursiveLeastSquares:
             solution(s, case["alpha"], case["f0"], self._start)
             for case, s in zip(self._cases, spectra, strict=True)
         ]
-        return SampledEstimates(np.array(solved), None)
+        return SampledEstimates(np.array(solved)[..., 0], None)
 
     @property
     def requirement(self) -> Requirement:
