@@ -124,7 +124,7 @@ def test_variance_over_seeds_is_what_was_asked_for_at_every_time(shape):
             grid.mesh.points.ravel(), grid.mesh.inside.ravel()
         ).reshape(*grid.mesh.points.shape, 1))
         y, u = draw_errors(true, grid, noise_levels(settings, system), seed)
-        points = (grid.mesh.size, 13, 1)
+        points = (*grid.mesh.points.shape, 1)
         sampler = grid.mesh.sampler(t)
         errors.append([
             sampler(np.broadcast_to(between(e, grid, shape), points))[:, 0] for e in (y, u)
