@@ -27,7 +27,7 @@ from gpebo_cli.settings import NoiseSettings
 from gpebo_cli.simulation.simulate import Signals
 from gpebo_cli.systems.descriptor import Array
 
-_NUMBERS = 1 << 20  # in Y of one batch of seeds: estimators hold tens of times that, and more is slower
+_NUMBERS = 1 << 20  # in Y of one batch of seeds; estimators hold tens of times that
 
 
 def check_seeds(settings: NoiseSettings, levels: NoiseLevels, observer: str) -> None:
