@@ -36,7 +36,7 @@ _KEYS = (
     "reference",
 )
 _DESCRIPTIVE = ("title", "reference")  # of files in the groups; for people
-_FOLDER = "estimator"  # of an observer that estimates by itself; its runs are called after it
+_FOLDER = "estimator"  # an observer that estimates by itself: its name again, for its folders
 
 # Accepted ranges, ends included. What a type cannot say; beyond them nothing sensible happens.
 _RANGES = {
@@ -74,11 +74,7 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         estimator=_group(config, "estimator"),
         time=read(TimeSettings, _group(config, "time"), "time"),
         solver=read(SolverSettings, _group(config, "solver"), "solver"),
-        observer=read(
-            ObserverSettings,
-            {k: v for k, v in _group(config, "observer").items() if k != _FOLDER},
-            "observer",
-        ),
+        observer=read(ObserverSettings, _observer(config), "observer"),
         excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
         output=_output(config, draw=draw),
         noise=read(NoiseSettings, _group(config, "noise"), "noise"),
@@ -105,6 +101,13 @@ def _group(config: Mapping[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(section, Mapping):
         raise ConfigError(f"{name}: expected a mapping of keys to values, got {shown(section)}")
     return {str(k): v for k, v in section.items() if k not in _DESCRIPTIVE}
+
+
+def _observer(config: Mapping[str, Any]) -> dict[str, Any]:
+    section = _group(config, "observer")
+    if section.get(_FOLDER) == section.get("name"):
+        section.pop(_FOLDER, None)
+    return section
 
 
 def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:
