@@ -39,6 +39,8 @@ _ADVICE = {
     "Assumption 5": "as for Assumption 2: change the input, measure more, or lengthen time.horizon",
     "Assumption 6": "name an output that fits (observer.output), or use observer=gpebo",
     "Assumption 7": "choose another gain (observer.L_w), or use observer=gpebo",
+    "uniform observability": "what was learnt before lasts only as long as observer.process is 0; "
+    "measure more, or use observer=gpebo, which needs Assumption 2 alone",
     "Growth of Φ": "the observer's own dynamics are unstable over this horizon: shorten "
     "time.horizon, or take outputs that see more of the state",
 }

@@ -38,7 +38,7 @@ _KEYS = (
     "reference",
 )
 _DESCRIPTIVE = ("title", "reference")  # of files in the groups; for people
-_FOLDER = "estimator"  # of an observer that estimates by itself; its runs are called after it
+_FOLDER = "estimator"  # an observer that estimates by itself: its name again, for its folders
 
 # Accepted ranges, ends included. What a type cannot say; beyond them nothing sensible happens.
 _RANGES = {
@@ -83,11 +83,7 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         estimator=_group(config, "estimator"),
         time=_time(config, recorded=data.name == "csv"),
         solver=read(SolverSettings, _group(config, "solver"), "solver"),
-        observer=read(
-            ObserverSettings,
-            {k: v for k, v in _group(config, "observer").items() if k != _FOLDER},
-            "observer",
-        ),
+        observer=read(ObserverSettings, _observer(config), "observer"),
         excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
         output=_output(config, draw=draw),
         noise=read(NoiseSettings, _group(config, "noise"), "noise"),
@@ -128,6 +124,13 @@ def _time(config: Mapping[str, Any], *, recorded: bool) -> TimeSettings:
         start=time.start if "start" in section else -math.inf,
         horizon=time.horizon if "horizon" in section else math.inf,
     )
+
+
+def _observer(config: Mapping[str, Any]) -> dict[str, Any]:
+    section = _group(config, "observer")
+    if section.get(_FOLDER) == section.get("name"):
+        section.pop(_FOLDER, None)
+    return section
 
 
 def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:

@@ -39,6 +39,8 @@ _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
 # Standard deviations below this share of the largest one, each relative to that at the start, are
 # resolved less: P as a matrix does not hold them, for its rounding is that of its largest entry.
 _SMALLEST = 3e-5
+_FALL = 1e12  # of P over the horizon: beyond, a double does not hold both ends
+_LEFT = 3e-3  # of the rounding of P(0): it falls as well, if less
 _GROWTH = 1e3  # of X₁ within an element: as many digits of P are lost
 
 
@@ -187,6 +189,13 @@ def run_filter(
     variance = 1.0 / max(float(np.abs(W).max(initial=0.0)), np.finfo(float).tiny)
     if not np.isfinite(variance):
         variance = 1.0
+    fall = float(np.diag(P0).max()) / variance * float(mesh.edges[-1] - mesh.edges[0])
+    if fall > _FALL:
+        raise SolverError(
+            f"the covariance of the {name} would fall to {1 / fall:.1e} of where it starts, beyond "
+            "the digits of a double; lower observer.P0, or raise observer.regularisation or the "
+            "noise"
+        )
 
     def coefficients(t: Array, inside: Array) -> Coefficients:
         m, extras = model(t, inside)
@@ -211,6 +220,8 @@ def run_filter(
         coefficients, pair(P0 / variance, start), signals, name, renewal=_Restart()
     )
     try:
+        # The rounding of P(0) is what is left to resolve of a P that has fallen so far.
+        tol = max(tol, _LEFT * float(np.finfo(float).eps) * fall)
         solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
         P, _ = quotient(solution.trajectory.values)
     except np.linalg.LinAlgError as error:
