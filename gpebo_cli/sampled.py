@@ -122,7 +122,7 @@ class SampledRun:
             ),
             Assumption(
                 "Assumption 1", "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
-                True, {"smallest_singular_value": self._reached.injectivity},
+                True, {"smallest_singular_value_at_least": self._reached.injectivity},
             ),
         )
 

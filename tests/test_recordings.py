@@ -12,6 +12,7 @@ import pytest
 from plants import shipped
 from test_cli import gpebo
 
+from gpebo_cli import check, run
 from gpebo_cli.collocation.mesh import Mesh
 from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ConfigError
@@ -19,7 +20,13 @@ from gpebo_cli.experiment import run_experiment
 from gpebo_cli.recordings.hold import edges, held, on_mesh, recording_mesh
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import LineReader, read_table
-from gpebo_cli.settings import DataSettings, ObserverSettings, Settings, TimeSettings
+from gpebo_cli.settings import (
+    DataSettings,
+    NoiseSettings,
+    ObserverSettings,
+    Settings,
+    TimeSettings,
+)
 
 WHOLE = TimeSettings(-np.inf, np.inf, 201)
 ESTIMATOR = {"name": "ls_drem"}
@@ -62,39 +69,39 @@ def test_estimates_converge_to_those_of_the_run_as_samples_get_finer(tmp_path, h
     system = shipped("circuit")
     errors = []
     for samples in (201, 401, 801):
-        run = simulated(samples=samples, horizon=10.0)
+        made = simulated(samples=samples, horizon=10.0)
         result = recorded(
-            write(tmp_path / "r.csv", signals_of(run)), hold=hold,
+            write(tmp_path / "r.csv", signals_of(made)), hold=hold,
             time=TimeSettings(0.0, 10.0, samples),
         )
-        difference = result.estimation.parameters[0, -1] - run.estimation.parameters[0, -1]
+        difference = result.estimation.parameters[0, -1] - made.estimation.parameters[0, -1]
         errors.append(np.abs(difference).max())
-        assert result.estimation.names == run.estimation.names
+        assert result.estimation.names == made.estimation.names
     assert system.name == "circuit"
     rates = np.log2(np.array(errors[:-1]) / errors[1:])
     assert abs(rates[-1] - order) < 0.35
 
 
 def test_a_cubic_recording_reproduces_the_estimates(tmp_path):
-    run = simulated()
-    columns = signals_of(run)
+    made = simulated()
+    columns = signals_of(made)
     path = write(tmp_path / "r.csv", columns)
     result = recorded(path, hold="cubic", time=TimeSettings(0.0, 20.0, 1001))
-    late = run.signals.t > 3.0
-    difference = np.abs(result.estimation.states - run.estimation.states)[0]
-    size = np.abs(run.signals.states).max(axis=0)
+    late = made.signals.t > 3.0
+    difference = np.abs(result.estimation.states - made.estimation.states)[0]
+    size = np.abs(made.signals.states).max(axis=0)
     assert (difference / size)[late].max() < 1e-6
     np.testing.assert_allclose(
-        result.estimation.true_parameters, run.estimation.true_parameters, atol=1e-12
+        result.estimation.true_parameters, made.estimation.true_parameters, atol=1e-12
     )
     assert result.metrics.final_error_states[0] < 1e-7 * size.max()
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 def test_a_run_on_held_signals_is_reproduced_to_rounding(tmp_path, hold):
-    run = simulated(samples=201)
+    made = simulated(samples=201)
     first = recorded(
-        write(tmp_path / "1.csv", signals_of(run)), hold=hold, time=TimeSettings(0.0, 20.0, 201)
+        write(tmp_path / "1.csv", signals_of(made)), hold=hold, time=TimeSettings(0.0, 20.0, 201)
     )
     again = recorded(
         write(tmp_path / "2.csv", signals_of(first)), hold=hold, time=TimeSettings(0.0, 20.0, 201)
@@ -105,8 +112,8 @@ def test_a_run_on_held_signals_is_reproduced_to_rounding(tmp_path, hold):
 
 
 def test_unknown_parameters_of_a_recording_are_estimated_and_their_truth_is_not_known(tmp_path):
-    run = simulated("descriptor")
-    result = recorded(write(tmp_path / "r.csv", signals_of(run)), "descriptor", "cubic")
+    made = simulated("descriptor")
+    result = recorded(write(tmp_path / "r.csv", signals_of(made)), "descriptor", "cubic")
     truth = result.estimation.true_parameters
     assert np.isnan(truth[:, :2]).all()
     np.testing.assert_allclose(truth[:, 2:], [[-1.0, 1.0]] * len(truth), atol=1e-12)
@@ -339,3 +346,25 @@ def test_what_is_wrong_with_a_recording_is_one_line(tmp_path, words, part):
     assert done.stderr.startswith("gpebo: error: ")
     assert done.stderr.count("\n") == 1
     assert part in done.stderr
+
+
+def test_noise_is_not_added_to_a_recording(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text(GOOD)
+    with pytest.raises(ConfigError, match="has its own"):
+        recorded(str(path), noise=NoiseSettings(outputs=0.1))
+
+
+def test_a_recording_from_python(tmp_path):
+    columns = signals_of(simulated(samples=401))
+    path = write(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y")})
+    from_path = run("circuit", estimator="ls_drem", data=Path(path))
+    cubic = run("circuit", estimator="ls_drem", data={"file": path, "hold": "cubic"})
+    assert from_path.t[-1] == 20.0
+    assert np.isnan(cubic["il"]).all()
+    fits = [result.details.fit.residual[0] for result in (from_path, cubic)]
+    assert fits[1] < 1e-2 * fits[0]
+    found = check("circuit", data=path)
+    assert all(assumption.holds for assumption in found)
+    saved = cubic.save(tmp_path / "out", figures=False)
+    assert json.loads((saved / "summary.json").read_text())["recording"]["hold"] == "cubic"
