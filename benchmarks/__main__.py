@@ -83,7 +83,9 @@ def _cpu() -> str:
 
 
 def _blas() -> str:
-    """Libraries of linear algebra that are loaded, and their threads."""
+    """NumPy's and SciPy's libraries of linear algebra, and their threads."""
+    import scipy.linalg  # noqa: F401  loads its own
+
     try:
         from threadpoolctl import threadpool_info
     except ImportError:

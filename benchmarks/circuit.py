@@ -204,26 +204,22 @@ def scipy_peer(method: str, right: Any, gammas: list[float] | None = None) -> Pr
 class DiffraxPeer:
     """A solver of diffrax on the script's right-hand side, jitted, in double precision.
 
-    With gains the same compiled function is called for each, or once for all (``vmap``). The
-    first call compiles, for every tolerance, and is not timed. Implicit solvers get Newton's
+    With gains the same compiled function is called for each. The first call compiles, for every
+    tolerance, and is not timed. Implicit solvers get Newton's
     method with tolerances of its own: with diffrax's default, the controller's tolerances and a
     chord iteration, steps are rejected without end.
     """
 
-    def __init__(
-        self, solver: str, gammas: list[float] | None = None, *, vmap: bool = False
-    ) -> None:
-        self.solver, self.gammas, self.vmap = solver, gammas, vmap
+    def __init__(self, solver: str, gammas: list[float] | None = None) -> None:
+        self.solver, self.gammas = solver, gammas
         self.run: Any = None
 
     def __call__(self, rtol: float) -> Solve:
         """What to time at ``rtol``."""
         if self.run is None:
             self.run = self._compiled()
-        gammas = [GAMMA] if self.gammas is None else self.gammas
-        if self.vmap:
-            return lambda: np.asarray(self.run(rtol, np.array(gammas)))
-        if self.gammas is None:
+        gammas = self.gammas
+        if gammas is None:
             return lambda: np.asarray(self.run(rtol, GAMMA))
         return lambda: np.array([self.run(rtol, gamma) for gamma in gammas])
 
@@ -237,7 +233,8 @@ class DiffraxPeer:
 
         kind = getattr(diffrax, self.solver)
         implicit = issubclass(kind, diffrax.AbstractImplicitSolver)
-        solver = kind(optimistix.Newton(rtol=1e-6, atol=1e-8)) if implicit else kind()
+        newton = optimistix.Newton(rtol=1e-6, atol=1e-8)
+        solver = kind(root_finder=newton) if implicit else kind()
         term = diffrax.ODETerm(lambda t, x, gamma: script(t, x, gamma, jnp))
         times = diffrax.SaveAt(ts=jnp.array(_reference()[0]))
 
@@ -249,9 +246,8 @@ class DiffraxPeer:
             )
             return done.ys[:, jnp.array([0, 1, 26, 27, 28])]
 
-        compiled = jax.jit(jax.vmap(run, (None, 0)) if self.vmap else run)
-        gammas = np.array(self.gammas or [GAMMA])
-        np.asarray(compiled(1e-3, gammas if self.vmap else gammas[0]))
+        compiled = jax.jit(run)
+        np.asarray(compiled(1e-3, GAMMA))
         return compiled
 
 

@@ -218,7 +218,7 @@ def _circuit(_: Data, rows: list[Row]) -> list[str]:
 def _gains(_: Data, rows: list[Row]) -> list[str]:
     return [
         ("The same with γ = 1e6 … 1e12. Ours is one run with a thousand cases; peers start anew "
-        "for each gain, and ten of the thousand are timed and scaled (`vmap`: a hundred at once). "
+        "for each gain, and ten of the thousand are timed and scaled. "
         f"{_target(rows)} at every gain."),
         _rows_table(rows),
     ]
@@ -240,7 +240,7 @@ def _problems(part: Data, rows: list[Row]) -> list[str]:
         "semi-explicit form where E is constant, else `x' = v, 0 = E v − A x − f`; its "
         'collocation is Radau of order 5 and its "tolerance" one over the number of elements. '
         "*Reduced by hand* is the ODE that is left after somebody has done the reduction on "
-        f"paper, by DOP853. {_target(rows)}."),
+        f"paper, by DOP853; where no ODE is left there is no row. {_target(rows)}."),
         "The peer's time over ours:",
         table(
             ["problem", "index", *peers],

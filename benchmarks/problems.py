@@ -193,8 +193,8 @@ def solve_dae_peer(method: str) -> Callable[[Problem], Prepare]:
     return peer
 
 
-def _casadi_dae(problem: Problem) -> tuple[dict[str, Any], Array, Array, list[int]]:
-    """The problem as CasADi's semi-explicit DAE, initial x and z, and where the states stand.
+def _casadi_dae(problem: Problem) -> tuple[dict[str, Any], Array, Array, Array, list[int]]:
+    """The problem as CasADi's semi-explicit DAE, initial x, x' and z, and where the states stand.
 
     Where E is constant with at most one entry in each row and column, those states are x and the
     others z. Else x' = v and 0 = E v − A x − f with v among z: the only form that CasADi takes
@@ -225,16 +225,18 @@ def _casadi_dae(problem: Problem) -> tuple[dict[str, Any], Array, Array, list[in
             "ode": ca.vertcat(*[right[i] / float(e) for i, _, e in entries]),
             "alg": ca.vertcat(*[right[i] for i in range(n) if i not in rows]),
         }
-        return dae, x0[columns], x0[z], [order.index(j) for j in range(n)]
+        return dae, x0[columns], dx0[columns], x0[z], [order.index(j) for j in range(n)]
     v = ca.SX.sym("v", n)
-    return {"t": t, "x": x, "z": v, "ode": v, "alg": E @ v - right}, x0, dx0, list(range(n))
+    return {"t": t, "x": x, "z": v, "ode": v, "alg": E @ v - right}, x0, dx0, dx0, list(range(n))
 
 
 def _casadi(problem: Problem, plugin: str, options: dict[str, Any]) -> Solve:
     import casadi as ca
 
-    dae, x0, z0, order = _casadi_dae(problem)
+    dae, x0, dx0, z0, order = _casadi_dae(problem)
     t = problem.t
+    if plugin == "idas":
+        options = {**options, "init_xdot": dx0.tolist()}
     integrator = ca.integrator("peer", plugin, dae, float(t[0]), list(t[1:]), options)
 
     def solve() -> Array:
@@ -246,10 +248,16 @@ def _casadi(problem: Problem, plugin: str, options: dict[str, Any]) -> Solve:
 
 
 def casadi_idas(problem: Problem) -> Prepare:
-    """CasADi's interface to IDAS; initial values are given, so it need not correct them."""
+    """CasADi's interface to IDAS; initial values are given, so it need not correct them.
+
+    Above index 1 algebraic variables are left out of the error test, as SUNDIALS recommends.
+    """
 
     def prepare(tol: float) -> Solve:
-        options = {"reltol": tol, "abstol": tol, "calc_ic": False, "max_num_steps": 20_000}
+        options = {
+            "reltol": tol, "abstol": tol, "calc_ic": False, "max_num_steps": 20_000,
+            "suppress_algebraic": problem.data["index"] > 1,
+        }
         return _casadi(problem, "idas", options)
 
     return prepare
@@ -302,8 +310,6 @@ def by_hand(problem: Problem) -> Prepare:
     import sympy as sp
     from scipy.integrate import solve_ivp
 
-    if problem.name not in BY_HAND:
-        raise Failed("no ODE is left to integrate: the reduction by hand is the solution")
     names, derivatives, states = BY_HAND[problem.name]
     t, symbols = sp.Symbol("t"), sp.symbols(names, seq=True)
     x1 = sp.sympify(_ASCHER["x1"])
@@ -350,12 +356,15 @@ def rows() -> list[Row]:
     for problem in problems():
         mine = loosest(ours(problem), decades(-6, -13), problem.error, TARGET)
         for peer, (build, tolerances) in PEERS.items():
+            if build is by_hand and problem.name not in BY_HAND:
+                continue  # no ODE is left to integrate: the reduction is the solution
+
             def prepare(tol: float, build: Any = build, problem: Problem = problem) -> Solve:
                 return build(problem)(tol)  # type: ignore[no-any-return]  # imports, too
 
             table.append(
                 compare(problem.name, mine, peer, prepare, tolerances, problem.error, TARGET,
-                        budget=0.8, patience=3.0)
+                        budget=0.8, patience=4.0)
             )
     return table
 
