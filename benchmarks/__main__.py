@@ -11,6 +11,7 @@ import json
 import os
 import platform
 import sys
+import traceback
 from collections.abc import Callable
 from datetime import date
 from importlib import metadata
@@ -110,12 +111,21 @@ def main(words: list[str]) -> int:
         sys.stderr.write(f"there is no part {unknown[0]!r}; there are {', '.join(PARTS)}\n")
         return 2
     data = json.loads(JSON.read_text("utf-8")) if JSON.exists() else {"rows": [], "parts": {}}
+    failed = []
     for part in words or [part for part in PARTS if part != "sweeps"]:
         sys.stderr.write(f"{part}\n")
         measured = environment()
-        rows, more = MEASURE[part]()
+        try:
+            rows, more = MEASURE[part]()
+        except Exception:  # noqa: BLE001  ours failed; the other parts are still worth measuring
+            traceback.print_exc()
+            failed.append(part)
+            continue
         data = merged(data, part, rows, more, measured)
         write(data)
+    if failed:
+        sys.stderr.write(f"not measured, old numbers kept: {', '.join(failed)}\n")
+        return 1
     sys.stdout.write(PAGE.read_text("utf-8"))
     return 0
 

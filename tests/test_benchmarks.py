@@ -181,6 +181,23 @@ def test_parts_are_known_to_the_program_and_unknown_ones_refused(capsys):
     assert "circut" in capsys.readouterr().err
 
 
+def test_a_part_that_fails_keeps_its_old_numbers_and_stops_no_other(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(program, "JSON", tmp_path / "benchmarks.json")
+    monkeypatch.setattr(program, "PAGE", tmp_path / "benchmarks.md")
+    monkeypatch.setattr(program, "MEASURE", {
+        "circuit": lambda: ([row(name="first")], {}), "cold": lambda: ([row(name="old")], {}),
+    })
+    assert program.main(["cold"]) == 0
+    program.MEASURE["cold"] = lambda: 1 / 0
+    assert program.main(["cold", "circuit"]) == 1
+    data = json.loads(program.JSON.read_text("utf-8"))
+    assert [r["name"] for r in data["rows"]] == ["first", "old"]
+    assert program.PAGE.read_text("utf-8") == page(data)
+    assert "old numbers kept: cold" in capsys.readouterr().err
+
+
 def test_the_peer_of_the_cold_run_draws_the_same_figures(tmp_path, monkeypatch):
     result = make_result(gammas=(1e10,))
     write_run(with_figures(result, False), tmp_path, "")
