@@ -38,12 +38,12 @@ _GRID = 41  # samples of ours; the reference's times are among them
 
 
 @cache
-def plant() -> DescriptorSystem:
-    """The shipped circuit."""
+def plant(name: str = "circuit") -> DescriptorSystem:
+    """A shipped plant."""
     import yaml
 
-    text = (ROOT / "conf" / "plant" / "circuit.yaml").read_text("utf-8")
-    return plant_from_mapping(yaml.safe_load(text), "circuit.yaml")
+    text = (ROOT / "conf" / "plant" / f"{name}.yaml").read_text("utf-8")
+    return plant_from_mapping(yaml.safe_load(text), f"{name}.yaml")
 
 
 @cache

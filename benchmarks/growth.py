@@ -22,6 +22,7 @@ from benchmarks.measure import at_most, say
 ROOT = Path(__file__).parent.parent
 AXES: dict[str, tuple[str, tuple[int, ...]]] = {
     "horizon": ("the circuit experiment, horizon in s", (20, 200, 2_000, 20_000)),
+    "descriptor": ("the descriptor experiment, horizon in s", (20, 200, 2_000, 20_000)),
     "lti": ("a chain with constant elements, states", (3, 10, 30, 60, 100, 200)),
     "ltv": ("a chain with time-varying elements, states", (3, 10, 20, 40)),
     "gains": ("the circuit experiment, gains", (1, 10, 100, 1_000, 10_000, 100_000, 1_000_000)),
@@ -30,8 +31,10 @@ AXES: dict[str, tuple[str, tuple[int, ...]]] = {
 PATIENCE = 200.0  # seconds for one point, of its own work
 
 
-def experiment(horizon: float = 20.0, gains: int = 1, samples: int = 2) -> Callable[[], object]:
-    """The numerical part of the circuit experiment."""
+def experiment(
+    horizon: float = 20.0, gains: int = 1, samples: int = 2, name: str = "circuit"
+) -> Callable[[], object]:
+    """The numerical part of the experiment with a shipped plant."""
     from benchmarks.circuit import plant
     from gpebo_cli.experiment import run_experiment
     from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
@@ -41,7 +44,7 @@ def experiment(horizon: float = 20.0, gains: int = 1, samples: int = 2) -> Calla
         plant={}, estimator={"name": "drem", "gamma": gamma},
         time=TimeSettings(horizon=horizon, samples=samples), solver=SolverSettings(tol=1e-9),
     )
-    system = plant()
+    system = plant(name)
 
     def run() -> object:
         estimation = run_experiment(settings, system).estimation
@@ -82,7 +85,9 @@ def work(axis: str, value: int) -> Callable[[], object]:
     """What is timed at one point."""
     if axis in ("lti", "ltv"):
         return chain(value, varying=axis == "ltv")
-    return experiment(**{axis: value})
+    if axis == "descriptor":
+        return experiment(value, name="descriptor")
+    return experiment(**{axis: value})  # type: ignore[arg-type]
 
 
 def point(axis: str, value: int) -> dict[str, float]:
@@ -163,10 +168,14 @@ def plot(axes: list[dict[str, Any]], path: Path) -> None:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    groups = (("horizon", "horizon (s)"), ("gains", "gains"), ("samples", "samples"))
-    columns = [([axis for axis in axes if axis["axis"] == key], label) for key, label in groups]
-    states = [axis for axis in axes if axis["axis"] in ("lti", "ltv")]
-    columns.insert(1, (states, "states"))
+    panels_of = (
+        (("horizon", "descriptor"), "horizon (s)"), (("lti", "ltv"), "states"),
+        (("gains",), "gains"), (("samples",), "samples"),
+    )
+    columns = [([a for a in axes if a["axis"] in keys], label) for keys, label in panels_of]
+    names = {
+        "horizon": "circuit", "descriptor": "descriptor", "lti": "constant", "ltv": "time-varying"
+    }
     figure, panels = plt.subplots(
         2, 4, figsize=(11, 5.2), sharex="col", sharey="row", layout="constrained"
     )
@@ -178,7 +187,7 @@ def plot(axes: list[dict[str, Any]], path: Path) -> None:
                 if not shown:
                     continue
                 x, y = np.array(shown).T
-                name = {"lti": "constant", "ltv": "time-varying"}.get(axis["axis"], "measured")
+                name = names.get(axis["axis"], "measured")
                 panel.loglog(x, y, "o-" if k == 0 else "s--", color=f"C{k}", label=name)
                 if k == 0:
                     panel.loglog(x, y[-1] * x / x[-1], ":", color="0.5", label="slope 1")

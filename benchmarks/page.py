@@ -170,7 +170,7 @@ def _problem_score(rows: Sequence[Row]) -> str:
 
 
 def _exponents(axes: Sequence[dict[str, Any]]) -> str:
-    shown = [axis for axis in axes if axis["axis"] in ("horizon", "gains", "samples")]
+    shown = [axis for axis in axes if axis["axis"] not in ("lti", "ltv")]
     return "; ".join(
         f"{axis['axis']}: time ^{_exponent(axis['seconds_exponent'])}, "
         f"memory ^{_exponent(axis['bytes_exponent'])}" for axis in shown
