@@ -1,9 +1,10 @@
 """Seconds and memory of a sweep on each launcher, and of the same gains as an axis of one run.
 
-    python benchmarks/sweeps.py [JOBS] [axis|basic|joblib|ray|submitit_slurm …]
+    python -m benchmarks sweeps
 
 Memory is the largest sum, over all processes that work on the sweep, of their proportional set
-sizes, sampled four times a second. Linux only; launchers must be installed, Slurm must run.
+sizes, sampled four times a second. Linux only. A launcher that is not installed, or Slurm that
+does not run, is a row that says so.
 """
 
 from __future__ import annotations
@@ -14,23 +15,30 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
+
+from benchmarks.measure import say
 
 LAUNCHERS = ("axis", "basic", "joblib", "ray", "submitit_slurm")
+JOBS = 1000
 ROOT = Path(__file__).parents[1]
 
 
-def main() -> None:
-    """Print one line per way."""
-    words = sys.argv[1:]
-    jobs = int(words.pop(0)) if words and words[0].isdigit() else 100
-    for launcher in words or LAUNCHERS:
+def table(jobs: int = JOBS) -> list[dict[str, Any]]:
+    """One row for each way."""
+    rows = []
+    for launcher in LAUNCHERS:
+        say(f"sweeps: {launcher}, {jobs:,} jobs")
+        row: dict[str, Any] = {
+            "launcher": launcher, "jobs": jobs, "seconds": None, "bytes": None, "note": ""
+        }
         with tempfile.TemporaryDirectory() as folder:
-            seconds, memory = measure(command(launcher, jobs), folder)
-        each = f"{1e3 * seconds / jobs:8.1f} ms per job"
-        sys.stdout.write(
-            f"{launcher:<15} {jobs:5d} {seconds:8.1f} s {each} {memory / 2**20:6.0f} MiB\n"
-        )
-        sys.stdout.flush()
+            try:
+                row["seconds"], row["bytes"] = measure(command(launcher, jobs), folder)
+            except ArithmeticError as problem:
+                row["note"] = str(problem)
+        rows.append(row)
+    return rows
 
 
 def command(launcher: str, jobs: int) -> list[str]:
@@ -41,16 +49,25 @@ def command(launcher: str, jobs: int) -> list[str]:
 
 
 def measure(words: list[str], folder: str) -> tuple[float, int]:
-    """Seconds until the command ends, and bytes of memory at the worst moment."""
+    """Seconds until the command ends, and bytes of memory at the worst moment.
+
+    Raises:
+        ArithmeticError: it ended with an error, its last line.
+    """
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     start = time.monotonic()
-    process = subprocess.Popen(words, cwd=folder, env=environment, stdout=subprocess.DEVNULL)  # noqa: S603
-    most = 0
-    while process.poll() is None:
-        most = max(most, sum(map(memory, family(process.pid))))
-        time.sleep(0.25)
-    if process.returncode:
-        sys.exit(f"{' '.join(words)} ended with {process.returncode}")
+    with (Path(folder) / "stderr").open("w+", encoding="utf-8") as errors:
+        process = subprocess.Popen(  # noqa: S603
+            words, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=errors
+        )
+        most = 0
+        while process.poll() is None:
+            most = max(most, sum(map(memory, family(process.pid))))
+            time.sleep(0.25)
+        if process.returncode:
+            errors.seek(0)
+            lines = errors.read().strip().splitlines()
+            raise ArithmeticError(lines[-1] if lines else f"exit {process.returncode}")
     return time.monotonic() - start, most
 
 
@@ -80,7 +97,3 @@ def memory(process: int) -> int:
     except OSError:
         return 0
     return sum(int(line.split()[1]) * 1024 for line in text.splitlines() if line.startswith("Pss:"))
-
-
-if __name__ == "__main__":
-    main()
