@@ -21,6 +21,8 @@ NOTEBOOK = DOCS / "first_run.ipynb"
 
 # Sphinx's roles in docstrings, which mkdocstrings shows as they stand.
 _ROLE = re.compile(r":(?:func|class|data|meth|attr|mod):(?=<code>)")
+_CELL_CODE = re.compile(r"(?<=<td>).*?(?=</td>)")
+_DOT = re.compile(r"(?<=\w)\.(?=\w+[^<>]*</code>)")
 _CODE_PATH = re.compile(r"<code>~?gpebo_cli\.(?:\w+\.)*(\w+)</code>")
 
 
@@ -45,8 +47,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Take the roles out of what mkdocstrings has rendered."""
-    return _CODE_PATH.sub(r"<code>\1</code>", _ROLE.sub("", html))
+    """Take the roles out of what mkdocstrings has rendered; let names in tables break at dots."""
+    html = _CODE_PATH.sub(r"<code>\1</code>", _ROLE.sub("", html))
+    return _CELL_CODE.sub(lambda match: _DOT.sub(".<wbr>", match[0]), html)
 
 
 def commands_page() -> str:
