@@ -49,7 +49,8 @@ def main(words: list[str]) -> int:
     """Print the table, or JSON; 0 if everything that is needed holds, else 1.
 
     Raises:
-        GpeboError: the words or the configuration are wrong, or the solver fails.
+        ConfigError: the words or the configuration are wrong.
+        GpeboError: the solver fails.
     """
     if "--help" in words or "-h" in words:
         from gpebo_cli.commands.usage import CHECK_HELP

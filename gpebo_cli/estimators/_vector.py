@@ -96,7 +96,7 @@ class VectorEstimates:
     requirement: Requirement
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
-        """Nothing is mixed."""
+        """Nothing is mixed, at any of the times t (M,)."""
         return
 
     def parameters(self, cases: slice) -> Array:

@@ -20,7 +20,14 @@ def observe(
     settings: ObserverSettings,
     solver: SolverSettings,
 ) -> Observation:
-    """Run the observer that ``settings.name`` asks for on the signals u and y of one mesh.
+    """Run the observer that ``settings.name`` asks for on the signals of one mesh.
+
+    Args:
+        system: the plant; its true θ and initial state are not looked at.
+        inputs: u, values (K, s + 1, m).
+        outputs: y, values (K, s + 1, r).
+        settings: which observer, and what it is free to choose.
+        solver: tolerances.
 
     Raises:
         ModelError: an assumption of the observer fails; names the time and the evidence.
