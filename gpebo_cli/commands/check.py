@@ -58,7 +58,9 @@ def main(words: list[str]) -> int:
         sys.stdout.write(CHECK_HELP)
         return 0
     as_json = "--json" in words
-    arguments = command_line.parse([word for word in words if word != "--json"])
+    arguments = command_line.parse(
+        [word for word in words if word != "--json"], "check", ("--json", "--help")
+    )
     word = "-m" if "--multirun" in arguments.switches else arguments.of_a_sweep
     if word:
         raise ConfigError(f"gpebo check looks at one configuration; leave out {word}")

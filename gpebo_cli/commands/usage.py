@@ -62,7 +62,7 @@ usage: gpebo compare DIR … [OPTIONS]
 One table over finished runs and sweeps, the best first, and figures: error curves overlaid,
 metrics over every gain that varies, a heat map where two do. DIR is a folder of a run or of a
 sweep; of a sweep that is not finished, what is there. Gains, tolerances, whatever varies and is
-a positive number makes an axis.
+a positive number makes an axis. Of a folder of runs, outputs/runs for instance, all are taken.
 
 options:
   --sort COLUMN       seconds_to_1pct_parameters by default; heat maps show it
