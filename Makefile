@@ -39,7 +39,7 @@ wheel: $(VENV)/installed-dev
 # The notebook is executed, so that it cannot say what is not so; --strict: no warnings.
 docs: $(VENV)/installed-docs
 	$(BIN)/python docs/notebook.py
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(VENV)/installed-dev
 	$(BIN)/python -m benchmarks
