@@ -6,7 +6,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
 	&& { command -v $$p; break; }; done)
 
-.PHONY: help run test lint types layers wheel bench clean
+.PHONY: help run test lint types layers wheel docs bench clean
 .DELETE_ON_ERROR:
 
 help:
@@ -14,6 +14,7 @@ help:
 	@echo 'make test     set up, then the tests'
 	@echo 'make lint types layers    ruff, mypy, import-linter'
 	@echo 'make wheel    dist/gpebo-*.whl'
+	@echo 'make docs     site/index.html, the documentation; the notebook is run'
 	@echo 'make bench    docs/benchmarks.md, measured afresh; about ten minutes'
 	@echo 'make clean    remove .venv and what tools leave behind; outputs/ is kept'
 
@@ -34,6 +35,11 @@ layers: $(VENV)/installed-dev
 
 wheel: $(VENV)/installed-dev
 	$(BIN)/python -m build --wheel --no-isolation
+
+# The notebook is executed, so that it cannot say what is not so; --strict: no warnings.
+docs: $(VENV)/installed-docs
+	$(BIN)/python docs/notebook.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m benchmarks
@@ -60,6 +66,10 @@ $(VENV)/installed-bench: pyproject.toml | $(VENV)/bin/pip
 			$(BIN)/pip install --quiet $$p || true; \
 		done; }
 	@touch $@ $(VENV)/installed
+
+$(VENV)/installed-docs: pyproject.toml | $(VENV)/bin/pip
+	$(BIN)/pip install --quiet --editable '.[docs]'
+	@touch $@
 
 $(VENV)/bin/pip:
 	@test -n '$(PYTHON)' || { \

@@ -73,7 +73,7 @@ def _dispatch(words: list[str]) -> int:
 
         sys.stdout.write(HELP)
         return 0
-    if command in ("--version", "-V"):
+    if command in ("--version", "-V", "version"):
         from gpebo_cli._version import __version__
 
         sys.stdout.write(f"gpebo {__version__}\n")

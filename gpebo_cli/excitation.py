@@ -82,7 +82,7 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
 
 
 def window_level(outer: Trajectory, t: Array, window: float) -> Array:
-    """λ_min of ∫_{t−T}^{t} ψᵀψ at the times t; NaN before the first whole window.
+    """λ_min of ∫_{t−T}^{t} ψᵀψ at the times t (M,); NaN before the first whole one.
 
     Whole elements are summed afresh for every window. The difference G(t) − G(t − T) was
     rejected: once a regressor has died out, it is the rounding of two large numbers.

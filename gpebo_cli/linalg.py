@@ -12,12 +12,12 @@ from gpebo_cli.systems.descriptor import Array
 
 
 def transpose(a: Array) -> Array:
-    """Transpose the last two axes."""
+    """Transpose the last two axes, (…, a, b) to (…, b, a)."""
     return np.swapaxes(a, -1, -2)
 
 
 def joined(*parts: Array, axis: int) -> Array:
-    """Blocks of matrices side by side (axis 2) or stacked (axis 1); those of one time repeat."""
+    """Blocks (N or 1, a, b) side by side (axis 2) or stacked (axis 1); those of one time repeat."""
     count = max(map(len, parts))
     return np.concatenate(
         [p if len(p) == count else np.broadcast_to(p, (count, *p.shape[1:])) for p in parts],
@@ -39,6 +39,12 @@ def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Ar
     Returns:
         det(Ω) of shape (...,), adj(Ω) b of the shape of b, and the reciprocal condition number
         σ_min/σ_max of shape (...,), zero where Ω = 0.
+
+    Examples:
+        >>> import numpy as np
+        >>> delta, action, _ = determinant_and_adjugate_action(np.zeros((2, 2)), np.ones(2))
+        >>> float(delta), action.tolist()  # the adjugate of Ω = 0 is defined, its inverse is not
+        (0.0, [0.0, 0.0])
     """
     p = omega.shape[-1]
     u, sigma, vt = np.linalg.svd(omega)

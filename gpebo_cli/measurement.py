@@ -210,7 +210,7 @@ def noise_grid(mesh: Mesh, settings: NoiseSettings) -> SampledMesh:
 
 
 def on_mesh(signal: Trajectory, mesh: Mesh) -> Trajectory:
-    """The same signal on a mesh that has all edges of its own."""
+    """The same signal (K, s + 1, …) on a mesh that has all edges of its own."""
     values = signal(mesh.points.ravel(), mesh.inside.ravel())
     return Trajectory(mesh, values.reshape(*mesh.points.shape, *signal.values.shape[2:]))
 

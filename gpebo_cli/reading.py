@@ -23,7 +23,14 @@ _SHOWN = 60  # characters of a wrong value that a message repeats
 
 
 def nearest(given: str, known: Iterable[str]) -> str:
-    """``"; did you mean x?"`` where one of the known names is near, else nothing."""
+    """``"; did you mean x?"`` where one of the known names is near, else nothing.
+
+    Examples:
+        >>> nearest("gama", ["gamma", "lambda"])
+        '; did you mean gamma?'
+        >>> nearest("zzz", ["gamma", "lambda"])
+        ''
+    """
     folded = {name.casefold(): name for name in reversed(list(known))}  # a for A is the nearest
     near = difflib.get_close_matches(given[:_SHOWN].casefold(), folded, 1, cutoff=0.5)
     return f"; did you mean {folded[near[0]]}?" if near else ""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from examples import ROOT, gpebo
 from omegaconf import OmegaConf
 
 import gpebo_cli
@@ -27,8 +27,6 @@ from gpebo_cli import (
 )
 from gpebo_cli.api.choice import choose, default
 
-ROOT = Path(__file__).parents[1]
-
 MINE = """\
 name: mine
 states: [x]
@@ -38,16 +36,6 @@ A: [[-1]]
 C: [[1]]
 initial_state: {x: 1}
 """
-
-
-def gpebo(*words, cwd):
-    done = subprocess.run(
-        [sys.executable, "-m", "gpebo_cli", *map(str, words)], cwd=cwd, capture_output=True,
-        text=True, check=False, timeout=120,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
-    )
-    assert done.returncode in (0, 2), done.stderr
-    return done
 
 
 @pytest.fixture(scope="module")

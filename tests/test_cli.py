@@ -65,7 +65,7 @@ def test_help(tmp_path, words):
     assert "gpebo run plant=circuit estimator=drem" in done.stdout
 
 
-@pytest.mark.parametrize("words", [["--version"], ["-V"], ["run", "--version"]])
+@pytest.mark.parametrize("words", [["--version"], ["-V"], ["version"], ["run", "--version"]])
 def test_version(tmp_path, words):
     done = gpebo(*words, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -193,6 +193,18 @@ WRONG = [
     (["run", "--config-dir"], "--config-dir needs a value"),
     (["run", "--config-dir", "nowhere"], "--config-dir nowhere: there is no such folder"),
     (["run", "--config-name", "gpbo"], "did you mean gpebo?"),
+    (["run", "tank"], "see gpebo run --help"),
+    (["run", "circuit"], "did you mean plant=circuit?"),
+    (["check", "drem"], "did you mean estimator=drem?"),
+    (["run", "--plant=circuit"], "plant is written without dashes, as in plant=circuit"),
+    (["run", "gamma=3"], "did you mean estimator.gamma?"),
+    (["run", "horizon=3"], "did you mean time.horizon?"),
+    (["run", "plant=plant/mine.yaml"], "write --config-dir . plant=mine"),
+    (["check", "--jsn"], "see gpebo check --help; did you mean --json?"),
+    (["list", "--confg-dir", "."], "did you mean --config-dir?"),
+    (["figures", "paper_circit"], "did you mean paper_circuit?"),
+    (["compare", "--srot", "x"], "did you mean --sort?"),
+    (["run", "launcher=jobli"], "did you mean joblib?"),
     (["run", "-m", "plant=circuit,circut"], "plant=circut: there is no such plant"),
 ]
 
@@ -206,6 +218,14 @@ def test_wrong_usage_is_one_line_and_exit_code_2(tmp_path, words, expected):
     assert done.stderr.count("\n") == 1
     assert expected in done.stderr
     assert folders(tmp_path) == [], "a run that never began leaves no folder"
+
+
+def test_a_plant_in_this_folder_is_told_from_one_that_is_nowhere(tmp_path, mine):
+    done = gpebo("run", "plant=mine", *FAST, cwd=mine)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "yours, plant/mine.yaml, is found with --config-dir ." in done.stderr
+    done = gpebo("run", "mine", *FAST, cwd=mine)
+    assert "did you mean plant=mine?" in done.stderr
 
 
 def test_a_failed_run_is_exit_code_1(tmp_path):

@@ -10,10 +10,10 @@ import subprocess
 import sys
 import time
 from dataclasses import fields
-from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
+from examples import ROOT, environment
 
 from gpebo_cli.app import COMMANDS
 from gpebo_cli.commands.completion import SCRIPTS, candidates
@@ -22,8 +22,6 @@ from gpebo_cli.outputs.figures import FIGURES
 from gpebo_cli.outputs.names import FIGURE_NAMES, METRICS
 from gpebo_cli.result import Metrics
 from gpebo_cli.settings import ObserverSettings
-
-ROOT = Path(__file__).parents[1]
 
 
 def names(*words):
@@ -35,13 +33,9 @@ def here(tmp_path, monkeypatch):
     """A folder with a plant, and with `gpebo` on the PATH."""
     (tmp_path / "plant").mkdir()
     (tmp_path / "plant" / "mine.yaml").write_text("name: mine\ntitle: a decaying state\n")
-    (tmp_path / "bin").mkdir()
-    program = tmp_path / "bin" / "gpebo"
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m gpebo_cli "$@"\n')
-    program.chmod(0o755)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    for name, value in environment().items():
+        monkeypatch.setenv(name, value)
     monkeypatch.setenv("HOME", str(tmp_path))
     return tmp_path
 

@@ -359,6 +359,17 @@ def test_the_comparison_draws_errors_and_metrics_over_the_gain(compared):
     ]
 
 
+def test_a_folder_of_runs_and_sweeps_stands_for_all_of_them(compared, uninterrupted, tmp_path):
+    _, direct = compared
+    (tmp_path / "all").mkdir()
+    (tmp_path / "all" / "sweep").symlink_to(uninterrupted)
+    (tmp_path / "all" / "other").mkdir()
+    done = gpebo("compare", "all", "--no-figures", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = len(list(csv.reader((uninterrupted / "results.csv").open())))
+    assert len(done.stdout.splitlines()) == rows, direct
+
+
 def test_runs_and_their_cases_are_compared_with_a_heat_map_of_two_gains(tmp_path):
     words = ["estimator=ls_drem", "estimator.gamma=[1,10,100]", "estimator.f0=[1e-6,1e-4]", *FAST]
     assert gpebo("run", *words, "hydra.run.dir=a", cwd=tmp_path).returncode == 0

@@ -135,7 +135,8 @@ def solve(
         tol: target for the tail of each element's Legendre coefficients, relative to each
             signal's own size.
         max_elements: refuse to go beyond.
-        restarts: at these edges, the map from the limit from the left to the new start.
+        restarts: at these edges, the map from the limit from the left (n, columns) to the new
+            start.
         known: the coefficients at all points of ``mesh``, where they are at hand.
 
     Raises:

@@ -56,7 +56,7 @@ class Mesh:
         return inside
 
     def split(self, parts: IntArray) -> tuple[Mesh, IntArray]:
-        """Cut element k into ``parts[k]`` equal ones.
+        """Cut element k into ``parts[k]`` equal ones; ``parts`` has shape (K,).
 
         Returns:
             The new mesh, and for each new element the old one it equals, or −1 if it is new.
@@ -171,7 +171,7 @@ class Trajectory:
     """
 
     mesh: Mesh
-    values: Array
+    values: Array  # (K, s + 1, …)
 
     def __call__(self, t: Array, inside: Array | None = None) -> Array:
         """Values at the times t (N,), shape (N, ...); at edges see :meth:`Mesh.sampler`."""
@@ -201,7 +201,8 @@ class Trajectory:
         """Z of Z' = −λ (Z − S), Z(start) = 0: the filter λ/(p + λ) applied to this signal S.
 
         Args:
-            rate: λ > 0, a scalar or an array that broadcasts against one value of the signal.
+            rate: λ > 0 in 1/s, a scalar () or an array that broadcasts against one value of the
+                signal.
         """
         mesh, rule = self.mesh, self.mesh.rule
         shape = self.values.shape[2:]
@@ -241,7 +242,7 @@ def _filter(
 
 
 def unresolved(values: Array, rule: RadauRule, floor: float = 0.0) -> Array:
-    """:func:`unresolved_kinds` of signals of one kind."""
+    """:func:`unresolved_kinds` of signals of one kind, values (K, s + 1, …); shape (K,)."""
     return unresolved_kinds([(values, floor)], rule)
 
 
@@ -324,7 +325,7 @@ def signal_scale(values: Array, floor: float = 0.0) -> Array:
 
 def initial_mesh(start: float, stop: float, breakpoints: Sequence[float] | Array,
                  elements: int, rule: RadauRule) -> Mesh:
-    """About ``elements`` equal elements, with every breakpoint an edge."""
+    """About ``elements`` equal elements, with every breakpoint (B,), in seconds, an edge."""
     cuts = np.unique(np.concatenate([[start], np.asarray(breakpoints, dtype=float), [stop]]))
     cuts = cuts[(cuts >= start) & (cuts <= stop)]
     counts = np.maximum(1, np.rint(elements * np.diff(cuts) / (stop - start))).astype(int)

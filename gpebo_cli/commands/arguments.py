@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gpebo_cli.commands.locations import choices, conf_folder
+from gpebo_cli.commands.locations import GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import nearest, shown
 
@@ -46,6 +47,7 @@ _LOGSPACE = re.compile(r"^([^=]+)=(logspace\([^()'\"]*\))$")
 
 _SWEEPER = "gpebo"
 _SWEEP_WORDS = ("resume", "fail_fast")  # of a sweep, not of the configuration
+_KEYS = (*GROUPS, "launcher", "time", "excitation", "figures", "output", *_SWEEP_WORDS)
 
 PRIMARY = "gpebo"
 """The primary configuration, conf/gpebo.yaml; another name than a run's own config.yaml."""
@@ -103,8 +105,13 @@ class Arguments:
         return [conf_folder(), *([] if self.config_dir is None else [self.config_dir])]
 
 
-def parse(words: list[str]) -> Arguments:
+def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> Arguments:
     """Sort the words of the command line.
+
+    Args:
+        words: after the command.
+        command: its name, for messages.
+        more: options that the command has besides those of ``gpebo run``, for messages.
 
     Raises:
         ConfigError: an unknown flag, a flag without its value, a folder or a primary
@@ -126,8 +133,15 @@ def parse(words: list[str]) -> Arguments:
         given, equals, value = word.partition("=")
         flag = _SWITCHES.get(given) or _WITH_VALUE.get(given) or _LONG.get(given)
         if flag is None:
+            key = given.lstrip("-")
+            if key.partition(".")[0] in _KEYS:
+                raise ConfigError(
+                    f"unknown option {shown(given)}; {key} is written without dashes, as in "
+                    f"{key}={value or 'VALUE'}"
+                )
             raise ConfigError(
-                f"unknown option {shown(given)}; see gpebo run --help" + nearest(given, _LONG)
+                f"unknown option {shown(given)}; see gpebo {command} --help"
+                + nearest(given, [*_LONG, *more])
             )
         if flag in _SWITCHES.values():
             if equals:

@@ -51,7 +51,8 @@ def main(words: list[str]) -> int:
     """Print the table, or JSON; 0 if everything that is needed holds, else 1.
 
     Raises:
-        GpeboError: the words or the configuration are wrong, or the solver fails.
+        ConfigError: the words or the configuration are wrong.
+        GpeboError: the solver fails.
     """
     if "--help" in words or "-h" in words:
         from gpebo_cli.commands.usage import CHECK_HELP
@@ -59,7 +60,9 @@ def main(words: list[str]) -> int:
         sys.stdout.write(CHECK_HELP)
         return 0
     as_json = "--json" in words
-    arguments = command_line.parse([word for word in words if word != "--json"])
+    arguments = command_line.parse(
+        [word for word in words if word != "--json"], "check", ("--json", "--help")
+    )
     word = "-m" if "--multirun" in arguments.switches else arguments.of_a_sweep
     if word:
         raise ConfigError(f"gpebo check looks at one configuration; leave out {word}")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpebo_cli.commands.report import columns
-from gpebo_cli.commands.sweep_folder import job_folder, read_plan, read_records
+from gpebo_cli.commands.sweep_folder import PLAN, job_folder, read_plan, read_records
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.reading import nearest, shown
 
@@ -118,7 +118,10 @@ def _parse(words: list[str]) -> _Arguments:
 
 
 def _cases(name: str) -> list[Case]:
-    """All cases in a run's or a sweep's folder; jobs that are not done are counted on stderr."""
+    """All cases in a run's or a sweep's folder, or in all of those that a folder holds.
+
+    Jobs that are not done are counted on stderr.
+    """
     from gpebo_cli.outputs.finished import is_run, read_run
 
     folder = Path(name)
@@ -131,9 +134,13 @@ def _cases(name: str) -> list[Case]:
         return read_run(label, folder, {})
     plan = read_plan(folder)
     if plan is None:
-        raise ConfigError(
-            f"{name}: neither a finished run (summary.json) nor a sweep (sweep.json)"
-        )
+        inside = [p for p in sorted(folder.iterdir()) if is_run(p) or (p / PLAN).is_file()]
+        if not inside:
+            raise ConfigError(
+                f"{name}: neither a finished run (summary.json) nor a sweep (sweep.json), and "
+                "nothing of that kind in it"
+            )
+        return [case for path in inside for case in _cases(str(path))]
     records = read_records(folder, plan)
     done = [record for record in records if record.status == "done"]
     if len(done) < len(records):

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 
 from gpebo_cli.commands.arguments import OPTIONS, VALUES
 from gpebo_cli.commands.listing import KINDS, described
-from gpebo_cli.commands.locations import GROUPS, choices, conf_folder
+from gpebo_cli.commands.locations import DATA_GROUPS, GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.outputs.names import FIGURE_NAMES, FORMATS, METRICS
 from gpebo_cli.reading import nearest, shown
@@ -31,6 +31,7 @@ _FIXED = {
     "figures": ("all", "none", "["),
 }
 _FOLDER_OPTIONS = ("--config-dir", "-cd", "--output", "--check", "--update")
+_WITH_KEYS = tuple(group for group in DATA_GROUPS if group != "plant")
 _NOT_KEYS = ("name", "title", "reference", "defaults", "hydra")
 
 # Bash cuts words at "=" (COMP_WORDBREAKS) and replaces the last piece only, so what stands before
@@ -235,11 +236,11 @@ def _keys(word: str, before: Sequence[str], folders: Sequence[str]) -> list[str]
     section, dot, _ = word.partition(".")
     if not dot:
         top = [key for key in _read_keys(primary) if key not in (*_NOT_KEYS, "figures")]
-        inside = [f"{name}." for name in ("estimator", "observer", "solver", *top)]
+        inside = [f"{name}." for name in (*_WITH_KEYS, *top)]
         return ["figures=", "resume=", "fail_fast=", "hydra.run.dir=", "hydra.sweep.dir=", *inside]
     if section == "hydra":
         return ["hydra.run.dir=", "hydra.sweep.dir="]
-    if section in ("estimator", "observer", "solver"):
+    if section in _WITH_KEYS:
         chosen = [w.partition("=")[2] for w in before if w.startswith(f"{section}=")]
         name = chosen[-1] if chosen else _default(primary, section)
         paths = [os.path.join(folder, section, f"{name}.yaml") for folder in folders]

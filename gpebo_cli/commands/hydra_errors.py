@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 
 import yaml
@@ -34,7 +35,7 @@ def explain(error: BaseException, arguments: Arguments) -> str:
     if isinstance(error, MissingConfigException):
         return _missing(error, arguments)
     if isinstance(error, OverrideParseException):
-        return _unparsable(error)
+        return _unparsable(error, arguments)
     text, cause = str(error), error.__cause__
     if match := _SEVERAL.search(text):
         return _several(match[1])
@@ -56,6 +57,8 @@ def _missing(error: MissingConfigException, arguments: Arguments) -> str:
     group, _, name = (error.missing_cfg_file or "").rpartition("/")
     if not group:
         return _one_line(str(error))
+    if group.partition("/")[0] in GROUPS and ("/" in group or name.endswith(".yaml")):
+        return _a_path((error.missing_cfg_file or "").partition("/"))
     if group == "hydra/launcher" and name in _EXTRAS:
         return f"{group}={name} is not installed; pip install 'gpebo[{_EXTRAS[name]}]'"
     known = sorted({found for folder in arguments.folders for found in choices(folder, group)})
@@ -65,16 +68,35 @@ def _missing(error: MissingConfigException, arguments: Arguments) -> str:
     where = "" if chooser == arguments.config_name else f"{chooser}: "
     text = f"{where}{group}={name}: there is no such {group}; known: {', '.join(known)}"
     hint = nearest(name, known)
+    if arguments.config_dir is None and os.path.isfile(os.path.join(group, f"{name}.yaml")):
+        return f"{text}; yours, {group}/{name}.yaml, is found with --config-dir ."
     if not hint and arguments.config_dir is None and group in GROUPS:
         hint = f" (yours: --config-dir DIR with DIR/{group}/{name}.yaml)"
     return text + hint
 
 
-def _unparsable(error: OverrideParseException) -> str:
+def _a_path(parts: tuple[str, str, str]) -> str:
+    """Of a choice that is the path of a file instead of its name."""
+    group, _, path = parts
+    name = os.path.basename(path).removesuffix(".yaml")
+    folder = os.path.dirname(os.path.dirname(path)) or "."
+    return (
+        f"{group}={path}: give the name of a file in the folder {group} of a --config-dir, not its "
+        f"path; write --config-dir {folder} {group}={name}"
+    )
+
+
+def _unparsable(error: OverrideParseException, arguments: Arguments) -> str:
     given = str(error.override)
     if "=" not in given and not given.startswith("~"):
         known = ", ".join(f"{group}=" for group in GROUPS)
-        return f"{shown(given)} is not key=value; groups are {known} (see gpebo run --help)"
+        named = [
+            f"{group}={given}"
+            for group in GROUPS
+            if any(given in choices(folder, group) for folder in (*arguments.folders, "."))
+        ]
+        hint = f"; did you mean {named[0]}?" if named else " (see gpebo run --help)"
+        return f"{shown(given)} is not key=value; groups are {known}{hint}"
     reason = str(error.message).splitlines()[0] if error.message else "cannot be read"
     return _one_line(
         f"{shown(given)} cannot be read as key=value: {reason}; "
@@ -110,7 +132,14 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
     missing = key.removeprefix(path).lstrip(".").partition(".")[0]
     full = f"{path}.{missing}" if path else missing
     inside = path or "the configuration"
-    return f"{full}: no such key; {inside} has {', '.join(known)}" + nearest(missing, known)
+    deeper = [
+        f"{section}.{missing}"
+        for section in (known if not path else ())
+        if isinstance(child := parent.get(section), DictConfig)
+        and missing in child
+    ]
+    hint = f"; did you mean {deeper[0]}?" if deeper else nearest(missing, known)
+    return f"{full}: no such key; {inside} has {', '.join(known)}{hint}"
 
 
 def _path(node: DictConfig) -> str:

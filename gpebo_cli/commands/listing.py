@@ -47,6 +47,14 @@ def _parse(words: list[str]) -> tuple[list[str], list[str]]:
             folders.append(value)
         elif word in ("--help", "-h"):
             return [], folders
+        elif word.startswith("-"):
+            from gpebo_cli.reading import nearest, shown
+
+            known = ("--config-dir", "--help")
+            raise ConfigError(
+                f"gpebo list: {shown(word)} is no option; known: {', '.join(known)}"
+                + nearest(word, known)
+            )
         else:
             kinds.append(_kind(word))
     return list(dict.fromkeys(kinds)) or list(KINDS), folders

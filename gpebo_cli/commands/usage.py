@@ -51,9 +51,9 @@ options:
   -h, --help          this text
 
 examples:
-  gpebo figures
-  gpebo figures paper_circuit 'figures.formats=[png,pdf]' --update tables
-  gpebo figures paper_circuit --check tables
+  gpebo figures paper_circuit                        # without a name, all of them
+  gpebo figures literal_regressor 'figures.formats=[png,pdf]' --update tables
+  gpebo figures literal_regressor --check tables
 """
 
 COMPARE_HELP = """\
@@ -62,7 +62,7 @@ usage: gpebo compare DIR … [OPTIONS]
 One table over finished runs and sweeps, the best first, and figures: error curves overlaid,
 metrics over every gain that varies, a heat map where two do. DIR is a folder of a run or of a
 sweep; of a sweep that is not finished, what is there. Gains, tolerances, whatever varies and is
-a positive number makes an axis.
+a positive number makes an axis. Of a folder of runs, outputs/runs for instance, all are taken.
 
 options:
   --sort COLUMN       seconds_to_1pct_parameters by default; heat maps show it
@@ -73,9 +73,9 @@ options:
   -h, --help          this text
 
 examples:
-  gpebo run -m estimator.gamma=1e6,1e8 estimator=drem,lion hydra.sweep.dir=gains
-  gpebo compare gains
-  gpebo compare gains/0 gains/1 --sort final_error_states --csv best.csv --no-figures
+  gpebo run -m estimator.gamma=1e6,1e8 estimator=drem,lion hydra.sweep.dir=both
+  gpebo compare both
+  gpebo compare both/0 both/1 --sort final_error_states --csv best.csv --no-figures
 """
 
 CHECK_HELP = """\
@@ -188,9 +188,22 @@ def run_help() -> str:
         names = choices(folder, group)
         default = _DEFAULTS.get(group)
         names.sort(key=lambda name: name != default)  # stable: the default first, rest by name
-        lines.append(f"  {group + '=':<12} {' '.join(names)}{_NOTES.get(group, '')}\n")
+        text = f"{' '.join(names)}{_NOTES.get(group, '')}"
+        lines += _wrapped(f"  {group + '=':<12} ", text)
     return _RUN_HELP.format(groups="".join(lines))
 
+
+def _wrapped(head: str, text: str) -> list[str]:
+    """Lines of at most ``_WIDTH`` characters, the words of all but the first below each other."""
+    lines = [head]
+    for word in text.split(" "):
+        if len(lines[-1]) + len(word) >= _WIDTH:
+            lines.append(" " * len(head))
+        lines[-1] += f"{word} "
+    return [f"{line.rstrip()}\n" for line in lines]
+
+
+_WIDTH = 100
 
 # As in conf/gpebo.yaml, which is not read: a YAML parser costs more than all the rest of this.
 _DEFAULTS = {

@@ -25,6 +25,10 @@ def axis(value: object, where: str, *, positive: bool = True) -> tuple[float, ..
 
     Raises:
         ConfigError: anything else, an empty list, or a value that is not finite and positive.
+
+    Examples:
+        >>> axis("logspace(0, 2, 3)", "estimator.gamma")
+        (1.0, 10.0, 100.0)
     """
     if isinstance(value, str):
         value = _from_text(value, where)
@@ -67,7 +71,15 @@ def number(value: object, where: str, *, positive: bool = True) -> float:
 
 
 def combinations(axes: Mapping[str, Sequence[float]]) -> tuple[Mapping[str, float], ...]:
-    """Every combination of the axes' values; the last axis varies fastest."""
+    """Every combination of the axes' values; the last axis varies fastest.
+
+    Raises:
+        ConfigError: more combinations than fit into one run.
+
+    Examples:
+        >>> [dict(case) for case in combinations({"alpha": [1.0], "gamma": [10.0, 100.0]})]
+        [{'alpha': 1.0, 'gamma': 10.0}, {'alpha': 1.0, 'gamma': 100.0}]
+    """
     total = int(np.prod([len(values) for values in axes.values()], dtype=np.int64))
     if total > _MAX_CASES:
         raise ConfigError(f"the gains make {total} cases; at most {_MAX_CASES} fit in one run")

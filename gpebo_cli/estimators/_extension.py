@@ -22,7 +22,12 @@ def kreisselmeier(regression: LinearRegression, rates: Array) -> Trajectory:
 
 
 def resolved_low_pass(signal: Trajectory, rate: Array) -> Trajectory:
-    """``signal.low_pass(rate)`` on a mesh fine enough for the filter's own transient."""
+    """``signal.low_pass(rate)`` on a mesh fine enough for the filter's own transient.
+
+    Args:
+        signal: to be filtered.
+        rate: λ of the filters in 1/s, (p,) or any shape that broadcasts against the signal.
+    """
     tail = np.zeros(0)
     for _ in range(_ROUNDS):
         filtered = signal.low_pass(rate)

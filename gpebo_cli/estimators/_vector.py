@@ -101,7 +101,7 @@ class VectorEstimates:
     realisations: tuple[int, ...] = ()
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
-        """Nothing is mixed."""
+        """Nothing is mixed, at any of the times t (M,)."""
         return
 
     def parameters(self, cases: slice) -> Array:

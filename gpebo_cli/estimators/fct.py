@@ -48,14 +48,18 @@ class FiniteTime:
 
     @property
     def cases(self) -> tuple[Mapping[str, float], ...]:
-        """Those of the inner estimator."""
+        """Those of the inner estimator.
+
+        Raises:
+            ConfigError: ``mu`` is not between 0 and 1.
+        """
         mu = number(self.mu, "estimator.mu")
         if not mu < 1:
             raise ConfigError(f"estimator.mu must lie between 0 and 1, got {mu:g}")
         return self.inner.cases
 
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
-        """The inner estimates with the correction on top."""
+        """The inner estimates at the times t (M,) with the correction on top."""
         inner = self.inner.estimate(regression, t)
         mu = float(self.mu)
 

@@ -35,7 +35,7 @@ class Gradient:
         return combinations(gain_axis(self.gamma, "estimator.gamma"))
 
     def estimate(self, regression: LinearRegression, t: Array) -> VectorEstimates:
-        """Prepare the law; each case is integrated when it is asked for."""
+        """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         information = Trajectory(regression.mesh, regression.outer.values[..., : regression.p])
         gains = gain_matrix(self.gamma, regression.parameters, "estimator.gamma")
         return VectorEstimates(

@@ -42,7 +42,11 @@ class LeastSquares:
         return combinations(self.axes())
 
     def axes(self) -> dict[str, Sequence[float]]:
-        """The gains as axes, f₀ checked against the bound."""
+        """The gains as axes, f₀ checked against the bound.
+
+        Raises:
+            ConfigError: a gain is no gain, or M is below 1/f₀.
+        """
         axes: dict[str, Sequence[float]] = {
             "alpha": axis(self.alpha, "estimator.alpha"),
             "f0": axis(self.f0, "estimator.f0"),
@@ -64,7 +68,7 @@ class LeastSquares:
         return None if self.bound is None else number(self.bound, "estimator.bound")
 
     def spectra(self, regression: LinearRegression, t: Array) -> list[Spectrum]:
-        """The spectrum of G_z at the times t for every case, computed once where it is shared."""
+        """The spectrum of G_z at the times t (M,) for every case, once where it is shared."""
         bound = self.covariance_bound
         made: dict[tuple[float, ...], Spectrum] = {}
         out = []
@@ -110,7 +114,7 @@ class LeastSquaresEstimates:
     realisations: tuple[int, ...] = ()
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
-        """Nothing is mixed."""
+        """Nothing is mixed, at any of the times t (M,)."""
         return
 
     @property

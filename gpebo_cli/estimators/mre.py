@@ -44,7 +44,7 @@ class MemoryExtension:
         return combinations(gain_axis(self.gamma, "estimator.gamma"))
 
     def estimate(self, regression: LinearRegression, t: Array) -> VectorEstimates:
-        """Prepare the law; each case is integrated when it is asked for."""
+        """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         p = regression.p
         rate = number(self.rate, "estimator.lambda")
         extended = kreisselmeier(regression, np.full(p, rate))

@@ -253,5 +253,5 @@ def _labels(expressions: Sequence[Expression], place_of: dict[int, int]) -> tupl
 def taylor(
     expressions: Sequence[Expression], t: Array, order: int, inside: Array | None = None
 ) -> Array:
-    """Taylor coefficients of expressions at times; :meth:`Tape.taylor` of their tape."""
+    """Taylor coefficients of expressions at times t (N,); :meth:`Tape.taylor` of their tape."""
     return record(expressions).taylor(t, order, inside)

@@ -31,7 +31,14 @@ def observe(
     solver: SolverSettings,
     noise: SignalNoise | None = None,
 ) -> Observation:
-    """Run the observer that ``settings.name`` asks for on the signals u and y of one mesh.
+    """Run the observer that ``settings.name`` asks for on the signals of one mesh.
+
+    Args:
+        system: the plant; its true θ and initial state are not looked at.
+        inputs: u, values (K, s + 1, m).
+        outputs: y, values (K, s + 1, r).
+        settings: which observer, and what it is free to choose.
+        solver: tolerances.
 
     What is known of their ``noise`` (None: there is none) is for an observer that weighs by it.
 

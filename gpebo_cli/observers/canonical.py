@@ -388,7 +388,10 @@ def _assumptions(
 
 
 def transition_decay(M: Trajectory) -> float:
-    """‖Φ_w(end)‖ of φ̇ = M_w φ from the identity at the start: below 1, errors have shrunk."""
+    """‖Φ_w(end)‖ of φ̇ = M_w φ from the identity at the start: below 1, errors have shrunk.
+
+    The values of M have shape (K, s + 1, 2, 2).
+    """
     problem = LinearProblem(
         lambda t, inside: Coefficients(None, M(t, inside), np.zeros((1, 2, 2))),
         np.eye(2),
@@ -413,7 +416,7 @@ class CanonicalStateMap:
         return np.zeros(0) if self.zb is None else self.zb.mesh.points.ravel()
 
     def at(self, t: Array) -> Reconstruction:
-        """Sample everything once; each batch of cases is one integration with as many columns."""
+        """Sample all at the times t (M,) once; each batch of cases is one integration."""
         sampler = self.xi_a.mesh.sampler(t)
         xi_a, gain = sampler(self.xi_a.values), sampler(self.gain.values)
 
@@ -427,7 +430,7 @@ class CanonicalStateMap:
         return reconstruct
 
     def checks(self, t: Array, states: Array) -> Mapping[str, Array]:
-        """Algebraic z_b1 = −f_b1 and z_b2 = (y_w + c1 f_b1)/c2, which need no observer."""
+        """Algebraic z_b1 = −f_b1 and z_b2 = (y_w + c1 f_b1)/c2, (g, M), from x̂ (g, M, n)."""
         if self.zb is None:
             return {}
         za = states[..., : self.xi_a.values.shape[2]]

@@ -52,7 +52,7 @@ class AffineStateMap:
         return np.zeros(0)
 
     def at(self, t: Array) -> Reconstruction:
-        """Sample offset and gain once for all cases."""
+        """Sample offset and gain at the times t (M,) once for all cases."""
         sampler = self.offset.mesh.sampler(t)
         offset, gain = sampler(self.offset.values), sampler(self.gain.values)
 
@@ -62,7 +62,7 @@ class AffineStateMap:
         return reconstruct
 
     def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
-        """None."""
+        """None, whatever x̂ (g, M, n)."""
         return {}
 
 

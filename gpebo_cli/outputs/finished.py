@@ -35,8 +35,8 @@ class ErrorCurves:
     """Norms of the errors of one case, (M,) each, and the size of what they are errors of."""
 
     t: Array
-    parameters: Array
-    states: Array
+    parameters: Array  # (M,)
+    states: Array  # (M,)
     parameter_size: float
     state_size: float
 

@@ -468,7 +468,7 @@ def _figure_class() -> type[Figure]:
         def _repr_png_(self) -> bytes:
             stream = BytesIO()
             with our_rc():
-                self.savefig(stream, format="png")
+                self.savefig(stream, format="png", pil_kwargs={"optimize": True})
             return stream.getvalue()
 
     return Drawing

@@ -49,8 +49,8 @@ class Pivots:
     """
 
     rank: int  # r
-    rows: IntArray  # all of them, the r pivots first
-    columns: IntArray  # likewise
+    rows: IntArray  # (rows,) all of them, the r pivots first
+    columns: IntArray  # (columns,) likewise
     Z1: Array  # (n, d) orthonormal, completes the constraints at that time
 
 
@@ -89,10 +89,10 @@ class StrangenessFree:
     matrices have a leading axis of 1 when E and A are constant.
     """
 
-    E1: Array
-    A1: Array
+    E1: Array  # (N or 1, d, n)
+    A1: Array  # (N or 1, d, n)
     f1: Array  # (N, d)
-    A2: Array
+    A2: Array  # (N or 1, a, n)
     f2: Array  # (N, a)
     basis: Array | None  # (N, n, d) T, of the kernel of A2, with E1 T = I; None if a = 0
     offset: Array | None  # (N, n)

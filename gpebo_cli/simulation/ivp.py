@@ -58,7 +58,7 @@ def solve(
     max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None,
 ) -> LinearSolution:
-    """Same meaning as :func:`gpebo_cli.collocation.linear.solve`, for E = I only.
+    """Same meaning as :func:`gpebo_cli.collocation.linear.solve`, for E = I (n, n) only.
 
     Raises:
         SolverError: solve_ivp gave up, or the mesh cannot resolve the result.

@@ -34,7 +34,7 @@ class FunctionCoefficients:
     """Coefficients from arrays and functions, see :func:`system_from_functions`."""
 
     shapes: Mapping[str, tuple[int, ...]]
-    fixed: Mapping[str, Array]  # constant matrices
+    fixed: Mapping[str, Array]  # constant matrices, (rows, columns)
     functions: Mapping[str, tuple[Function, ...]]  # f, and its derivatives as far as given
     radius: float
     name: str = ""
@@ -157,6 +157,18 @@ def system_from_functions(
 
     Raises:
         ConfigError: shapes that disagree, with both numbers.
+
+    Examples:
+        >>> import numpy as np
+        >>> def A(t):
+        ...     out = np.zeros((len(t), 2, 2), dtype=t.dtype)
+        ...     out[:, 0], out[:, 1, 0], out[:, 1, 1] = [-1, 1], 1, 2 + np.cos(t)
+        ...     return out
+        >>> plant = system_from_functions(
+        ...     "mine", E=[[1, 0], [0, 0]], A=A, C=[[1, 0]], initial_state=[1, 0]
+        ... )
+        >>> plant.states, plant.outputs
+        (('x1', 'x2'), ('y1',))
     """
     x0 = np.asarray(initial_state, dtype=np.float64)
     n = len(x0)
