@@ -71,7 +71,8 @@ class Structure:
     d: int  # number of differential equations, n − a
     scaling: Scaling
     rank_tol: float
-    smallest_singular_value: float  # smallest one counted as nonzero, relative, over the probes
+    # Smallest one counted as nonzero, relative, at the probes where a bound of it is smallest.
+    smallest_singular_value: float
     time_invariant: bool  # E and A are constant
     reference: Pivots | Bases  # of one time, to start from at the others
 
