@@ -92,7 +92,7 @@ class SampledRun:
         """What the parameters really are at samples, for those who know the states.
 
         Args:
-            extension: [ξ_a | ξ_b | Φ] at the samples it will be asked about.
+            extension: [ξ_a | ξ_b | Φ] at the samples it will be asked about, (K, n_w, 1 + q + n_a).
         """
         o = self._observer
         return InitialError(o.initial_basis, o.xi_a0, o.basis, lambda _t: extension)

@@ -366,7 +366,8 @@ def test_a_folder_of_runs_and_sweeps_stands_for_all_of_them(compared, uninterrup
     (tmp_path / "all" / "other").mkdir()
     done = gpebo("compare", "all", "--no-figures", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    rows = len(list(csv.reader((uninterrupted / "results.csv").open())))
+    with (uninterrupted / "results.csv").open(encoding="utf-8", newline="") as stream:
+        rows = len(list(csv.reader(stream)))
     assert len(done.stdout.splitlines()) == rows, direct
 
 

@@ -28,7 +28,8 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
     """Treat rows until standard input ends; the verdict goes to stderr.
 
     Raises:
-        GpeboError: a row is wrong, or an assumption fails. Estimates of the rows before it are out.
+        ConfigError: a row is wrong, or there is none; estimates of the rows before it are out.
+        ModelError: an assumption fails.
     """
     stream = Stream(settings, system)
     reader = LineReader(_SOURCE, system)

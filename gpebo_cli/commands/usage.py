@@ -172,11 +172,11 @@ examples:
   gpebo run 'estimator.gamma=logspace(6,12,100)' 'figures=[gains]'    # one run, 100 cases
   gpebo run -m plant=circuit,descriptor estimator=drem,ls_drem        # a run for each of four
   gpebo run noise=gaussian noise.outputs=0.01 noise.seed=1            # noisy outputs
-  gpebo run data.file=rec.csv data.hold=cubic                         # measured, not simulated
-  logger | gpebo run data.file=- estimator=ls_drem                    # a row out for each row in
   gpebo run observer=none time.horizon=5                              # simulate only
   gpebo run experiment=paper_circuit hydra.run.dir=paper              # a recipe, and where to
   gpebo run --config-dir paper --config-name config                   # repeat that run
+  gpebo run data.file=paper/signals.csv data.hold=cubic               # measured, not simulated
+  logger | gpebo run data.file=- estimator=ls_drem                    # a row out for each row in
 """
 
 

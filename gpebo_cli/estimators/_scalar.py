@@ -108,7 +108,7 @@ def _closed_form(
 
 
 def mean_decay(x: Array) -> Array:
-    """(1 − e^{−x})/x and its limit 1."""
+    """(1 − e^{−x})/x and its limit 1, of each entry of x (...,)."""
     return np.divide(-np.expm1(-x), x, out=np.ones_like(x), where=x > 0.0)
 
 

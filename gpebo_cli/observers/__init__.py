@@ -39,8 +39,7 @@ def observe(
         outputs: y, values (K, s + 1, r).
         settings: which observer, and what it is free to choose.
         solver: tolerances.
-
-    What is known of their ``noise`` (None: there is none) is for an observer that weighs by it.
+        noise: of u and y, for an observer that weighs by it; None: there is none.
 
     Raises:
         ModelError: an assumption of the observer fails; names the time and the evidence.

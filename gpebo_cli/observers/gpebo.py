@@ -253,7 +253,10 @@ def _constant_split(E: Array, states: tuple[str, ...], rank_tol: float) -> Split
 
 
 def split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
-    """E⁺ = B (UᵀE B)⁻¹ Uᵀ, or None where kernel, range or rank are not those of the frame."""
+    """E⁺ = B (UᵀE B)⁻¹ Uᵀ of E (N, n, n), or None.
+
+    None where kernel, range or rank are not those of the frame at one of the times.
+    """
     B, U = frame.domain, frame.range
     rank = B.shape[1]
     size = float(np.abs(E).max(initial=0.0))

@@ -134,7 +134,7 @@ class NoiseModel:
     rows: Array  # (e + r,) zero: V needs none
 
     def state_space(self, s: ReducedSystem, q: int, basis: Array) -> StateSpace:
-        """The model with its covariances, one column of signals."""
+        """The model with its covariances, one column of signals, from the basis (n, n_w) of w."""
         Zt = transpose(s.rows)
         D = Zt @ s.in_measurement
         weighted = s.from_noise * self.signals  # Γ S
@@ -388,11 +388,11 @@ class FilterStateMap:
         return np.unique(self.spread.filtered.mesh.points)
 
     def at(self, t: Array) -> Reconstruction:
-        """As any affine map."""
+        """The affine map at the times t (M,), ascending."""
         return self.spread.state_map.at(t)
 
     def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
-        """Columns ``<name>_std`` of what is estimated, then of the states."""
+        """Columns ``<name>_std``, (1, M) each, of what is estimated, then of the states."""
         own, of_state = self.spread.deviations(t)
         columns = {f"{name}_std": own[None, :, i] for i, name in enumerate(self.names)}
         columns |= {f"{name}_std": of_state[None, :, i] for i, name in enumerate(self.states)}
@@ -424,7 +424,7 @@ class KalmanBucyEstimates:
     requirement: Requirement
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  protocol
-        """Nothing is mixed."""
+        """Nothing is mixed at any time (M,)."""
         return
 
     def parameters(self, cases: slice) -> Array:

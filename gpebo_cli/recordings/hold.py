@@ -60,7 +60,10 @@ def on_mesh(signal: Held, mesh: Mesh) -> Trajectory:
 
 
 def edges(t: Array, cuts: Array) -> Array:
-    """Sample times ``t`` and ``cuts`` between them, in order; a cut on a sample is that sample."""
+    """Sample times ``t`` (N,) and ``cuts`` (C,) between them, in order.
+
+    A cut on a sample is that sample.
+    """
     if len(cuts) == 0 or len(t) < 2:
         return t
     k = np.clip(np.searchsorted(t, cuts), 1, len(t) - 1)

@@ -97,9 +97,9 @@ class StrangenessFree:
     f2: Array  # (N, a)
     basis: Array | None  # (N, n, d) T, of the kernel of A2, with E1 T = I; None if a = 0
     offset: Array | None  # (N, n)
-    # (n, n + 1) by how much relative rounding of each state and of f2 reaches each state through
-    # the constraints, the most at some of the times
-    amplification: Array
+    # By how much relative rounding of each state and of f2 reaches each state through the
+    # constraints, the most at some of the times.
+    amplification: Array  # (n, n + 1)
     E: Array  # (N, n, n) the model's own
     u: Array  # (N, m) the inputs and
     C: Array  # (N, r, n) the output matrix at the same times
