@@ -288,6 +288,17 @@ def test_a_span_that_is_not_recorded(tmp_path, time, parts):
         assert part in str(caught.value)
 
 
+def test_measured_columns_are_what_the_observer_sees(tmp_path):
+    """As in the signals.csv of a run with noise: y is the truth, y_measured what was measured."""
+    columns = signals_of(simulated(samples=401))
+    wrong = {name: np.zeros(401) for name in ("V", "y")}
+    beside = {"V_measured": columns["V"], "y_measured": columns["y"]}
+    plain = recorded(write(tmp_path / "plain.csv", columns))
+    read = recorded(write(tmp_path / "beside.csv", {**columns, **wrong, **beside}))
+    np.testing.assert_array_equal(read.estimation.states, plain.estimation.states)
+    np.testing.assert_array_equal(read.signals.outputs, plain.signals.outputs)
+
+
 def test_a_recording_without_an_observer_is_refused(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(GOOD)

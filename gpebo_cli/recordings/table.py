@@ -123,6 +123,9 @@ def split_cells(source: str, line: int, text: str) -> list[str]:
 def read_header(source: str, cells: Sequence[str], system: DescriptorSystem) -> Header:
     """Find the columns of the plant's signals among the names in the first line.
 
+    A column ``<name>_measured``, as ``signals.csv`` of a run with noise has it beside the truth, is
+    what an observer gets to see, and is read in place of ``<name>``.
+
     Raises:
         ConfigError: a column is missing or stands there twice.
     """
@@ -135,7 +138,11 @@ def read_header(source: str, cells: Sequence[str], system: DescriptorSystem) -> 
                     "numbers"
                 )
     known = tuple(i for i, state in enumerate(system.states) if state in names)
-    needed = (TIME, *system.inputs, *system.outputs)
+    seen = (
+        f"{name}_measured" if f"{name}_measured" in names else name
+        for name in (*system.inputs, *system.outputs)
+    )
+    needed = (TIME, *seen)
     wanted = (*needed, *(system.states[i] for i in known))
     for name in wanted:
         count = names.count(name)
