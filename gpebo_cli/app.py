@@ -23,6 +23,8 @@ COMMANDS = {
 }
 """Commands, and the modules of ``gpebo_cli.commands`` whose ``main`` they are."""
 
+_AT_ONCE = ("list", "new", "completion")  # over before anybody can press Ctrl-C
+
 
 def main() -> int:
     """Run the command line in ``sys.argv``; the exit code: 0, 1, 2 or 130."""
@@ -86,7 +88,12 @@ def _dispatch(words: list[str]) -> int:
     if command in COMMANDS:
         from importlib import import_module
 
-        return int(import_module(f"gpebo_cli.commands.{COMMANDS[command]}").main(rest))
+        if command in _AT_ONCE:
+            return int(import_module(f"gpebo_cli.commands.{COMMANDS[command]}").main(rest))
+        from gpebo_cli.commands import interrupts
+
+        with interrupts.remembered():
+            return int(import_module(f"gpebo_cli.commands.{COMMANDS[command]}").main(rest))
     if command == "__complete":  # asked by the scripts that `gpebo completion` prints
         from gpebo_cli.commands import completion
 

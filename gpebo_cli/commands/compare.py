@@ -7,15 +7,15 @@ import io
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gpebo_cli.commands.options import parse
 from gpebo_cli.commands.report import columns
 from gpebo_cli.commands.sweep_folder import PLAN, job_folder, read_plan, read_records
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.reading import nearest, shown
+from gpebo_cli.reading import nearest
 
 if TYPE_CHECKING:
     from gpebo_cli.outputs.comparison import Value
@@ -26,15 +26,6 @@ _SWITCHES = ("--reverse", "--no-figures")
 _SHOWN_ROWS = 40
 
 
-@dataclass
-class _Arguments:
-    """What ``gpebo compare`` was asked to do."""
-
-    folders: list[str] = field(default_factory=list)
-    values: dict[str, str] = field(default_factory=dict)
-    switches: set[str] = field(default_factory=set)
-
-
 def main(words: list[str]) -> int:
     """Compare finished runs; the exit code.
 
@@ -42,18 +33,20 @@ def main(words: list[str]) -> int:
         ConfigError: an unknown option or column, or a folder that is neither a run nor a sweep.
         GpeboError: there is nothing to compare, or a file cannot be read or written.
     """
-    if not {"--help", "-h"}.isdisjoint(words):
+    arguments = parse("compare", words, _VALUES, _SWITCHES)
+    if arguments.help:
         from gpebo_cli.commands.usage import COMPARE_HELP
 
         sys.stdout.write(COMPARE_HELP)
         return 0
-    arguments = _parse(words)
+    if not arguments.words:
+        raise ConfigError("gpebo compare needs folders of runs or sweeps; see gpebo compare --help")
 
     from gpebo_cli.outputs import comparison
     from gpebo_cli.outputs.files import make_folder, write_text
     from gpebo_cli.outputs.finished import METRICS
 
-    cases = [case for name in arguments.folders for case in _cases(name)]
+    cases = [case for name in arguments.words for case in _cases(name)]
     if not cases:
         raise GpeboError("nothing to compare: no run in these folders has estimated anything")
     sort = arguments.values.get("--sort", comparison.SORT)
@@ -90,31 +83,6 @@ def main(words: list[str]) -> int:
             save(figure, path)
             sys.stdout.write(f"{path}\n")
     return 0
-
-
-def _parse(words: list[str]) -> _Arguments:
-    arguments = _Arguments()
-    rest = iter(words)
-    for word in rest:
-        key, equals, value = word.partition("=")
-        if key in _VALUES:
-            value = value if equals else next(rest, "")
-            if not value or value.startswith("--"):
-                raise ConfigError(f"{key} needs {_VALUES[key]}; see gpebo compare --help")
-            arguments.values[key] = value
-        elif word in _SWITCHES:
-            arguments.switches.add(word)
-        elif word.startswith("-"):
-            known = (*_VALUES, *_SWITCHES)
-            raise ConfigError(
-                f"gpebo compare: {shown(key)} is no option; known: {', '.join(known)}"
-                + nearest(key, known)
-            )
-        else:
-            arguments.folders.append(word)
-    if not arguments.folders:
-        raise ConfigError("gpebo compare needs folders of runs or sweeps; see gpebo compare --help")
-    return arguments
 
 
 def _cases(name: str) -> list[Case]:

@@ -6,11 +6,12 @@ import itertools
 import os
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpebo_cli.commands.locations import choices, conf_folder
+from gpebo_cli.commands.options import Options, parse, unknown
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.reading import nearest, shown
 
@@ -23,16 +24,16 @@ if TYPE_CHECKING:
 
 _OUTPUT = "outputs/paper"
 _FORMATS = "figures.formats"
-_FOLDERS = {"--output": "output", "--check": "check", "--update": "update"}
+_FOLDERS = {"--output": "a folder", "--check": "a folder", "--update": "a folder"}
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Arguments:
     """What ``gpebo figures`` was asked to do."""
 
-    names: list[str] = field(default_factory=list)
-    formats: list[str] = field(default_factory=lambda: ["png"])
-    folders: dict[str, str] = field(default_factory=dict)  # output, check, update
+    names: list[str]
+    formats: list[str]
+    folders: Mapping[str, str]  # --output, --check, --update
 
 
 def main(words: list[str]) -> int:
@@ -42,12 +43,13 @@ def main(words: list[str]) -> int:
         ConfigError: an unknown recipe, option or format.
         GpeboError: a run failed, a file cannot be written, or ``--check`` found a difference.
     """
-    if not {"--help", "-h"}.isdisjoint(words):
+    options = parse("figures", words, _FOLDERS)
+    if options.help:
         from gpebo_cli.commands.usage import FIGURES_HELP
 
         sys.stdout.write(FIGURES_HELP)
         return 0
-    arguments = _parse(words)
+    arguments = _arguments(options)
 
     # Only now, when the words are known to be good: half a second of imports.
     from gpebo_cli.outputs import gallery
@@ -56,8 +58,8 @@ def main(words: list[str]) -> int:
     from gpebo_cli.outputs.provenance import provenance
     from gpebo_cli.outputs.studies import STUDIES
 
-    folder = Path(arguments.folders.get("output", _OUTPUT))
-    update, check = arguments.folders.get("update"), arguments.folders.get("check")
+    folder = Path(arguments.folders.get("--output", _OUTPUT))
+    update, check = arguments.folders.get("--update"), arguments.folders.get("--check")
     names = arguments.names or list(STUDIES)
     if gallery.lacks_circuit(names):
         sys.stderr.write("Fig. 1 is left out: it needs schemdraw, pip install 'gpebo[figures]'\n")
@@ -84,31 +86,21 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def _parse(words: list[str]) -> _Arguments:
-    arguments = _Arguments()
-    rest = iter(words)
-    for word in rest:
+def _arguments(options: Options) -> _Arguments:
+    names: list[str] = []
+    formats = ["png"]
+    for word in options.words:
         key, equals, value = word.partition("=")
-        if key in _FOLDERS:
-            value = value if equals else next(rest, "")
-            if not value or value.startswith("-"):
-                raise ConfigError(f"{key} needs a folder; see gpebo figures --help")
-            arguments.folders[_FOLDERS[key]] = value
-        elif key == _FORMATS:
-            arguments.formats = _formats(value)
-        elif equals or word.startswith("-"):
-            known = (*_FOLDERS, _FORMATS)
-            raise ConfigError(
-                f"gpebo figures: {shown(key)} is no option; known: {', '.join(known)}"
-                + nearest(key, known)
-            )
+        if key == _FORMATS:
+            formats = _formats(value)
+        elif equals and key != "experiment":
+            raise unknown("figures", key, (*_FOLDERS, _FORMATS, "--help"))
         else:
-            arguments.names.append(_recipe(word))
-    check = arguments.folders.get("check")
+            names.append(_recipe(word))
+    check = options.values.get("--check")
     if check is not None and not os.path.isdir(check):
         raise ConfigError(f"--check {check}: there is no such folder")
-    arguments.names = list(dict.fromkeys(arguments.names))
-    return arguments
+    return _Arguments(list(dict.fromkeys(names)), formats, options.values)
 
 
 def _recipe(word: str) -> str:

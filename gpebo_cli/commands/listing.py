@@ -6,12 +6,14 @@ import os
 import sys
 
 from gpebo_cli.commands.locations import choices, conf_folder
+from gpebo_cli.commands.options import CONFIG_DIR, parse
 from gpebo_cli.errors import ConfigError
 
 KINDS = {
     "plants": "plant",
     "observers": "observer",
     "estimators": "estimator",
+    "noise": "noise",
     "experiments": "experiment",
 }
 
@@ -35,28 +37,15 @@ def main(words: list[str]) -> int:
 
 def _parse(words: list[str]) -> tuple[list[str], list[str]]:
     """Kinds (none if help is wanted) and the folders to look in."""
-    kinds: list[str] = []
+    options = parse("list", words, CONFIG_DIR)
     folders = [conf_folder()]
-    rest = iter(words)
-    for word in rest:
-        flag, _, value = word.partition("=")
-        if flag in ("--config-dir", "-cd"):
-            value = value or next(rest, "")
-            if not os.path.isdir(value):
-                raise ConfigError(f"--config-dir {value or '(nothing)'}: there is no such folder")
-            folders.append(value)
-        elif word in ("--help", "-h"):
-            return [], folders
-        elif word.startswith("-"):
-            from gpebo_cli.reading import nearest, shown
-
-            known = ("--config-dir", "--help")
-            raise ConfigError(
-                f"gpebo list: {shown(word)} is no option; known: {', '.join(known)}"
-                + nearest(word, known)
-            )
-        else:
-            kinds.append(_kind(word))
+    if options.config_dir is not None:
+        if not os.path.isdir(options.config_dir):
+            raise ConfigError(f"--config-dir {options.config_dir}: there is no such folder")
+        folders.append(options.config_dir)
+    if options.help:
+        return [], folders
+    kinds = [_kind(word) for word in options.words]
     return list(dict.fromkeys(kinds)) or list(KINDS), folders
 
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from gpebo_cli.commands.locations import choices, conf_folder
+from gpebo_cli.commands.options import CONFIG_DIR, parse
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import nearest, shown
 
@@ -101,22 +102,8 @@ def main(words: list[str]) -> int:
 
 def _parse(words: list[str]) -> tuple[str, str, str]:
     """Kind, name and folder."""
-    given: list[str] = []
-    folder = "."
-    rest = iter(words)
-    for word in rest:
-        flag, equals, value = word.partition("=")
-        if flag in ("--config-dir", "-cd"):
-            folder = value if equals else next(rest, "")
-            if not folder or folder.startswith("-"):
-                raise ConfigError("--config-dir needs a folder; see gpebo new --help")
-        elif word.startswith("-"):
-            raise ConfigError(
-                f"gpebo new: {shown(word)} is no option; known: --config-dir, --help"
-                + nearest(word, ("--config-dir", "--help"))
-            )
-        else:
-            given.append(word)
+    options = parse("new", words, CONFIG_DIR)
+    given = options.words
     if not given or given[0] not in KINDS:
         what = f"gpebo new: {shown(given[0])} cannot be made" if given else "gpebo new needs a kind"
         raise ConfigError(
@@ -128,7 +115,7 @@ def _parse(words: list[str]) -> tuple[str, str, str]:
         raise ConfigError(
             f"gpebo new {given[0]} needs one name, as in gpebo new {given[0]} tank; got {got}"
         )
-    return given[0], given[1].removesuffix(".yaml"), os.path.expanduser(folder)
+    return given[0], given[1].removesuffix(".yaml"), os.path.expanduser(options.config_dir or ".")
 
 
 def _check_name(kind: str, name: str, path: Path) -> None:

@@ -10,6 +10,8 @@ from time import monotonic
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+from gpebo_cli.commands import interrupts
+
 if TYPE_CHECKING:
     from gpebo_cli.result import NoiseStatistics, RunResult
 
@@ -41,7 +43,8 @@ class Progress:
         self._timer.cancel()
 
     def __call__(self, stage: str) -> None:
-        """A stage begins."""
+        """A stage begins, unless Ctrl-C was pressed in the last one."""
+        interrupts.check()
         self._stage = stage
         if self._terminal and monotonic() - self._start > _DELAY:
             self._show()

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from gpebo_cli.commands import interrupts
 from gpebo_cli.commands.arguments import Arguments, quoted
 from gpebo_cli.commands.hydra_errors import LIBRARY_ERRORS
 from gpebo_cli.commands.job import output_folder, run_job
@@ -73,12 +74,14 @@ def run_sweep_job(cfg: DictConfig, arguments: Arguments) -> None:
     start = perf_counter()
     cases: list[dict[str, float | None]] = []
     error = ""
+    interrupts.check()
     try:
         rows = case_rows(run_job(cfg, arguments, str(folder), draw=False, quiet=True))
         cases = [{k: v if math.isfinite(v) else None for k, v in row.items()} for row in rows]
     except GpeboError as raised:
         error = str(raised)
     except Exception as raised:  # noqa: BLE001  the next job runs whatever became of this one
+        interrupts.check()  # a library may have wrapped it
         error = f"internal error: {type(raised).__name__}: {raised}"
     make_folder(folder)
     record = JobRecord(

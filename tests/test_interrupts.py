@@ -1,0 +1,42 @@
+"""Ctrl-C is obeyed even where Python drops the exception."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+import pytest
+
+from gpebo_cli.commands import interrupts
+
+
+class Finaliser:
+    """Whatever is raised in ``__del__`` is printed and dropped by Python."""
+
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_what_a_finaliser_drops_is_raised_at_the_next_stage(capsys):
+    reached = []
+    with pytest.raises(KeyboardInterrupt), interrupts.remembered():
+        Finaliser()
+        reached.append("after the signal")  # Python went on
+        interrupts.check()
+        reached.append("the next stage")
+    assert reached == ["after the signal"]
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_dropped_in_the_last_stage_is_raised_at_the_end():
+    with pytest.raises(KeyboardInterrupt), interrupts.remembered():
+        Finaliser()
+
+
+def test_without_a_signal_nothing_happens_and_all_is_as_before():
+    handler, hook = signal.getsignal(signal.SIGINT), sys.unraisablehook
+    with interrupts.remembered():
+        interrupts.check()
+        assert signal.getsignal(signal.SIGINT) is not handler
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert sys.unraisablehook is hook
