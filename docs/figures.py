@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from gpebo_cli.collocation.linear import LinearProblem, solve
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
 from gpebo_cli.collocation.mesh import Trajectory, initial_mesh
 from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.commands.locations import conf_folder
@@ -51,7 +51,8 @@ def error_matrices(t: Array, inside: Array) -> tuple[Array, Array]:
 def transition_norm(M: Trajectory, t: Array) -> Array:
     """‖Φ_w(t)‖₂ of φ̇ = M φ from the identity at the start, shape (N,)."""
     problem = LinearProblem(
-        lambda t, inside: (None, M(t, inside), np.zeros((1, 2, 2))), np.eye(2), name="M_w"
+        lambda t, inside: Coefficients(None, M(t, inside), np.zeros((len(t), 2, 2))),
+        np.eye(2), name="M_w",
     )
     solution = solve(problem, M.mesh, tol=1e-11, max_elements=10_000)
     return np.asarray(np.linalg.norm(solution.trajectory(t), 2, axis=(1, 2)))
@@ -101,7 +102,29 @@ def sampled_orders(path: Path) -> None:
     save(compose([panel]), path)
 
 
+def unbounded(path: Path) -> None:
+    """Draw the relative error of the state on the plant of docs/howto/unstable.md, by remedy."""
+    text = (Path(__file__).parent / "examples" / "plant" / "unbounded.yaml").read_text("utf-8")
+    system = plant_from_mapping(yaml.safe_load(text))
+    curves = []
+    for k, remedy in enumerate(("none", "output_injection", "reset", "current_coordinates")):
+        result = run_experiment(
+            Settings(
+                plant={},
+                estimator={"name": "least_squares", "f0": 1e-8},
+                time=TimeSettings(horizon=40.0),
+                observer=ObserverSettings(remedy=remedy),
+            ),
+            system,
+        )
+        states, estimation = result.simulation.states, result.estimation
+        error = np.abs(estimation.states[0] - states).max(axis=1) / np.abs(states).max(axis=1)
+        curves.append(Curve(estimation.t, error, remedy, line(k)))
+    save(compose([Panel("relative error of x", tuple(curves), log=True, legend=True)]), path)
+
+
 if __name__ == "__main__":
     make_folder(IMAGES)
+    unbounded(IMAGES / "unbounded.png")
     errata_assumption7(IMAGES / "errata_assumption7.png")
     sampled_orders(IMAGES / "sampled.png")

@@ -151,6 +151,11 @@ class Observed(Protocol):
         """Largest entry of Φ; None: the states do not rest on it."""
         ...
 
+    @property
+    def growth_rate(self) -> float | None:
+        """In 1/s, ln ‖Φ‖ over the horizon."""
+        ...
+
 
 def of_observation(observation: Observed, excitation: Excitation) -> list[Assumption]:
     """The observer's own assumptions, excitation, and the growth of Φ."""
@@ -176,7 +181,20 @@ def of_observation(observation: Observed, excitation: Excitation) -> list[Assump
                 "Growth of Φ",
                 "Φ stays bounded, so that θ̂ → θ implies x̂ → x",
                 observation.growth < _GROWTH,
-                {"largest_entry": observation.growth},
+                {"largest_entry": observation.growth, "rate": observation.growth_rate},
             )
         )
     return found
+
+
+def warnings(observation: Observed) -> tuple[str, ...]:
+    """What does not stop a run and spoils its result, one line each: Φ that grows too far."""
+    growth, rate = observation.growth, observation.growth_rate
+    if growth is None or rate is None or growth < _GROWTH:
+        return ()
+    text = (
+        f"Φ has grown to {growth:.2g}, at {rate:.3g} 1/s: of its 16 digits the state estimate "
+        f"loses {np.log10(growth):.0f}; a remedy is needed, observer.remedy=output_injection, "
+        "reset or current_coordinates"
+    )
+    return (text,)

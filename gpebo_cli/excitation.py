@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
-from gpebo_cli.regression import LinearRegression, SampledRegression
+from gpebo_cli.regression import ExtensionState, LinearRegression, SampledRegression, largest
 from gpebo_cli.result import Direction, Excitation, Requirement
 from gpebo_cli.settings import ExcitationSettings
 from gpebo_cli.systems.descriptor import Array
@@ -38,11 +38,10 @@ def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings)
     weakest = vectors[:, 0] * np.sign(vectors[np.argmax(np.abs(vectors[:, 0])), 0])
     smallest, largest = max(float(values[0]), 0.0), float(values[-1])
     t_c = _first_time(gram, rho)
-    outer = Trajectory(mesh, regression.outer.values[..., :p])
     return Excitation(
         t=t,
         gram_eigenvalues=eigenvalues,
-        pe_level=window_level(outer, t, window),
+        pe_level=segment_level(regression, t, window),
         window=window,
         is_ie=t_c is not None,
         t_c=t_c,
@@ -81,6 +80,35 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
     return high
 
 
+def segment_level(regression: LinearRegression, t: Array, window: float) -> Array:
+    """:func:`window_level` at the times t (M,) where parameters may be replaced inside a window.
+
+    What was seen before a reset counts for the parameters after it: T⁻ᵀ G T⁻¹, as in
+    ``ExtensionState.after``.
+    """
+    p = regression.p
+    if not regression.resets:
+        outer = Trajectory(regression.mesh, regression.outer.values[..., :p])
+        return window_level(outer, t, window)
+    level = np.full(len(t), np.nan)
+    start = t - window
+    whole = np.flatnonzero(start >= regression.mesh.edges[0] - 1e-12 * max(1.0, window))
+    gram = np.zeros((len(whole), p, p + 1))
+    before: LinearRegression | None = None
+    for segment, reset in zip(regression.segments, (None, *regression.resets), strict=True):
+        if before is not None and reset is not None:
+            size = largest(before.gram.final)
+            for i in np.flatnonzero((start[whole] < reset.time) & (t[whole] > reset.time)):
+                gram[i] = ExtensionState(gram[i], size).after(reset).values
+        low, high = segment.mesh.edges[[0, -1]]
+        a, b = np.clip(start[whole], low, high), np.clip(t[whole], low, high)
+        here = np.flatnonzero(b > a)
+        gram[here] += between(segment.outer, a[here], b[here])
+        before = segment
+    level[whole] = np.maximum(np.linalg.eigvalsh(gram[..., :p])[:, 0], 0.0)
+    return level
+
+
 def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     """λ_min of ∫_{t−T}^{t} ψᵀψ at the times t (M,); NaN before the first whole one.
 
@@ -93,21 +121,26 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     whole = np.flatnonzero(start >= mesh.edges[0] - 1e-12 * max(1.0, window))
     if len(whole) == 0:
         return level
-    a, b = np.maximum(start[whole], mesh.edges[0]), t[whole]
+    sums = between(outer, np.maximum(start[whole], mesh.edges[0]), t[whole])
+    level[whole] = np.maximum(np.linalg.eigvalsh(sums)[:, 0], 0.0)
+    return level
+
+
+def between(signal: Trajectory, a: Array, b: Array) -> Array:
+    """∫ of a signal from a to b ≥ a (N,) within its mesh, whole elements summed afresh."""
+    mesh = signal.mesh
     first = mesh.sampler(a).element
     last = mesh.sampler(b).element
-    within = outer.local_integral()
+    within = signal.local_integral()
     totals = within.values[:, -1]
     head = within(a)  # from the left end of a's element to a
     tail = within(b)
-    p = outer.values.shape[-1]
     # Sums of totals[first:last] for every window: pairs of indices to reduceat.
-    padded = np.concatenate([totals, np.zeros((1, p, p))])
+    padded = np.concatenate([totals, np.zeros_like(totals[:1])])
     pairs = np.stack([first, last], axis=1).ravel().astype(np.intp)
     sums = np.add.reduceat(padded, pairs, axis=0)[::2]
-    sums = np.where((first < last)[:, None, None], sums, 0.0) + tail - head
-    level[whole] = np.maximum(np.linalg.eigvalsh(sums)[:, 0], 0.0)
-    return level
+    whole = (first < last).reshape(-1, *(1,) * (sums.ndim - 1))
+    return np.asarray(np.where(whole, sums, 0.0) + tail - head)
 
 
 def sampled_window_level(regression: SampledRegression, window: float) -> Array:

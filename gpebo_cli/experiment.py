@@ -12,13 +12,13 @@ from time import perf_counter
 import numpy as np
 
 from gpebo_cli import estimators
-from gpebo_cli.assumptions import of_observation, of_simulation
+from gpebo_cli.assumptions import of_observation, of_simulation, warnings
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.excitation import WINDOWS, assess, sampled_window_level
 from gpebo_cli.measurement import NoiseLevels, check_samples, measure, noise_levels
 from gpebo_cli.metrics import settling_time, time_rms
-from gpebo_cli.observers import Observation, observe, signal_noise
+from gpebo_cli.observers import Observation, check_remedy, observe, signal_noise
 from gpebo_cli.realisations import check_seeds, over_seeds
 from gpebo_cli.recordings.load import Recording, load
 from gpebo_cli.regression import SampledRegression
@@ -110,6 +110,7 @@ def run_experiment(
             timings=clock.seconds, verdict=source.verdict,
         )
 
+    check_remedy(settings.observer)
     if settings.observer.sample_time is not None:
         return _run_at_samples(settings, system, source, estimator, clock)
     clock.stage("observe")
@@ -142,14 +143,18 @@ def run_experiment(
         truth = estimation.true_parameters[-1]
         noise = over_seeds(observation, source.true, estimator, truth, settings.noise, levels)
     fit = _fit(observation, estimation) if recorded else None
+    found = warnings(observation)
     clock.stage("")
     return RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=sampled,
         excitation=excitation, estimation=estimation, metrics=metrics,
         assumptions=(*source.assumptions, *of_observation(observation, excitation)),
         timings=clock.seconds,
-        verdict=_verdict(excitation, estimation, metrics, fit) + observation.note,
+        verdict="; ".join([
+            _verdict(excitation, estimation, metrics, fit) + observation.note, *found
+        ]),
         noise=noise,
+        warnings=found,
         recording=source.recording,
         fit=fit,
     )
@@ -314,6 +319,7 @@ def _run_at_samples(
         weakest_direction=direction,
     )
     fit = run.fit(parameters[:, -1]) if source.recording is not None else None
+    found = warnings(run)
     clock.stage("")
     return RunResult(
         settings=settings, system=system, simulation=source.simulation,
@@ -323,9 +329,10 @@ def _run_at_samples(
         excitation=excitation, estimation=estimation, metrics=metrics,
         assumptions=(*source.assumptions, *of_observation(run, excitation)),
         timings=clock.seconds,
-        verdict=_verdict(excitation, estimation, metrics, fit),
+        verdict="; ".join([_verdict(excitation, estimation, metrics, fit), *found]),
         recording=source.recording,
         fit=fit,
+        warnings=found,
     )
 
 
@@ -414,7 +421,7 @@ def _estimate(
     cases = estimator.cases
     kept = t[_kept_samples(len(cases), len(t), settings.output.max_rows)]
     grid = np.unique(np.concatenate([regression.mesh.points.ravel(), state_map.times, kept]))
-    estimates = estimator.estimate(regression, grid)
+    estimates = estimators.estimate(estimator, regression, grid)
     chosen = np.searchsorted(grid, kept)
 
     reconstruct = state_map.at(grid)

@@ -44,6 +44,11 @@ def check_seeds(
         return
     if levels.silent:
         raise ConfigError(f"noise.seeds = {settings.seeds}, but there is no noise; set its levels")
+    if observer.remedy not in ("none", "output_injection"):
+        raise ConfigError(
+            f"noise.seeds = {settings.seeds} goes with observer.remedy=none or output_injection, "
+            f"not {observer.remedy}; with others, run one job per seed: -m noise.seed=0,1,2"
+        )
     if observer.name != "gpebo" or observer.sample_time is not None:
         asked = observer.name if observer.sample_time is None else "one with a sample_time"
         raise ConfigError(

@@ -229,6 +229,7 @@ class RunResult:
     noise: NoiseStatistics | None = None  # where more than one seed was asked for
     recording: RecordingResult | None = None
     fit: Fit | None = None  # of a recording
+    warnings: tuple[str, ...] = ()  # what does not stop a run and spoils its result, one line each
 
     @property
     def signals(self) -> SignalsResult:

@@ -108,6 +108,12 @@ class SampledRun:
         return self._reached.growth
 
     @property
+    def growth_rate(self) -> float | None:
+        """In 1/s, the logarithm of the largest entry of Φ over the time so far."""
+        elapsed = self._reached.t - self._start
+        return float(np.log(self.growth)) / elapsed if elapsed > 0 and self.growth > 0 else None
+
+    @property
     def error_estimate(self) -> float:
         """Of the integration between samples; the hold's own error is not in it."""
         return self._reached.error_estimate

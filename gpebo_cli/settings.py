@@ -55,6 +55,15 @@ class ObserverSettings:
     xi_a0: Mapping[str, float] | list[float] | None = None
     # gpebo: the whole residual, or its last r rows as the paper has it.
     regression: Literal["projected", "paper"] = "projected"
+    # gpebo: what is done about a Φ that grows (docs/howto/unstable.md).
+    remedy: Literal["none", "reset", "output_injection", "current_coordinates"] = "none"
+    # of output_injection: n rows, as many columns as outputs, numbers or expressions of t; None:
+    # from a Riccati equation.
+    injection: list[list[float | str]] | None = None
+    # of reset: every so many seconds, and at these times; neither: where Φ has grown a hundredfold.
+    reset_interval: float | None = None
+    reset_times: list[float] = field(default_factory=list)
+    reset_keep: float = 1.0  # share of what is known that counts after a reset; 0: learn anew
     # canonical: the output that Proposition 4 rests on (None: the first that fits), its gain
     # (diagonal, remark4, or two expressions of t) and the start of its state.
     output: str | None = None

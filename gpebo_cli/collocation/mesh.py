@@ -197,31 +197,33 @@ class Trajectory:
         local[1:] += total[:-1, None]
         return Trajectory(self.mesh, local)
 
-    def low_pass(self, rate: Array | float) -> Trajectory:
-        """Z of Z' = −λ (Z − S), Z(start) = 0: the filter λ/(p + λ) applied to this signal S.
+    def low_pass(self, rate: Array | float, start: Array | None = None) -> Trajectory:
+        """Z of Z' = −λ (Z − S): the filter λ/(p + λ) applied to this signal S.
 
         Args:
             rate: λ > 0 in 1/s, a scalar () or an array that broadcasts against one value of the
                 signal.
+            start: Z at the start, of the shape of one value; None: 0.
         """
         mesh, rule = self.mesh, self.mesh.rule
         shape = self.values.shape[2:]
         rates = np.broadcast_to(np.asarray(rate, dtype=np.float64), shape).ravel()
         flat = self.values.reshape(mesh.size, rule.stages + 1, -1)
         distinct, which = np.unique(rates, return_inverse=True)
+        at_start = np.zeros(flat.shape[2]) if start is None else start.ravel()
         out = np.empty_like(flat)
         batch = max(1, _CHUNK // (mesh.size * rule.stages**2))
         for first in range(0, len(distinct), batch):
             some = distinct[first : first + batch]
             columns = [np.flatnonzero(which == first + i) for i in range(len(some))]
-            _filter(mesh, some, columns, flat, out)
+            _filter(mesh, some, columns, flat, at_start, out)
         return Trajectory(mesh, out.reshape(self.values.shape))
 
 
 def _filter(
-    mesh: Mesh, rates: Array, columns: Sequence[IntArray], values: Array, out: Array
+    mesh: Mesh, rates: Array, columns: Sequence[IntArray], values: Array, start: Array, out: Array
 ) -> None:
-    """Z of Z' = −λ (Z − S), zero start, for the columns of S that each rate λ belongs to.
+    """Z of Z' = −λ (Z − S) from ``start``, for the columns of S that each rate λ belongs to.
 
     Columns that share a rate share a factorisation; all rates are solved in one batch.
     """
@@ -229,12 +231,14 @@ def _filter(
     hl = rates[:, None, None, None] * mesh.steps[:, None, None]  # h λ, (rates, K, 1, 1)
     right = np.zeros((len(rates), mesh.size, rule.stages, 1 + max(map(len, columns))))
     right[..., 0] = rule.differentiation.sum(axis=1)  # the response to the left end
+    first = np.zeros((len(rates), right.shape[-1] - 1))
     for i, those in enumerate(columns):
+        first[i, : len(those)] = start[those]
         right[i, :, :, 1 : 1 + len(those)] = hl[i] * values[:, 1:, those]
     operator = rule.differentiation + hl * np.eye(rule.stages)
     solved = np.asarray(np.linalg.solve(operator, right), dtype=np.float64)
     last = np.moveaxis(solved[:, :, -1], 0, 1)  # (K, rates, 1 + columns)
-    starts = affine_scan(last[..., :1], last[..., 1:], np.zeros(()))[:-1]
+    starts = affine_scan(last[..., :1], last[..., 1:], first)[:-1]
     for i, those in enumerate(columns):
         left = starts[:, i, None, : len(those)]
         out[:, :1, those] = left

@@ -51,12 +51,13 @@ _RANGES = {
     "output.max_rows": (2, math.inf),
     "observer.regularisation": (1e-6, 1.0),
     "noise.seed": (0, math.inf),
+    "observer.reset_keep": (0, 1),
     "noise.seeds": (1, 1_000_000),
 }
 _OPEN = ("start", "horizon")  # of time: null where the data, or a default, decides
 _POSITIVE = (
     "time.horizon", "observer.sample_time", "excitation.rho", "excitation.window",
-    "noise.sample_time",
+    "noise.sample_time", "observer.reset_interval",
 )
 
 

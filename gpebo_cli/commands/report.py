@@ -145,5 +145,7 @@ def run_lines(result: RunResult, folder: str = "") -> list[str]:
 
 
 def print_run(result: RunResult, folder: str) -> None:
-    """Table, folder and verdict to stdout, the verdict last."""
+    """Table, folder and verdict to stdout, the verdict last; warnings to stderr."""
     sys.stdout.write("".join(f"{line}\n" for line in run_lines(result, folder)))
+    sys.stdout.flush()  # before what follows on stderr
+    sys.stderr.write("".join(f"gpebo: warning: {line}\n" for line in result.warnings))

@@ -17,6 +17,7 @@ from typing import cast
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._recursive import InformationRoot, Recursion
+from gpebo_cli.estimators._segments import estimate
 from gpebo_cli.reading import nearest, read
 from gpebo_cli.regression import Estimates, Estimator
 
@@ -24,7 +25,8 @@ GROUP = "gpebo.estimators"
 """The entry points under which other packages offer estimators."""
 
 __all__ = [
-    "GROUP", "Estimates", "Estimator", "InformationRoot", "Recursion", "build", "names",
+    "GROUP", "Estimates", "Estimator", "InformationRoot", "Recursion", "build", "estimate",
+    "names",
     "recursion", "settings_of",
 ]
 

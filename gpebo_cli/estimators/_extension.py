@@ -12,25 +12,28 @@ _TOLERANCE = 1e-11
 _ROUNDS = 30
 
 
-def kreisselmeier(regression: LinearRegression, rates: Array) -> Trajectory:
-    """[Ω | 𝒴] of shape (p, p + c) with Ω' = −Λ(Ω − ψᵀψ), 𝒴' = −Λ(𝒴 − ψᵀY), zero start.
+def kreisselmeier(
+    regression: LinearRegression, rates: Array, start: Array | None = None
+) -> Trajectory:
+    """[Ω | 𝒴] of shape (p, p + c) with Ω' = −Λ(Ω − ψᵀψ), 𝒴' = −Λ(𝒴 − ψᵀY), from ``start``.
 
     Λ = diag(``rates``): one filter λ_i/(p + λ_i) per row, as in the paper (Section V); all rates
     equal is the classical extension. Since Λ multiplies rows, Ω η = 𝒴 holds for any rates.
     """
-    return resolved_low_pass(regression.outer, rates[:, None])
+    return resolved_low_pass(regression.outer, rates[:, None], start)
 
 
-def resolved_low_pass(signal: Trajectory, rate: Array) -> Trajectory:
+def resolved_low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Trajectory:
     """``signal.low_pass(rate)`` on a mesh fine enough for the filter's own transient.
 
     Args:
         signal: to be filtered.
         rate: λ of the filters in 1/s, (p,) or any shape that broadcasts against the signal.
+        start: of the filtered signal, of the shape of one value; None: 0.
     """
     tail = np.zeros(0)
     for _ in range(_ROUNDS):
-        filtered = signal.low_pass(rate)
+        filtered = signal.low_pass(rate, start)
         flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
         tail = unresolved(flat, signal.mesh.rule)
         poor = tail > _TOLERANCE
@@ -46,7 +49,7 @@ def resolved_low_pass(signal: Trajectory, rate: Array) -> Trajectory:
     return filtered
 
 
-def lion(regression: LinearRegression, rates: Array) -> Trajectory:
+def lion(regression: LinearRegression, rates: Array, start: Array | None = None) -> Trajectory:
     """[Ω | 𝒴] of shape (p, p + c), row i being λ_i/(p + λ_i) of one row of [ψ | Y].
 
     Row i takes row i mod r of the regression: with one output every row is a filtered copy of the
@@ -55,4 +58,5 @@ def lion(regression: LinearRegression, rates: Array) -> Trajectory:
     psi = regression.psi.values
     both = np.concatenate([psi, with_realisations(psi, regression.Y.values)], axis=-1)
     rows = np.arange(regression.p) % both.shape[2]
-    return resolved_low_pass(Trajectory(regression.mesh, both[:, :, rows]), rates[:, None])
+    signal = Trajectory(regression.mesh, both[:, :, rows])
+    return resolved_low_pass(signal, rates[:, None], start)

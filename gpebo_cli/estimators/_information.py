@@ -20,7 +20,7 @@ from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import SolverError
 from gpebo_cli.estimators._extension import resolved_low_pass
 from gpebo_cli.linalg import transpose
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import ExtensionState, LinearRegression, largest
 from gpebo_cli.systems.descriptor import Array
 
 _PICARD_ROUNDS = 200
@@ -32,6 +32,12 @@ class Information:
 
     gram: Trajectory  # [G_z | h_z], shape (p, p + c)
     memory: Trajectory  # z, scalar
+    level: float  # ‖∫ψᵀψ‖ over this regression alone, or more
+
+    @property
+    def reached(self) -> ExtensionState:
+        """[G_z | h_z] and z at the end."""
+        return ExtensionState(self.gram.final, self.level, float(self.memory.final))
 
     def spectrum(self, t: Array, inside: Array | None = None) -> Spectrum:
         """G_z = V diag(λ) Vᵀ at the times t (M,)."""
@@ -54,7 +60,8 @@ class Spectrum:
 
 
 def information(
-    regression: LinearRegression, alpha: float, f0: float, beta: float, bound: float | None
+    regression: LinearRegression, alpha: float, f0: float, beta: float, bound: float | None,
+    known: ExtensionState | None = None,
 ) -> Information:
     """G_z, h_z and z for one set of gains.
 
@@ -64,22 +71,35 @@ def information(
         f0: f₀ > 0, matters only with a bound.
         beta: forgetting rate, β₀ ≥ 0.
         bound: M of β = β₀ (1 − ‖F‖/M), at least 1/f₀; None: constant β = β₀.
+        known: G_z, h_z and z at the start; None: 0, 0 and 1.
     """
+    level = largest(regression.gram.final)
+    if known is not None:
+        level = max(level, known.level)
     if beta == 0.0:
-        ones = np.ones(regression.outer.values.shape[:2])
-        return Information(regression.gram, Trajectory(regression.mesh, ones))
+        memory = np.ones(regression.outer.values.shape[:2])
+        gram = regression.gram
+        if known is not None:
+            gram = Trajectory(gram.mesh, gram.values + known.values)
+            memory *= known.memory
+        return Information(gram, Trajectory(regression.mesh, memory), level)
     if bound is None:
-        filtered = resolved_low_pass(regression.outer, np.array(beta))  # β ∫ e^{−β(t−s)} (·) ds
+        start = None if known is None else beta * known.values
+        # β ∫ e^{−β(t−s)} (·) ds
+        filtered = resolved_low_pass(regression.outer, np.array(beta), start)
         mesh = filtered.mesh
         memory = np.exp(-beta * (mesh.points - mesh.edges[0]))
+        if known is not None:
+            memory *= known.memory
         return Information(
-            Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory)
+            Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory), level
         )
-    return _bounded(regression, alpha, f0, beta, bound)
+    return _bounded(regression, alpha, f0, beta, bound, known, level)
 
 
 def _bounded(
-    regression: LinearRegression, alpha: float, f0: float, beta0: float, bound: float
+    regression: LinearRegression, alpha: float, f0: float, beta0: float, bound: float,
+    known: ExtensionState | None, level: float,
 ) -> Information:
     """Forgetting that stops where ‖F‖ reaches the bound: β = β₀ (1 − ‖F‖/M).
 
@@ -98,6 +118,8 @@ def _bounded(
     R, p = mesh.rule.integration, regression.p
     gram, memory = np.empty_like(outer.values), np.empty(outer.values.shape[:2])
     G, z = np.zeros(outer.values.shape[2:]), 1.0
+    if known is not None:
+        G, z = known.values, known.memory
     eye = f0 * np.eye(p)
     for k, h in enumerate(mesh.steps):
         gram[k, 0], memory[k, 0] = G, z
@@ -121,4 +143,4 @@ def _bounded(
         decay = np.exp(-h * (R @ beta))
         gram[k, 1:], memory[k, 1:] = nodes, z * decay
         G, z = nodes[-1], z * decay[-1]
-    return Information(Trajectory(mesh, gram), Trajectory(mesh, memory))
+    return Information(Trajectory(mesh, gram), Trajectory(mesh, memory), level)

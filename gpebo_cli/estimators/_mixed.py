@@ -12,7 +12,7 @@ from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.estimators._base import axis, number, per_parameter
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import ExtensionState, LinearRegression, largest
 from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
@@ -42,21 +42,39 @@ def filter_rates(rates: object, parameters: tuple[str, ...]) -> Array:
     return per_parameter(rates, parameters, "estimator.lambda", positive=True)
 
 
-Extension = Callable[[LinearRegression, Array], Trajectory]  # (regression, rates) -> [Ω | 𝒴]
+# (regression, rates, start) -> [Ω | 𝒴]
+Extension = Callable[[LinearRegression, Array, Array | None], Trajectory]
 
 
 def estimate_mixed(
-    regression: LinearRegression, t: Array, extend: Extension, settings: MixedSettings
+    regression: LinearRegression, t: Array, extend: Extension, settings: MixedSettings,
+    known: Sequence[ExtensionState], *, linear: bool = False,
 ) -> MixedEstimates:
     """Extend by filters, mix, and keep what the closed form needs at the times t (M,)."""
     names = regression.parameters
+    extended = extend(
+        regression, filter_rates(settings.rates, names), known[0].values if known else None
+    )
     return MixedEstimates(
-        groups=(mix(extend(regression, filter_rates(settings.rates, names)), t),),
+        groups=(mix(extended, t, regression.floor),),
+        reached=(reached(regression, extended, known, linear=linear),),
         start=per_parameter(settings.initial, names, "estimator.initial"),
         gains=gain_matrix(settings.gamma, names, "estimator.gamma"),
         condition="Δ not in L2",
         realisations=regression.realisations,
     )
+
+
+def reached(
+    regression: LinearRegression, extended: Trajectory, known: Sequence[ExtensionState],
+    *, linear: bool = False,
+) -> ExtensionState:
+    """[Ω | 𝒴] at the end; no filter exceeds the largest ψᵀψ, or for Lion's ψ, that went in."""
+    level = largest(regression.outer.values)
+    if linear:
+        level = np.sqrt(regression.p * level)
+    level = max(level, known[0].level) if known else level
+    return ExtensionState(extended.final, level, surplus=1.0)
 
 
 class MixedSettings(Protocol):
@@ -99,7 +117,7 @@ def energy_requirement(
     )
 
 
-# (η̂ (g, M, P), γ∫Δ² (g, M, P or 1), η̂ at the start (P,)) -> estimates
+# (η̂ (g, M, P), γ∫Δ² (g, M, P or 1), η̂ at the start (1 or g, 1, P)) -> estimates
 Transform = Callable[[Array, Array, Array], Array]
 
 
@@ -111,6 +129,7 @@ class MixedEstimates:
     start: Array  # (p,)
     gains: Array  # (g, p or 1)
     condition: str
+    reached: tuple[ExtensionState, ...]  # of each group
     needed: float = ONE_PERCENT  # of γ∫Δ²
     needed_for: str = "1 % of the initial error"
     transform: Transform | None = None
@@ -129,20 +148,26 @@ class MixedEstimates:
             self.condition, float(self.gains.min()), min(energies), self.needed, self.needed_for
         )
 
-    def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases, shape (g, M, p) or (g, M, p, c)."""
+    def parameters(self, cases: slice, start: Array | None = None) -> Array:
+        """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
         g, c = len(self.gains), self.groups[0].quotient.shape[-1] // len(self.start)
-        start = np.repeat(self.start, c)
+        usual = np.repeat(self.start, c)
         first, last, _ = cases.indices(g * len(self.groups))
-        pieces = []
+        pieces: list[Array] = []
+        done = 0
         for group in range(first // g, (max(last, 1) - 1) // g + 1):
             path = self.groups[group]
             gains = self.gains[max(first - group * g, 0) : min(last - group * g, g)]
             if gains.shape[1] > 1:  # one for each parameter, and for each of its realisations
                 gains = np.repeat(gains, c, axis=1)
-            eta = scalar_law(path, start, gains)
+            own = usual
+            if start is not None:
+                own = np.repeat(start[done : done + len(gains)], c, axis=1)
+            done += len(gains)
+            eta = scalar_law(path, own, gains)
             if self.transform is not None:
-                eta = self.transform(eta, gains[:, None, :] * path.energy_at_t[:, None], start)
+                energy = gains[:, None, :] * path.energy_at_t[:, None]
+                eta = self.transform(eta, energy, np.atleast_2d(own)[:, None])
             pieces.append(eta)
         estimates = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
         return estimates.reshape(*estimates.shape[:2], len(self.start), *self.realisations)

@@ -14,7 +14,7 @@ from gpebo_cli.systems.descriptor import Array, BoolArray
 SINGULAR = 1e-14
 
 
-def mix(extended: Trajectory, t: Array) -> ScalarPath:
+def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     """Mix [Ω | 𝒴] (p, p + c): the path that the scalar law takes, reported at the times t (M,).
 
     Realisations are so many parameters more to the law: p·c of them, in the order of (p, c).
@@ -34,7 +34,7 @@ def mix(extended: Trajectory, t: Array) -> ScalarPath:
     )
     quotient = quotient.reshape(*delta.shape, -1)
     return scalar_path(
-        extended.mesh, signals, delta, filled(quotient, usable), t, determinant
+        extended.mesh, signals, delta, filled(quotient, usable), t, determinant, floor
     )
 
 

@@ -42,6 +42,7 @@ class ScalarPath:
     energy: Array  # (K, s + 1) I
     t: Array  # (M,)
     energy_at_t: Array  # (M,)
+    floor: float  # size below which η̂ is rounding
 
 
 def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
@@ -49,7 +50,7 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
 
     Args:
         path: the mixed regression.
-        start: η̂ at the start, shape (p,).
+        start: η̂ at the start, shape (p,), or (g, p) for each gain its own.
         gains: γ, shape (g, p) or (g, 1).
 
     Returns:
@@ -62,18 +63,22 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     weight = np.minimum(1.0, float(gains.max(initial=0.0)) * length)
     change = np.diff(path.quotient, axis=1)
     size = max(float(np.abs(path.quotient[-1]).max(initial=0.0)), float(np.abs(start).max()))
+    size = max(size, path.floor)
     variation = float((weight[..., None] * np.abs(change)).max(initial=0.0))
     if variation <= _CONSTANT * size:
         final = path.quotient[-1, -1]
         decay = np.exp(-gains[:, None, :] * path.energy_at_t[:, None])  # (g, M, p or 1)
-        return np.asarray(final + decay * (start - final))
+        distance = start - final if start.ndim == 1 else (start - final)[:, None]
+        return np.asarray(final + decay * distance)
     if variation <= _SMALL * size:
         return _closed_form(path, length, change, start, gains)
     lanes = path.mesh.points.size * path.quotient.shape[2] * path.mesh.rule.stages
     batch = max(1, _LANES // lanes)
-    return np.concatenate(
-        [_integrate(path, start, gains[i : i + batch]) for i in range(0, len(gains), batch)]
-    )
+    starts = np.broadcast_to(start, (len(gains), start.shape[-1]))
+    return np.concatenate([
+        _integrate(path, starts[i : i + batch], gains[i : i + batch])
+        for i in range(0, len(gains), batch)
+    ])
 
 
 def _closed_form(
@@ -119,7 +124,7 @@ def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
         delta, Y = path.signals(mesh.points.ravel(), mesh.inside.ravel())
         delta, Y = delta.reshape(mesh.points.shape), Y.reshape(*mesh.points.shape, p)
         values = _solve_batch(mesh, delta, Y, start, gains)  # (K, s + 1, g, p)
-        tail = unresolved(values.reshape(*values.shape[:2], g * p), mesh.rule)
+        tail = unresolved(values.reshape(*values.shape[:2], g * p), mesh.rule, path.floor)
         poor = tail > _TOLERANCE
         # The signals themselves are known to about 1e-12 of their size; nothing is gained below
         # steps at which they do not change.
@@ -140,7 +145,7 @@ def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
 
 def _solve_batch(mesh: Mesh, delta: Array, Y: Array, start: Array, gains: Array) -> Array:
     """Collocation of η̂' = γΔ𝐘 − γΔ²η̂ for gains (g, p or 1): point values (K, s + 1, g, p)."""
-    rule, (g, lanes), p = mesh.rule, gains.shape, len(start)
+    rule, (g, lanes), p = mesh.rule, gains.shape, start.shape[-1]
     h = mesh.steps[:, None, None]
     rate = (h * (delta[:, 1:] ** 2)[:, None, :])[:, None] * gains[None, :, :, None]  # (K, g, l, s)
     operator = np.broadcast_to(
@@ -156,7 +161,7 @@ def _solve_batch(mesh: Mesh, delta: Array, Y: Array, start: Array, gains: Array)
     right[..., 1:] = np.moveaxis(by_lane, 1, 2)[:, None] * gains[None, :, :, None, None]
     solved = np.asarray(np.linalg.solve(operator, right), dtype=np.float64)
     ends = solved[:, :, :, -1]  # (K, g, l, 1 + per_lane)
-    starts = affine_scan(ends[..., :1], ends[..., 1:], start.reshape(lanes, per_lane))[:-1]
+    starts = affine_scan(ends[..., :1], ends[..., 1:], start.reshape(g, lanes, per_lane))[:-1]
     values = np.empty((mesh.size, rule.stages + 1, g, lanes, per_lane))
     values[:, 0] = starts
     inner = solved[..., :1] * starts[:, :, :, None] + solved[..., 1:]  # (K, g, l, s, per_lane)
@@ -166,7 +171,7 @@ def _solve_batch(mesh: Mesh, delta: Array, Y: Array, start: Array, gains: Array)
 
 def scalar_path(
     mesh: Mesh, signals: MixedSignals, delta: Array, quotient: Array, t: Array,
-    determinant: Callable[[Array], Array] | None = None,
+    determinant: Callable[[Array], Array] | None = None, floor: float = 0.0,
 ) -> ScalarPath:
     """Prepare the law for Δ (K, s + 1) and η̄ (K, s + 1, p), reported at the times t (M,).
 
@@ -178,4 +183,4 @@ def scalar_path(
     if determinant is None:
         def determinant(t: Array) -> Array:
             return signals(t, t)[0]
-    return ScalarPath(mesh, signals, determinant, quotient, energy, t, at_t)
+    return ScalarPath(mesh, signals, determinant, quotient, energy, t, at_t, floor)

@@ -9,7 +9,8 @@ import numpy as np
 
 from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
 from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.regression import with_realisations
+from gpebo_cli.moving import Dynamics
+from gpebo_cli.regression import ExtensionState, with_realisations
 from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
@@ -25,6 +26,8 @@ class VectorLaw:
     M: Trajectory
     N: Trajectory
     b: Trajectory
+    floor: float = 0.0  # size below which η̂ is rounding
+    dynamics: Dynamics | None = None  # η̂' = 𝔸η̂ + 𝕓 + Γ Mᵀ (b − N η̂) for parameters that move
 
     def solve(self, gains: Array, start: Array) -> Trajectory:
         """η̂ (p, c) for one gain vector Γ = diag(``gains``), shape (p,).
@@ -59,12 +62,15 @@ class VectorLaw:
             A[:, p:, p:] = -np.eye(k)
             f = np.zeros((len(t), p + k, c))
             f[:, p:] = signals[:, :, 2 * p :]
+            if self.dynamics is not None:
+                A[:, :p, :p] = self.dynamics.A(t, inside)
+                f[:, :p] = self.dynamics.b(t, inside)[:, :, None]
             return Coefficients(E, A, f)
 
         first = packed.values[0, 0]
         residual = first[:, 2 * p :] - (first[:, p : 2 * p] @ start)[:, None]
         starts = np.concatenate([np.broadcast_to(start[:, None], (p, c)), residual])
-        problem = LinearProblem(coefficients, starts, name="estimator")
+        problem = LinearProblem(coefficients, starts, name="estimator", floor=self.floor)
         solution = solve(
             problem, mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
             restarts=_residual_restarts(packed, p),
@@ -99,16 +105,18 @@ class VectorEstimates:
     t: Array  # (M,)
     requirement: Requirement
     realisations: tuple[int, ...] = ()
+    reached: tuple[ExtensionState, ...] = ()
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
         """Nothing is mixed, at any of the times t (M,)."""
         return
 
-    def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases, shape (g, M, p) or (g, M, p, c)."""
-        p = len(self.start)
+    def parameters(self, cases: slice, start: Array | None = None) -> Array:
+        """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
+        gains, p = self.gains[cases], len(self.start)
+        starts = np.broadcast_to(self.start if start is None else start, (len(gains), p))
         eta = np.array([
-            self.law.solve(np.broadcast_to(gain, (p,)), self.start)(self.t)
-            for gain in self.gains[cases]
+            self.law.solve(np.broadcast_to(gain, (p,)), own)(self.t)
+            for gain, own in zip(gains, starts, strict=True)
         ])
         return eta.reshape(*eta.shape[:3], *self.realisations)

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from gpebo_cli.estimators._base import combinations, per_parameter
 from gpebo_cli.estimators._extension import kreisselmeier
+from gpebo_cli.estimators._following import FollowingEstimates, follow
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     energy_requirement,
@@ -21,7 +24,8 @@ from gpebo_cli.estimators._recursive import (
     ScalarLaw,
     mix_sampled,
 )
-from gpebo_cli.regression import LinearRegression, SampledRegression
+from gpebo_cli.moving import Dynamics, filtered
+from gpebo_cli.regression import ExtensionState, LinearRegression, SampledRegression
 from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
@@ -54,9 +58,22 @@ class Drem:
         """The same at samples."""
         return RecursiveDrem(self, parameters)
 
-    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
+    def estimate(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    ) -> MixedEstimates:
         """Extend, mix, and keep what the closed form needs at the times t (M,)."""
-        return estimate_mixed(regression, t, kreisselmeier, self)
+        return estimate_mixed(regression, t, kreisselmeier, self, known)
+
+    def estimate_moving(
+        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+    ) -> FollowingEstimates:
+        """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂): it follows where γΔ² exceeds the growth of η."""
+        names = regression.parameters
+        rates = filter_rates(self.rates, names)
+        extended = filtered(regression.outer, rates, rates, dynamics)
+        gains = gain_matrix(self.gamma, names, "estimator.gamma")
+        start = per_parameter(self.initial, names, "estimator.initial")
+        return follow(extended, dynamics, start, gains, np.asarray(t))
 
 
 class RecursiveDrem:

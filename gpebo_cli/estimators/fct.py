@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -13,7 +13,7 @@ from gpebo_cli.estimators._base import number
 from gpebo_cli.estimators._mixed import MixedEstimates
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.estimators.ls_drem import LsDrem
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import ExtensionState, LinearRegression
 from gpebo_cli.systems.descriptor import Array
 
 
@@ -58,9 +58,14 @@ class FiniteTime:
             raise ConfigError(f"estimator.mu must lie between 0 and 1, got {mu:g}")
         return self.inner.cases
 
-    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
-        """The inner estimates at the times t (M,) with the correction on top."""
-        inner = self.inner.estimate(regression, t)
+    def estimate(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    ) -> MixedEstimates:
+        """The inner estimates at the times t (M,) with the correction on top.
+
+        After a reset the law starts anew from the corrected estimate.
+        """
+        inner = self.inner.estimate(regression, t, known)
         mu = float(self.mu)
 
         def correct(eta: Array, energy: Array, start: Array) -> Array:

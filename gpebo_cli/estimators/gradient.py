@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from gpebo_cli.estimators._base import combinations, per_parameter
 from gpebo_cli.estimators._mixed import gain_axis, gain_matrix
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.excitation import persistent
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.moving import Dynamics
+from gpebo_cli.regression import ExtensionState, LinearRegression
 from gpebo_cli.systems.descriptor import Array
 
 
@@ -34,18 +35,27 @@ class Gradient:
         """One case per gain; a gain per parameter is one case."""
         return combinations(gain_axis(self.gamma, "estimator.gamma"))
 
-    def estimate(self, regression: LinearRegression, t: Array) -> VectorEstimates:
+    def estimate(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()  # noqa: ARG002
+    ) -> VectorEstimates:
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         information = Trajectory(regression.mesh, regression.outer.values[..., : regression.p])
         gains = gain_matrix(self.gamma, regression.parameters, "estimator.gamma")
         return VectorEstimates(
-            law=VectorLaw(regression.psi, regression.psi, regression.Y),
+            law=VectorLaw(regression.psi, regression.psi, regression.Y, regression.floor),
             start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
             gains=gains,
             t=np.asarray(t),
             realisations=regression.realisations,
             requirement=persistent(information, float(gains.min())),
         )
+
+    def estimate_moving(
+        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+    ) -> VectorEstimates:
+        """η̂' = 𝔸η̂ + 𝕓 + Γψᵀ(Y − ψη̂)."""
+        plain = self.estimate(regression, t)
+        return replace(plain, law=replace(plain.law, dynamics=dynamics))
 
 
 ESTIMATOR = Gradient

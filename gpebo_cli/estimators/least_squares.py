@@ -9,9 +9,11 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import axis, combinations, number, per_parameter
+from gpebo_cli.estimators._following import SolvedEstimates
 from gpebo_cli.estimators._information import Spectrum, information
 from gpebo_cli.estimators._recursive import InformationRoot, SampledEstimates, spectrum
-from gpebo_cli.regression import LinearRegression, SampledRegression
+from gpebo_cli.moving import Dynamics, filtered
+from gpebo_cli.regression import ExtensionState, LinearRegression, SampledRegression
 from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array
 
@@ -67,18 +69,23 @@ class LeastSquares:
         """M, or None."""
         return None if self.bound is None else number(self.bound, "estimator.bound")
 
-    def spectra(self, regression: LinearRegression, t: Array) -> list[Spectrum]:
-        """The spectrum of G_z at the times t (M,) for every case, once where it is shared."""
+    def spectra(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
+    ) -> list[tuple[Spectrum, ExtensionState]]:
+        """Of every case the spectrum of G_z at the times t, and G_z at the end."""
         bound = self.covariance_bound
-        made: dict[tuple[float, ...], Spectrum] = {}
+        made: dict[tuple[float, ...], tuple[Spectrum, ExtensionState]] = {}
         out = []
-        for case in self.cases:
+        for i, case in enumerate(self.cases):
             key: tuple[float, ...] = (case["beta"],)
             if bound is not None and case["beta"] > 0:
                 key = (case["alpha"], case["f0"], case["beta"])
             if key not in made:
-                info = information(regression, case["alpha"], case["f0"], case["beta"], bound)
-                made[key] = info.spectrum(t)
+                info = information(
+                    regression, case["alpha"], case["f0"], case["beta"], bound,
+                    known[i] if known else None,
+                )
+                made[key] = info.spectrum(t), info.reached
             out.append(made[key])
         return out
 
@@ -94,12 +101,44 @@ class LeastSquares:
             )
         return RecursiveLeastSquares(self, parameters)
 
-    def estimate(self, regression: LinearRegression, t: Array) -> LeastSquaresEstimates:
-        """Everything but the gains, at the times t (M,)."""
+    def estimate_moving(
+        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+    ) -> SolvedEstimates:
+        """η̂ = F 𝒴 with F⁻¹ and 𝒴 from (f₀ I, f₀ η̂₀), their forgetting β + ρ.
+
+        Raises:
+            ConfigError: forgetting with a bound.
+        """
+        if self.covariance_bound is not None:
+            raise ConfigError(
+                "observer.remedy=current_coordinates: least_squares forgets at a constant rate; "
+                "accepted: estimator.bound=null"
+            )
+        p = regression.p
+        start = per_parameter(self.initial, regression.parameters, "estimator.initial")
+        prior = np.column_stack([np.eye(p), start])
+        ones = np.ones(p)
+        return SolvedEstimates(tuple(
+            filtered(
+                regression.outer, case["beta"] * ones, case["alpha"] * ones, dynamics,
+                case["f0"] * prior,
+            )(t)
+            for case in self.cases
+        ))
+
+    def estimate(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    ) -> LeastSquaresEstimates:
+        """Everything but the gains, at the times t (M,).
+
+        After a reset the prior z f₀ I is about the new parameters, centred at the estimate there.
+        """
+        found = self.spectra(regression, t, known)
         return LeastSquaresEstimates(
             self.cases,
-            self.spectra(regression, t),
+            [spectrum for spectrum, _ in found],
             per_parameter(self.initial, regression.parameters, "estimator.initial"),
+            tuple(reached for _, reached in found),
             regression.realisations,
         )
 
@@ -111,6 +150,7 @@ class LeastSquaresEstimates:
     cases: tuple[Mapping[str, float], ...]
     spectra: list[Spectrum]
     start: Array  # (p,)
+    reached: tuple[ExtensionState, ...]  # of each case
     realisations: tuple[int, ...] = ()
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
@@ -128,11 +168,15 @@ class LeastSquaresEstimates:
         ]
         return ratio_requirement(float(min(ratios)))
 
-    def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases, shape (g, M, p) or (g, M, p, c)."""
+    def parameters(self, cases: slice, start: Array | None = None) -> Array:
+        """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
+        chosen, spectra = self.cases[cases], self.spectra[cases]
+        starts = np.broadcast_to(
+            self.start if start is None else start, (len(chosen), len(self.start))
+        )
         eta = np.array([
-            solution(spectrum, case["alpha"], case["f0"], self.start)
-            for case, spectrum in zip(self.cases[cases], self.spectra[cases], strict=True)
+            solution(spectrum, case["alpha"], case["f0"], own)
+            for case, spectrum, own in zip(chosen, spectra, starts, strict=True)
         ])
         return eta.reshape(*eta.shape[:3], *self.realisations)
 

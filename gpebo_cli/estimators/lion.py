@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from gpebo_cli.estimators._base import combinations
 from gpebo_cli.estimators._extension import lion
 from gpebo_cli.estimators._mixed import MixedEstimates, estimate_mixed, gain_axis
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import ExtensionState, LinearRegression
 from gpebo_cli.systems.descriptor import Array
 
 
@@ -28,9 +28,11 @@ class Lion:
         """One case per gain; a gain per parameter is one case."""
         return combinations(gain_axis(self.gamma, "estimator.gamma"))
 
-    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
+    def estimate(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    ) -> MixedEstimates:
         """Extend, mix, and keep what the closed form needs at the times t (M,)."""
-        return estimate_mixed(regression, t, lion, self)
+        return estimate_mixed(regression, t, lion, self, known, linear=True)
 
 
 ESTIMATOR = Lion

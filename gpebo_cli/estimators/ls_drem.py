@@ -23,7 +23,7 @@ from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import SampledEstimates, ScalarLaw, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares
-from gpebo_cli.regression import LinearRegression, SampledRegression
+from gpebo_cli.regression import ExtensionState, LinearRegression, SampledRegression
 from gpebo_cli.result import Requirement
 from gpebo_cli.systems.descriptor import Array, BoolArray
 
@@ -69,20 +69,24 @@ class LsDrem:
         """
         return RecursiveLsDrem(self, parameters)
 
-    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
+    def estimate(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    ) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,)."""
         part = self.least_squares
-        groups = tuple(
-            mix_least_squares(
-                information(
-                    regression, case["alpha"], case["f0"], case["beta"], part.covariance_bound
-                ),
-                case["alpha"], case["f0"], t,
+        infos = tuple(
+            information(
+                regression, case["alpha"], case["f0"], case["beta"], part.covariance_bound,
+                known[i] if known else None,
             )
-            for case in part.cases
+            for i, case in enumerate(part.cases)
         )
         return MixedEstimates(
-            groups=groups,
+            groups=tuple(
+                mix_least_squares(info, case["alpha"], case["f0"], t, regression.floor)
+                for info, case in zip(infos, part.cases, strict=True)
+            ),
+            reached=tuple(info.reached for info in infos),
             start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
             gains=gain_matrix(self.gamma, regression.parameters, "estimator.gamma"),
             condition="IE",
@@ -122,7 +126,7 @@ class RecursiveLsDrem:
 
 
 def mix_least_squares(
-    info: Information, alpha: float, f0: float, t: Array
+    info: Information, alpha: float, f0: float, t: Array, floor: float = 0.0
 ) -> ScalarPath:
     """The path of H = I − z f₀ F that the scalar law takes, reported at the times t (M,).
 
@@ -151,7 +155,7 @@ def mix_least_squares(
     delta = np.prod(_shares(s, alpha, f0), axis=1)
     shape = mesh.points.shape
     quotient = filled(quotient.reshape(*shape, -1), usable.reshape(shape))
-    return scalar_path(mesh, signals, delta.reshape(shape), quotient, t)
+    return scalar_path(mesh, signals, delta.reshape(shape), quotient, t, floor=floor)
 
 
 def _shares(s: Spectrum, alpha: float, f0: float) -> Array:

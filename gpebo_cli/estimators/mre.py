@@ -6,18 +6,19 @@ The worked example of how an estimator is added (docs/howto/estimator.md): this 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.estimators._base import combinations, number, per_parameter
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import gain_axis, gain_matrix
+from gpebo_cli.estimators._mixed import gain_axis, gain_matrix, reached
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.excitation import persistent
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.moving import Dynamics, filtered
+from gpebo_cli.regression import ExtensionState, LinearRegression
 from gpebo_cli.systems.descriptor import Array
 
 
@@ -43,11 +44,31 @@ class MemoryExtension:
         """One case per gain; a gain per parameter is one case."""
         return combinations(gain_axis(self.gamma, "estimator.gamma"))
 
-    def estimate(self, regression: LinearRegression, t: Array) -> VectorEstimates:
+    def estimate(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    ) -> VectorEstimates:
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
+        extended = kreisselmeier(
+            regression, self._rates(regression.p), known[0].values if known else None
+        )
+        estimates = self._estimates(regression, extended, t)
+        return replace(estimates, reached=(reached(regression, extended, known),))
+
+    def estimate_moving(
+        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+    ) -> VectorEstimates:
+        """η̂' = 𝔸η̂ + 𝕓 + Γ(𝒴 − Ω η̂)."""
+        rates = self._rates(regression.p)
+        plain = self._estimates(regression, filtered(regression.outer, rates, rates, dynamics), t)
+        return replace(plain, law=replace(plain.law, dynamics=dynamics))
+
+    def _rates(self, p: int) -> Array:
+        return np.full(p, number(self.rate, "estimator.lambda"))
+
+    def _estimates(
+        self, regression: LinearRegression, extended: Trajectory, t: Array
+    ) -> VectorEstimates:
         p = regression.p
-        rate = number(self.rate, "estimator.lambda")
-        extended = kreisselmeier(regression, np.full(p, rate))
         mesh, values = extended.mesh, extended.values
         omega = Trajectory(mesh, values[..., :p])
         identity = np.broadcast_to(np.eye(p), values[..., :p].shape)
@@ -57,6 +78,7 @@ class MemoryExtension:
                 M=Trajectory(mesh, identity),
                 N=omega,
                 b=Trajectory(mesh, values[..., p:]),
+                floor=regression.floor,
             ),
             start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
             gains=gains,

@@ -5,16 +5,29 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli.collocation.mesh import Trajectory
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.measurement import NoiseLevels
-from gpebo_cli.observers import canonical, gpebo, kalman_bucy
+from gpebo_cli.observers import canonical, current, gpebo, injection, kalman_bucy, resets
 from gpebo_cli.observers.kalman_bucy import SignalNoise
 from gpebo_cli.observers.observation import Observation, StateMap
 from gpebo_cli.settings import NoiseSettings, ObserverSettings, SolverSettings
 from gpebo_cli.systems.descriptor import DescriptorSystem
 
-__all__ = ["Observation", "SignalNoise", "StateMap", "observe", "signal_noise"]
+__all__ = ["Observation", "SignalNoise", "StateMap", "check_remedy", "observe", "signal_noise"]
 
 _OBSERVERS = {"gpebo": gpebo.observe, "canonical": canonical.observe}
+_REMEDIES = {
+    "none": gpebo.observe,
+    "output_injection": injection.observe,
+    "reset": resets.observe,
+    "current_coordinates": current.observe,
+}
+_DEFAULT = ObserverSettings()
+# Keys of the remedies, and which of them each belongs to.
+_KEYS = {
+    "injection": "output_injection", "reset_interval": "reset", "reset_times": "reset",
+    "reset_keep": "reset",
+}
 
 
 def signal_noise(settings: NoiseSettings, levels: NoiseLevels) -> SignalNoise:
@@ -46,8 +59,37 @@ def observe(
         ConfigError: settings that do not fit the plant.
         SolverError: the tolerance cannot be reached.
     """
+    check_remedy(settings)
     if settings.name == "kalman_bucy":
         if noise is None:
             noise = SignalNoise(np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time)
         return kalman_bucy.observe(system, inputs, outputs, settings, solver, noise)
-    return _OBSERVERS[settings.name](system, inputs, outputs, settings, solver)
+    run = _OBSERVERS[settings.name] if settings.remedy == "none" else _REMEDIES[settings.remedy]
+    return run(system, inputs, outputs, settings, solver)
+
+
+def check_remedy(settings: ObserverSettings) -> None:
+    """Refuse a remedy for an observer that has none, and keys of another remedy.
+
+    Args:
+        settings: of the observer.
+
+    Raises:
+        ConfigError: names the key.
+    """
+    if settings.remedy != "none" and settings.name != "gpebo":
+        raise ConfigError(
+            f"observer.remedy={settings.remedy} is for observer=gpebo; observer={settings.name} "
+            "accepts none"
+        )
+    if settings.remedy != "none" and settings.sample_time is not None:
+        raise ConfigError(
+            f"observer.remedy={settings.remedy} works in continuous time only; at samples "
+            "(observer.sample_time) there is none"
+        )
+    for key, remedy in _KEYS.items():
+        if settings.remedy != remedy and getattr(settings, key) != getattr(_DEFAULT, key):
+            raise ConfigError(
+                f"observer.{key} is of observer.remedy={remedy}, but the remedy is "
+                f"{settings.remedy}"
+            )

@@ -30,7 +30,12 @@ from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.expressions import parse, taylor
 from gpebo_cli.observers.extension import initial_extension, output_scale
-from gpebo_cli.observers.observation import InitialError, Observation, Reconstruction
+from gpebo_cli.observers.observation import (
+    InitialError,
+    Observation,
+    Reconstruction,
+    log_norm,
+)
 from gpebo_cli.reading import nearest
 from gpebo_cli.regression import LinearRegression, outer_products
 from gpebo_cli.result import Assumption
@@ -185,6 +190,7 @@ def observe(
             *(zb.assumptions if zb is not None else ()),
         ),
         growth=float(np.abs(Phi).max(initial=0.0)),
+        growth_rate=log_norm(Phi[-1, -1]) / float(mesh.edges[-1] - mesh.edges[0]),
     )
 
 

@@ -27,16 +27,21 @@ last r, which loses everything in its own circuit (``regression: paper`` shows i
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, LinearSolution, solve
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.linalg import joined, orthonormal_complement, transpose
 from gpebo_cli.observers.extension import initial_extension, output_scale
-from gpebo_cli.observers.observation import AffineStateMap, InitialError, Observation
+from gpebo_cli.observers.observation import (
+    AffineStateMap,
+    InitialError,
+    Observation,
+    log_norm,
+)
 from gpebo_cli.regression import LinearRegression, outer_products
 from gpebo_cli.result import Assumption
 from gpebo_cli.settings import ObserverSettings, SolverSettings
@@ -47,6 +52,7 @@ _TURNED = 8 * float(np.finfo(float).eps)  # of E outside the frame, relative: ro
 _PROJECTOR_TURNED = 1e-13
 _TINY = float(np.finfo(float).tiny)
 _RESPONSE = 1e-6  # error of the response to noise, which is known to no more digits than that
+_LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 _VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
 
 
@@ -133,6 +139,23 @@ class ObserverMatrices:
     def residual(self) -> Array:
         """R = I − 𝒜 Q K, (N, e + r, e + r)."""
         return orthonormal_complement(self.range)
+
+    def injected(self, gain: Array) -> ObserverMatrices:
+        """The same w, driven by gain · (𝒜 w + g_y + G θ) too, for a gain (N, k, e + r).
+
+        The gain must be N = N R with columns in range P: R (𝒜 w + g_y + G θ) = 0 is all that w
+        has to fulfil, and w must stay in range P.
+        """
+        return replace(
+            self,
+            dynamics=self.dynamics - gain @ (self.algebraic @ self.split.basis),
+            from_unknowns=self.from_unknowns - gain @ self.G,
+            from_signals=self.from_signals - gain @ self.g_signals,
+        )
+
+
+# (matrices at the times t (N,), t, inside) -> gain (N, k, e + r) of ``ObserverMatrices.injected``
+Injection = Callable[[ObserverMatrices, Array, Array], Array]
 
 
 def row_sizes(E: Array) -> Array:
@@ -370,6 +393,157 @@ def _weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
     return float(values[k]), int(candidates[k])
 
 
+@dataclass(frozen=True, eq=False)
+class ReducedSystem:
+    """w' = A_0 w + b_0 + D_0 θ and 0 = R (𝒜 w + g_y + G θ) on measured signals."""
+
+    system: DescriptorSystem
+    inputs: Trajectory
+    outputs: Trajectory
+    solver: SolverSettings
+    mesh: Mesh  # where to start integrating
+    first: ObserverMatrices  # at the points of the signals' mesh, without injection
+    initial_basis: Array  # (n, n_a) V1
+    names: tuple[str, ...]  # of e₀'s components
+    injection: Injection | None = None
+
+    @property
+    def basis(self) -> Array:
+        """Coordinates in which w is integrated, (n, k): n_a of them, or n if the kernel rotates."""
+        return self.first.split.basis
+
+    @property
+    def rank(self) -> int:
+        """n_a."""
+        return int(self.first.split.rank)
+
+    def matrices(self, t: Array, inside: Array) -> ObserverMatrices:
+        """At the times t (N,), output injection included."""
+        o = observer_matrices(self.system, t, inside, self.solver.rank_tol, self.first)
+        return o if self.injection is None else o.injected(self.injection(o, t, inside))
+
+    def signals(self, t: Array, inside: Array) -> Array:
+        """[u; y] at the times t (N,), shape (N, m + r, 1)."""
+        both = np.concatenate([self.inputs(t, inside), self.outputs(t, inside)], axis=1)
+        return both[:, :, None]
+
+    def start(self, xi_a: Array, basis: Array) -> Array:
+        """[ξ_a | ξ_b | Φ] = [ξ_a | 0 | V] for ξ_a (n,) and V (n, n_a), shape (k, 1 + q + n_a)."""
+        still = np.zeros((len(xi_a), self.system.q))
+        return np.asarray(
+            self.basis.T @ np.concatenate([xi_a[:, None], still, basis], axis=1)
+        )
+
+
+def reduce(
+    system: DescriptorSystem,
+    inputs: Trajectory,
+    outputs: Trajectory,
+    settings: ObserverSettings,
+    solver: SolverSettings,
+) -> ReducedSystem:
+    """The reduced system on the signals u (m,) and y (r,), which share a mesh.
+
+    Args:
+        system: the model.
+        inputs: u (m,) and
+        outputs: y (r,), on the same mesh.
+        settings: the weights of the outputs.
+        solver: tolerances.
+
+    Raises:
+        ModelError: rank of E not constant, or Assumption 1 violated.
+        ConfigError: no outputs.
+    """
+    if system.r == 0:
+        raise ConfigError(
+            f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
+        )
+    mesh = inputs.mesh
+    t, inside = mesh.points.ravel(), mesh.inside.ravel()
+    first = observer_matrices(
+        system, t, inside, solver.rank_tol, normalise=True,
+        output_scale=output_scale(settings, system),
+    )
+    V1, names = initial_basis(first.split.projector[0], first.split.rank, system.states)
+    return ReducedSystem(system, inputs, outputs, solver, mesh, first, V1, names)
+
+
+@dataclass(frozen=True, eq=False)
+class Extension:
+    """The dynamic extension on the mesh that resolves it and everything computed from it."""
+
+    solution: LinearSolution  # [ξ_a | ξ_b | Φ] (k, 1 + q + n_a)
+    assembled: Assembled
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh."""
+        return self.solution.trajectory.mesh
+
+    def growth(self, q: int) -> float:
+        """Largest entry of Φ."""
+        return float(np.abs(self.solution.trajectory.values[..., 1 + q :]).max(initial=0.0))
+
+    def logarithm(self, q: int) -> float:
+        """ln ‖Φ(end)‖₂, which is 0 at the start."""
+        return log_norm(self.solution.trajectory.final[:, 1 + q :])
+
+
+def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
+    """Integrate [ξ_a | ξ_b | Φ] from ``start`` (k, 1 + q + n_a) over ``mesh``, refined.
+
+    Raises:
+        ModelError: rank of E not constant, Assumption 1 violated.
+        SolverError: the tolerance cannot be reached, or the extension grows beyond all bounds.
+    """
+    system, solver, basis = reduced.system, reduced.solver, reduced.basis
+    q, n_a = system.q, reduced.rank
+
+    def equations(o: ObserverMatrices, signals: Array) -> Coefficients:
+        f = np.zeros((len(signals), basis.shape[1], 1 + q + n_a))
+        f[:, :, :1] = o.from_signals @ signals
+        f[:, :, 1 : 1 + q] = o.from_unknowns
+        g_y = (o.g_signals @ signals)[:, :, 0]
+        seen = (o.algebraic @ basis, g_y, o.G, o.range, o.elimination, o.injectivity)
+        return Coefficients(None, o.dynamics, f, seen)
+
+    def coefficients(t: Array, inside: Array) -> Coefficients:
+        return equations(reduced.matrices(t, inside), reduced.signals(t, inside))
+
+    latest: list[Assembled] = []
+
+    def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+        if np.abs(values).max(initial=0.0) > _LARGEST:
+            raise SolverError(
+                f"the dynamic extension of plant {system.name} grows beyond {_LARGEST:.0e}: A_0 is "
+                "unstable; use observer.remedy=output_injection, reset or current_coordinates, or "
+                "a shorter time.horizon"
+            )
+        z, *flat = (
+            signal.reshape(signal.shape[0] * signal.shape[1], *signal.shape[2:])
+            for signal in (values, *extras)
+        )
+        assembled = regression_signals(z, q, basis, *flat)
+        latest[:] = [assembled]
+        return [
+            (signal.reshape(*values.shape[:2], -1), floor) for signal, floor in assembled.kinds()
+        ]
+
+    problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
+    if solver.name == "ivp":
+        solution = ivp.solve(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
+    else:
+        known = None
+        if mesh is reduced.inputs.mesh and reduced.injection is None:
+            both = np.concatenate([reduced.inputs.values, reduced.outputs.values], axis=2)
+            known = equations(reduced.first, both.reshape(mesh.points.size, -1, 1))
+        solution = solve(
+            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
+        )
+    return Extension(solution, latest[0])
+
+
 def observe(
     system: DescriptorSystem,
     inputs: Trajectory,
@@ -391,100 +565,54 @@ def observe(
         ConfigError: ``xi_a0`` does not fit.
         SolverError: the tolerance cannot be reached.
     """
-    if system.r == 0:
-        raise ConfigError(
-            f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
-        )
-    mesh = inputs.mesh
-    t, inside = mesh.points.ravel(), mesh.inside.ravel()
-    first = observer_matrices(
-        system, t, inside, solver.rank_tol, normalise=True,
-        output_scale=output_scale(settings, system),
-    )
-    split, rank = first.split, first.split.rank
-    V1, names = initial_basis(split.projector[0], rank, system.states)
-    # Where the kernel of E rotates, w is integrated in all n coordinates; else in its own n_a.
-    basis = split.basis
-    xi_a0 = initial_extension(settings, system, names)
-    q, n_a = system.q, rank
-    start = np.concatenate(
-        [(basis.T @ V1 @ xi_a0)[:, None], np.zeros((basis.shape[1], q)), basis.T @ V1], axis=1
-    )
+    return observe_reduced(reduce(system, inputs, outputs, settings, solver), settings)
 
-    def equations(o: ObserverMatrices, u: Array, y: Array) -> Coefficients:
-        signals = np.concatenate([u, y], axis=1)[:, :, None]
-        f = np.zeros((len(u), basis.shape[1], 1 + q + n_a))
-        f[:, :, :1] = o.from_signals @ signals
-        f[:, :, 1 : 1 + q] = o.from_unknowns
-        g_y = (o.g_signals @ signals)[:, :, 0]
-        seen = (o.algebraic @ basis, g_y, o.G, o.range, o.elimination, o.injectivity)
-        return Coefficients(None, o.dynamics, f, seen)
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
-        o = observer_matrices(system, t, inside, solver.rank_tol, first)
-        return equations(o, inputs(t, inside), outputs(t, inside))
-
-    known = equations(
-        first, inputs.values.reshape(len(t), -1), outputs.values.reshape(len(t), -1)
-    )
-    latest: list[_Assembled] = []
-
-    def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-        z, *flat = (
-            signal.reshape(signal.shape[0] * signal.shape[1], *signal.shape[2:])
-            for signal in (values, *extras)
-        )
-        assembled = regression_signals(z, q, basis, *flat)
-        latest[:] = [assembled]
-        return [
-            (signal.reshape(*values.shape[:2], -1), floor) for signal, floor in assembled.kinds()
-        ]
-
-    problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
-    if solver.name == "ivp":
-        solution = ivp.solve(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
-    else:
-        solution = solve(
-            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
-        )
-    mesh, values = solution.trajectory.mesh, solution.trajectory.values
-
-    def on_mesh(signal: Array) -> Trajectory:
-        return Trajectory(mesh, signal.reshape(*values.shape[:2], *signal.shape[1:]))
-
-    final = latest[0]
+def observe_reduced(reduced: ReducedSystem, settings: ObserverSettings) -> Observation:
+    """:func:`observe` for a reduced system, perhaps with output injection."""
+    system, q, V1 = reduced.system, reduced.system.q, reduced.initial_basis
+    xi_a0 = initial_extension(settings, system, reduced.names)
+    extension = extend(reduced, reduced.mesh, reduced.start(V1 @ xi_a0, V1))
+    mesh, final = extension.mesh, extension.assembled
     kept = final.kept_rows(system, settings.regression)
-    smallest, weakest = _weakest(final.injectivity, final.elimination)
-
-    def matrices(t: Array, inside: Array) -> ObserverMatrices:
-        return observer_matrices(system, t, inside, solver.rank_tol, first)
-
     return Observation(
         regression=LinearRegression(
-            Y=on_mesh(final.Y[:, kept]),
-            psi=on_mesh(final.psi[:, kept]),
-            parameters=(*system.unknowns, *names),
+            Y=on_mesh(mesh, final.Y[:, kept]),
+            psi=on_mesh(mesh, final.psi[:, kept]),
+            parameters=(*system.unknowns, *reduced.names),
             scale=final.psi_scale,
         ),
-        state_map=AffineStateMap(on_mesh(final.offset), on_mesh(final.gain)),
-        truth=InitialError(V1, xi_a0, basis, solution.trajectory),
-        error_estimate=solution.error_estimate,
-        assumptions=(
-            Assumption(
-                "Rank of E", "rank E(t) is constant", True, {"rank": n_a, "states": system.n}
-            ),
-            Assumption(
-                "Assumption 1",
-                "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
-                True,
-                {
-                    "smallest_singular_value": smallest,
-                    "at": float(mesh.points.ravel()[weakest]),
-                },
-            ),
+        state_map=AffineStateMap(on_mesh(mesh, final.offset), on_mesh(mesh, final.gain)),
+        truth=InitialError(V1, xi_a0, reduced.basis, extension.solution.trajectory),
+        error_estimate=extension.solution.error_estimate,
+        assumptions=assumptions(reduced, mesh, final),
+        growth=extension.growth(q),
+        growth_rate=extension.logarithm(q) / float(mesh.edges[-1] - mesh.edges[0]),
+        respond=lambda e_u, e_y: respond(mesh, reduced.matrices, kept, e_u, e_y),
+    )
+
+
+def on_mesh(mesh: Mesh, signal: Array) -> Trajectory:
+    """A signal (K (s + 1), ...) at the points of a mesh."""
+    return Trajectory(mesh, signal.reshape(*mesh.points.shape, *signal.shape[1:]))
+
+
+def assumptions(
+    reduced: ReducedSystem, mesh: Mesh, found: Assembled
+) -> tuple[Assumption, ...]:
+    """Rank of E and Assumption 1, with their evidence at the points of the mesh."""
+    smallest, weakest = _weakest(found.injectivity, found.elimination)
+    return (
+        Assumption(
+            "Rank of E", "rank E(t) is constant", True,
+            {"rank": reduced.rank, "states": reduced.system.n},
         ),
-        growth=float(np.abs(values[..., 1 + q :]).max(initial=0.0)),
-        respond=lambda e_u, e_y: respond(mesh, matrices, kept, e_u, e_y),
+        Assumption(
+            "Assumption 1",
+            "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
+            True,
+            {"smallest_singular_value": smallest, "at": float(mesh.points.ravel()[weakest])},
+        ),
     )
 
 
@@ -531,7 +659,7 @@ def respond(
 
 
 @dataclass(frozen=True, eq=False)
-class _Assembled:
+class Assembled:
     """Everything algebraic in ξ_a, ξ_b, Φ, u and y at N times, all rows of the residual."""
 
     Y: Array  # (N, e + r)
@@ -571,7 +699,7 @@ class _Assembled:
 def regression_signals(
     z: Array, q: int, basis: Array, algebraic: Array, g_y: Array, G: Array, Q1: Array, H: Array,
     injectivity: Array,
-) -> _Assembled:
+) -> Assembled:
     """All rows of Y and ψ, and the state's offset and gain, at N times.
 
     Args:
@@ -589,17 +717,18 @@ def regression_signals(
     signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
     signed = z * signs
     terms = algebraic @ signed  # [𝒜 ξ_a + g_y | −𝒜 ξ_b − G | 𝒜 Φ]
+    Y_scale = max(float(np.abs(part).max(initial=0.0)) for part in (terms[:, :, 0], g_y))
     terms[:, :, 0] += g_y
     terms[:, :, 1 : 1 + q] -= G
     seen = transpose(Q1) @ terms
     left = terms - Q1 @ seen  # R (…)
     state = basis @ signed - H @ seen  # w − K (…): the state, signed likewise
-    return _Assembled(
+    return Assembled(
         Y=left[:, :, 0],
         psi=left[:, :, 1:],
         offset=state[:, :, 0],
         gain=-state[:, :, 1:],  # [X_w ξ_b + X_θ | −X_w Φ]
-        Y_scale=float(np.abs(terms[:, :, 0]).max(initial=0.0)),
+        Y_scale=Y_scale,
         psi_scale=float(np.abs(terms[:, :, 1:]).max(initial=0.0)),
         elimination=H,
         injectivity=injectivity,

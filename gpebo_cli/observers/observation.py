@@ -97,13 +97,23 @@ class InitialError:
             parts = np.where(self.initial_basis == 0.0, 0.0, self.initial_basis * start[:, None])
             e0 = self.xi_a0 - parts.sum(axis=0)
             return np.concatenate([theta, np.broadcast_to(e0, (len(t), len(e0)))], axis=1)
-        q = theta.shape[1]
-        W = self.extension(t)
-        xi_a, xi_b, Phi = W[..., 0], W[..., 1 : 1 + q], W[..., 1 + q :]
-        # Φᵀ x = Φᵀ w, because the columns of Φ lie in the range of the projector P.
-        distance = xi_a + np.einsum("mij,mj->mi", xi_b, theta) - states(t) @ self.basis
-        e0 = np.einsum("mij,mj->mi", np.linalg.pinv(Phi, rcond=0.0), distance)
+        e0 = error_of_extension(self.extension(t), theta, states(t) @ self.basis)
         return np.concatenate([theta, e0], axis=1)
+
+
+def error_of_extension(W: Array, theta: Array, x: Array) -> Array:
+    """e₀ = Φ⁺ (ξ_a + ξ_b θ − x) of [ξ_a | ξ_b | Φ] (M, k, 1 + p), θ (M, q) and x (M, k)."""
+    q = theta.shape[1]
+    xi_a, xi_b, Phi = W[..., 0], W[..., 1 : 1 + q], W[..., 1 + q :]
+    # Φᵀ x = Φᵀ w, because the columns of Φ lie in the range of the projector P.
+    distance = xi_a + np.einsum("mij,mj->mi", xi_b, theta) - x
+    return np.asarray(np.einsum("mij,mj->mi", np.linalg.pinv(Phi, rcond=0.0), distance))
+
+
+def log_norm(Phi: Array) -> float:
+    """ln ‖Φ‖₂ of a matrix (n, n_a); Φ = 0 counts as the smallest number there is."""
+    size = float(np.linalg.norm(Phi, 2)) if Phi.size else 1.0
+    return float(np.log(max(size, np.finfo(float).tiny)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +130,11 @@ class Observation:
     truth: Truth
     error_estimate: float
     assumptions: tuple[Assumption, ...]  # of this observer, with their evidence
-    growth: float | None  # largest ‖Φ(t)‖ entry; None: the states do not rest on Φ
+    growth: float | None  # largest entry of Φ since its last reset; None: states do not rest on Φ
     estimator: Estimator | None = None
     names: tuple[str, ...] | None = None
     respond: Response | None = None  # None: the observer cannot tell
+    growth_rate: float | None = None  # 1/s, ln ‖Φ‖₂ over the horizon
     note: str = ""  # what the last line of a run has to say of it, from "; " on
 
     @property

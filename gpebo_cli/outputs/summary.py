@@ -56,6 +56,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
             {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
             for a in result.assumptions
         ],
+        "warnings": result.warnings,
         "excitation": _excitation(result.excitation),
         "estimator_requirement": _requirement(estimation),
         "cases": _cases(estimation, result.metrics),

@@ -1,0 +1,144 @@
+"""Any estimator over a regression whose parameters are replaced at resets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from inspect import signature
+from typing import Protocol, cast, runtime_checkable
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.moving import Dynamics
+from gpebo_cli.regression import (
+    Estimates,
+    Estimator,
+    ExtensionState,
+    LinearRegression,
+    Reset,
+)
+from gpebo_cli.result import Requirement
+from gpebo_cli.systems.descriptor import Array
+
+
+class Resumable(Estimates, Protocol):
+    """Estimates from which the next segment can go on."""
+
+    @property
+    def reached(self) -> tuple[ExtensionState, ...]:
+        """The extensions at the end of the regression: what ``estimate`` takes as ``known``."""
+        ...
+
+    def parameters(self, cases: slice, start: Array | None = None) -> Array:
+        """η̂ of some cases at the times, shape (g, M, p).
+
+        Args:
+            cases: which.
+            start: η̂ of each of them (g, p) at the start of the regression; None: the settings'.
+        """
+        ...
+
+
+class Resuming(Protocol):
+    """An estimator that can go on after a reset."""
+
+    def estimate(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    ) -> Resumable:
+        """As ``Estimator.estimate``, from extensions at the start; none: they start at zero."""
+        ...
+
+
+@runtime_checkable
+class Following(Protocol):
+    """An estimator that can follow parameters that move."""
+
+    def estimate_moving(
+        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+    ) -> Estimates:
+        """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending."""
+        ...
+
+
+def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Estimates:
+    """``estimator.estimate`` from segment to segment, at the times t (M,), ascending.
+
+    At a reset η̂ goes on as T η̂ + τ and the extension as ``ExtensionState.after``. A time at which
+    there is a reset belongs to what follows it.
+
+    Raises:
+        ConfigError: the estimator cannot follow parameters that move, or go on after a reset.
+    """
+    if regression.dynamics is not None:
+        if not isinstance(estimator, Following):
+            raise ConfigError(
+                "observer.remedy=current_coordinates: this estimator cannot follow a state; "
+                "accepted: estimator=drem, mre, least_squares or gradient"
+            )
+        return estimator.estimate_moving(regression, regression.dynamics, t)
+    if not regression.resets:
+        return estimator.estimate(regression, t)
+    segments = regression.segments
+    first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
+    parts: list[Resumable] = []
+    known: tuple[ExtensionState, ...] = ()
+    resuming = _resuming(estimator)
+    for k, (segment, own) in enumerate(zip(segments, np.split(t, first), strict=True)):
+        if k > 0:
+            reset = regression.resets[k - 1]
+            known = tuple(state.after(reset) for state in parts[-1].reached)
+        # Besides the times that are asked for, the end, where the next one takes over.
+        times = np.append(own, segment.mesh.edges[-1])
+        parts.append(resuming.estimate(segment, times, known))
+    return Chain(tuple(parts), regression.resets, tuple(int(k) for k in first))
+
+
+def _resuming(estimator: Estimator) -> Resuming:
+    if "known" not in signature(estimator.estimate).parameters:
+        raise ConfigError(
+            "observer.remedy=reset: this estimator cannot go on after a reset (its estimate() has "
+            "no argument known, docs/howto/estimator.md); use another remedy"
+        )
+    return cast(Resuming, estimator)
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Estimates of each segment at its own times and its end."""
+
+    parts: tuple[Resumable, ...]
+    resets: tuple[Reset, ...]
+    first: tuple[int, ...]  # index of each but the first segment's first time
+
+    @property
+    def reached(self) -> tuple[ExtensionState, ...]:
+        """Of the last segment."""
+        return self.parts[-1].reached
+
+    def delta(self, t: Array) -> Array | None:
+        """Δ at the times t (M,); it jumps where the parameters do."""
+        cuts = np.searchsorted(t, [reset.time for reset in self.resets], side="left")
+        pieces = [
+            part.delta(own) for part, own in zip(self.parts, np.split(t, cuts), strict=True)
+        ]
+        found = [piece for piece in pieces if piece is not None]
+        return np.concatenate(found, axis=1) if found else None
+
+    @property
+    def requirement(self) -> Requirement:
+        """What is needed, of the first segment that meets it, or of the last."""
+        found = [part.requirement for part in self.parts]
+        k = next((i for i, requirement in enumerate(found) if requirement.holds), len(found) - 1)
+        text = f"in segment {k + 1} of the {len(found)} between resets, {found[k].text}"
+        return replace(found[k], text=text)
+
+    def parameters(self, cases: slice, start: Array | None = None) -> Array:
+        """η̂ of some cases, shape (g, M, p), each in the parameters of its time."""
+        pieces: list[Array] = []
+        for k, part in enumerate(self.parts):
+            eta = part.parameters(cases, start)
+            pieces.append(eta[:, :-1])
+            if k < len(self.resets):
+                start = self.resets[k].parameters(eta[:, -1])
+        return np.concatenate(pieces, axis=1)

@@ -1,0 +1,169 @@
+"""Output injection: a dynamic extension that forgets, for a plant whose A_0 does not.
+
+The residual c w = y_c of the regression, c = R𝒜 and y_c = −R (g_y + G θ), holds at every time. So
+
+    w' = (A_0 − K_o c) w + (b_0 − K_o R g_y) + (D_0 − K_o R G) θ
+
+for any K_o(t) whose columns lie in range P. A_0, b_0 and D_0 change, nothing after them does, and
+w is still exactly ξ_a + ξ_b θ − Φ e₀. What K_o is decides how fast Φ decays, not what is true.
+
+By default K_o is that of a Kalman–Bucy filter with unit weights,
+
+    K_o = S cᵀ/c₀²,     S' = A_0 S + S A_0ᵀ + κ² P − S cᵀc S/c₀²,     S(start) = κ P
+
+with c₀ the root mean square of ‖c‖ over the horizon and κ twice that of the largest real part of
+A_0's eigenvalues where it is positive (at least four per horizon), so that neither the unit of
+time nor that of the outputs matters. Φ then decays about as fast as it would grow, or twice as
+fast; not faster, because with Φ the excitation of e₀ fades, too. S = X₂X₁⁻¹ follows from the
+linear Hamiltonian system
+
+    X₁' = −A_0ᵀX₁ + cᵀc/c₀² X₂,     X₂' = κ² P X₁ + A_0 X₂
+
+started anew from (I, S) at every edge of a mesh on which ‖A_0‖ h ≤ 10, before its growing
+solutions are all that is left. S need not be accurate: what counts is that it is one and the same
+smooth function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.expressions import parse, taylor
+from gpebo_cli.linalg import transpose
+from gpebo_cli.observers.gpebo import Injection, ObserverMatrices, ReducedSystem, observe_reduced
+from gpebo_cli.observers.gpebo import reduce as reduced_system
+from gpebo_cli.observers.observation import Observation
+from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+
+_TOLERANCE = 1e-6  # of S
+_PER_HORIZON = 4.0  # rate of the injection where A_0 is stable
+_PER_ELEMENT = 10.0  # ‖A_0‖ h
+_MOST_PARTS = 10_000
+
+
+def observe(
+    system: DescriptorSystem,
+    inputs: Trajectory,
+    outputs: Trajectory,
+    settings: ObserverSettings,
+    solver: SolverSettings,
+) -> Observation:
+    """The observer of ``gpebo.observe`` with output injection.
+
+    Raises:
+        ModelError, ConfigError, SolverError: as there; ConfigError also if ``injection`` does not
+            fit the plant.
+    """
+    reduced = reduced_system(system, inputs, outputs, settings, solver)
+    if settings.injection is None:
+        injection, mesh = riccati_injection(reduced)
+    else:
+        injection, mesh = given_injection(system, settings.injection), reduced.mesh
+    return observe_reduced(replace(reduced, injection=injection, mesh=mesh), settings)
+
+
+def given_injection(system: DescriptorSystem, entries: list[list[float | str]]) -> Injection:
+    """K_o as the user has it, a number or an expression of t for each entry.
+
+    It takes the outputs' rows of the residual, as L does in L (y − C x̂). What points out of
+    range P is left out.
+
+    Raises:
+        ConfigError: the wrong size, or text that is no expression.
+    """
+    n, r = system.n, system.r
+    sizes = {len(row) for row in entries}
+    if len(entries) != n or sizes != {r}:
+        raise ConfigError(
+            f"observer.injection has {len(entries)} rows of "
+            f"{' or '.join(map(str, sorted(sizes)))} entries; plant {system.name} needs {n} "
+            f"(states) of {r} (outputs)"
+        )
+    parsed = [
+        parse(entry, {}, f"observer.injection[{i}][{j}]")
+        for i, row in enumerate(entries)
+        for j, entry in enumerate(row)
+    ]
+
+    def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
+        values = taylor(parsed, t, 0, inside)[0].reshape(-1, n, r)
+        return np.asarray(o.split.basis.T @ o.projector @ values @ o.residual[:, -r:])
+
+    return gain
+
+
+def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
+    """K_o R of the Riccati equation above, for a reduced system without injection.
+
+    Returns:
+        The gain, and the mesh in whose elements it is smooth.
+
+    Raises:
+        SolverError: S cannot be resolved.
+    """
+    mesh, basis = reduced.mesh, reduced.basis
+    o = reduced.first
+    horizon = float(mesh.edges[-1] - mesh.edges[0])
+    A_0 = np.broadcast_to(o.dynamics, (mesh.points.size, *o.dynamics.shape[1:]))
+    n = basis.shape[1]
+    unstable = np.maximum(np.linalg.eigvals(A_0).real.max(axis=1, initial=0.0), 0.0)
+    kappa = max(2.0 * float(np.sqrt((unstable**2).mean())), _PER_HORIZON / horizon)
+    size = max(_rms(o.residual @ o.algebraic @ basis), np.finfo(float).tiny)
+    speed = np.linalg.norm(A_0, axis=(1, 2)).reshape(mesh.points.shape).max(axis=1)
+    parts = np.clip(np.ceil(mesh.steps * speed / _PER_ELEMENT), 1, _MOST_PARTS).astype(np.intp)
+    mesh, _ = mesh.split(parts)
+
+    def coefficients(t: Array, inside: Array) -> Coefficients:
+        o = reduced.matrices(t, inside)
+        A = np.broadcast_to(o.dynamics, (len(t), n, n))
+        c = o.residual @ o.algebraic @ basis / size
+        H = np.empty((len(t), 2 * n, 2 * n))
+        H[:, :n, :n], H[:, :n, n:] = -transpose(A), transpose(c) @ c
+        H[:, n:, :n], H[:, n:, n:] = kappa**2 * (basis.T @ o.projector @ basis), A
+        return Coefficients(None, H, np.zeros((len(t), 2 * n, n)))
+
+    def again(reached: Array) -> Array:
+        return np.concatenate([np.eye(n), _quotient(reached)])
+
+    S0 = kappa * (basis.T @ reduced.initial_basis) @ (reduced.initial_basis.T @ basis)
+    problem = LinearProblem(
+        coefficients, np.concatenate([np.eye(n), S0]),
+        name=f"output injection for plant {reduced.system.name}",
+    )
+    restarts: dict[float, Callable[[Array], Array]] = {
+        float(edge): again for edge in mesh.edges[1:-1]
+    }
+    with np.errstate(over="ignore", invalid="ignore"):  # of the error estimate, which is not used
+        solution = solve(
+            problem, mesh, tol=_TOLERANCE, max_elements=reduced.solver.max_elements,
+            restarts=restarts,
+        )
+    trajectory = solution.trajectory
+    S = Trajectory(trajectory.mesh, _quotient(trajectory.values))
+
+    def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
+        weight = basis.T @ o.projector @ basis @ S(t, inside) / size**2
+        return np.asarray(weight @ transpose(o.algebraic @ basis) @ o.residual)
+
+    return gain, S.mesh
+
+
+def _quotient(X: Array) -> Array:
+    """S = X₂X₁⁻¹ (…, n, n), symmetric, from (X₁; X₂) (…, 2n, n)."""
+    n = X.shape[-1]
+    S: Array = np.asarray(np.linalg.solve(transpose(X[..., :n, :]), transpose(X[..., n:, :])))
+    return 0.5 * (S + transpose(S))
+
+
+def _rms(matrices: Array) -> float:
+    """Root mean square over time of the spectral norm of matrices (N, …, …)."""
+    if not matrices.size:
+        return 0.0
+    return float(np.sqrt((np.linalg.norm(matrices, 2, axis=(1, 2)) ** 2).mean()))

@@ -1,0 +1,283 @@
+"""Resets of the dynamic extension, for a plant whose A_0 does not forget.
+
+At times t_k the extension starts again, from [ξ_a₊ | 0 | V₊] with V₊ an orthonormal basis of
+range P(t_k), and the regression goes on about other parameters. From
+w = ξ_a + ξ_b θ − Φ e₀ = ξ_a₊ − V₊ e₊,
+
+    η₊ = T η + τ,    T = [[I, 0], [−V₊ᵀξ_b, V₊ᵀΦ]],    τ = (0, V₊ᵀ(ξ_a₊ − ξ_a)),
+
+which is exact whatever ξ_a₊ is. It is the least-squares estimate of w(t_k) by all that the
+regression has shown. If ξ_a went on instead it would grow as Φ does, and so would e₊: w would
+become the difference of large numbers, which is the loss that resets are for.
+
+Between resets Φ starts at size 1. Without times being given it is reset before it exceeds 100.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
+from gpebo_cli.collocation.mesh import Mesh, Trajectory
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.observers.extension import initial_extension
+from gpebo_cli.observers.gpebo import (
+    Assembled,
+    Extension,
+    ReducedSystem,
+    assumptions,
+    extend,
+    initial_basis,
+    on_mesh,
+)
+from gpebo_cli.observers.gpebo import reduce as reduced_system
+from gpebo_cli.observers.observation import (
+    AffineStateMap,
+    Observation,
+    error_of_extension,
+    log_norm,
+)
+from gpebo_cli.regression import ExtensionState, LinearRegression, Reset, largest, outer_products
+from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+
+_GROWTH = 100.0  # of Φ between resets: two digits
+_TOLERANCE = 1e-6  # of Φ, where only its size matters
+_MOST = 10_000  # resets in one run
+_FLOOR = 1e-3  # of the size of w and θ: parameters are resolved to so much, relatively
+_KNOWN = 1e-10  # eigenvalues of G below this share of the largest say nothing about w
+
+
+def observe(
+    system: DescriptorSystem,
+    inputs: Trajectory,
+    outputs: Trajectory,
+    settings: ObserverSettings,
+    solver: SolverSettings,
+) -> Observation:
+    """The observer of ``gpebo.observe`` with resets.
+
+    Raises:
+        ModelError, ConfigError, SolverError: as there; ConfigError also for times of resets that
+            are not inside the horizon.
+    """
+    reduced = reduced_system(system, inputs, outputs, settings, solver)
+    mesh, times = _with_edges(reduced.mesh, reset_times(reduced, settings))
+    if not len(times):
+        xi = _Start(float(mesh.edges[0]), reduced.initial_basis, _first(reduced, settings))
+        extension = extend(reduced, mesh, reduced.start(xi.xi_a, xi.basis))
+        return _joined(reduced, settings, [xi], [extension], [])
+    cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
+    starts = [_Start(float(mesh.edges[0]), reduced.initial_basis, _first(reduced, settings))]
+    extensions: list[Extension] = []
+    resets: list[Reset] = []
+    known = ExtensionState(np.zeros((system.q + reduced.rank, system.q + reduced.rank + 1)), 0.0)
+    for first, last in pairwise(cuts):
+        piece = Mesh(mesh.edges[first : last + 1], mesh.rule)
+        extensions.append(extend(reduced, piece, reduced.start(starts[-1].xi_a, starts[-1].basis)))
+        if last == mesh.size:
+            break
+        known = _learned(extensions[-1], known)
+        time = float(mesh.edges[last])
+        basis = _basis(reduced, time, float(mesh.inside[last, 0]))
+        reset, start = _restart(reduced, extensions[-1], known, time, basis)
+        reset = replace(reset, keep=settings.reset_keep)
+        known = known.after(reset)
+        resets.append(reset)
+        starts.append(start)
+    return _joined(reduced, settings, starts, extensions, resets)
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """Where a segment begins: e = Vᵀ(ξ_a − w(time))."""
+
+    time: float
+    basis: Array  # (n, n_a) V
+    xi_a: Array  # (n,)
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentErrors:
+    """η = (θ, e) with e = Vᵀ(ξ_a − x) at the start of the segment that a time belongs to.
+
+    If θ varies within segments, e does too, see ``InitialError``.
+    """
+
+    starts: tuple[_Start, ...]
+    basis: Array  # (n, k)
+    extension: Trajectory  # [ξ_a | ξ_b | Φ] of all segments, (k, 1 + p)
+
+    def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
+        """η at the times t (M,), shape (M, p)."""
+        if (np.diff(theta, axis=0) != 0.0).any() and not np.isnan(theta).any():
+            e = error_of_extension(self.extension(t), theta, states(t) @ self.basis)
+            return np.concatenate([theta, e], axis=1)
+        first = np.array([start.time for start in self.starts])
+        x = states(first)
+        x[0] = states.values[0, 0]
+        # A state that nobody knows (NaN) does not spoil components it has no part in.
+        errors = np.array([
+            np.where(s.basis == 0.0, 0.0, s.basis * (s.xi_a - own)[:, None]).sum(axis=0)
+            for s, own in zip(self.starts, x, strict=True)
+        ])
+        segment = np.searchsorted(first[1:], t, side="right")
+        return np.concatenate([theta, errors[segment]], axis=1)
+
+
+def _first(reduced: ReducedSystem, settings: ObserverSettings) -> Array:
+    """ξ_a at the start, (n,)."""
+    xi_a0 = initial_extension(settings, reduced.system, reduced.names)
+    return np.asarray(reduced.initial_basis @ xi_a0)
+
+
+def _basis(reduced: ReducedSystem, time: float, inside: float) -> Array:
+    """V₊ (n, n_a): the one of the start where the kernel of E is constant."""
+    if reduced.first.split.turn is None:
+        return reduced.initial_basis
+    P = reduced.matrices(np.array([time]), np.array([inside])).projector[0]
+    return initial_basis(P, reduced.rank, reduced.system.states)[0]
+
+
+def _learned(extension: Extension, known: ExtensionState) -> ExtensionState:
+    """[G | h] at the end of a segment."""
+    a = extension.assembled
+    own = on_mesh(extension.mesh, outer_products(a.psi, a.Y)).integral().final
+    return ExtensionState(known.values + own, max(known.level, largest(own)))
+
+
+def _restart(
+    reduced: ReducedSystem, extension: Extension, known: ExtensionState, time: float, basis: Array
+) -> tuple[Reset, _Start]:
+    """T and τ from [ξ_a | ξ_b | Φ] at the end, and where the next segment begins."""
+    q = reduced.system.q
+    end = reduced.basis @ extension.solution.trajectory.final
+    xi_a, xi_b, Phi = end[:, 0], end[:, 1 : 1 + q], end[:, 1 + q :]
+    eta = np.linalg.pinv(known.values[:, :-1], rcond=_KNOWN, hermitian=True) @ known.values[:, -1]
+    after = basis @ (basis.T @ (xi_a + xi_b @ eta[:q] - Phi @ eta[q:]))
+    p = q + basis.shape[1]
+    transform = np.eye(p)
+    transform[q:, :q], transform[q:, q:] = -basis.T @ xi_b, basis.T @ Phi
+    shift = np.concatenate([np.zeros(q), basis.T @ (after - xi_a)])
+    floor = _FLOOR * max(float(np.abs(part).max(initial=0.0)) for part in (eta[:q], after))
+    return Reset(time, transform, shift, floor), _Start(time, basis, after)
+
+
+def _joined(
+    reduced: ReducedSystem, settings: ObserverSettings, starts: list[_Start],
+    extensions: list[Extension], resets: list[Reset],
+) -> Observation:
+    """One regression and one state map over all segments."""
+    system = reduced.system
+    edges = [e.mesh.edges[:-1] for e in extensions[:-1]] + [extensions[-1].mesh.edges]
+    mesh = Mesh(np.concatenate(edges), reduced.mesh.rule)
+    parts = [e.assembled for e in extensions]
+    whole = Assembled(
+        Y=np.concatenate([a.Y for a in parts]),
+        psi=np.concatenate([a.psi for a in parts]),
+        offset=np.concatenate([a.offset for a in parts]),
+        gain=np.concatenate([a.gain for a in parts]),
+        Y_scale=max(a.Y_scale for a in parts),
+        psi_scale=max(a.psi_scale for a in parts),
+        elimination=np.concatenate([
+            np.broadcast_to(a.elimination, (len(a.Y), *a.elimination.shape[1:])) for a in parts
+        ]),
+        injectivity=np.concatenate([
+            np.broadcast_to(a.injectivity, (len(a.Y),)) for a in parts
+        ]),
+    )
+    kept = whole.kept_rows(system, settings.regression)
+    q = system.q
+    return Observation(
+        regression=LinearRegression(
+            Y=on_mesh(mesh, whole.Y[:, kept]),
+            psi=on_mesh(mesh, whole.psi[:, kept]),
+            parameters=(*system.unknowns, *reduced.names),
+            scale=whole.psi_scale,
+            resets=tuple(resets),
+        ),
+        state_map=AffineStateMap(on_mesh(mesh, whole.offset), on_mesh(mesh, whole.gain)),
+        truth=SegmentErrors(
+            tuple(starts), reduced.basis,
+            Trajectory(mesh, np.concatenate([e.solution.trajectory.values for e in extensions])),
+        ),
+        error_estimate=max(e.solution.error_estimate for e in extensions),
+        assumptions=assumptions(reduced, mesh, whole),
+        growth=max(e.growth(q) for e in extensions),
+        growth_rate=sum(e.logarithm(q) for e in extensions) / float(mesh.edges[-1] - mesh.edges[0]),
+    )
+
+
+def reset_times(reduced: ReducedSystem, settings: ObserverSettings) -> Array:
+    """When to reset, ascending, strictly inside the horizon.
+
+    Raises:
+        ConfigError: a time outside, or too many.
+    """
+    start, stop = float(reduced.mesh.edges[0]), float(reduced.mesh.edges[-1])
+    outside = [t for t in settings.reset_times if not start < t < stop]
+    if outside:
+        raise ConfigError(
+            f"observer.reset_times: {outside[0]:g} is not between start and end, {start:g} and "
+            f"{stop:g}"
+        )
+    times = list(settings.reset_times)
+    interval = settings.reset_interval
+    if interval is not None:
+        count = (stop - start) / interval
+        if count > _MOST:
+            raise ConfigError(
+                f"observer.reset_interval = {interval:g} makes {count:.0f} resets; at most {_MOST}"
+            )
+        times += [start + k * interval for k in range(1, int(np.ceil(count * (1 - 1e-12))))]
+    if interval is None and not times:
+        return growth_times(reduced)
+    return np.unique(times)
+
+
+def growth_times(reduced: ReducedSystem) -> Array:
+    """The last edges of the signals' mesh before ‖Φ‖ exceeds its limit, from reset to reset."""
+    mesh, basis = reduced.mesh, reduced.basis
+    d = basis.shape[1]
+    eye = np.eye(d)
+
+    def coefficients(t: Array, inside: Array) -> Coefficients:
+        return Coefficients(
+            None, reduced.matrices(t, inside).dynamics, np.zeros((len(t), d, d))
+        )
+
+    restarts: dict[float, Callable[[Array], Array]] = {
+        float(edge): lambda _: eye for edge in mesh.edges[1:-1]
+    }
+    problem = LinearProblem(coefficients, eye, name=f"growth of plant {reduced.system.name}")
+    with np.errstate(over="ignore", invalid="ignore"):  # of the error estimate, which is not used
+        solution = solve(
+            problem, mesh, tol=_TOLERANCE, max_elements=reduced.solver.max_elements,
+            restarts=restarts,
+        )
+    finer = solution.trajectory
+    last = np.searchsorted(finer.mesh.edges, mesh.edges[1:]) - 1  # its last part, of each element
+    Phi = basis.T @ reduced.initial_basis
+    times = []
+    for k, step in enumerate(finer.values[last, -1]):
+        if k > 0 and log_norm(step @ Phi) > np.log(_GROWTH):
+            times.append(float(mesh.edges[k]))
+            Phi = np.linalg.svd(Phi, full_matrices=False)[0]  # orthonormal, of the same range
+        Phi = step @ Phi
+    return np.array(times)
+
+
+def _with_edges(mesh: Mesh, times: Array) -> tuple[Mesh, Array]:
+    """The mesh with edges at the times, and the times as edges; near ones fall together."""
+    if not len(times):
+        return mesh, times
+    near = 1e-9 * float(mesh.edges[-1] - mesh.edges[0])
+    edges = [t for t in times if np.abs(mesh.edges - t).min() > near]
+    finer = Mesh(np.unique(np.concatenate([mesh.edges, edges])), mesh.rule)
+    k = np.unique([int(np.abs(finer.edges - t).argmin()) for t in times])
+    k = k[(k > 0) & (k < finer.size)].astype(np.intp)
+    return finer, finer.edges[k]

@@ -1,0 +1,526 @@
+"""Remedies for a Φ that grows: the state stays known where without one it is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plants import shipped
+from regressions import ETA, three
+from regressions import regression as make_regression
+from scipy.linalg import expm
+from test_observer import ROTATING
+
+from gpebo_cli import estimators
+from gpebo_cli.assumptions import check
+from gpebo_cli.errors import ConfigError, SolverError
+from gpebo_cli.excitation import segment_level, window_level
+from gpebo_cli.experiment import run_experiment
+from gpebo_cli.moving import filtered
+from gpebo_cli.observers import observe
+from gpebo_cli.observers.gpebo import observer_matrices
+from gpebo_cli.regression import ExtensionState, Reset, largest
+from gpebo_cli.settings import (
+    NoiseSettings,
+    ObserverSettings,
+    Settings,
+    SolverSettings,
+    TimeSettings,
+)
+from gpebo_cli.simulation.simulate import simulate
+from gpebo_cli.systems.plant import plant_from_mapping
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "docs" / "examples"
+UNBOUNDED = yaml.safe_load((EXAMPLES / "plant" / "unbounded.yaml").read_text(encoding="utf-8"))
+SOLVER = SolverSettings()
+
+# x grows itself, with the eigenvalues of the other plant's A_0: E = I, A_0 = A.
+GROWING = {
+    "name": "growing", "states": ["x1", "x2", "x3"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+    "E": np.eye(3).tolist(),
+    "A": [[0.64, 1.01, 0], [-1.01, 0.64, 0.2], [0, 0, 0.33]],
+    "B": [[0], [1], [0]], "C": [[1, 0.5, -0.3]], "initial_state": [1, -1, 0.5],
+}
+# One direction grows, one decays fast, and there is an unknown.
+MIXED = {
+    "name": "mixed", "states": ["x1", "x2", "x3"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+    "unknowns": {"theta": 0.7}, "F": [[1], [0], [0]],
+    "E": np.eye(3).tolist(), "A": [[0.4, 0.3, 0], [0, -3, 0.5], [0.1, 0, -0.6]],
+    "B": [[0], [1], [0]], "C": [[1, 0.5, -0.3]], "initial_state": [1, -1, 0.5],
+}
+WITH_UNKNOWN = {**UNBOUNDED, "unknowns": {"theta": 0.7}, "F": [[0], [0], [1], [0]]}
+
+
+def run(mapping, horizon=40.0, estimator=None, samples=401, **observer):
+    return run_experiment(
+        Settings(
+            plant={}, estimator=estimator or {"name": "least_squares"},
+            time=TimeSettings(horizon=horizon, samples=samples),
+            observer=ObserverSettings(**observer),
+        ),
+        plant_from_mapping(mapping) if isinstance(mapping, dict) else mapping,
+    )
+
+
+def relative_error(result, case=0):
+    """Of the state, at every sample."""
+    states = result.simulation.states
+    error = np.abs(result.estimation.states[case] - states).max(axis=1)
+    return error / np.abs(states).max(axis=1)
+
+
+@lru_cache(maxsize=8)
+def observed(name, horizon=20.0, **observer):
+    mapping = {"rotating": ROTATING, "unbounded": UNBOUNDED, "mixed": MIXED}.get(name)
+    system = shipped(name) if mapping is None else plant_from_mapping(mapping)
+    signals = simulate(system, TimeSettings(horizon=horizon), SOLVER).signals
+    found = observe(system, signals.inputs, signals.outputs, ObserverSettings(**observer), SOLVER)
+    return system, signals, found
+
+
+def test_the_plant_is_the_one_that_needs_a_remedy():
+    system = plant_from_mapping(UNBOUNDED)
+    o = observer_matrices(system, np.zeros(1), np.zeros(1), 1e-10)
+    eigenvalues = np.sort_complex(np.linalg.eigvals(o.A0[0][:3, :3]))
+    np.testing.assert_allclose(eigenvalues, [0.33, 0.64 - 1.01j, 0.64 + 1.01j], atol=1e-12)
+
+
+def test_without_a_remedy_the_state_is_lost_and_a_warning_says_so():
+    result = run(UNBOUNDED)
+    assert relative_error(result)[-1] > 0.05
+    (warning,) = result.warnings
+    assert "1/s" in warning
+    assert warning in result.verdict
+    growth = next(a for a in result.assumptions if a.name == "Growth of Φ")
+    assert not growth.holds
+    assert growth.evidence["rate"] == pytest.approx(0.64, abs=0.1)
+
+
+INJECTED = [
+    {"name": "least_squares"}, {"name": "ls_drem"}, {"name": "drem"}, {"name": "mre"},
+    {"name": "gradient"}, {"name": "lion"}, {"name": "fct"},
+]
+FOLLOWING = [{"name": "least_squares"}, {"name": "drem"}, {"name": "mre"}]
+CASES = [
+    *(("output_injection", e) for e in INJECTED),
+    *(("reset", e) for e in INJECTED if e["name"] != "gradient"),  # see the test below
+    *(("current_coordinates", e) for e in FOLLOWING),
+]
+
+
+@pytest.mark.parametrize(("remedy", "estimator"), CASES)
+def test_every_remedy_keeps_the_state(remedy, estimator):
+    result = run(UNBOUNDED, estimator=estimator, remedy=remedy)
+    late = result.estimation.t >= 39.0
+    assert relative_error(result)[late].max() < 1e-9
+    assert not result.warnings
+
+
+@pytest.mark.parametrize(
+    ("remedy", "estimator"),
+    [
+        ("output_injection", {"name": "ls_drem"}),
+        ("output_injection", {"name": "drem"}),
+        ("reset", {"name": "ls_drem"}),
+        ("reset", {"name": "mre"}),
+        ("current_coordinates", {"name": "least_squares"}),
+        ("current_coordinates", {"name": "mre", "gamma": 1000}),
+    ],
+)
+def test_a_state_that_grows_is_kept_too(remedy, estimator):
+    result = run(GROWING, estimator=estimator, remedy=remedy)
+    assert np.abs(result.simulation.states[-1]).max() > 1e9
+    assert relative_error(result)[result.estimation.t >= 20.0].max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("remedy", "estimator"),
+    [
+        ("output_injection", {"name": "ls_drem"}),
+        ("reset", {"name": "least_squares"}),
+        ("reset", {"name": "ls_drem"}),
+        ("reset", {"name": "drem"}),
+        ("current_coordinates", {"name": "least_squares", "f0": 1e-12}),
+    ],
+)
+@pytest.mark.parametrize("mapping", [WITH_UNKNOWN, MIXED], ids=["unbounded", "mixed"])
+def test_the_unknown_is_found_as_well(mapping, remedy, estimator):
+    result = run(mapping, 30.0, estimator=estimator, remedy=remedy)
+    assert relative_error(result)[-1] < 1e-9
+    theta = result.estimation.parameters[0, -1, 0]
+    # Beside a state of 1e5, and with filters that forget within a second, θ has fewer digits.
+    assert theta == pytest.approx(0.7, abs=1e-5 if remedy == "current_coordinates" else 1e-7)
+
+
+@pytest.mark.parametrize("remedy", ["reset", "current_coordinates"])
+def test_gradient_is_too_slow_for_two_of_them_and_says_so(remedy):
+    """With one output the plain gradient cannot pull as fast as errors grow, at any gain."""
+    result = run(UNBOUNDED, estimator={"name": "gradient"}, remedy=remedy)
+    assert relative_error(result)[-1] > 1e-9
+    assert not result.estimation.requirement.holds
+
+
+@pytest.mark.parametrize("estimator", [{"name": "ls_drem"}, {"name": "drem"}, {"name": "mre"}])
+def test_resets_change_nothing_where_none_is_needed(estimator):
+    system = shipped("circuit")
+    plain = run(system, 20.0, estimator=estimator)
+    reset = run(system, 20.0, estimator=estimator, remedy="reset", reset_interval=5.0)
+    late = plain.estimation.t >= 18.0
+    np.testing.assert_allclose(
+        reset.estimation.states[:, late], plain.estimation.states[:, late], atol=1e-9
+    )
+
+
+def test_no_resets_where_nothing_grows():
+    """Automatic resets on a stable plant: none, and every number the same."""
+    plain = run(shipped("descriptor"), 20.0, estimator={"name": "drem"})
+    reset = run(shipped("descriptor"), 20.0, estimator={"name": "drem"}, remedy="reset")
+    np.testing.assert_array_equal(reset.estimation.states, plain.estimation.states)
+    np.testing.assert_array_equal(reset.estimation.parameters, plain.estimation.parameters)
+
+
+@pytest.mark.parametrize(
+    ("remedy", "estimator"),
+    [
+        ("output_injection", {"name": "ls_drem"}),
+        ("reset", {"name": "ls_drem"}),
+        ("reset", {"name": "mre"}),
+        ("current_coordinates", {"name": "least_squares"}),
+        ("current_coordinates", {"name": "drem", "gamma": 1e12}),
+    ],
+)
+def test_a_kernel_that_rotates(remedy, estimator):
+    more = {"reset_times": [3.0, 8.0]} if remedy == "reset" else {}
+    result = run(ROTATING, 20.0, estimator=estimator, remedy=remedy, **more)
+    assert relative_error(result)[-1] < 1e-9
+
+
+@pytest.mark.parametrize("name", ["unbounded", "rotating", "mixed"])
+def test_the_regression_holds_in_every_segment(name):
+    """Y = ψη and x = offset + gain η with the true parameters of each time, and T η + τ."""
+    system, signals, observation = observed(name, remedy="reset", reset_interval=4.0)
+    t = np.linspace(0.0, 20.0, 401)
+    eta = observation.truth(t, np.broadcast_to(system.theta, (401, system.q)), signals.states)
+    regression = observation.regression
+    assert len(regression.resets) == 4
+    residual = regression.Y(t) - np.einsum("mij,mj->mi", regression.psi(t), eta)
+    assert np.abs(residual).max() < 1e-9
+    states = observation.state_map.at(t)(eta[None])[0]
+    assert np.abs(states - signals.states(t)).max() < 1e-9
+    for reset in regression.resets:
+        before = eta[np.searchsorted(t, reset.time) - 1]
+        after = eta[np.searchsorted(t, reset.time)]
+        np.testing.assert_allclose(reset.parameters(before), after, atol=1e-8)
+
+
+def test_the_gram_matrix_goes_on_through_a_reset():
+    system, signals, observation = observed("mixed", remedy="reset", reset_interval=4.0)
+    regression = observation.regression
+    start = np.array([r.time for r in regression.resets])
+    theta = np.broadcast_to(system.theta, (len(start), 1))
+    eta = observation.truth(start, theta, signals.states)
+    values = regression.gram(start)  # of the segment that begins
+    residual = np.einsum("mij,mj->mi", values[..., :-1], eta) - values[..., -1]
+    assert np.abs(residual).max() < 1e-9 * np.abs(values[..., :-1]).max()
+    assert np.linalg.eigvalsh(values[..., :-1]).min() > 0.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 5), st.booleans())
+def test_transport_of_an_extension(seed, p, gram):
+    """Ωη = 𝒴 stays true under any T and τ; a Gram matrix becomes T⁻ᵀGT⁻¹."""
+    rng = np.random.default_rng(seed)
+    eta, shift = rng.normal(size=(2, p))
+    transform = rng.normal(size=(p, p)) + 3 * np.eye(p)
+    omega = rng.normal(size=(p, p)) + 2 * np.eye(p)
+    if gram:
+        omega = omega.T @ omega
+    reset = Reset(1.0, transform, shift, 0.0)
+    state = ExtensionState(np.column_stack([omega, omega @ eta]), 1e12)
+    after = state.after(reset).values
+    inverse = np.linalg.inv(transform)
+    expected = inverse.T @ omega @ inverse
+    scale = np.abs(expected).max() * np.linalg.cond(transform) * np.linalg.cond(omega)
+    np.testing.assert_allclose(after[:, :-1], expected, atol=1e-13 * scale)
+    residual = after[:, :-1] @ reset.parameters(eta) - after[:, -1]
+    assert np.abs(residual).max() < 1e-12 * scale * (1 + np.abs(reset.parameters(eta)).max())
+
+
+def test_knowledge_of_what_has_decayed_is_bounded():
+    """T shrinks one direction to nothing: it is known as well as the limit allows, no better."""
+    transform = np.diag([50.0, 1.0, 1e-30])
+    eta = np.array([1.0, -2.0, 0.5])
+    omega = np.array([[2.0, 0.5, 0.1], [0.5, 1.0, 0.3], [0.1, 0.3, 1.0]])
+    state = ExtensionState(np.column_stack([omega, omega @ eta]), 2.0, surplus=10.0)
+    reset = Reset(1.0, transform, np.array([0.1, 0.2, 0.3]), 0.0)
+    after = state.after(reset).values
+    assert largest(after) <= 20.0 * np.sqrt(3)
+    assert np.linalg.eigvalsh(after[:, :-1]).min() > 1e-5  # and the others are still known
+    np.testing.assert_allclose(
+        np.linalg.solve(after[:, :-1], after[:, -1]), reset.parameters(eta), atol=1e-10
+    )
+
+
+def test_windows_of_excitation_run_through_resets():
+    """Resets that change nothing change no level."""
+    plain = make_regression(three, ETA)
+    edges = plain.mesh.edges
+    resets = tuple(
+        Reset(float(edges[k]), np.eye(3), np.zeros(3), 0.0) for k in (16, 40, 41)
+    )
+    t = np.linspace(0.0, 10.0, 57)
+    cut = type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
+    expected = window_level(type(plain.outer)(plain.mesh, plain.outer.values[..., :3]), t, 3.0)
+    np.testing.assert_allclose(segment_level(cut, t, 3.0), expected, atol=1e-12)
+    np.testing.assert_allclose(cut.gram.values, plain.gram.values, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "name", ["drem", "mre", "lion", "gradient", "least_squares", "ls_drem", "fct"]
+)
+def test_a_reset_to_the_same_parameters_changes_nothing(name):
+    """T = I, τ = 0: every estimator goes on where it was, but for its prior."""
+    plain = make_regression(three, ETA)
+    resets = (Reset(float(plain.mesh.edges[30]), np.eye(3), np.zeros(3), 0.0),)
+    cut = type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
+    estimator = estimators.build({"name": name})
+    t = np.linspace(0.0, 10.0, 41)
+    expected = estimators.estimate(estimator, plain, t).parameters(slice(None))
+    found = estimators.estimate(estimator, cut, t).parameters(slice(None))
+    late = t >= 8.0 if name in ("least_squares", "fct") else t >= 0.0
+    np.testing.assert_allclose(found[:, late], expected[:, late], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "settings_of_estimator",
+    [{"beta": 0.3}, {"beta": 0.3, "f0": 0.01, "bound": 1e3}, {"beta": 0.0}],
+)
+def test_memory_is_carried_through_a_reset(settings_of_estimator):
+    plain = make_regression(three, ETA)
+    resets = (Reset(float(plain.mesh.edges[30]), np.eye(3), np.zeros(3), 0.0),)
+    cut = type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
+    estimator = estimators.build({"name": "least_squares", **settings_of_estimator})
+    t = np.array([0.0, 10.0])
+    expected = estimators.estimate(estimator, plain, t).reached[0]
+    found = estimators.estimate(estimator, cut, t).reached[0]
+    np.testing.assert_allclose(found.values, expected.values, rtol=1e-9, atol=1e-9)
+    assert found.memory == pytest.approx(expected.memory, rel=1e-9)
+
+
+def test_filters_in_current_coordinates_hold_the_state():
+    """Ωζ = 𝒴 for the true ζ, at every point, with rates that differ by row."""
+    system, signals, observation = observed("mixed", remedy="current_coordinates")
+    regression = observation.regression
+    rates = np.array([0.1, 0.2, 0.3, 0.4])
+    both = filtered(regression.outer, rates, rates, regression.dynamics)
+    t = np.linspace(0.0, 20.0, 201)
+    zeta = observation.truth(t, np.broadcast_to(system.theta, (201, 1)), signals.states)
+    values = both(t)
+    residual = np.einsum("mij,mj->mi", values[..., :-1], zeta) - values[..., -1]
+    size = np.linalg.norm(values[..., :-1], axis=(1, 2)) * np.linalg.norm(zeta, axis=1)
+    assert (np.abs(residual).max(axis=1) <= 1e-10 * size.max()).all()
+    expected = (*system.unknowns, "w_x1", "w_x2", "w_x3")
+    assert observation.parameters == expected
+
+
+def test_a_gain_of_ones_own_moves_the_eigenvalues():
+    """E = I: w' = (A − L C) w + …, so Φ(T) = exp((A − L C) T)."""
+    gain = [[2.5], ["1 + 0*t"], [0.3]]
+    system = plant_from_mapping(GROWING)
+    signals = simulate(system, TimeSettings(horizon=5.0), SOLVER).signals
+    observation = observe(
+        system, signals.inputs, signals.outputs,
+        ObserverSettings(remedy="output_injection", injection=gain), SOLVER,
+    )
+    Phi = expm(5.0 * (np.array(GROWING["A"]) - np.array([[2.5], [1], [0.3]]) @ GROWING["C"]))
+    np.testing.assert_allclose(
+        observation.state_map.gain(np.array([5.0]))[0], -Phi, atol=1e-10
+    )
+
+
+def test_the_automatic_gain_does_not_depend_on_units():
+    """Time in milliseconds and the output in other units: Φ decays as much over the horizon."""
+    slow = observed("unbounded", 10.0, remedy="output_injection")[2]
+    A = [[1000 * x for x in row] for row in UNBOUNDED["A"]]
+    fast = plant_from_mapping({
+        **UNBOUNDED, "A": A, "B": [[0], [0], [0], [1000]],
+        "inputs": {"u": "sin(1000*t) + cos(2300*t)/2"},
+        "C": [[x * 1e6 for x in UNBOUNDED["C"][0][:3]] + [1e6]],
+    })
+    system = plant_from_mapping(UNBOUNDED)
+    ratio = []
+    for plant, horizon in ((system, 10.0), (fast, 0.01)):
+        signals = simulate(plant, TimeSettings(horizon=horizon), SOLVER).signals
+        o = observe(
+            plant, signals.inputs, signals.outputs,
+            ObserverSettings(remedy="output_injection"), SOLVER,
+        )
+        ratio.append(o.growth_rate * horizon)
+    assert ratio[0] < 0.0
+    assert slow.growth_rate * 10.0 == pytest.approx(ratio[0], rel=1e-6)
+    assert ratio[1] < 0.0
+
+
+def test_a_fundamental_matrix_beyond_all_bounds_ends_in_one_line():
+    plant = plant_from_mapping({**GROWING, "A": [[9, 1, 0], [-1, 9, 0.2], [0, 0, 8]]})
+    signals = simulate(plant, TimeSettings(horizon=20.0), SOLVER).signals
+    with pytest.raises(SolverError, match=r"A_0 is unstable; use observer\.remedy="):
+        observe(plant, signals.inputs, signals.outputs, ObserverSettings(), SOLVER)
+
+
+@pytest.mark.parametrize(
+    ("observer", "message"),
+    [
+        ({"name": "canonical", "remedy": "reset"}, "is for observer=gpebo"),
+        ({"reset_interval": 5.0}, "observer.reset_interval is of observer.remedy=reset"),
+        ({"remedy": "reset", "sample_time": 0.1}, "works in continuous time only"),
+        ({"name": "kalman_bucy", "remedy": "reset"}, "is for observer=gpebo"),
+        ({"reset_keep": 0.5}, "observer.reset_keep is of observer.remedy=reset"),
+        ({"remedy": "reset", "injection": [[1.0]]}, "of observer.remedy=output_injection"),
+        ({"remedy": "reset", "reset_times": [0.0]}, "not between start and end, 0 and 20"),
+        ({"remedy": "reset", "reset_interval": 1e-5}, "at most 10000"),
+        ({"remedy": "output_injection", "injection": [[1.0]]}, "needs 4 (states) of 1 (outputs)"),
+        ({"remedy": "output_injection", "injection": [["a"], [0.0], [0.0], [0.0]]},
+         "observer.injection[0][0]"),
+    ],
+)
+def test_settings_that_do_not_fit(observer, message):
+    system = plant_from_mapping(UNBOUNDED)
+    with pytest.raises(ConfigError) as caught:
+        check(Settings(plant={}, estimator={}, observer=ObserverSettings(**observer)), system)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_many_seeds_go_with_output_injection_and_with_no_other_remedy():
+    def settings_of(remedy):
+        return Settings(
+            plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(horizon=10.0),
+            observer=ObserverSettings(remedy=remedy),
+            noise=NoiseSettings(outputs=0.01, sample_time=0.1, seeds=5),
+        )
+
+    system = plant_from_mapping(UNBOUNDED)
+    result = run_experiment(settings_of("output_injection"), system)
+    assert result.noise.seeds == 5
+    assert np.isfinite(result.noise.rms).all()
+    with pytest.raises(ConfigError, match=r"goes with observer\.remedy=none or output_injection"):
+        run_experiment(settings_of("reset"), system)
+
+
+@pytest.mark.parametrize("remedy", ["output_injection", "reset", "current_coordinates"])
+def test_remedies_bear_noise_and_weights(remedy):
+    """The error of the state stays near the noise, where without a remedy it grows with Φ."""
+    noise = NoiseSettings(outputs=1e-4, sample_time=0.05)
+    results = [
+        run_experiment(
+            Settings(
+                plant={}, estimator={"name": "least_squares"}, noise=noise,
+                time=TimeSettings(horizon=40.0, samples=201),
+                observer=ObserverSettings(remedy=kind, weights=2.0),
+            ),
+            plant_from_mapping(UNBOUNDED),
+        )
+        for kind in (remedy, "none")
+    ]
+    kept, lost = (relative_error(result)[-1] for result in results)
+    assert kept < 0.05
+    assert lost > 1e3 * kept
+
+
+class Outsider:
+    """An estimator of another package, with no more than the protocol."""
+
+    cases = ({},)
+
+    def estimate(self, regression, t):
+        return estimators.build({"name": "ls_drem"}).estimate(regression, t)
+
+
+@pytest.mark.parametrize(
+    ("remedy", "message"),
+    [("reset", "no argument known"), ("current_coordinates", "cannot follow a state")],
+)
+def test_estimators_of_other_packages_are_refused_where_they_cannot_go_on(remedy, message):
+    settings_of = Settings(
+        plant={}, estimator={}, time=TimeSettings(horizon=20.0),
+        observer=ObserverSettings(remedy=remedy),
+    )
+    with pytest.raises(ConfigError, match=message):
+        run_experiment(settings_of, plant_from_mapping(UNBOUNDED), estimator=Outsider())
+
+
+@pytest.mark.parametrize("name", ["ls_drem", "lion", "fct"])
+def test_estimators_that_cannot_follow_are_refused(name):
+    with pytest.raises(ConfigError, match="accepted: estimator=drem, mre, least_squares or g"):
+        run(UNBOUNDED, 5.0, estimator={"name": name}, remedy="current_coordinates")
+
+
+@pytest.mark.parametrize("name", ["least_squares", "ls_drem", "drem", "mre"])
+def test_a_reset_that_keeps_nothing_follows_a_step_of_an_unknown(name):
+    """θ steps at 10; learnt anew from there on it is exact, and without that it is not."""
+    system = shipped("descriptor", unknowns={"theta1": "1.5 + step(t - 10)", "theta2": -0.8})
+    gain = {"drem": {"gamma": 1e16}, "mre": {"gamma": 1e3}}.get(name, {})
+    estimator = {"name": name, **gain}
+    anew = {"remedy": "reset", "reset_times": [10.0], "reset_keep": 0.0}
+    followed = run(system, 30.0, estimator=estimator, **anew)
+    kept = run(system, 30.0, estimator=estimator)
+    assert followed.estimation.true_parameters[-1, 0] == 2.5
+    assert followed.estimation.parameters[0, -1, 0] == pytest.approx(2.5, abs=1e-4)
+    assert relative_error(followed)[-1] < 1e-4
+    assert relative_error(kept)[-1] > 100 * relative_error(followed)[-1]
+
+
+def command(*words, cwd):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, "-m", "gpebo_cli", *words], cwd=cwd, env=environment, timeout=120,
+        capture_output=True, text=True, check=False,
+    )
+
+
+def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
+    words = [
+        "run", "--config-dir", str(EXAMPLES), "plant=unbounded", "time.horizon=40", "figures=none",
+        "estimator=least_squares", "hydra.run.dir=out",
+    ]
+    done = command(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("gpebo: warning: Φ has grown to ")
+    warning = line.removeprefix("gpebo: warning: ")
+    assert warning in done.stdout.splitlines()[-1]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["warnings"] == [warning]
+    done = command(*words, "observer.remedy=reset", cwd=tmp_path)
+    assert done.returncode == 0
+    assert not done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["observer.remedy=resets"], "did you mean reset?"),
+        (["observer.remedy=reset", "observer.reset_interval=-1"], "expected a positive number"),
+        (["observer.remedy=current_coordinates", "estimator=lion"], "cannot follow"),
+        (["observer.remedy=output_injection", "observer.injection=[[1,2],[3]]"], "6 (states)"),
+    ],
+)
+def test_command_refuses_in_one_line(words, message, tmp_path):
+    done = command("run", "plant=circuit", "figures=none", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("gpebo: error: ")
+    assert message in line
