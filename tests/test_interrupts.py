@@ -19,11 +19,16 @@ class Finaliser:
 
 def test_what_a_finaliser_drops_is_raised_at_the_next_stage(capsys):
     reached = []
-    with pytest.raises(KeyboardInterrupt), interrupts.remembered():
-        Finaliser()
-        reached.append("after the signal")  # Python went on
-        interrupts.check()
-        reached.append("the next stage")
+
+    def run():
+        with interrupts.remembered():
+            Finaliser()
+            reached.append("after the signal")  # Python went on
+            interrupts.check()
+            reached.append("the next stage")
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
     assert reached == ["after the signal"]
     assert capsys.readouterr().err == ""
 
