@@ -84,11 +84,11 @@ def follow(
 class SolvedEstimates:
     """η̂ = Ω⁻¹ 𝒴 of every case, from [Ω | 𝒴] (M, p, p + 1) with Ω > 0."""
 
-    extended: tuple[Array, ...]
+    extended: tuple[Array, ...]  # (M, p, p + 1) each
     reached: tuple[ExtensionState, ...] = ()
 
     def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
-        """Nothing is mixed."""
+        """Nothing is mixed, at any of the times t (M,)."""
         return
 
     @property
@@ -104,7 +104,11 @@ class SolvedEstimates:
         )
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:  # noqa: ARG002
-        """η̂ of some cases, shape (g, M, p)."""
+        """η̂ of some cases, shape (g, M, p).
+
+        Raises:
+            SolverError: Ω is singular at one of the times.
+        """
         try:
             return np.array([
                 np.linalg.solve(e[..., :-1], e[..., -1:])[..., 0] for e in self.extended[cases]

@@ -69,7 +69,10 @@ def reached(
     regression: LinearRegression, extended: Trajectory, known: Sequence[ExtensionState],
     *, linear: bool = False,
 ) -> ExtensionState:
-    """[Ω | 𝒴] at the end; no filter exceeds the largest ψᵀψ, or for Lion's ψ, that went in."""
+    """[Ω | 𝒴] (p, p + 1) at the end.
+
+    No filter exceeds the largest ψᵀψ, or for Lion's filters ψ, that went in.
+    """
     level = largest(regression.outer.values)
     if linear:
         level = np.sqrt(regression.p * level)

@@ -46,7 +46,13 @@ class Resuming(Protocol):
     def estimate(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
     ) -> Resumable:
-        """As ``Estimator.estimate``, from extensions at the start; none: they start at zero."""
+        """As ``Estimator.estimate`` at the times t (M,), from extensions that are known.
+
+        Args:
+            regression: Y = ψη without resets.
+            t: times.
+            known: the extensions at its start; none: they start at zero.
+        """
         ...
 
 

@@ -67,7 +67,10 @@ class Drem:
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
     ) -> FollowingEstimates:
-        """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂): it follows where γΔ² exceeds the growth of η."""
+        """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) at the times t (M,).
+
+        It follows where γΔ² exceeds the growth of η.
+        """
         names = regression.parameters
         rates = filter_rates(self.rates, names)
         extended = filtered(regression.outer, rates, rates, dynamics)

@@ -53,7 +53,7 @@ class Gradient:
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
     ) -> VectorEstimates:
-        """η̂' = 𝔸η̂ + 𝕓 + Γψᵀ(Y − ψη̂)."""
+        """η̂' = 𝔸η̂ + 𝕓 + Γψᵀ(Y − ψη̂) at the times t (M,)."""
         plain = self.estimate(regression, t)
         return replace(plain, law=replace(plain.law, dynamics=dynamics))
 

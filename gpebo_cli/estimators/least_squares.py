@@ -72,7 +72,7 @@ class LeastSquares:
     def spectra(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> list[tuple[Spectrum, ExtensionState]]:
-        """Of every case the spectrum of G_z at the times t, and G_z at the end."""
+        """Of every case the spectrum of G_z at the times t (M,), and G_z at the end."""
         bound = self.covariance_bound
         made: dict[tuple[float, ...], tuple[Spectrum, ExtensionState]] = {}
         out = []
@@ -104,7 +104,9 @@ class LeastSquares:
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
     ) -> SolvedEstimates:
-        """η̂ = F 𝒴 with F⁻¹ and 𝒴 from (f₀ I, f₀ η̂₀), their forgetting β + ρ.
+        """η̂ = F 𝒴 with F⁻¹ and 𝒴 from (f₀ I, f₀ η̂₀), at the times t (M,).
+
+        They forget at the rate β + ρ.
 
         Raises:
             ConfigError: forgetting with a bound.

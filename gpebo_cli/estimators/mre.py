@@ -57,7 +57,7 @@ class MemoryExtension:
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
     ) -> VectorEstimates:
-        """η̂' = 𝔸η̂ + 𝕓 + Γ(𝒴 − Ω η̂)."""
+        """η̂' = 𝔸η̂ + 𝕓 + Γ(𝒴 − Ω η̂) at the times t (M,)."""
         rates = self._rates(regression.p)
         plain = self._estimates(regression, filtered(regression.outer, rates, rates, dynamics), t)
         return replace(plain, law=replace(plain.law, dynamics=dynamics))

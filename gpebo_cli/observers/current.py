@@ -55,7 +55,7 @@ def observe(
     settings: ObserverSettings,
     solver: SolverSettings,
 ) -> Observation:
-    """The observer of ``gpebo.observe`` in current coordinates.
+    """The observer of ``gpebo.observe`` on u (m,) and y (r,), in current coordinates.
 
     Raises:
         ModelError, ConfigError, SolverError: as there.

@@ -514,6 +514,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     latest: list[Assembled] = []
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+        """Everything to resolve; SolverError if the extension is beyond all bounds."""
         if np.abs(values).max(initial=0.0) > _LARGEST:
             raise SolverError(
                 f"the dynamic extension of plant {system.name} grows beyond {_LARGEST:.0e}: A_0 is "
@@ -593,7 +594,7 @@ def observe_reduced(reduced: ReducedSystem, settings: ObserverSettings) -> Obser
 
 
 def on_mesh(mesh: Mesh, signal: Array) -> Trajectory:
-    """A signal (K (s + 1), ...) at the points of a mesh."""
+    """A signal (K (s + 1), …) at the points of a mesh, as values (K, s + 1, …)."""
     return Trajectory(mesh, signal.reshape(*mesh.points.shape, *signal.shape[1:]))
 
 

@@ -55,7 +55,7 @@ def observe(
     settings: ObserverSettings,
     solver: SolverSettings,
 ) -> Observation:
-    """The observer of ``gpebo.observe`` with output injection.
+    """The observer of ``gpebo.observe`` on u (m,) and y (r,), with output injection.
 
     Raises:
         ModelError, ConfigError, SolverError: as there; ConfigError also if ``injection`` does not

@@ -59,7 +59,7 @@ def observe(
     settings: ObserverSettings,
     solver: SolverSettings,
 ) -> Observation:
-    """The observer of ``gpebo.observe`` with resets.
+    """The observer of ``gpebo.observe`` on u (m,) and y (r,), with resets.
 
     Raises:
         ModelError, ConfigError, SolverError: as there; ConfigError also for times of resets that
