@@ -97,3 +97,13 @@ def test_any_start_of_a_manufactured_system_ends_on_its_constraints():
     residual = np.einsum("nij,nj->ni", c.E[0], slope) - np.einsum("nij,nj->ni", c.A[0], x(times))
     residual -= np.einsum("nij,nj->ni", c.B[0], c.u[0])
     assert np.abs(residual).max() < 1e-7
+
+
+def test_the_estimate_forgets_an_elimination_that_was_not_used():
+    """Where pivots will not do singular vectors do, and only their rounding counts."""
+    plant, exact = manufactured(20, 12, [4, 2, 2], 11, True)
+    result = simulate(plant, TimeSettings(horizon=5.0), SolverSettings())
+    times = np.linspace(0, 5, 201)
+    truth = np.array([entry(times) for entry in exact]).T
+    error = np.abs(result.signals.states(times) - truth).max() / np.abs(truth).max()
+    assert error < result.error_estimate < 1e3 * error

@@ -454,6 +454,11 @@ def reduce(
                 system, structure, e[0][poor], M[poor], N[poor], t[poor]
             )
             A2[poor], f2[poor] = transpose(Z2) @ N[poor], transpose(Z2) @ g[poor]
+            # What the elimination made grow there is not used, and amplifies nothing.
+            looked = np.arange(len(t))[some]
+            again = poor[looked]
+            terms = np.abs(np.concatenate([N[poor], g[poor]], axis=2))
+            size[again] = (np.abs(transpose(Z2)) @ terms)[(np.cumsum(poor) - 1)[looked[again]]]
             whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
             inverse[poor], poor[poor] = _inverse(whole)
     if poor.any():
