@@ -392,3 +392,8 @@ def test_an_estimator_of_another_package(tmp_path):
         done = command(*words)
         assert (done.returncode, done.stderr.count("\n")) == (2, 1)
         assert expected in done.stderr
+
+
+def test_the_span_that_a_default_decides_is_written_down():
+    result = run("circuit", observer="none", time={"samples": 11})
+    assert result.config["time"] == {"start": 0.0, "horizon": 20.0, "samples": 11}

@@ -197,7 +197,8 @@ def _configure(
         config[name], _ = choose(name, sections[name], config_dir)
     _check_gains(gains, config["estimator"])
     config["estimator"] |= plain(gains)
-    return config, system, configuration.settings(config, draw=True)
+    settings = configuration.settings(config, draw=True)
+    return configuration.complete(config, settings), system, settings
 
 
 def _recording(data: Choice | os.PathLike[str] | None) -> object:

@@ -113,6 +113,13 @@ def _group(config: Mapping[str, Any], name: str) -> dict[str, Any]:
     return {str(k): v for k, v in section.items() if k not in _DESCRIPTIVE}
 
 
+def complete(config: Mapping[str, Any], built: Settings) -> dict[str, Any]:
+    """The configuration with the span of time that ``null`` stands for, where a default decides."""
+    decided = {key: getattr(built.time, key) for key in _OPEN}
+    span = {key: value for key, value in decided.items() if math.isfinite(value)}
+    return {**config, "time": {**config.get("time", {}), **span}}
+
+
 def _time(config: Mapping[str, Any], *, recorded: bool) -> TimeSettings:
     """The span of the experiment; ``null`` is the default, or where a recording begins or ends."""
     section = {key: value for key, value in _group(config, "time").items()

@@ -82,7 +82,8 @@ def read_job(
 
     from gpebo_cli.systems.plant import plant_from_mapping
 
-    return settings, plant_from_mapping(settings.plant, _plant_file(choices, arguments)), config
+    system = plant_from_mapping(settings.plant, _plant_file(choices, arguments))
+    return settings, system, configuration.complete(config, settings)
 
 
 def _refuse_shadowed(choices: dict[str, str | None], arguments: Arguments) -> None:

@@ -176,7 +176,7 @@ examples:
   gpebo run experiment=paper_circuit hydra.run.dir=paper              # a recipe, and where to
   gpebo run --config-dir paper --config-name config                   # repeat that run
   gpebo run data.file=paper/signals.csv data.hold=cubic               # measured, not simulated
-  gpebo run data.file=- estimator=ls_drem < paper/signals.csv          # a row out for each row in
+  gpebo run data.file=- estimator=ls_drem < paper/signals.csv         # a row out for each row in
 """
 
 
