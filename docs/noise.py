@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from gpebo_cli.outputs.figures import describe
 from gpebo_cli.outputs.files import make_folder, write_text
 from gpebo_cli.outputs.style import Axis, Curve, Panel, compose, line, save
 from gpebo_cli.result import RunResult
-from gpebo_cli.settings import NoiseSettings, Settings, TimeSettings
+from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings, TimeSettings
 from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 from gpebo_cli.systems.plant import plant_from_mapping
 
@@ -123,7 +124,7 @@ def level_figure(found: Mapping[str, Mapping[str, Array]], path: Path) -> None:
 
 
 def step_figure(path: Path) -> None:
-    """The recipe theta_step: estimates of an unknown that steps."""
+    """The recipe theta_step: estimates of an unknown that steps; and with a reset at the step."""
     recipe = yaml.safe_load(
         (Path(conf_folder()) / "experiment" / "theta_step.yaml").read_text(encoding="utf-8")
     )
@@ -134,7 +135,21 @@ def step_figure(path: Path) -> None:
     )
     system = plant("descriptor", **recipe["plant"])
     [(_, panels)] = describe(run_experiment(settings, system), ["parameters"])
-    save(compose(panels), path)
+    renewed = replace(
+        settings, estimator={"name": "least_squares", "beta": 0.0},
+        observer=ObserverSettings(remedy="reset", reset_times=[10.0], reset_keep=0.0),
+    )
+    [(_, again)] = describe(run_experiment(renewed, system), ["parameters"])
+    style = line(len(panels[0].curves) + 1)  # the next one looks like the truth
+    both = [
+        replace(panel, curves=(
+            *panel.curves[:-1],
+            replace(other.curves[0], label="reset at 10 s", style=style),
+            panel.curves[-1],
+        ))
+        for panel, other in zip(panels, again, strict=True)
+    ]
+    save(compose(both), path)
 
 
 if __name__ == "__main__":
