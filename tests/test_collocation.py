@@ -229,3 +229,38 @@ def test_a_kept_sampler_is_not_used_for_other_times():
     signal(t)
     t += 0.5
     np.testing.assert_allclose(signal(t)[:, 0], np.sin([0.8, 1.2]), atol=1e-12)
+
+
+def test_elements_are_joined_where_one_polynomial_does_as_well():
+    rule = radau_rule(8)
+    mesh = initial_mesh(0.0, 16.0, [4.0], 16, rule)
+    smooth, narrow = np.sin(mesh.points), np.exp(-(((mesh.points - 10.3) / 0.2) ** 2))
+    joined = mesh.joined([smooth[..., None]], 1e-3, np.array([4.0]))
+    np.testing.assert_array_equal(joined.edges, [0, 4, 8, 12, 16])
+    both = mesh.joined([smooth[..., None], narrow[..., None]], 1e-3, np.array([4.0]))
+    assert {0.0, 4.0, 8.0, 10.0, 11.0, 16.0} <= set(both.edges)
+    assert both.size < mesh.size
+    assert mesh.joined([np.sign(mesh.points - 8.01)[..., None]], 1e-3, np.zeros(0)).size < 16
+    assert mesh.joined([np.random.default_rng(1).random((16, 9, 1))], 1e-3, np.zeros(0)) is mesh
+
+
+def test_long_elements_that_seem_to_grow_beyond_all_numbers_are_cut():
+    """x' = 2 sin(t) x has the period of an element, whose map is 19 and not 1 before it is cut."""
+    def coefficients(t, inside):
+        return Coefficients(None, 2 * np.sin(t)[:, None, None], np.zeros((len(t), 1, 1)))
+
+    mesh = initial_mesh(0.0, 400 * 2 * np.pi, [], 400, radau_rule(8))
+    problem = LinearProblem(coefficients, np.ones((1, 1)))
+    solution = solve(problem, mesh, tol=1e-8, max_elements=10**5)
+    t = np.linspace(0.0, 400 * 2 * np.pi, 4001)
+    error = np.abs(solution.trajectory(t)[:, 0, 0] - np.exp(2 - 2 * np.cos(t))).max() / np.exp(4)
+    assert error < 10 * solution.error_estimate < 1e-4
+
+
+def test_growth_beyond_all_numbers_is_named_with_its_time():
+    def coefficients(t, inside):
+        return Coefficients(None, np.ones((1, 1, 1)), np.zeros((len(t), 1, 1)))
+
+    mesh = initial_mesh(0.0, 1000.0, [], 250, radau_rule(14))
+    with pytest.raises(SolverError, match=r"not finite from t = 70"):
+        solve(LinearProblem(coefficients, np.ones((1, 1))), mesh, tol=1e-8, max_elements=5000)

@@ -289,3 +289,50 @@ def test_start_need_not_be_zero():
     result = simulate(system, TimeSettings(start=3.0, horizon=5.0), SOLVER)
     t = np.linspace(3, 8, 77)
     np.testing.assert_allclose(result.signals.states(t)[:, 0], np.sin(t), atol=1e-12)
+
+
+@pytest.mark.parametrize("where", [3.21, 9.99, 13.37, 17.08])
+@pytest.mark.parametrize("place", ["u", "A", "E"])
+def test_a_narrow_feature_of_an_otherwise_smooth_plant_is_noticed(place, where):
+    """Elements are joined only after short ones have been looked at for what is narrow."""
+    pulse = f"exp(-(({where} - t)/0.12)**2)"
+    entries = {"u": "1", "A": "-1/10", "E": "1"}
+    entries[place] += f" + 3*{pulse}" if place != "A" else f" - 3*{pulse}"
+    system = plant(
+        states=["x", "z"], inputs={"u": entries["u"]}, E=[[entries["E"], 0], [0, 0]],
+        A=[[entries["A"], 0], [1, -1]], B=[[1], [1]], initial_state=[1, 2],
+    )
+
+    def right(t, x):
+        bump = 3 * np.exp(-(((where - t) / 0.12) ** 2))
+        u, a, e = np.array([1, 0.1, 1]) + bump * np.array([place == name for name in "uAE"])
+        return (-a * x + u) / e
+
+    exact = solve_ivp(right, (0, 20), [1.0], rtol=1e-11, atol=1e-12, max_step=0.05).y[0, -1]
+    result = simulate(system, TimeSettings(horizon=20.0), SolverSettings(tol=1e-6))
+    assert result.signals.states.final[0] == pytest.approx(exact, abs=1e-5)
+    assert result.signals.mesh.steps.min() < 0.5
+
+
+def test_smooth_plants_are_solved_on_few_elements():
+    system = plant(
+        states=["x"], inputs={"u": "sin(t)"}, E=[["2 + t"]], A=[["-1"]], B=[["t"]],
+        initial_state=[1],
+    )
+    few = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-6))
+    many = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-13))
+    assert few.signals.mesh.size == 3
+    t = np.linspace(0, 2, 50)
+    np.testing.assert_allclose(few.signals.states(t), many.signals.states(t), atol=1e-6)
+
+
+@pytest.mark.parametrize("horizon", [10.0, 100.0, 2000.0])
+@pytest.mark.parametrize("tol", [1e-5, 1e-8])
+def test_a_state_that_almost_vanishes_is_seen_to_return(horizon, tol):
+    """x' = 10 cos(t) x is exp(10 sin t): from 2e4 to 5e-5 and back, over and over."""
+    system = plant(states=["x"], E=[["1"]], A=[["10*cos(t)"]], initial_state=[1])
+    result = simulate(system, TimeSettings(horizon=horizon), SolverSettings(tol=tol))
+    t = np.linspace(0, horizon, 5001)
+    error = np.abs(result.signals.states(t)[:, 0] - np.exp(10 * np.sin(t))).max() / np.exp(10)
+    assert error < tol
+    assert error < 10 * max(result.error_estimate, tol)

@@ -62,9 +62,13 @@ Monitor = Callable[[Array, tuple[Array, ...]], list[tuple[Array, float]]]
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
+_MODEST = 1e100  # values up to here may be multiplied with each other
 _MAX_PARTS = 8  # an element is cut into at most this many at once
 _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _ROUNDING = 64 * np.finfo(float).eps
+# The C library gives freed memory back to the system, page by page, and takes as much again a
+# moment later, unless it has seen a larger array come and go. This one is never written to.
+np.empty(_CHUNK // 4)
 
 
 class Renewal(Protocol):
@@ -147,18 +151,19 @@ def solve(
     rounds = 1
     while True:
         values = _chain(maps, problem, mesh, restarts or {})
-        if not np.isfinite(values).all():
-            k = int(np.argmin(np.isfinite(values).all(axis=(1, 2, 3))))
-            raise SolverError(
-                f"the solution of the {problem.name} is not finite from t = {mesh.edges[k]:.6g} "
-                "on: it grows beyond all numbers; is a sign wrong? Else shorten time.horizon"
-            )
-        tail = unresolved_signals(problem, mesh, values, maps.extras)
+        finite = np.asarray(np.isfinite(values).all(axis=(1, 2, 3)))
+        tail = _tail_of_numbers(problem, mesh, values, maps.extras, finite)
         # Rounding floor: an element whose parent was already this good is not cut again.
         stalled = (floor > 0) & (tail > 0.25 * floor) & (tail < 1e-6)
         poor = (tail > tol) & ~stalled
         if not poor.any():
-            break
+            if finite.all():
+                break
+            raise SolverError(
+                f"the solution of the {problem.name} is not finite from "
+                f"t = {mesh.edges[int(np.argmin(finite))]:.6g} on: it grows beyond all numbers; "
+                "is a sign wrong? Else shorten time.horizon"
+            )
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         _check_budget(problem, mesh, tail, parts, max_elements)
         finer, kept = mesh.split(parts)
@@ -175,6 +180,28 @@ def solve(
         _rounding(problem, values),
     )
     return LinearSolution(Trajectory(mesh, values), estimate, rounds, maps.extras)
+
+
+def _tail_of_numbers(
+    problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...],
+    finite: BoolArray,
+) -> Array:
+    """:func:`unresolved_signals`; where not all is finite, of the elements before, else zero.
+
+    Elements that are too long may seem to grow, and many of them multiply to anything: those in
+    front are resolved first.
+    """
+    if finite.all():
+        return unresolved_signals(problem, mesh, values, extras)
+    with np.errstate(invalid="ignore"):
+        count = int(np.argmin((np.abs(values) < _MODEST).all(axis=(1, 2, 3))))
+    tail = np.zeros(mesh.size)
+    if count:
+        tail[:count] = unresolved_signals(
+            problem, Mesh(mesh.edges[: count + 1], mesh.rule), values[:count],
+            tuple(e if e.shape[:2] == (1, 1) else e[:count] for e in extras),
+        )
+    return tail
 
 
 def wanted_parts(tail: Array, poor: BoolArray, tol: float, stages: int) -> IntArray:

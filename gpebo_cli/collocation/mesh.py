@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,6 +21,8 @@ _CHUNK = 1 << 22  # numbers gathered at once when sampling
 _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
 _MANY = 2000  # times, from which on sampling them by element pays
 _KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
+_JOINED = (2, 4, 8)  # as many elements become one
+_MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -68,6 +71,48 @@ class Mesh:
         edges = np.append(left, self.edges[-1])
         return Mesh(edges, self.rule), np.where(parts[parent] == 1, parent, -1)
 
+    def joined(
+        self, kinds: Sequence[Array], tol: float, keep: Array, longest: float = np.inf
+    ) -> Mesh:
+        """Neighbours of equal length joined where a polynomial over all of them does as well.
+
+        Compared at all points of the short elements, so that nothing they have seen is lost.
+
+        Args:
+            kinds: point values (K, s + 1, c) of signals of one kind each.
+            tol: by how much a value may change, relative to the signal's own size so far.
+            keep: edges (B,) that stay.
+            longest: no element is joined to one that is longer.
+
+        Returns:
+            this mesh itself, where nothing is joined.
+        """
+        cuts = np.searchsorted(self.edges, keep).tolist()
+        pieces = list(pairwise([0, *sorted(set(cuts) - {0, self.size}), self.size]))
+        values = np.concatenate([np.zeros((*self.points.shape, 0)), *kinds], axis=2)
+        counts = np.array([0, *(kind.shape[2] for kind in kinds)])
+        if len(pieces) > _MANY_PIECES:
+            return self
+        scale = _scale_so_far(values, counts[1:], np.full(len(kinds), _TINY))[:, None]
+        stays = np.ones(self.size + 1, dtype=bool)
+        for count in _JOINED:
+            first = np.concatenate([np.arange(a, b - count + 1, count) for a, b in pieces])
+            # What could not be joined to less will not be joined to more.
+            half = count // 2
+            inside = np.arange(1, half) if half > 1 else np.zeros(0, dtype=np.intp)
+            ready = ~stays[first[:, None] + np.concatenate([inside, half + inside])].any(axis=1)
+            first = first[ready & (count * self.steps[first] <= longest)]
+            together = first[:, None] + np.arange(count)
+            seen = values[together]  # (groups, count, s + 1, c)
+            flat = seen.reshape(len(first), count * seen.shape[2], seen.shape[3])
+            change = np.abs(joining_change(self.rule, count) @ flat).reshape(seen.shape)
+            change /= scale[together]
+            first = first[change.max(axis=(1, 2, 3), initial=0.0) <= tol]
+            if not len(first):
+                break
+            stays[first[:, None] + np.arange(1, count)] = False
+        return self if stays.all() else Mesh(self.edges[stays], self.rule)
+
     def sampler(self, t: Array, inside: Array | None = None) -> Sampler:
         """Interpolation from this mesh to the times ``t`` (N,).
 
@@ -104,6 +149,22 @@ class Mesh:
         weights[hit] = exact[hit]
         weights /= weights.sum(axis=1, keepdims=True)
         return Sampler(element, weights)
+
+
+@lru_cache(maxsize=64)
+def joining_change(rule: RadauRule, count: int) -> Array:
+    """By how much point values of ``count`` equal elements change if one polynomial replaces them.
+
+    Values at the points of the joined element are read from the polynomials of the short ones.
+    Shape (count (s + 1), count (s + 1)), for the point values one element after the other.
+    """
+    short = Mesh(np.arange(count + 1) / count, rule)
+    joined = Mesh(np.array([0.0, 1.0]), rule)
+    size = count * len(rule.points)
+    unit = np.eye(size).reshape(count, len(rule.points), size)
+    sampled = short.sampler(joined.points.ravel(), joined.inside.ravel())(unit)
+    there = joined.sampler(short.points.ravel())(sampled[None])
+    return np.asarray(there - np.eye(size))
 
 
 def _same(known: Array | None, asked: Array | None) -> bool:

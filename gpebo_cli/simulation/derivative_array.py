@@ -13,7 +13,7 @@ or M (x_1, …, x_{μ+1}) = N x_0 + g with M_ij = (j + 1) e_{i−j} − a_{i−j
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from gpebo_cli.systems.descriptor import Array, BoolArray, Coefficients, Descrip
 _PROBES = 65  # times at which the structure is established before anything is integrated
 _DIP = 0.2  # a singular value that falls below this share of its maximum is followed down
 _DIP_ROUNDS = 14
+_FALL = 1e-2  # towards an end of the horizon, singular values may fall to this share
 _DIP_POINTS = 17
 
 
@@ -75,11 +76,27 @@ class Structure:
     smallest_singular_value: float
     time_invariant: bool  # E and A are constant
     reference: Pivots | Bases  # of one time, to start from at the others
+    steady: bool  # no singular value behind the ranks comes near zero between the ends
+    # 1/s, Z1ᵀA T with [Z1ᵀE; Â2] T = [I; 0] at the probes (N or 1, d, d): z' = this z + … with
+    # z = Z1ᵀE x; None where it is not determined
+    dynamics: Array | None
 
     @property
     def index(self) -> int:
         """Differentiation index: 0 for an explicit ODE, else μ + 1."""
         return self.mu + 1 if self.a else 0
+
+    @property
+    def rate(self) -> float:
+        """How fast the differential part may change by itself at the probes, at most, 1/s."""
+        return np.inf if self.dynamics is None else float(_norm(self.dynamics).max())
+
+    @property
+    def growth(self) -> float:
+        """Largest real part of its eigenvalues at the probes, 1/s, or zero."""
+        if self.dynamics is None:
+            return 0.0
+        return float(np.linalg.eigvals(self.dynamics).real.max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +217,8 @@ def analyse(
         return Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
             smallest_singular_value=levels.least, time_invariant=invariant,
-            reference=reference,
+            reference=reference, steady=invariant or _steady(levels.smallest),
+            dynamics=None if levels.dynamics is None else levels.dynamics / scaling.time,
         )
     raise ModelError(
         f"{_who(system)} is not uniquely solvable, or its index is above {max_mu + 1}: with "
@@ -231,6 +249,7 @@ class _Levels:
     least: float = np.inf  # of those that were computed
     Z2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, (μ+1) n, a)
     T2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, n, d)
+    dynamics: Array | None = None  # in scaled time, see ``Structure``
 
 
 def _levels(
@@ -304,9 +323,12 @@ def _all_levels(
     Singular values are computed where a bound is small, or smallest.
     """
     if isinstance(reference, Bases):
-        return one
+        A2 = transpose(reference.Z2) @ derivative_array(e[:, :1], aa[:, :1], mu)[1]
+        whole = np.concatenate([transpose(reference.Z1) @ e[0, :1], A2], axis=1)
+        return replace(one, dynamics=_dynamics(reference.Z1[0], aa[0, :1], _inverse(whole)[0]))
     M, N = derivative_array(e, aa, mu)
     r = reference.rank
+    dynamics: Array | None = None
     M = M[:, reference.rows[:, None], reference.columns]
     N = N[:, reference.rows]
     bounds = np.full((len(t), 3), np.inf)
@@ -314,7 +336,8 @@ def _all_levels(
         inverse = np.asarray(np.linalg.inv(M[:, :r, :r]), dtype=np.float64)
         X = M[:, r:, :r] @ inverse
         whole = np.concatenate([reference.Z1.T @ e[0], N[:, r:] - X @ N[:, :r]], axis=1)
-        determined = _norm(np.asarray(np.linalg.inv(whole), dtype=np.float64))
+        states = np.asarray(np.linalg.inv(whole), dtype=np.float64)
+        determined, dynamics = _norm(states), _dynamics(reference.Z1, aa[0], states)
         size = _array_size(_norm(M), aa)
         left = _norm(M[:, r:, r:] - X @ M[:, :r, r:])
         if r:
@@ -331,7 +354,22 @@ def _all_levels(
     closer[len(t) // 2] = True  # of the reference, whose ranks the others must have
     exact = _levels(t[closer], e[:, closer], aa[:, closer], mu, rank_tol)
     bounds[closer] = exact.smallest
-    return _Levels(exact.a, bounds, exact.failure, float(exact.smallest.min()))
+    return _Levels(exact.a, bounds, exact.failure, float(exact.smallest.min()), dynamics=dynamics)
+
+
+def _dynamics(Z1: Array, A: Array, inverse: Array) -> Array | None:
+    """Z1ᵀA T (N, d, d), T being the first columns of the inverses (N, n, n), if it is finite."""
+    found = np.asarray(Z1.T @ A @ inverse[:, :, : Z1.shape[1]])
+    return found if np.isfinite(found).all() else None
+
+
+def _steady(smallest: Array) -> bool:
+    """Whether no column of the singular values or bounds (N, 3) has a dip between its ends."""
+    values = smallest[:, np.isfinite(smallest).all(axis=0)]
+    largest = values.max(axis=0)
+    inner = values[1:-1]
+    dips = (inner <= values[:-2]) & (inner <= values[2:]) & (inner < _DIP * largest)
+    return not dips.any() and bool((values >= _FALL * largest).all())
 
 
 def _norm(matrix: Array) -> Array:
@@ -417,9 +455,12 @@ _RESIDUAL = 1e-13  # rows that should vanish after elimination, relative to the 
 
 
 def reduce(
-    system: DescriptorSystem, structure: Structure, t: Array, inside: Array
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array,
+    c: Coefficients | None = None,
 ) -> StrangenessFree:
     """The strangeness-free equations at the times t (N,), one sweep over all of them.
+
+    ``c`` are the model's coefficients there to the order μ, where they are at hand.
 
     Elimination on the pivots of one reference time where that is well conditioned, singular
     vectors at the times where it is not.
@@ -428,7 +469,8 @@ def reduce(
         ModelError: a rank differs from that of ``structure``; names the time.
     """
     mu, scaling = structure.mu, structure.scaling
-    c = system.coefficients.taylor(t, mu, inside)
+    if c is None:
+        c = system.coefficients.taylor(t, mu, inside)
     f = forcing(c)
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]

@@ -22,9 +22,14 @@ from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.consistency import Jump, consistent_state, jump
 from gpebo_cli.simulation.derivative_array import StrangenessFree, Structure, analyse, reduce
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+from gpebo_cli.systems.descriptor import MATRIX_NAMES, Array, DescriptorSystem
+from gpebo_cli.systems.descriptor import Coefficients as ModelCoefficients
 
 _FIRST_ELEMENTS = 24  # of the first mesh: enough nodes to notice a pulse, few enough to be free
+_MARGIN = 0.1  # of the tolerance: by how much known functions have to be resolved when joined
+_SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
+_MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
+_NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +70,8 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     )
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
-    mesh = _inputs_resolved(system, mesh, solver)
-    first = reduce(system, structure, mesh.points.ravel(), mesh.inside.ravel())
+    mesh, c = _known_resolved(system, structure, mesh, cuts, solver)
+    first = reduce(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
     x0 = _initial_state(system, first)
 
     happened: dict[float, tuple[Array, Jump]] = {}
@@ -110,25 +115,79 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     )
 
 
-def _inputs_resolved(system: DescriptorSystem, mesh: Mesh, solver: SolverSettings) -> Mesh:
-    """The mesh with elements cut until the inputs are resolved, as far as cutting helps.
+def _known_resolved(
+    system: DescriptorSystem, structure: Structure, mesh: Mesh, cuts: Array,
+    solver: SolverSettings,
+) -> tuple[Mesh, ModelCoefficients]:
+    """The mesh that the known functions ask for, and all of them at its points.
 
-    The solution's mesh has to resolve them in any case, and evaluating an input costs next to
-    nothing beside solving for the state on elements that are too long.
+    Elements are cut until the inputs are resolved, as far as cutting helps: the solution's mesh
+    has to resolve them in any case, and evaluating an input costs next to nothing beside solving
+    for the state on elements that are too long. Where nothing needs the elements that short, they
+    are joined again: what is narrow has been looked for on the short ones. But not where the state
+    may grow or decay much within one of them: an element that does not resolve growth may hide it.
     """
-    if system.m == 0 or "u" in system.coefficients.constant or solver.name == "ivp":
-        return mesh
-    before = np.full(mesh.size, np.inf)
-    while True:
-        u = system.coefficients.taylor(mesh.points.ravel(), 0, mesh.inside.ravel()).u[0]
-        tail = unresolved(u.reshape(*mesh.points.shape, -1), mesh.rule)
+    def evaluated(mesh: Mesh) -> ModelCoefficients:
+        return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
+
+    longest = _SHORT / max(structure.rate, float(np.finfo(float).tiny))
+    if solver.name != "ivp" and mesh.steps.max() > longest:
+        mesh = _growth_resolved(structure, mesh, solver)
+    c = evaluated(mesh)
+    if solver.name == "ivp":
+        return mesh, c
+    given, before = mesh, np.full(mesh.size, np.inf)
+    while system.m and "u" not in system.coefficients.constant:
+        tail = unresolved(c.u[0].reshape(*mesh.points.shape, -1), mesh.rule)
         poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
         parts = wanted_parts(tail, poor, solver.tol, mesh.rule.stages)
         too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
         if not poor.any() or too_short.any() or parts.sum() > solver.max_elements:
-            return mesh
+            break
         before = np.repeat(tail, parts)
         mesh, _ = mesh.split(parts)
+        c = evaluated(mesh)
+    if mesh is not given or not structure.steady:
+        return mesh, c
+    if 2.0 * float(mesh.steps.min()) > longest:
+        return mesh, c
+    kinds = _known_kinds(system, c, mesh)
+    joined = mesh.joined(kinds, _MARGIN * solver.tol, cuts, longest)
+    return (mesh, c) if joined is mesh else (joined, evaluated(joined))
+
+
+def _growth_resolved(structure: Structure, mesh: Mesh, solver: SolverSettings) -> Mesh:
+    """The mesh with elements short enough for the state not to grow much within one.
+
+    An element that is too long damps what it does not resolve. A state that has become small would
+    never be seen to grow again: its error is invisible beside the size it once had.
+    """
+    parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / _SHORT)))
+    n = structure.d + structure.a
+    if parts.sum() > min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements / 2):
+        return mesh
+    return mesh.split(parts.astype(np.intp))[0]
+
+
+def _known_kinds(system: DescriptorSystem, c: ModelCoefficients, mesh: Mesh) -> list[Array]:
+    """Every function of the model with its derivatives, (K, s + 1, c) each.
+
+    Reciprocals of what E holds are among them: the state sees those, and they may be harder to
+    resolve by far.
+    """
+    kinds: list[Array] = []
+    for name in MATRIX_NAMES:
+        values = getattr(c, name)
+        if name in system.coefficients.constant or not values[0].size:
+            continue
+        flat = values.reshape(len(values), *mesh.points.shape, -1)
+        size = np.abs(flat[0])
+        moving = np.ptp(flat[0], axis=(0, 1)) > 0.0
+        kinds += list(flat[..., moving])
+        if name == "E":
+            away = moving & (size.min(axis=(0, 1)) > _NEAR_ZERO * size.max(axis=(0, 1)))
+            kinds.append(1.0 / flat[0][..., away])
+    return [kind for kind in kinds if kind.shape[2]]
 
 
 def _equations(reduced: StrangenessFree) -> Coefficients:
