@@ -13,6 +13,7 @@ import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
+from functools import lru_cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from gpebo_cli.errors import ConfigError
@@ -61,7 +62,7 @@ def read(cls: type[T], mapping: object, where: str) -> T:
         raise ConfigError(f"{where}: expected a mapping of keys to values, got {shown(mapping)}")
     if not is_dataclass(cls):
         raise TypeError(f"{cls!r} is not a dataclass")
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     by_key = {field.metadata.get("key", field.name): field for field in fields(cls)}
     for key in mapping:
         if key not in by_key:
@@ -76,6 +77,12 @@ def read(cls: type[T], mapping: object, where: str) -> T:
         elif field.default is MISSING and field.default_factory is MISSING:
             raise ConfigError(f"{where}.{key} is missing; it has no default")
     return cls(**values)
+
+
+@lru_cache(maxsize=64)
+def _hints(cls: type) -> dict[str, Any]:
+    """Types of a class's fields: annotations are text, which is compiled to read it."""
+    return typing.get_type_hints(cls)
 
 
 def convert(value: object, kind: Any, where: str) -> Any:

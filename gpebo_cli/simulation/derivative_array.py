@@ -539,7 +539,10 @@ def _inverse(whole: Array) -> tuple[Array, BoolArray]:
         for k, one in enumerate(whole):
             with suppress(np.linalg.LinAlgError):
                 inverse[k] = np.linalg.inv(one)
-    return inverse, np.asarray(~np.isfinite(inverse).all(axis=(1, 2)))
+    finite = np.isfinite(inverse)
+    if finite.all():
+        return inverse, np.zeros(len(inverse), dtype=bool)
+    return inverse, np.asarray(~finite.all(axis=(1, 2)))
 
 
 def _by_elimination(
