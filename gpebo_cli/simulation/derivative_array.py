@@ -77,9 +77,8 @@ class Structure:
     time_invariant: bool  # E and A are constant
     reference: Pivots | Bases  # of one time, to start from at the others
     steady: bool  # no singular value behind the ranks comes near zero between the ends
-    # 1/s, Z1ᵀA T with [Z1ᵀE; Â2] T = [I; 0] at the probes (N or 1, d, d): z' = this z + … with
-    # z = Z1ᵀE x; None where it is not determined
-    dynamics: Array | None
+    # z' = this z + … with z = Z1ᵀE x: Z1ᵀA T, [Z1ᵀE; Â2] T = [I; 0]; None where not determined
+    dynamics: Array | None  # (N or 1, d, d) at the probes, 1/s
 
     @property
     def index(self) -> int:
@@ -157,12 +156,11 @@ def balance(c: Coefficients) -> Scaling:
     """Scalings that bring the rows and columns of E/τ and A to comparable size over time."""
     E, A = np.abs(c.E[0]).max(axis=0), np.abs(c.A[0]).max(axis=0)
     rows, columns, tau = np.ones(len(E)), np.ones(len(E)), 1.0
-    if not E.any() or not A.any():
-        tau = 1.0
+    both = bool(E.any() and A.any())
     for _ in range(4):
-        weight = rows[:, None] * columns
-        if E.any() and A.any():
-            tau = float(np.linalg.norm(E * weight) / np.linalg.norm(A * weight))
+        if both:
+            scaled_E, scaled_A = rows[:, None] * E * columns, rows[:, None] * A * columns
+            tau = float(np.sqrt(np.vdot(scaled_E, scaled_E) / np.vdot(scaled_A, scaled_A)))
         W = E / tau + A
         rows = _reciprocal((W * columns).max(axis=1))
         columns = _reciprocal((W * rows[:, None]).max(axis=0))
@@ -170,7 +168,7 @@ def balance(c: Coefficients) -> Scaling:
 
 
 def _reciprocal(x: Array) -> Array:
-    return np.where(x > 0, 1.0 / np.where(x > 0, x, 1.0), 1.0)
+    return 1.0 / np.where(x > 0, x, 1.0)
 
 
 def _power_of_two(x: Array) -> Array:
@@ -249,7 +247,7 @@ class _Levels:
     least: float = np.inf  # of those that were computed
     Z2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, (μ+1) n, a)
     T2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, n, d)
-    dynamics: Array | None = None  # in scaled time, see ``Structure``
+    dynamics: Array | None = None  # (N or 1, d, d) in scaled time, see ``Structure``
 
 
 def _levels(

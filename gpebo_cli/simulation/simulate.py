@@ -26,7 +26,8 @@ from gpebo_cli.systems.descriptor import MATRIX_NAMES, Array, DescriptorSystem
 from gpebo_cli.systems.descriptor import Coefficients as ModelCoefficients
 
 _FIRST_ELEMENTS = 24  # of the first mesh: enough nodes to notice a pulse, few enough to be free
-_MARGIN = 0.1  # of the tolerance: by how much known functions have to be resolved when joined
+_MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
+# of them takes more degrees
 _SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
