@@ -53,9 +53,9 @@ def determinant_and_quotient(omega: Array, rhs: Array) -> tuple[Array, Array, Bo
         both = np.concatenate([unit, rhs[usable]], axis=-1)
         solved = np.linalg.solve(square, both)
         quotient[usable] = solved[..., p:]
-        condition = (
-            np.linalg.norm(square, axis=(-2, -1)) * np.linalg.norm(solved[..., :p], axis=(-2, -1))
-        )
+        with np.errstate(over="ignore", invalid="ignore"):  # where Ω is 1e-160, that is singular
+            inverse = np.linalg.norm(solved[..., :p], axis=(-2, -1))
+            condition = np.linalg.norm(square, axis=(-2, -1)) * inverse
         usable[usable] = condition * SINGULAR < 1.0  # False for nan, too
     return delta, quotient, usable
 
