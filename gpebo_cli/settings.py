@@ -14,13 +14,13 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class TimeSettings:
-    """The experiment runs on [start, start + horizon]; ``samples`` is the output grid only.
+    """The experiment runs on [start, start + horizon], in seconds; ``samples`` is the output grid.
 
     With a recording, a start of −∞ is its first sample and a horizon of ∞ lasts to its last one.
     """
 
-    start: float = 0.0
-    horizon: float = 20.0
+    start: float = 0.0  # seconds
+    horizon: float = 20.0  # seconds
     samples: int = 1001
 
 
@@ -60,9 +60,9 @@ class ObserverSettings:
     # of output_injection: n rows, as many columns as outputs, numbers or expressions of t; None:
     # from a Riccati equation.
     injection: list[list[float | str]] | None = None
-    # of reset: every so many seconds, and at these times; neither: where Φ has grown a hundredfold.
-    reset_interval: float | None = None
-    reset_times: list[float] = field(default_factory=list)
+    # of reset: at intervals, and at these times; neither: where Φ has grown a hundredfold.
+    reset_interval: float | None = None  # seconds
+    reset_times: list[float] = field(default_factory=list)  # seconds
     reset_keep: float = 1.0  # share of what is known that counts after a reset; 0: learn anew
     # canonical: the output that Proposition 4 rests on (None: the first that fits), its gain
     # (diagonal, remark4, or two expressions of t) and the start of its state.
@@ -79,9 +79,8 @@ class ObserverSettings:
     # Where the noise leaves measurements exact: standard deviation of the noise assumed instead,
     # relative to each one's own size, at the noise's sample time.
     regularisation: float = 1e-3
-    # Seconds between samples of an observer in discrete time, and what it assumes between them;
-    # None: continuous time.
-    sample_time: float | None = None
+    # Between samples of an observer in discrete time (None: continuous), and what it assumes there.
+    sample_time: float | None = None  # seconds
     hold: Literal["zoh", "linear"] = "zoh"
 
 

@@ -144,3 +144,32 @@ def test_the_packages_own_example_runs(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "first" / "summary.json").is_file()
+
+
+MATHEMATICS = [
+    name for name in MODULES
+    if re.fullmatch(
+        r"gpebo_cli\.(estimators\.[a-z]\w+|observers\.[a-z]\w+|simulation\.\w+|collocation\.\w+"
+        r"|excitation|metrics|regression|measurement|linalg)", name,
+    )
+]
+EQUATION = re.compile(r"\S ?[=≤≥→⇒] ?\S|∫")
+
+
+@pytest.mark.parametrize("name", MATHEMATICS)
+def test_mathematics_says_its_equations(name):
+    """In the docstring of the module or in those of what is in it."""
+    docs = [inspect.getdoc(importlib.import_module(name)) or ""]
+    docs += [inspect.getdoc(found) or "" for key, found in MEMBERS.items() if key.startswith(name)]
+    assert EQUATION.search("\n".join(docs)), name
+
+
+def test_settings_that_are_times_say_their_unit():
+    lines = (PACKAGE / "settings.py").read_text().splitlines()
+    fields = [line.strip() for line in lines if re.match(r"    \w+: ", line)]
+    times = [
+        line for line in fields
+        if re.match(r"(start|horizon|window|sample_time|\w*_(interval|times|time)):", line)
+    ]
+    assert len(times) >= 7
+    assert [line for line in times if "seconds" not in line.partition("#")[2]] == []

@@ -1,4 +1,7 @@
-"""What every observer is told: where its extension starts, and how much each output counts."""
+"""What every observer is told: where its extension starts, and how much each output counts.
+
+ξ_a(start) = V1 ξ_a0, and with weights w the outputs are √(w/max w) y = √(w/max w) C x.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,10 @@
 """The GPEBO observer at samples, as a controller runs it: from one sample to the next.
 
-The state of the recursion is [ξ_a | ξ_b | Φ]. Between two samples u and y are what the hold rule
+The state of the recursion is W = [ξ_a | ξ_b | Φ]; from t_k to t_{k+1}, with the u and y of the hold,
+
+    W' = A_0 W + [b_0 | D_0 | 0],      Y_{k+1} = ψ_{k+1} η.
+
+Between two samples u and y are what the hold rule
 makes of them, and the dynamic extension is carried over by the same collocation as in continuous
 time; ψ and Y are then those of the new sample. What remains is the error of the hold: order 1 in
 the time between samples for zoh, order 2 for linear. Nothing grows with the number of samples.
