@@ -1,6 +1,6 @@
 """The GPEBO observer at samples, as a controller runs it: from one sample to the next.
 
-The state of the recursion is W = [ξ_a | ξ_b | Φ]; from t_k to t_{k+1}, with the u and y of the hold,
+The state of the recursion is W = [ξ_a | ξ_b | Φ]; between samples, with the u and y of the hold,
 
     W' = A_0 W + [b_0 | D_0 | 0],      Y_{k+1} = ψ_{k+1} η.
 
