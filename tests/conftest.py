@@ -1,8 +1,14 @@
-"""Compare pictures in every run of the tests, where pytest-mpl is installed."""
+"""Pictures are compared in every run of the tests; how slow the machine is says nothing of us."""
 
 from __future__ import annotations
 
+import hypothesis
 import pytest
+
+hypothesis.settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("any machine")
 
 
 @pytest.hookimpl(tryfirst=True)
