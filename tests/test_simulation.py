@@ -336,3 +336,20 @@ def test_a_state_that_almost_vanishes_is_seen_to_return(horizon, tol):
     error = np.abs(result.signals.states(t)[:, 0] - np.exp(10 * np.sin(t))).max() / np.exp(10)
     assert error < tol
     assert error < 10 * max(result.error_estimate, tol)
+
+
+@pytest.mark.parametrize("width", [0.003, 0.01])
+@pytest.mark.parametrize("when", [0.777, 9.31, 17.123])
+def test_what_stands_between_the_nodes_is_seen(when, width):
+    """Pulses much narrower than the distance of the first nodes, of an input and of a matrix."""
+    pulse = f"exp(-((t - {when})/{width})**2)"
+    system = plant_from_mapping({
+        "name": "pulses", "states": ["x1", "x2"], "inputs": {"u": f"1e-3*sin(t) + {pulse}"},
+        "E": [[1, 0], [0, 1]], "A": [[0, 0], [0, f"-100*{pulse}"]], "B": [[1], [0]],
+        "initial_state": [0, 1],
+    })
+    result = simulate(system, TimeSettings(horizon=20.0), SolverSettings())
+    area = width * np.sqrt(np.pi)
+    x1, x2 = result.signals.states(np.array([20.0]))[0]
+    assert x1 == pytest.approx(area + 1e-3 * (1 - np.cos(20.0)), rel=1e-10)
+    assert x2 == pytest.approx(np.exp(-100 * area), rel=1e-10)

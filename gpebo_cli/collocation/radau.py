@@ -41,6 +41,10 @@ class RadauRule:
         """Order of the values at element ends."""
         return 2 * self.stages - 1
 
+    def interpolation(self, places: Array) -> Array:
+        """From values at ``points`` to those at ``places`` (M,) in [0, 1], shape (M, s + 1)."""
+        return legendre.legvander(2.0 * places - 1.0, self.stages) @ self.to_legendre
+
 
 @lru_cache(maxsize=16)
 def radau_rule(stages: int) -> RadauRule:

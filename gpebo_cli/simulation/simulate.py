@@ -22,7 +22,7 @@ from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.consistency import Jump, consistent_state, jump
 from gpebo_cli.simulation.derivative_array import StrangenessFree, Structure, analyse, reduce
-from gpebo_cli.systems.descriptor import MATRIX_NAMES, Array, DescriptorSystem
+from gpebo_cli.systems.descriptor import MATRIX_NAMES, Array, BoolArray, DescriptorSystem
 from gpebo_cli.systems.descriptor import Coefficients as ModelCoefficients
 
 _FIRST_ELEMENTS = 24  # of the first mesh: enough nodes to notice a pulse, few enough to be free
@@ -30,6 +30,10 @@ _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when j
 # of them takes more degrees
 _SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
+_LOOKS = 40  # times within each first element at which known functions are looked at once more
+_MOST_LOOKS = 1 << 16
+_SURPRISE = 100.0  # times what the nodes let expect: then something stands between them
+_LOOK_ROUNDS = 8
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
 
 
@@ -137,7 +141,14 @@ def _known_resolved(
     c = evaluated(mesh)
     if solver.name == "ivp":
         return mesh, c
-    given, before = mesh, np.full(mesh.size, np.inf)
+    given = mesh
+    for _ in range(_LOOK_ROUNDS):
+        overlooked = _overlooked(system, c, mesh, solver.tol)
+        if not overlooked.any():
+            break
+        mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
+        c = evaluated(mesh)
+    before = np.full(mesh.size, np.inf)
     while system.m and "u" not in system.coefficients.constant:
         tail = unresolved(c.u[0].reshape(*mesh.points.shape, -1), mesh.rule)
         poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
@@ -155,6 +166,38 @@ def _known_resolved(
     kinds = _known_kinds(system, c, mesh)
     joined = mesh.joined(kinds, _MARGIN * solver.tol, cuts, longest)
     return (mesh, c) if joined is mesh else (joined, evaluated(joined))
+
+
+def _overlooked(
+    system: DescriptorSystem, c: ModelCoefficients, mesh: Mesh, tol: float
+) -> BoolArray:
+    """Elements (K,) with something narrow between their nodes, a pulse of an input for instance.
+
+    What the nodes do not see leaves no trace in Legendre coefficients. So every known function is
+    looked at in between, and an element is suspected where it is far from what the coefficients
+    make one expect.
+    """
+    looks = min(_LOOKS, _MOST_LOOKS // mesh.size)
+    names = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
+    found = np.zeros(mesh.size, dtype=bool)
+    if looks == 0 or not names:
+        return found
+    places = (np.arange(looks) + 0.5) / looks
+    between = mesh.rule.interpolation(places)
+    t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
+    seen = system.coefficients.taylor(t.ravel(), 0)
+    for name in names:
+        nodal = getattr(c, name)[0].reshape(*mesh.points.shape, -1)
+        actual = getattr(seen, name)[0].reshape(mesh.size, looks, -1)
+        moving = (np.ptp(nodal, axis=(0, 1)) > 0.0) | (np.ptp(actual, axis=(0, 1)) > 0.0)
+        nodal, actual = nodal[..., moving], actual[..., moving]
+        if not nodal.size:
+            continue
+        size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodal).max(axis=(0, 1)))
+        missed = (np.abs(between @ nodal - actual).max(axis=1) / size).max(axis=1)
+        expected = np.maximum(unresolved(nodal, mesh.rule), max(tol, 1e-12))
+        found |= missed > _SURPRISE * expected
+    return found
 
 
 def _growth_resolved(structure: Structure, mesh: Mesh, solver: SolverSettings) -> Mesh:
