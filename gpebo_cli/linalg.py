@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.systems.descriptor import Array
 
 
@@ -68,9 +69,9 @@ _SCAN_LIMIT = 1 << 11  # above this many parallel recurrences a plain loop over 
 def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
     """All z_k of z_{k+1} = a_k z_k + b_k along axis 0.
 
-    For few recurrences a parallel prefix scan: it composes neighbouring affine maps in log2(K)
-    vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the recurrence. For
-    many, the recurrence itself, each step vectorised over all of them.
+    In NumPy, for few recurrences a parallel prefix scan: it composes neighbouring affine maps in
+    log2(K) vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the
+    recurrence. For many, the recurrence itself, each step vectorised over all of them.
 
     Args:
         factor: a, shape (K, ...), broadcastable against ``shift``.
@@ -81,6 +82,14 @@ def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
         z_0 … z_K, shape (K + 1, ...).
     """
     shape = np.broadcast_shapes(factor.shape, shift.shape)
+    if kernels.compiled is not None:
+        lanes = (shape[0], int(np.prod(shape[1:])))
+        z: Array = kernels.compiled.affine_scan(
+            np.broadcast_to(factor, shape).reshape(lanes),
+            np.broadcast_to(shift, shape).reshape(lanes),
+            np.broadcast_to(np.asarray(start, dtype=np.float64), shape[1:]).reshape(lanes[1]),
+        )
+        return z.reshape(shape[0] + 1, *shape[1:])
     out = np.empty((shape[0] + 1, *shape[1:]))
     out[0] = start
     if np.prod(shape[1:], dtype=np.int64) > _SCAN_LIMIT:

@@ -1,0 +1,113 @@
+#include "common.h"
+
+#include <stdarg.h>
+
+int begin(Call *call, PyObject *const *given, Py_ssize_t count, Py_ssize_t expected)
+{
+    call->given = given;
+    call->count = count;
+    call->used = 0;
+    if (count == expected)
+        return 1;
+    PyErr_Format(PyExc_TypeError, "%zd arguments, expected %zd", count, expected);
+    return 0;
+}
+
+static PyArrayObject *keep(Call *call, PyObject *made)
+{
+    if (made == NULL)
+        return NULL;
+    if (call->used == MOST_HELD) {
+        Py_DECREF(made);
+        PyErr_SetString(PyExc_SystemError, "a kernel holds too many arrays");
+        return NULL;
+    }
+    call->held[call->used++] = made;
+    return (PyArrayObject *)made;
+}
+
+static PyArrayObject *argument(Call *call, Py_ssize_t place, int axes, int type)
+{
+    PyObject *given = call->given[place];
+    if (!PyArray_Check(given) || PyArray_NDIM((PyArrayObject *)given) != axes ||
+        PyArray_TYPE((PyArrayObject *)given) != type) {
+        PyErr_Format(PyExc_TypeError, "argument %zd must be an array of %s with %d axes", place,
+                     type == NPY_DOUBLE ? "float64" : "intp", axes);
+        return NULL;
+    }
+    return keep(call, PyArray_FROM_OF(given, NPY_ARRAY_CARRAY_RO));
+}
+
+PyArrayObject *doubles(Call *call, Py_ssize_t place, int axes)
+{
+    return argument(call, place, axes, NPY_DOUBLE);
+}
+
+PyArrayObject *indices(Call *call, Py_ssize_t place, int axes)
+{
+    return argument(call, place, axes, NPY_INTP);
+}
+
+PyArrayObject *fresh(Call *call, int axes, const npy_intp *shape)
+{
+    return keep(call, PyArray_SimpleNew(axes, (npy_intp *)shape, NPY_DOUBLE));
+}
+
+PyArrayObject *zeros(Call *call, int axes, const npy_intp *shape)
+{
+    return keep(call, PyArray_ZEROS(axes, (npy_intp *)shape, NPY_DOUBLE, 0));
+}
+
+double *scratch(Call *call, size_t numbers)
+{
+    npy_intp length = numbers ? (npy_intp)numbers : 1;
+    PyArrayObject *memory = fresh(call, 1, &length);
+    return memory == NULL ? NULL : data(memory);
+}
+
+int *integers(Call *call, size_t numbers)
+{
+    npy_intp length = numbers ? (npy_intp)numbers : 1;
+    PyArrayObject *memory = keep(call, PyArray_SimpleNew(1, &length, NPY_INT));
+    return memory == NULL ? NULL : (int *)PyArray_DATA(memory);
+}
+
+static void release(Call *call)
+{
+    while (call->used)
+        Py_DECREF(call->held[--call->used]);
+}
+
+PyObject *failed(Call *call)
+{
+    release(call);
+    return NULL;
+}
+
+PyObject *results(Call *call, int count, ...)
+{
+    PyObject *answer = NULL;
+    va_list list;
+    va_start(list, count);
+    if (count == 1) {
+        answer = va_arg(list, PyObject *);
+        Py_INCREF(answer);
+    } else if ((answer = PyTuple_New(count)) != NULL) {
+        for (int i = 0; i < count; i++) {
+            PyObject *one = va_arg(list, PyObject *);
+            Py_INCREF(one);
+            PyTuple_SetItem(answer, i, one);
+        }
+    }
+    va_end(list);
+    release(call);
+    return answer;
+}
+
+int same(const char *what, npy_intp one, npy_intp other)
+{
+    if (one == other)
+        return 1;
+    PyErr_Format(PyExc_ValueError, "%s: %zd and %zd", what, (Py_ssize_t)one, (Py_ssize_t)other);
+    return 0;
+}

@@ -1,0 +1,55 @@
+"""The compiled kernels against the lines of NumPy that they stand for.
+
+``by_both`` computes something with the kernels and without them. Where nothing could be compiled
+these tests say so and are skipped, unless ``GPEBO_KERNELS=compiled`` asks for the kernels.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gpebo_cli import kernels
+from gpebo_cli.linalg import affine_scan
+
+needed = os.environ.get("GPEBO_KERNELS") == "compiled"
+pytestmark = pytest.mark.skipif(
+    kernels.compiled is None and not needed, reason="the kernels are not compiled"
+)
+COMPILED: Any = kernels.compiled
+
+
+def by_both(compute: Callable[[], Any]) -> tuple[Any, Any]:
+    """What ``compute`` returns with the kernels, and without."""
+    with_kernels = compute()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "compiled", None)
+        return with_kernels, compute()
+
+
+def test_kernels_are_there_where_they_were_asked_for():
+    assert kernels.compiled is not None
+
+
+@given(st.integers(0, 40), st.integers(1, 4), st.booleans(), st.integers(0, 2**32 - 1))
+def test_affine_scan(steps, lanes, shared, seed):
+    rng = np.random.default_rng(seed)
+    factor = rng.uniform(0, 1, (steps, 1 if shared else lanes))
+    shift, start = rng.normal(size=(steps, lanes)), rng.normal(size=lanes)
+    one, other = by_both(lambda: affine_scan(factor, shift, start))
+    np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
+def test_a_kernel_refuses_arrays_that_do_not_fit():
+    with pytest.raises(TypeError, match="argument 0 must be an array of float64 with 2 axes"):
+        COMPILED.affine_scan(np.zeros(3), np.zeros((3, 1)), np.zeros(1))
+    with pytest.raises(ValueError, match="steps of factor and shift: 2 and 3"):
+        COMPILED.affine_scan(np.zeros((2, 1)), np.zeros((3, 1)), np.zeros(1))
+    with pytest.raises(TypeError, match="2 arguments, expected 3"):
+        COMPILED.affine_scan(np.zeros((2, 1)), np.zeros((3, 1)))
