@@ -1,14 +1,6 @@
-"""The compiled kernels against the lines of NumPy that they stand for.
-
-``by_both`` computes something with the kernels and without them. Where nothing could be compiled
-these tests say so and are skipped, unless ``GPEBO_KERNELS=compiled`` asks for the kernels.
-"""
+"""The compiled kernels against the lines of NumPy that they stand for: linalg, and what all share."""
 
 from __future__ import annotations
-
-import os
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,20 +9,9 @@ from hypothesis import strategies as st
 
 from gpebo_cli import kernels
 from gpebo_cli.linalg import affine_scan
+from tests.kernel_paths import COMPILED, by_both, needs_kernels
 
-needed = os.environ.get("GPEBO_KERNELS") == "compiled"
-pytestmark = pytest.mark.skipif(
-    kernels.compiled is None and not needed, reason="the kernels are not compiled"
-)
-COMPILED: Any = kernels.compiled
-
-
-def by_both(compute: Callable[[], Any]) -> tuple[Any, Any]:
-    """What ``compute`` returns with the kernels, and without."""
-    with_kernels = compute()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "compiled", None)
-        return with_kernels, compute()
+pytestmark = needs_kernels
 
 
 def test_kernels_are_there_where_they_were_asked_for():

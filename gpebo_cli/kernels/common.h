@@ -76,6 +76,7 @@ static inline void multiply(double *restrict C, const double *restrict A,
 }
 
 /* Kernels of one subject each; a file is added to the module in module.c. */
-extern PyMethodDef linear_kernels[];
+extern PyMethodDef linear_kernels[], jets_kernels[], mesh_kernels[], structure_kernels[],
+    collocation_kernels[], observer_kernels[], estimation_kernels[];
 
 #endif
