@@ -6,13 +6,14 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
 	&& { command -v $$p; break; }; done)
 
-.PHONY: help run test lint types layers wheel docs bench clean
+.PHONY: help run test lint types layers kernels wheel docs bench clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make run      set up, then the main job: gpebo run plant=circuit estimator=drem'
 	@echo 'make test     set up, then the tests'
 	@echo 'make lint types layers    ruff, mypy, import-linter'
+	@echo 'make kernels  compile gpebo_cli/kernels again, after a change of the C'
 	@echo 'make wheel    dist/gpebo-*.whl'
 	@echo 'make docs     site/index.html, the documentation; the notebook is run'
 	@echo 'make bench    docs/benchmarks.md, measured afresh; about ten minutes'
@@ -32,6 +33,10 @@ types: $(VENV)/installed-dev
 
 layers: $(VENV)/installed-dev
 	$(BIN)/lint-imports
+
+# pip has compiled them once, with the package.
+kernels: $(VENV)/installed-dev
+	$(BIN)/python hatch_build.py -Werror
 
 wheel: $(VENV)/installed-dev
 	$(BIN)/python -m build --wheel --no-isolation

@@ -28,14 +28,21 @@ class KernelsHook(BuildHookInterface):  # type: ignore[type-arg]
         except Exception as error:  # noqa: BLE001  no compiler, no headers: all the same to us
             self.app.display_warning(f"the kernels were not compiled ({error}); NumPy does it")
             return
-        target = FOLDER / built.name
         if version == "editable":
-            (Path(self.root) / target).write_bytes(built.read_bytes())
-        build_data["force_include"][str(built)] = target.as_posix()
+            into_checkout(Path(self.root), built)
+        build_data["force_include"][str(built)] = (FOLDER / built.name).as_posix()
         build_data["pure_python"] = False
         python = "cp{}{}".format(*STABLE_SINCE)
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["tag"] = f"{python}-abi3-{platform}"
+
+
+def into_checkout(root: Path, built: Path) -> None:
+    """Put the module beside its sources; processes that have loaded the old one keep it."""
+    target = root / FOLDER / built.name
+    beside = target.with_suffix(".new")
+    beside.write_bytes(built.read_bytes())
+    beside.replace(target)
 
 
 def compile_kernels(root: Path, *options: str) -> Path:
@@ -67,3 +74,8 @@ def compile_kernels(root: Path, *options: str) -> Path:
     command.ensure_finalized()
     command.run()
     return Path(command.get_ext_fullpath(extension.name))
+
+
+if __name__ == "__main__":  # `make kernels`, after a change of the C
+    here = Path(__file__).parent
+    into_checkout(here, compile_kernels(here, *sys.argv[1:]))

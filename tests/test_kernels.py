@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gpebo_cli import kernels
 from gpebo_cli.linalg import affine_scan
-from tests.kernel_paths import COMPILED, by_both, needs_kernels
+from kernel_paths import COMPILED, by_both, needs_kernels
 
 pytestmark = needs_kernels
 
