@@ -21,6 +21,7 @@ from typing import Any
 from benchmarks import circuit, cold, floor, gains, growth, problems, sweeps
 from benchmarks.measure import Row
 from benchmarks.page import PARTS, page
+from gpebo_cli import kernels
 
 ROOT = Path(__file__).parent.parent
 JSON = ROOT / "outputs" / "benchmarks.json"
@@ -68,6 +69,7 @@ def environment() -> dict[str, Any]:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
+    versions["kernels"] = kernels.kind()
     machine = f"{_cpu()}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}"
     return {
         "date": date.today().isoformat(),  # noqa: DTZ011  the reader's own calendar

@@ -11,7 +11,16 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.circuit import OURS, TARGET, DiffraxPeer, optimised, ours, scipy_peer, truth
+from benchmarks.circuit import (
+    OURS,
+    TARGET,
+    DiffraxPeer,
+    optimised,
+    ours,
+    scipy_peer,
+    script,
+    truth,
+)
 from benchmarks.measure import Array, Row, Solve, compare, decades, loosest
 
 COUNT = 1000
@@ -39,12 +48,13 @@ def rows() -> list[Row]:
     mine = loosest(all_gains, OURS, error, TARGET)
     row = partial(
         compare, "circuit, 1,000 gains", mine, tolerances=decades(-9, -13), error=error,
-        target=TARGET, budget=5.0, patience=60.0,
+        target=TARGET, budget=5.0, patience=120.0,
     )
     table = [
-        row(peer=f"scipy {method}, optimised, × 1,000",
-            prepare=scipy_peer(method, optimised, some(10)), scale=COUNT / 10)
-        for method in ("LSODA", "BDF")
+        row(peer=f"scipy {method}, {how}, × 1,000",
+            prepare=scipy_peer(method, right, some(10)), scale=COUNT / 10)
+        for method in ("LSODA", "BDF", "Radau")
+        for how, right in (("script", script), ("optimised", optimised))
     ]
     return [
         *table,

@@ -1,4 +1,4 @@
-"""The compiled kernels against the lines of NumPy that they stand for: linalg, and what all share."""
+"""The compiled kernels against the NumPy that they stand for: linalg, and what all share."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kernel_paths import COMPILED, by_both, needs_kernels
 
 from gpebo_cli import kernels
 from gpebo_cli.linalg import affine_scan
-from kernel_paths import COMPILED, by_both, needs_kernels
 
 pytestmark = needs_kernels
 

@@ -17,8 +17,14 @@ from types import ModuleType
 _CHOICE = "GPEBO_KERNELS"
 
 compiled: ModuleType | None = None
+"""The kernels, or None: look it up at every call, tests switch it off."""
 if os.environ.get(_CHOICE, "compiled") != "numpy":
     try:
         compiled = import_module("gpebo_cli.kernels._compiled")
     except ImportError:  # nothing was compiled when the package was built
         compiled = None
+
+
+def kind() -> str:
+    """What does the inner loops of this process: ``compiled`` or ``numpy``."""
+    return "numpy" if compiled is None else "compiled"

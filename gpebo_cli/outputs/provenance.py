@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from gpebo_cli import kernels
 from gpebo_cli._version import __version__
 
 PACKAGES = ("numpy", "scipy", "pandas", "hydra-core", "omegaconf", "matplotlib")
@@ -36,9 +37,10 @@ def provenance() -> Provenance:
 
 
 def package_versions() -> dict[str, str | None]:
-    """Version of this package, of Python and of each of :data:`PACKAGES`."""
+    """Version of this package, its kernels' kind, of Python and of each of :data:`PACKAGES`."""
     versions: dict[str, str | None] = {
         "gpebo": __version__,
+        "kernels": kernels.kind(),
         "python": platform.python_version(),
     }
     for name in PACKAGES:
