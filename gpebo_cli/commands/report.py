@@ -7,7 +7,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from threading import Timer
 from time import monotonic
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from gpebo_cli.commands import interrupts
@@ -34,12 +33,7 @@ class Progress:
             self._timer.start()  # says something even if the first stage takes for ever
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._timer.cancel()
 
     def __call__(self, stage: str) -> None:

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from threading import Event, Thread
 from time import monotonic
-from types import TracebackType
 from typing import Self
 
 from gpebo_cli.commands.sweep_folder import RESULT, Plan, job_folder, read_record
@@ -40,12 +39,7 @@ class Bar:
             self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._terminal:
             self._end.set()
             self._thread.join()
