@@ -1,4 +1,4 @@
-"""Table and figure of ``docs/howto/kalman.md``: ``python docs/kalman.py``.
+"""Tables and figure of ``docs/howto/kalman.md``: ``python docs/kalman.py``.
 
 GPEBO against the Kalman-Bucy filter, with and without noise, with uniform observability and
 without it. Errors are those of the differential states over the last quarter of the horizon, root
@@ -25,7 +25,7 @@ from gpebo_cli.systems.plant import plant_from_mapping
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "howto" / "kalman.md"
-BEGIN, END = "<!-- table: python docs/kalman.py -->\n", "<!-- end of table -->\n"
+BEGIN, END = "<!-- {}: python docs/kalman.py -->\n", "<!-- end of {} -->\n"
 SEEDS = 20
 SAMPLE_TIME = 0.1
 
@@ -113,6 +113,30 @@ def table(rows: list[tuple[str, dict[str, Any], float]]) -> str:
     return "".join("| " + " | ".join(cells) + " |\n" for cells in [head, rule, *lines])
 
 
+def over_time() -> str:
+    """Markdown: what the table's last quarter hides, errors of e1 and stated deviations."""
+    level, spans = 0.05, ((2.0, 5.0), (15.0, 20.0))
+    lines = [["plant", "", *(f"{a:g} to {b:g} s" for a, b in spans)], ["---", "---", "---:", "---:"]]
+    circuit = plant_from_mapping(shipped("circuit"), "")
+    for method in (methods(1e-4)[0], methods(1e-4)[2]):
+        results = [run(circuit, method, level, seed) for seed in range(SEEDS)]
+        t = results[0].simulation.t
+        e1 = np.array([errors(result)[0][:, 0] for result in results])
+        lines.append(["circuit", f"error of e1, {method.label}"])
+        lines[-1] += [f"{_rms(e1[:, (t >= a) & (t <= b)]):.2g}" for a, b in spans]
+    window = plant_from_mapping(shipped("window"), "")
+    result = run(window, methods(1e-3)[3], level, 0)
+    stated, t = errors(result)[1], result.simulation.t
+    for name, column in zip(window.states, stated.T, strict=True):
+        lines.append(["window", f"stated σ of {name}, {methods(1e-3)[3].label}"])
+        lines[-1] += [f"{_rms(column[(t >= a) & (t <= b)]):.2g}" for a, b in spans]
+    return "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def picture(path: Path) -> None:
     """Errors on the oscillator that is seen for three seconds, without and with noise."""
     system = plant_from_mapping(shipped("window"), "")
@@ -135,7 +159,7 @@ def main() -> None:
     """Write the picture, and the table into the page."""
     picture(DOCS / "img" / "kalman.png")
     window = shipped("window")
-    text = table(
+    compared = table(
         [
             ("circuit", shipped("circuit"), 1e-4),
             ("descriptor", shipped("descriptor"), 1e-4),
@@ -144,9 +168,12 @@ def main() -> None:
         ]
     )
     page = PAGE.read_text(encoding="utf-8")
-    before, _, rest = page.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    write_text(PAGE, before + BEGIN + text + END + after)
+    for name, text in (("table", compared), ("over time", over_time())):
+        begin, end = BEGIN.format(name), END.format(name)
+        before, _, rest = page.partition(begin)
+        _, _, after = rest.partition(end)
+        page = before + begin + text + end + after
+    write_text(PAGE, page)
 
 
 if __name__ == "__main__":
