@@ -116,7 +116,8 @@ def table(rows: list[tuple[str, dict[str, Any], float]]) -> str:
 def over_time() -> str:
     """Markdown: what the table's last quarter hides, errors of e1 and stated deviations."""
     level, spans = 0.05, ((2.0, 5.0), (15.0, 20.0))
-    lines = [["plant", "", *(f"{a:g} to {b:g} s" for a, b in spans)], ["---", "---", "---:", "---:"]]
+    head = ["plant", "", *(f"{a:g} to {b:g} s" for a, b in spans)]
+    lines = [head, ["---", "---", "---:", "---:"]]
     circuit = plant_from_mapping(shipped("circuit"), "")
     for method in (methods(1e-4)[0], methods(1e-4)[2]):
         results = [run(circuit, method, level, seed) for seed in range(SEEDS)]
