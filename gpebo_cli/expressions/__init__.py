@@ -13,10 +13,11 @@ intermediate value that overflows is refused even where the end result would be 
 
 from gpebo_cli.expressions.breakpoints import breakpoints, breakpoints_of_tape
 from gpebo_cli.expressions.syntax import RESERVED, Expression, parse, shorten
-from gpebo_cli.expressions.tape import Tape, record, taylor
+from gpebo_cli.expressions.tape import Assembly, Tape, record, taylor
 
 __all__ = [
     "RESERVED",
+    "Assembly",
     "Expression",
     "Tape",
     "breakpoints",

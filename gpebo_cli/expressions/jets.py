@@ -66,7 +66,7 @@ def divide(a: Jet, b: Jet, order: int) -> Jet:
     """q = a / b, from q b = a."""
     if len(b) == 1:
         # A float of NumPy's divides by zero as arrays do: by raising a flag.
-        divisor = b[0] if isinstance(b[0], np.ndarray) else np.float64(b[0])
+        divisor = np.float64(b[0]) if isinstance(b[0], float) else b[0]
         return [c / divisor for c in a[: order + 1]]
     q: Jet = [np.divide(a[0], b[0])]
     for k in range(1, order + 1):

@@ -9,18 +9,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.expressions import jets
 from gpebo_cli.expressions.jets import Coefficient, Jet
+from gpebo_cli.expressions.program import Program, Recorder, finished
 from gpebo_cli.expressions.syntax import Expression, shorten
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.systems.descriptor import Array, IntArray
 
 MAX_INSTRUCTIONS = 200_000
 MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in parts
+# Recording takes as long as evaluating four times without the kernel: where that is much, it may
+# never be gained again.
+_MOST_COMPILED = 1000
 
 # Function, its place in the pair of jets computed together, and which pair.
 _PAIRS = {
@@ -77,6 +83,9 @@ class Tape:
             ConfigError: a value that is not finite; names the entry, its text and the time.
         """
         t = np.asarray(t, dtype=np.float64)
+        filled = self._in_a_row.taylor(t, order, inside)
+        if filled is not None:
+            return filled[0]
         result = np.zeros((order + 1, len(self.outputs), len(t)))
         held = max(1, len(self.instructions)) * (order + 1 + max(self.extra, default=0))
         part = max(64, MAX_NUMBERS // held)
@@ -92,6 +101,33 @@ class Tape:
             if not np.isfinite(result[:, :, here]).all():
                 self._refuse(times, order, decided)
         return np.moveaxis(result, 1, 2)
+
+    @cached_property
+    def jumps(self) -> bool:
+        """Whether there is any step, abs or sign."""
+        return bool(self.switches) or any(i.operation == "step" for i in self.instructions)
+
+    def program(self, order: int, apart: bool) -> Program | None:
+        """What :meth:`taylor` does, for the compiled kernel; None where that is not worth it.
+
+        Args:
+            order: highest coefficient wanted.
+            apart: whether the times at which jumps are decided are others than the times.
+        """
+        if len(self.instructions) > _MOST_COMPILED:
+            return None
+        recorder = Recorder()
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
+                places = self._run(recorder.t, order, recorder.inside if apart else recorder.t)
+        except FloatingPointError:
+            return None  # to be refused at any time
+        return finished(recorder, places, self.outputs, order)
+
+    @cached_property
+    def _in_a_row(self) -> Assembly:
+        targets = np.array([(0, j) for j in range(len(self.outputs))], dtype=np.intp)
+        return Assembly(self, targets.reshape(-1, 2), (np.zeros(len(self.outputs)),))
 
     def arguments_of_switches(self, t: Array, inside: Array) -> Array:
         """Arguments of abs and sign at the times ``t``, shape (number of switches, N).
@@ -117,8 +153,11 @@ class Tape:
             with np.errstate(all="ignore"):
                 return self._run(t, order, inside)
 
-    def _run(self, t: Array, order: int, inside: Array, stop: int | None = None) -> list[Jet]:
-        """Jets of all places before ``stop``, those that jump decided at ``inside``."""
+    def _run(self, t: Any, order: int, inside: Any, stop: int | None = None) -> list[Jet]:
+        """Jets of all places before ``stop``, those that jump decided at ``inside``.
+
+        The times are arrays (N,), or symbols for them that record what is done.
+        """
         deciding: list[Jet] | None = None
         if self.switches and inside is not t:
             last = max(switch.argument for switch in self.switches)
@@ -182,6 +221,53 @@ class Tape:
                         f"{label.where} = {shorten(label.text)} has {what} "
                         f"at t = {times[index]:.10g}"
                     )
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """Matrices in which some entries are outputs of a tape, and all others constants."""
+
+    tape: Tape
+    targets: IntArray  # (outputs, 2) the matrix and the entry in it, counted by rows
+    fixed: tuple[Array, ...]  # the matrices; what stands at the targets does not matter
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None
+    ) -> tuple[Array, ...] | None:
+        """Taylor coefficients of the matrices at the times t (N,), by the compiled kernel.
+
+        Returns:
+            shape (order + 1, N, ...) each, read-only where constant in time; None where there is
+            no kernel for it, or where it met an operation that may have to be refused:
+            :meth:`Tape.taylor` has to decide.
+        """
+        if kernels.compiled is None:
+            return None
+        apart = inside is not None and inside is not t and self.tape.jumps
+        key = order, apart
+        if key not in self._plans:
+            self._plans[key] = self._plan(order, apart)
+        plan = self._plans[key]
+        if plan is None:
+            return None
+        return kernels.compiled.jets(t, inside if apart else t, *plan)  # type: ignore[no-any-return]
+
+    @cached_property
+    def _plans(self) -> dict[tuple[int, bool], tuple[Array | IntArray, ...] | None]:
+        """What the kernel is given besides the times; by order, and whether jumps are apart."""
+        return {}
+
+    def _plan(self, order: int, apart: bool) -> tuple[Array | IntArray, ...] | None:
+        program = self.tape.program(order, apart)
+        if program is None:
+            return None
+        matrices = []
+        for fixed in self.fixed:
+            once = np.zeros((order + 1, 1, *fixed.shape))
+            once[0, 0] = fixed
+            once.flags.writeable = False
+            matrices.append(once)
+        return *program, self.targets, *matrices
 
 
 def _first_not_finite(coefficient: Coefficient) -> float:

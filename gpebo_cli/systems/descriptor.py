@@ -9,7 +9,7 @@ estimates it; in a simulation it may vary all the same.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,7 @@ BoolArray = NDArray[np.bool_]
 MATRIX_NAMES = ("E", "A", "B", "F", "C", "u", "theta")
 
 
-@dataclass(frozen=True)
-class Coefficients:
+class Coefficients(NamedTuple):
     """Taylor coefficients of every matrix of the model at N times, up to some order K.
 
     ``E[k, i]`` is ``E^(k)(t_i) / k!``; time stands before the matrix axes, the order before time.

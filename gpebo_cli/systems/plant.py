@@ -10,6 +10,7 @@ import re
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.expressions import (
     RESERVED,
+    Assembly,
     Expression,
     Tape,
     breakpoints_of_tape,
@@ -99,8 +101,21 @@ class TextCoefficients:
         Raises:
             ConfigError: an entry without a finite value or derivative; names it and the time.
         """
+        filled = self._assembly.taylor(np.asarray(t, dtype=np.float64), order, inside)
+        if filled is not None:
+            return Coefficients._make(filled)
         values = self.tape.taylor(t, order, inside)
         return Coefficients(**{k: self.layouts[k].assemble(values) for k in MATRIX_NAMES})
+
+    @cached_property
+    def _assembly(self) -> Assembly:
+        layouts = [self.layouts[name] for name in MATRIX_NAMES]
+        targets = np.empty((len(self.tape.outputs), 2), dtype=np.intp)
+        for matrix, layout in enumerate(layouts):
+            targets[layout.columns, 0] = matrix
+            targets[layout.columns, 1] = layout.positions
+        fixed = tuple(layout.fixed.reshape(layout.shape) for layout in layouts)
+        return Assembly(self.tape, targets, fixed)
 
     def breakpoints(self, start: float, stop: float) -> Array:
         """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks."""
