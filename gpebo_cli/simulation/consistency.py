@@ -12,10 +12,14 @@ from math import comb, factorial
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.simulation.derivative_array import StrangenessFree, Structure, reduce
 from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
+_UNMOVED = 32 * float(np.finfo(float).eps)  # what moves by less, relatively, has not moved
+_PLAIN = 1e-8  # pivots above this, relatively, need no singular values
+_SMALL = 32  # largest number of states for the compiled kernel
 _IMPULSE = 1e-9  # impulses below this share of the state's size are rounding
 
 
@@ -32,6 +36,10 @@ def consistent_state(reduced: StrangenessFree, x0: Array) -> Array:
     E, A2, f2 = reduced.E[0], reduced.A2[0], reduced.f2[0]
     if len(A2) == 0:
         return x0.copy()
+    if kernels.compiled is not None and len(x0) <= _SMALL:
+        known, nearest = kernels.compiled.consistent(E, A2, f2, x0, _PLAIN, _UNMOVED)
+        if known[0]:
+            return np.asarray(nearest)
     U, sigma, Vt = np.linalg.svd(A2)
     a = len(sigma)
     particular = Vt[:a].T @ ((U.T @ (-f2 - A2 @ x0)) / sigma)  # of A2 δ = −(A2 x0 + f2)
@@ -39,7 +47,7 @@ def consistent_state(reduced: StrangenessFree, x0: Array) -> Array:
     free = np.linalg.lstsq(E @ kernel, -E @ particular, rcond=None)[0]
     x = x0 + particular + kernel @ free
     # What did not move keeps the digits it was given.
-    rounding = 32 * np.finfo(float).eps * max(np.abs(x).max(), np.abs(x0).max())
+    rounding = _UNMOVED * max(np.abs(x).max(), np.abs(x0).max())
     return np.where(np.abs(x - x0) <= rounding, x0, x)
 
 

@@ -14,9 +14,11 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.linalg import transpose
 from gpebo_cli.systems.descriptor import Array, BoolArray, Coefficients, DescriptorSystem, IntArray
@@ -26,6 +28,9 @@ _DIP = 0.2  # a singular value that falls below this share of its maximum is fol
 _DIP_ROUNDS = 14
 _FALL = 1e-2  # towards an end of the horizon, singular values may fall to this share
 _DIP_POINTS = 17
+_MOST_DIPS = 6  # of each kind
+# Largest derivative array for the compiled kernels; beyond it LAPACK's blocks are worth their calls.
+_SMALL = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +98,9 @@ class Structure:
     @property
     def growth(self) -> float:
         """Largest real part of its eigenvalues at the probes, 1/s, or zero."""
-        if self.dynamics is None:
+        if self.dynamics is None or not self.d:
             return 0.0
-        return float(np.linalg.eigvals(self.dynamics).real.max(initial=0.0))
+        return max(0.0, float(_largest_real_parts(self.dynamics).max()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +124,17 @@ class StrangenessFree:
     E: Array  # (N, n, n) the model's own
     u: Array  # (N, m) the inputs and
     C: Array  # (N, r, n) the output matrix at the same times
+
+
+def _largest_real_parts(matrices: Array) -> Array:
+    """Largest real parts (N,) of the eigenvalues of matrices (N, d, d), d > 0."""
+    if matrices.shape[1] == 1:
+        return matrices[:, 0, 0]
+    if matrices.shape[1] == 2:
+        first, last = matrices[:, 0, 0], matrices[:, 1, 1]
+        squared = (0.5 * (first - last)) ** 2 + matrices[:, 0, 1] * matrices[:, 1, 0]
+        return np.asarray(0.5 * (first + last) + np.sqrt(np.maximum(squared, 0.0)))
+    return np.asarray(np.linalg.eigvals(matrices).real.max(axis=1))
 
 
 def forcing(c: Coefficients) -> Array:
@@ -154,6 +170,9 @@ def derivative_array(e: Array, a: Array, mu: int) -> tuple[Array, Array]:
 
 def balance(c: Coefficients) -> Scaling:
     """Scalings that bring the rows and columns of E/τ and A to comparable size over time."""
+    if kernels.compiled is not None:
+        rows, columns, time = kernels.compiled.balance(c.E, c.A)
+        return Scaling(rows, columns, float(time[0]))
     E, A = np.abs(c.E[0]).max(axis=0), np.abs(c.A[0]).max(axis=0)
     rows, columns, tau = np.ones(len(E)), np.ones(len(E)), 1.0
     both = bool(E.any() and A.any())
@@ -193,29 +212,20 @@ def analyse(
     invariant = {"E", "A"} <= system.coefficients.constant
     if invariant:
         t = t[:1]
-    middle = slice(len(t) // 2, len(t) // 2 + 1)
     reason = ""
     for mu in range(max_mu + 1):
         if mu:
             c = system.coefficients.taylor(t, mu)
-        e, aa = scaled(c, scaling)
-        e, aa = e[:, : len(t)], aa[:, : len(t)]
-        # A μ that will not do fails at one time already.
-        one = _levels(t[middle], e[:, middle], aa[:, middle], mu, rank_tol)
-        if one.failure:
-            reason = one.failure
-            continue
-        reference = _reference(e[:, middle], aa[:, middle], mu, one, invariant)
-        levels = _all_levels(t, e, aa, mu, rank_tol, one, reference)
-        if levels.failure:
+        levels, reference = _judged(t, c, mu, scaling, rank_tol, invariant)
+        if reference is None:
             reason = levels.failure
             continue
-        if not invariant:
-            _follow_dips(system, t, levels, mu, scaling, rank_tol)
+        steady, dips = (True, []) if invariant else _dips(levels.smallest)
+        _follow_dips(system, t, levels, dips, mu, scaling, rank_tol)
         return Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
             smallest_singular_value=levels.least, time_invariant=invariant,
-            reference=reference, steady=invariant or _steady(levels.smallest),
+            reference=reference, steady=steady,
             dynamics=None if levels.dynamics is None else levels.dynamics / scaling.time,
         )
     raise ModelError(
@@ -228,13 +238,76 @@ def _who(system: DescriptorSystem) -> str:
     return f"plant {system.name}" + (f" ({system.source})" if system.source else "")
 
 
+_PLACES = np.sort([1e-3, 1.0 - 1e-3, *(np.arange(1, _PROBES + 1) * 0.6180339887498949 % 1.0)])
+
+
 def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
     """Interior times, none of them special: equal spacing would hit the zeros of sin(k π t)."""
-    golden = (np.arange(1, _PROBES + 1) * 0.6180339887498949) % 1.0
-    t = start + (stop - start) * np.sort(np.concatenate([[1e-3, 1.0 - 1e-3], golden]))
-    cuts = np.concatenate([[start], system.coefficients.breakpoints(start, stop), [stop]])
+    t = start + (stop - start) * _PLACES
+    jumps = system.coefficients.breakpoints(start, stop)
+    if not len(jumps):
+        return t
+    cuts = np.concatenate([[start], jumps, [stop]])
     middles = 0.5 * (cuts[:-1] + cuts[1:])  # no piece between jumps goes unprobed
-    return np.unique(np.concatenate([t, middles])) if len(middles) > 1 else t
+    return np.unique(np.concatenate([t, middles]))
+
+
+def _judged(
+    t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, invariant: bool
+) -> tuple[_Levels, Pivots | Bases | None]:
+    """Levels at all times, or at one that says why this μ will not do; and where to start from.
+
+    ``c`` may have more times than t where E and A are constant.
+    """
+    if kernels.compiled is not None and (mu + 1) * c.E.shape[2] <= _SMALL:
+        found = _judged_compiled(t, c, mu, scaling, rank_tol, invariant)
+        if found is not None:
+            return found
+    e, aa = scaled(c, scaling)
+    e, aa = e[:, : len(t)], aa[:, : len(t)]
+    # A μ that will not do fails at one time already.
+    middle = slice(len(t) // 2, len(t) // 2 + 1)
+    one = _levels(t[middle], e[:, middle], aa[:, middle], mu, rank_tol)
+    if one.failure:
+        return one, None
+    reference = _reference(e[:, middle], aa[:, middle], mu, one, invariant)
+    levels = _all_levels(t, e, aa, mu, rank_tol, one, reference)
+    return levels, None if levels.failure else reference
+
+
+def _judged_compiled(
+    t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, invariant: bool
+) -> tuple[_Levels, Pivots | Bases | None] | None:
+    """:func:`_judged`; None where it takes LAPACK to tell, or to say what is wrong."""
+    compiled: Any = kernels.compiled
+    n, middle = c.E.shape[2], len(t) // 2
+    model = (c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu)
+    known, smallest, rows, columns, Z1, Z2, dynamics = compiled.start(*model, middle, rank_tol)
+    trusted, counted = known.tolist()
+    a = int(counted)
+    if not trusted:
+        return None
+    at = t[middle : middle + 1]
+    failure = _too_many(a, n, at) if a > n else _why_not(a, at, smallest, rank_tol)
+    if failure:
+        return _Levels(a, smallest, failure), None
+    if invariant:
+        finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
+        least = float(smallest.min())
+        return _Levels(a, smallest, "", least, dynamics=finite), Bases(Z1[None], Z2[None])
+    r = (mu + 1) * n - a
+    known, smallest, dynamics = compiled.all_levels(
+        *model, rows, columns, r, Z1, rank_tol, max(_PLAIN, 10.0 * rank_tol), _RESIDUAL
+    )
+    trusted, least, is_finite = known.tolist()
+    if not trusted:
+        return None
+    levels = _Levels(a, smallest, "", least, dynamics=dynamics if is_finite else None)
+    return levels, Pivots(r, rows, columns, Z1)
+
+
+def _too_many(a: int, n: int, t: Array) -> str:
+    return f"{a} constraints appear for {n} states (t = {t[0]:.6g})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,9 +342,7 @@ def _levels(
             return _Levels(0, smallest, _changes("the derivative array", ranks, k, t, relative[k]))
         a = (mu + 1) * n - int(ranks[0])
     if a > n:
-        return _Levels(
-            a, smallest, f"{a} constraints appear for {n} states (t = {t[0]:.6g})"
-        )
+        return _Levels(a, smallest, _too_many(a, n, t))
     r = M.shape[1] - a
     if r:
         smallest[:, 0] = relative[:, r - 1]
@@ -286,15 +357,21 @@ def _levels(
     s3 = s3 / _norm(e[0])[:, None]
     if a < n:
         smallest[:, 2] = s3[:, -1]
+    failure = _why_not(a, t, smallest, rank_tol)
+    if failure:
+        return _Levels(a, smallest, failure)
+    return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)), Z2, T2)
+
+
+def _why_not(a: int, t: Array, smallest: Array, rank_tol: float) -> str:
+    """What the singular values of Â2 or E T2 (N, 3) say against this μ, or nothing."""
     for column, what in ((1, "constraints are linearly dependent"),
                          (2, "some states are in no equation's derivative and in no constraint")):
         bad = smallest[:, column] <= rank_tol
         if bad.any():
             k = int(np.argmax(bad))
-            return _Levels(
-                a, smallest, f"{what} at t = {t[k]:.6g} (singular value {smallest[k, column]:.1e})"
-            )
-    return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)), Z2, T2)
+            return f"{what} at t = {t[k]:.6g} (singular value {smallest[k, column]:.1e})"
+    return ""
 
 
 def _array_size(M: Array, aa: Array) -> Array:
@@ -361,13 +438,27 @@ def _dynamics(Z1: Array, A: Array, inverse: Array) -> Array | None:
     return found if np.isfinite(found).all() else None
 
 
-def _steady(smallest: Array) -> bool:
-    """Whether no column of the singular values or bounds (N, 3) has a dip between its ends."""
-    values = smallest[:, np.isfinite(smallest).all(axis=0)]
-    largest = values.max(axis=0)
-    inner = values[1:-1]
-    dips = (inner <= values[:-2]) & (inner <= values[2:]) & (inner < _DIP * largest)
-    return not dips.any() and bool((values >= _FALL * largest).all())
+def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
+    """Dips of the singular values or bounds (N, 3), and whether there is none between the ends.
+
+    A dip is a local minimum far below the column's maximum, given as its column and its place;
+    the deepest of each column come first. There is none in columns that are not finite.
+    """
+    if kernels.compiled is not None:
+        calm, found = kernels.compiled.dips(smallest, _DIP, _FALL, _MOST_DIPS)
+        return bool(calm[0]), [(int(column), int(k)) for column, k in found.tolist()]
+    steady, dips = True, []
+    for column in range(3):
+        values = smallest[:, column]
+        if not np.isfinite(values).all():
+            continue
+        padded = np.concatenate([[np.inf], values, [np.inf]])
+        is_minimum = (values <= padded[:-2]) & (values <= padded[2:])
+        deep = np.flatnonzero(is_minimum & (values < _DIP * values.max()))
+        inner = (deep > 0) & (deep < len(values) - 1)
+        steady &= not inner.any() and bool((values >= _FALL * values.max()).all())
+        dips += [(column, int(k)) for k in deep[np.argsort(values[deep])][:_MOST_DIPS]]
+    return steady, dips
 
 
 def _norm(matrix: Array) -> Array:
@@ -384,8 +475,8 @@ def _changes(what: str, ranks: Array, k: int, t: Array, sigma: Array) -> str:
 
 
 def _follow_dips(
-    system: DescriptorSystem, t: Array, levels: _Levels, mu: int, scaling: Scaling,
-    rank_tol: float,
+    system: DescriptorSystem, t: Array, levels: _Levels, dips: list[tuple[int, int]], mu: int,
+    scaling: Scaling, rank_tol: float,
 ) -> None:
     """Follow local minima of the decisive singular values between the probes.
 
@@ -394,32 +485,43 @@ def _follow_dips(
     that shrinks with its bracket all the way to rank_tol is a rank change.
     """
     names = ("derivative array", "constraints", "differential part")
-    for column in range(3):
-        values = levels.smallest[:, column]
-        if not np.isfinite(values).all():
-            continue
-        padded = np.concatenate([[np.inf], values, [np.inf]])
-        is_minimum = (values <= padded[:-2]) & (values <= padded[2:])
-        deep = np.flatnonzero(is_minimum & (values < _DIP * values.max()))
-        for k in deep[np.argsort(values[deep])][:6]:
-            left, right = t[max(k - 1, 0)], t[min(k + 1, len(t) - 1)]
-            lowest, where = values[k], t[k]
-            for _ in range(_DIP_ROUNDS):
-                grid = np.linspace(left, right, _DIP_POINTS)
-                e, aa = scaled(system.coefficients.taylor(grid, mu), scaling)
-                found = _levels(grid, e, aa, mu, rank_tol, levels.a)
-                line = found.smallest[:, column]
-                best = int(np.argmin(line))
-                shrinking = line[best] < 0.5 * lowest
-                lowest, where = min(lowest, line[best]), grid[best]
-                left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-                if lowest <= rank_tol or not shrinking:
-                    break
-            if lowest <= max(rank_tol, 1e-9):
-                raise ModelError(
-                    f"{_who(system)}: the rank of the {names[column]} changes at t = {where:.9g} "
-                    f"(singular value {lowest:.1e}); choose a horizon that avoids this time"
-                )
+    for column, k in dips:
+        left, right = t[max(k - 1, 0)], t[min(k + 1, len(t) - 1)]
+        lowest, where = float(levels.smallest[k, column]), t[k]
+        for _ in range(_DIP_ROUNDS):
+            grid = left + (right - left) * _CUTS
+            grid[-1] = right
+            c = system.coefficients.taylor(grid, mu)
+            line = _line(grid, c, mu, scaling, rank_tol, levels.a, column)
+            best = int(line.argmin())
+            value = float(line[best])
+            shrinking = value < 0.5 * lowest
+            lowest, where = min(lowest, value), grid[best]
+            left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+            if lowest <= rank_tol or not shrinking:
+                break
+        if lowest <= max(rank_tol, 1e-9):
+            raise ModelError(
+                f"{_who(system)}: the rank of the {names[column]} changes at t = {where:.9g} "
+                f"(singular value {lowest:.1e}); choose a horizon that avoids this time"
+            )
+
+
+_CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
+
+
+def _line(
+    t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, a: int, column: int
+) -> Array:
+    """One column (N,) of the levels that belong to ``a`` constraints, at the times t."""
+    if kernels.compiled is not None and (mu + 1) * c.E.shape[2] <= _SMALL:
+        known, line = kernels.compiled.levels(
+            c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu, a, column
+        )
+        if known[0]:
+            return np.asarray(line)
+    e, aa = scaled(c, scaling)
+    return _levels(t, e, aa, mu, rank_tol, a).smallest[:, column]
 
 
 def _reference(
@@ -469,6 +571,10 @@ def reduce(
     mu, scaling = structure.mu, structure.scaling
     if c is None:
         c = system.coefficients.taylor(t, mu, inside)
+    if kernels.compiled is not None and (mu + 1) * system.n <= _SMALL:
+        found = _reduced_compiled(structure, len(t), c)
+        if found is not None:
+            return found
     f = forcing(c)
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]
@@ -478,7 +584,7 @@ def reduce(
     weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
     g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
     reference = structure.reference
-    some = slice(0, None, max(1, len(t) // _LOOKS))
+    some = slice(0, None, _every(len(t)))
     if isinstance(reference, Bases):
         Z1 = reference.Z1
         A2, f2 = transpose(reference.Z2) @ N, transpose(reference.Z2) @ g
@@ -525,6 +631,35 @@ def reduce(
         E=E[0],
         u=c.u[0],
         C=c.C[0],
+    )
+
+
+def _every(count: int) -> int:
+    """At every how many of so many times the sensitivity to rounding is looked at."""
+    return max(1, count // _LOOKS)
+
+
+def _reduced_compiled(
+    structure: Structure, count: int, c: Coefficients
+) -> StrangenessFree | None:
+    """:func:`reduce`; None where the reference will not do at some time."""
+    compiled: Any = kernels.compiled
+    s, reference = structure.scaling, structure.reference
+    model = (c.E, c.A, s.rows, s.columns, s.time, structure.mu, c.B, c.F, c.u, c.theta)
+    if isinstance(reference, Bases):
+        found = compiled.reduced_constant(*model, reference.Z1, reference.Z2, _every(count))
+    else:
+        found = compiled.reduced(
+            *model, reference.rows, reference.columns, reference.rank, reference.Z1,
+            _every(count), _MAX_GROWTH, _RESIDUAL,
+        )
+    known, E1, A1, f1, A2, f2, basis, offset, amplification = found
+    if not known[0]:
+        return None
+    if not structure.a:
+        basis = offset = None
+    return StrangenessFree(
+        E1, A1, f1, A2, f2, basis, offset, amplification, c.E[0], c.u[0], c.C[0]
     )
 
 
