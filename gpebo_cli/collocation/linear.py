@@ -20,16 +20,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.mesh import (
+    SHARE,
     Mesh,
     Trajectory,
     legendre_tail,
     signal_scale,
     unresolved_kinds,
+    used_coefficients,
 )
 from gpebo_cli.collocation.radau import RadauRule, differentiation_schur
 from gpebo_cli.errors import SolverError
@@ -65,7 +69,12 @@ _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the 
 _MODEST = 1e100  # values up to here may be multiplied with each other
 _MAX_PARTS = 8  # an element is cut into at most this many at once
 _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
-_ROUNDING = 64 * np.finfo(float).eps
+_EPS = float(np.finfo(float).eps)
+_ROUNDING = 64 * _EPS
+_EQUAL = 1e-11  # relative difference of lengths that is rounding
+# Up to here the kernels are faster than LAPACK's and BLAS's products, see test_kernels_collocation
+_SMALL_SYSTEM = 100  # unknowns of an element
+_SMALL_STATE = 24  # components and columns
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.
 np.empty(_CHUNK // 4)
@@ -117,7 +126,7 @@ class LinearSolution:
 class _ElementMaps:
     """X at the nodes of each element = ``homogeneous`` X(left end) + ``particular``."""
 
-    homogeneous: Array  # (K, s, n, n)
+    homogeneous: Array  # (K, s, n, n), or (1, s, n, n) if it is the same for all
     particular: Array  # (K, s, n, columns)
     extras: tuple[Array, ...]  # (K, s + 1, ...) each, or (1, 1, ...) if constant
 
@@ -146,22 +155,22 @@ def solve(
     Raises:
         SolverError: if ``max_elements`` do not reach ``tol``; names the time.
     """
-    maps = _element_maps(problem, mesh, np.ones(mesh.size, dtype=bool), known)
-    floor = np.zeros(mesh.size)  # the tail of the parent, to notice that cutting no longer helps
+    maps = _element_maps(problem, mesh, None, known)
+    floor: Array | None = None  # the tail of the parent, to notice that cutting no longer helps
     rounds = 1
     while True:
-        values = _chain(maps, problem, mesh, restarts or {})
-        finite = np.asarray(np.isfinite(values).all(axis=(1, 2, 3)))
-        tail = _tail_of_numbers(problem, mesh, values, maps.extras, finite)
-        # Rounding floor: an element whose parent was already this good is not cut again.
-        stalled = (floor > 0) & (tail > 0.25 * floor) & (tail < 1e-6)
-        poor = (tail > tol) & ~stalled
+        values, whole = _chain(maps, problem, mesh, restarts or {})
+        tail = _tail_of_numbers(problem, mesh, values, maps.extras, whole)
+        poor = tail > tol
+        if floor is not None:
+            # Rounding floor: an element whose parent was already this good is not cut again.
+            poor &= ~((floor > 0) & (tail > 0.25 * floor) & (tail < 1e-6))
         if not poor.any():
-            if finite.all():
+            if whole == mesh.size:
                 break
             raise SolverError(
                 f"the solution of the {problem.name} is not finite from "
-                f"t = {mesh.edges[int(np.argmin(finite))]:.6g} on: it grows beyond all numbers; "
+                f"t = {mesh.edges[whole]:.6g} on: it grows beyond all numbers; "
                 "is a sign wrong? Else shorten time.horizon"
             )
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
@@ -169,29 +178,25 @@ def solve(
         finer, kept = mesh.split(parts)
         fresh = kept < 0
         new = _element_maps(problem, finer, fresh)
-        floor = np.where(fresh, np.repeat(tail, parts), np.repeat(floor, parts))
+        before = np.repeat(np.zeros(mesh.size) if floor is None else floor, parts)
+        floor = np.where(fresh, np.repeat(tail, parts), before)
         maps = _merge(maps, new, kept, fresh)
         mesh, rounds = finer, rounds + 1
-    propagated = _propagated_error(maps.homogeneous[:, -1], values, mesh, problem.renewal)
-    estimate = max(
-        float(tail.max(initial=0.0)),
-        _visible_noise(values, mesh),
-        propagated,
-        _rounding(problem, values),
-    )
+    estimate = max(float(tail.max(initial=0.0)), *_estimates(problem, maps, values, mesh))
     return LinearSolution(Trajectory(mesh, values), estimate, rounds, maps.extras)
 
 
 def _tail_of_numbers(
-    problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...],
-    finite: BoolArray,
+    problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...], whole: int
 ) -> Array:
     """:func:`unresolved_signals`; where not all is finite, of the elements before, else zero.
+
+    So many elements in front are finite as ``whole`` says.
 
     Elements that are too long may seem to grow, and many of them multiply to anything: those in
     front are resolved first.
     """
-    if finite.all():
+    if whole == mesh.size:
         return unresolved_signals(problem, mesh, values, extras)
     with np.errstate(invalid="ignore"):
         count = int(np.argmin((np.abs(values) < _MODEST).all(axis=(1, 2, 3))))
@@ -216,22 +221,47 @@ def unresolved_signals(
     problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...]
 ) -> Array:
     """:func:`unresolved_kinds` over the solution and everything computed from it, shape (K,)."""
-    kinds = [(values.reshape(*values.shape[:2], -1), problem.floor)]
+    size, points, n, columns = values.shape
+    kinds = [(values.reshape(size, points, n * columns), problem.floor)]
     if problem.monitor is not None:
         kinds += problem.monitor(values, extras)
     return unresolved_kinds(kinds, mesh.rule)
+
+
+def _estimates(
+    problem: LinearProblem, maps: _ElementMaps, values: Array, mesh: Mesh
+) -> tuple[float, float, float]:
+    """Visible noise, propagated error and rounding, relative to each component's size."""
+    rule = mesh.rule
+    if kernels.compiled is not None and problem.renewal is None and _is_small(values):
+        propagated, noise, rounding = kernels.compiled.estimates(
+            maps.homogeneous, values, rule.to_legendre, used_coefficients(rule),
+            problem.amplification, problem.floor, SHARE, _LEVEL,
+        )
+        return noise, propagated, max(_ROUNDING, rounding)
+    last = np.broadcast_to(maps.homogeneous[:, -1], (mesh.size, *maps.homogeneous.shape[2:]))
+    return (
+        _visible_noise(values, mesh),
+        _propagated_error(last, values, mesh, problem.renewal),
+        _rounding(problem, values),
+    )
+
+
+def _is_small(values: Array) -> bool:
+    """Whether kernels are faster for values (K, s + 1, n, columns)."""
+    return bool(max(values.shape[2:]) <= _SMALL_STATE)
 
 
 def _rounding(problem: LinearProblem, values: Array) -> float:
     """Rounding relative to each component: what the large ones and the coefficients bring along."""
     flat = values.reshape(*values.shape[:2], -1)
     scale = signal_scale(flat, problem.floor)
-    unit = float(np.finfo(float).eps) * float(np.abs(flat).max(initial=0.0))
+    unit = _EPS * float(np.abs(flat).max(initial=0.0))
     brought = np.zeros_like(scale)
     if problem.amplification is not None:
         size = np.abs(values).max(axis=(0, 1))  # (n, columns)
         through = problem.amplification[:, :-1] @ size + problem.amplification[:, -1:]
-        brought = np.finfo(float).eps * through.ravel()
+        brought = _EPS * through.ravel()
     return max(_ROUNDING, float(((unit + brought) / scale).max(initial=0.0)))
 
 
@@ -252,7 +282,7 @@ def _check_budget(
     worst = int(np.argmax(tail))
     t = mesh.edges[worst]
     # Next to t = 0 floating point resolves any transient; elsewhere 64 units in the last place.
-    resolution = 64 * np.finfo(float).eps * np.abs(mesh.edges[1:])
+    resolution = 64 * _EPS * np.abs(mesh.edges[1:])
     if parts.sum() > max_elements:
         raise SolverError(
             f"the {problem.name} is not resolved with {max_elements} elements; worst near "
@@ -269,7 +299,8 @@ def _check_budget(
 def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArray) -> _ElementMaps:
     def merged(before: Array, after: Array) -> Array:
         out = np.empty((len(kept), *before.shape[1:]))
-        out[~fresh], out[fresh] = before[kept[~fresh]], after
+        out[~fresh] = before if len(before) == 1 else before[kept[~fresh]]
+        out[fresh] = after
         return out
 
     return _ElementMaps(
@@ -283,16 +314,22 @@ def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArra
 
 
 def _element_maps(
-    problem: LinearProblem, mesh: Mesh, elements: BoolArray, known: Coefficients | None = None
+    problem: LinearProblem, mesh: Mesh, elements: BoolArray | None,
+    known: Coefficients | None = None,
 ) -> _ElementMaps:
-    """Solve the block systems of some elements, in chunks of bounded memory."""
+    """Solve the block systems of some elements, None: all, in chunks of bounded memory."""
     n, columns = problem.start.shape
     s = mesh.rule.stages
-    h, t, inside = mesh.steps[elements], mesh.points[elements], mesh.inside[elements]
+    h, t, inside = mesh.steps, mesh.points, mesh.inside
+    if elements is not None:
+        h, t, inside = h[elements], t[elements], inside[elements]
     numbers = s * n * (n + columns)
     if known is None or not _is_constant(known):
         numbers += s * s * n * n
     chunk = max(1, min(_CHUNK // numbers, _POINTS // (s + 1)))
+    if len(h) <= chunk:
+        c = problem.coefficients(t.ravel(), inside.ravel()) if known is None else known
+        return _solve_elements(problem, mesh.rule, h, t, c)
     pieces = []
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
@@ -301,10 +338,10 @@ def _element_maps(
         else:
             c = _at_points(known, slice(i * (s + 1), (i + chunk) * (s + 1)))
         pieces.append(_solve_elements(problem, mesh.rule, h[part], t[part], c))
-    if len(pieces) == 1:
-        return pieces[0]
     return _ElementMaps(
-        np.concatenate([p.homogeneous for p in pieces]),
+        np.concatenate([
+            np.broadcast_to(p.homogeneous, (len(p.particular), s, n, n)) for p in pieces
+        ]),
         np.concatenate([p.particular for p in pieces]),
         tuple(
             parts[0] if parts[0].shape[:2] == (1, 1) else np.concatenate(parts)
@@ -352,8 +389,10 @@ def _solve_elements(
 ) -> _ElementMaps:
     k, s = len(h), rule.stages
     n = len(problem.start)
-    extras = tuple(at_points(extra, k, s) for extra in c.extras)
+    extras = tuple([at_points(extra, k, s) for extra in c.extras])
     try:
+        if kernels.compiled is not None and _is_small_system(c, s, n):
+            return _ElementMaps(*_solve_small_elements(rule, h, c), extras)
         if _is_constant(c):
             from_left, particular = _solve_equal_elements(rule, h, c, n)
         else:
@@ -369,6 +408,27 @@ def _solve_elements(
     if c.constraints is not None:
         particular += _at_nodes(c.constraints.offset, k, s)
     return _ElementMaps(from_left, particular, extras)
+
+
+def _is_small_system(c: Coefficients, s: int, n: int) -> bool:
+    """Whether the kernel is faster."""
+    return (
+        s * c.A.shape[1] <= _SMALL_SYSTEM
+        and n <= _SMALL_STATE
+        and c.f.shape[2] <= _SMALL_STATE
+        and (c.E is not None or c.constraints is None)
+    )
+
+
+def _solve_small_elements(rule: RadauRule, h: Array, c: Coefficients) -> tuple[Array, Array]:
+    """:func:`_solve_equal_elements` or :func:`_solve_distinct_elements` in C, times T, plus p."""
+    basis, offset = (None, None) if c.constraints is None else c.constraints
+    solved: tuple[Array, Array] | None = kernels.compiled.element_maps(  # type: ignore[union-attr]
+        rule.differentiation, h, c.E, c.A, c.f, basis, offset, _EQUAL
+    )
+    if solved is None:
+        raise np.linalg.LinAlgError("a pivot is zero")
+    return solved
 
 
 def _forcing(rule: RadauRule, h: Array, c: Coefficients) -> Array:
@@ -429,8 +489,8 @@ def _solve_equal_elements(
     Lengths that differ by rounding only (equal parts of an element) count as equal.
 
     Returns:
-        T times the responses to the left end (k, s, n, n), perhaps the same memory for all, and
-        T times the particular solutions (k, s, n, columns).
+        T times the responses to the left end (k, s, n, n), or (1, s, n, n) for all, and T times
+        the particular solutions (k, s, n, columns).
     """
     k, s = len(h), rule.stages
     f = _forcing(rule, h, c)
@@ -443,7 +503,7 @@ def _solve_equal_elements(
     which = np.empty(k, dtype=np.intp)
     particular = np.empty((k, s, n, columns))
     for length in np.unique(rounded):
-        same = np.flatnonzero(np.abs(h - length) <= 1e-11 * h.max())
+        same = np.flatnonzero(np.abs(h - length) <= _EQUAL * h.max())
         step = h[same[0]]
         right = np.empty((s, d, n + len(same) * columns))
         right[:, :, :n] = start / step * E
@@ -454,7 +514,7 @@ def _solve_equal_elements(
         columns_apart = solved[:, :, n:].reshape(s, n, len(same), columns)
         particular[same] = np.moveaxis(columns_apart, 2, 0)
     if len(responses) == 1:
-        return np.broadcast_to(responses[0], (k, s, n, n)), particular
+        return responses[0][None], particular
     return np.array(responses)[which], particular
 
 
@@ -485,12 +545,15 @@ def _chain(
     problem: LinearProblem,
     mesh: Mesh,
     restarts: Mapping[float, Callable[[Array], Array]],
-) -> Array:
-    """Point values (K, s + 1, n, columns)."""
-    size, s, n = maps.homogeneous.shape[:3]
+) -> tuple[Array, int]:
+    """Point values (K, s + 1, n, columns), and how many elements in front are finite."""
+    size, s, n = maps.particular.shape[:3]
     columns = problem.start.shape[1]
     renewal = problem.renewal
-    last_h, last_p = maps.homogeneous[:, -1], maps.particular[:, -1]
+    if kernels.compiled is not None and renewal is None and _is_small(maps.particular):
+        return _chain_stretches(maps, problem, mesh, restarts)
+    homogeneous = np.broadcast_to(maps.homogeneous, (size, s, n, n))
+    last_h, last_p = homogeneous[:, -1], maps.particular[:, -1]
     jump = [restarts.get(float(edge)) for edge in mesh.edges[:-1]] if restarts else [None] * size
     left = np.empty((size, n, columns))
     state = problem.start
@@ -505,8 +568,36 @@ def _chain(
             left[k] = state
             state = last_h[k] @ state + last_p[k]
         values[:, 0] = left
-        values[:, 1:] = maps.homogeneous @ left[:, None] + maps.particular
-    return values
+        values[:, 1:] = homogeneous @ left[:, None] + maps.particular
+    finite = np.isfinite(values).all(axis=(1, 2, 3))
+    return values, size if finite.all() else int(np.argmin(finite))
+
+
+def _chain_stretches(
+    maps: _ElementMaps,
+    problem: LinearProblem,
+    mesh: Mesh,
+    restarts: Mapping[float, Callable[[Array], Array]],
+) -> tuple[Array, int]:
+    """:func:`_chain` in C, from one restart to the next."""
+    chain = kernels.compiled.chain  # type: ignore[union-attr]
+    if not restarts:
+        solved: tuple[Array, int] = chain(maps.homogeneous, maps.particular, problem.start)
+        return solved
+    edges = mesh.edges.tolist()
+    cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
+    state, pieces, whole = problem.start, [], 0
+    for first, last in pairwise(cuts):
+        if first:
+            state = restarts[edges[first]](state)
+        part = slice(first, last)
+        same = len(maps.homogeneous) == 1
+        homogeneous = maps.homogeneous if same else maps.homogeneous[part]
+        values, finite = chain(homogeneous, maps.particular[part], state)
+        whole += finite if whole == first else 0
+        pieces.append(values)
+        state = values[-1, -1]
+    return np.concatenate(pieces), whole
 
 
 def _propagated_error(
@@ -527,7 +618,7 @@ def _propagated_error(
     size = np.abs(flat).max(axis=1)  # (K, c)
     tail = legendre_tail(flat, rule, scale)
     decay = np.clip(tail / np.maximum(size, np.finfo(float).tiny), 0.0, 1.0) ** (1 / rule.stages)
-    rounding = 4 * np.finfo(float).eps * np.maximum(size, scale * np.finfo(float).eps)
+    rounding = 4 * _EPS * np.maximum(size, scale * _EPS)
     local = (tail * decay ** (0.5 * (rule.stages - 1)) + rounding).reshape(-1, *values.shape[2:])
     # Local errors have signs that nobody knows: all equal, and alternating, so that neither kind
     # of system can cancel both. Absolute values of the maps were rejected: a rotation would grow.

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
+from math import prod
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.radau import RadauRule
 from gpebo_cli.linalg import affine_scan
 from gpebo_cli.systems.descriptor import Array, IntArray
@@ -19,8 +21,12 @@ from gpebo_cli.systems.descriptor import Array, IntArray
 _INSIDE = 1e-3
 _CHUNK = 1 << 22  # numbers gathered at once when sampling
 _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
+SHARE = 1e-3  # of the largest component: what is smaller is measured against that
+_FOOT = 1e-8  # of its final size: what a component was before may be that wrong
+_MOST_KINDS = 24  # in one call of a kernel
 _MANY = 2000  # times, from which on sampling them by element pays
 _KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
+_SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
 _JOINED = (2, 4, 8)  # as many elements become one
 _MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
 _TINY = float(np.finfo(np.float64).tiny)
@@ -41,22 +47,32 @@ class Mesh:
     @cached_property
     def steps(self) -> Array:
         """Element lengths, shape (K,)."""
-        return np.diff(self.edges)
+        return np.asarray(self.edges[1:] - self.edges[:-1])
 
-    @cached_property
+    @property
     def points(self) -> Array:
         """Left end and nodes of every element, shape (K, s + 1)."""
-        points = self.edges[:-1, None] + self.steps[:, None] * self.rule.points
-        points[:, -1] = self.edges[1:]
-        return points
+        return self._places[0]
 
-    @cached_property
+    @property
     def inside(self) -> Array:
         """Where functions that jump are decided, shape (K, s + 1)."""
-        inside = self.points.copy()
+        return self._places[1]
+
+    @cached_property
+    def _places(self) -> tuple[Array, Array]:
+        """Points, and where functions that jump are decided."""
+        if kernels.compiled is not None:
+            places: tuple[Array, Array] = kernels.compiled.mesh_points(
+                self.edges, self.rule.points, _INSIDE
+            )
+            return places
+        points = self.edges[:-1, None] + self.steps[:, None] * self.rule.points
+        points[:, -1] = self.edges[1:]
+        inside = points.copy()
         inside[:, 0] += _INSIDE * self.steps
         inside[:, -1] -= _INSIDE * self.steps
-        return inside
+        return points, inside
 
     def split(self, parts: IntArray) -> tuple[Mesh, IntArray]:
         """Cut element k into ``parts[k]`` equal ones; ``parts`` has shape (K,).
@@ -119,33 +135,39 @@ class Mesh:
         At an edge the element that contains ``inside`` is used; by default the one to the right.
         """
         t = np.asarray(t, dtype=np.float64)
-        for known, decided, sampler in self._samplers:
-            if _same(known, t) and _same(decided, inside):
+        if t.size > _KEPT_TIMES:
+            return self._new_sampler(t, inside)
+        asked = (t.tobytes(), None if inside is None else inside.tobytes())
+        for known, sampler in self._samplers:
+            if known == asked:
                 return sampler
         sampler = self._new_sampler(t, inside)
-        if t.size <= _KEPT_TIMES:
-            self._samplers.insert(0, (t.copy(), None if inside is None else inside.copy(), sampler))
-            del self._samplers[_KEPT_SAMPLERS:]
+        self._samplers.insert(0, (asked, sampler))
+        del self._samplers[_KEPT_SAMPLERS:]
         return sampler
 
     @cached_property
-    def _samplers(self) -> list[tuple[Array, Array | None, Sampler]]:
+    def _samplers(self) -> list[tuple[tuple[bytes, bytes | None], Sampler]]:
         """The last few: all signals of a run are reported at the same few sets of times."""
         return []
 
     def _new_sampler(self, t: Array, inside: Array | None) -> Sampler:
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
-        snap = 8.0 * np.finfo(float).eps * np.abs(t)
-        belongs = t + snap if inside is None else inside
+        rule = self.rule
+        if kernels.compiled is not None:
+            return Sampler(*kernels.compiled.sampler(
+                self.edges, rule.points, rule.barycentric, t, inside, _SNAP, _EXACT
+            ))
+        belongs = t + _SNAP * np.abs(t) if inside is None else inside
         element = np.searchsorted(self.edges, belongs, side="right") - 1
         element = np.clip(element, 0, self.size - 1)
         local = (t - self.edges[element]) / self.steps[element]
-        distance = local[:, None] - self.rule.points
-        exact = np.abs(distance) < 4.0 * np.finfo(float).eps
+        distance = local[:, None] - rule.points
+        exact = np.abs(distance) < _EXACT
         hit = exact.any(axis=1)
         with np.errstate(divide="ignore"):
-            weights = self.rule.barycentric / np.where(exact, 1.0, distance)
+            weights = rule.barycentric / np.where(exact, 1.0, distance)
         weights[hit] = exact[hit]
         weights /= weights.sum(axis=1, keepdims=True)
         return Sampler(element, weights)
@@ -167,12 +189,6 @@ def joining_change(rule: RadauRule, count: int) -> Array:
     return np.asarray(there - np.eye(size))
 
 
-def _same(known: Array | None, asked: Array | None) -> bool:
-    if known is None or asked is None:
-        return known is asked
-    return np.array_equal(known, asked)
-
-
 @dataclass(frozen=True, eq=False)
 class Sampler:
     """Barycentric interpolation to fixed times; apply it to any signal of the same mesh."""
@@ -182,6 +198,9 @@ class Sampler:
 
     def __call__(self, values: Array) -> Array:
         """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
+        if kernels.compiled is not None:
+            sampled: Array = kernels.compiled.sample(self.element, self.weights, _flat(values))
+            return sampled.reshape(len(sampled), *values.shape[2:])
         flat = values.reshape(*values.shape[:2], -1)
         out = np.empty((len(self.element), flat.shape[2]))
         if self._grouped is not None:
@@ -246,6 +265,8 @@ class Trajectory:
     def local_integral(self) -> Trajectory:
         """∫ from the left end of each element, starting at zero again in the next one."""
         rule, mesh = self.mesh.rule, self.mesh
+        if kernels.compiled is not None:
+            return self._integral(on=False)
         flat = self.values.reshape(mesh.size, rule.stages + 1, -1)
         out = np.zeros_like(flat)
         out[:, 1:] = mesh.steps[:, None, None] * np.matmul(rule.integration, flat[:, 1:])
@@ -253,10 +274,20 @@ class Trajectory:
 
     def integral(self) -> Trajectory:
         """∫ from the start of the mesh, by the mesh's own quadrature (order 2s − 1 at the ends)."""
+        if kernels.compiled is not None:
+            return self._integral(on=True)
         local = self.local_integral().values
         total = np.cumsum(local[:, -1], axis=0)
         local[1:] += total[:-1, None]
         return Trajectory(self.mesh, local)
+
+    def _integral(self, *, on: bool) -> Trajectory:
+        """Either of them in C: on from the elements before, or from each left end."""
+        mesh = self.mesh
+        out = kernels.compiled.integral(  # type: ignore[union-attr]
+            mesh.rule.integration, mesh.steps, _flat(self.values), on
+        )
+        return Trajectory(mesh, out.reshape(self.values.shape))
 
     def low_pass(self, rate: Array | float, start: Array | None = None) -> Trajectory:
         """Z of Z' = −λ (Z − S): the filter λ/(p + λ) applied to this signal S.
@@ -269,6 +300,14 @@ class Trajectory:
         mesh, rule = self.mesh, self.mesh.rule
         shape = self.values.shape[2:]
         rates = np.broadcast_to(np.asarray(rate, dtype=np.float64), shape).ravel()
+        if kernels.compiled is not None:
+            at_start = np.zeros(len(rates)) if start is None else start.ravel()
+            filtered = kernels.compiled.low_pass(
+                rule.differentiation, mesh.steps, _flat(self.values), rates, at_start
+            )
+            if filtered is None:
+                raise np.linalg.LinAlgError("a pivot is zero")
+            return Trajectory(mesh, filtered.reshape(self.values.shape))
         flat = self.values.reshape(mesh.size, rule.stages + 1, -1)
         distinct, which = np.unique(rates, return_inverse=True)
         at_start = np.zeros(flat.shape[2]) if start is None else start.ravel()
@@ -279,6 +318,13 @@ class Trajectory:
             columns = [np.flatnonzero(which == first + i) for i in range(len(some))]
             _filter(mesh, some, columns, flat, at_start, out)
         return Trajectory(mesh, out.reshape(self.values.shape))
+
+
+def _flat(values: Array) -> Array:
+    """Values (K, s + 1, …) as (K, s + 1, c)."""
+    if values.ndim == 3:
+        return values
+    return values.reshape(values.shape[0], values.shape[1], prod(values.shape[2:]))
 
 
 def _filter(
@@ -326,6 +372,12 @@ def unresolved_kinds(kinds: Sequence[tuple[Array, float]], rule: RadauRule) -> A
     Returns:
         shape (K,).
     """
+    if kernels.compiled is not None and len(kinds) <= _MOST_KINDS:
+        tail: Array = kernels.compiled.tails(
+            rule.to_legendre, used_coefficients(rule), _FOOT, SHARE,
+            *[either for kind in kinds for either in kind],
+        )
+        return tail
     seen = [(values, floor) for values, floor in kinds if values.shape[2]]
     if not seen:
         return np.zeros(len(kinds[0][0]))
@@ -335,13 +387,13 @@ def unresolved_kinds(kinds: Sequence[tuple[Array, float]], rule: RadauRule) -> A
     floors = np.maximum([floor for _, floor in seen], _TINY)
     values = seen[0][0] if len(seen) == 1 else np.concatenate([v for v, _ in seen], axis=2)
     scale = _scale_so_far(values, counts, floors)
-    ratio = np.abs(np.matmul(rule.to_legendre[-_used(rule) :], values))
+    ratio = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))
     # Powers are monotone: the worst component of each degree first, then its power.
     worst = np.minimum((ratio / scale[:, None]).max(axis=2), 1.0)
     return np.asarray((worst ** _to_next(rule)).max(axis=1))
 
 
-def _used(rule: RadauRule) -> int:
+def used_coefficients(rule: RadauRule) -> int:
     """How many of the last Legendre coefficients predict the next one."""
     return min(_COEFFICIENTS, rule.stages - 1)
 
@@ -349,7 +401,7 @@ def _used(rule: RadauRule) -> int:
 def _to_next(rule: RadauRule) -> Array:
     """(ρ^j)^this = ρ^(s + 1) for the degrees j that are used."""
     s = rule.stages
-    return (s + 1.0) / np.arange(s + 1 - _used(rule), s + 1)
+    return (s + 1.0) / np.arange(s + 1 - used_coefficients(rule), s + 1)
 
 
 def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
@@ -359,7 +411,7 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     scale ρ^(s+1); the largest prediction counts. Several, because single coefficients vanish by
     accident, two of them where the signal is odd or even.
     """
-    last = np.abs(np.matmul(rule.to_legendre[-_used(rule) :], values))  # degrees s + 1 − used … s
+    last = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))  # degrees s + 1 − used … s
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
     predicted = size * np.minimum(last / size, 1.0) ** _to_next(rule)[:, None]
     return np.asarray(predicted.max(axis=1))
@@ -368,13 +420,13 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
 def _scale_so_far(values: Array, counts: IntArray, floors: Array) -> Array:
     """Size of each component up to each element, (K, c), floored as in :func:`signal_scale`.
 
-    Also floored at 1e-8 of the final size, so that the foot of a pulse costs nothing. Components
+    Also floored at a share of the final size, so that the foot of a pulse costs nothing. Components
     of one kind, ``counts`` of them, stand together and share a floor.
     """
     size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
-    size = np.maximum(size, 1e-8 * size[-1])
+    size = np.maximum(size, _FOOT * size[-1])
     largest = np.maximum.reduceat(size, np.cumsum(counts) - counts, axis=1)
-    level = np.maximum(1e-3 * largest, floors)
+    level = np.maximum(SHARE * largest, floors)
     return np.asarray(np.maximum(size, np.repeat(level, counts, axis=1)))
 
 
@@ -385,7 +437,7 @@ def signal_scale(values: Array, floor: float = 0.0) -> Array:
     against that: rounding in the large ones reaches it.
     """
     size = np.abs(values).max(axis=(0, 1))
-    return np.asarray(np.maximum(size, max(1e-3 * float(size.max(initial=0.0)), floor, _TINY)))
+    return np.asarray(np.maximum(size, max(SHARE * float(size.max(initial=0.0)), floor, _TINY)))
 
 
 def initial_mesh(start: float, stop: float, breakpoints: Sequence[float] | Array,

@@ -1,6 +1,547 @@
 /* gpebo_cli/collocation/linear.py: element systems, chaining, error estimates. */
-#include "common.h"
+#include "elimination.h"
+
+#include <float.h>
+
+/* --- the element systems ------------------------------------------------------------------ */
+
+/* Values at points, the same at all of them where `step` is 0; NULL for what is not there. */
+typedef struct {
+    const double *from;
+    npy_intp step;
+} Moving;
+
+static inline const double *at(Moving values, npy_intp point)
+{
+    return values.from + point * values.step;
+}
+
+/* The equation of some elements, d equations for n components, and memory to work in. */
+typedef struct {
+    npy_intp s, d, n, columns;
+    const double *D; /* (s, s) */
+    Moving E, A, f, T, p;
+    double *h;        /* lengths (K,) */
+    double *together; /* (n, s d): T at all nodes of an element, side by side */
+    double *coupling; /* (s d,): a row of E times that */
+    double *slope;    /* (n, columns): (D p)_i / h */
+    double *AT;       /* (d, d) */
+} Equation;
+
+/* Node i of element k among all points. */
+static inline npy_intp node(const Equation *q, npy_intp k, npy_intp i)
+{
+    return k * (q->s + 1) + 1 + i;
+}
+
+/* (D_ij/h E_i T_j − δ_ij A_i T_i) of element k into the first s d columns of W, and the response
+   to the left end, (D𝟙)_i/h E_i, into the next n. */
+static inline void assemble(const Equation *q, npy_intp k, double *W, npy_intp length)
+{
+    const npy_intp s = q->s, d = q->d, n = q->n, m = s * d;
+    const int varying = q->T.from != NULL && q->T.step != 0;
+    const double h = q->h[k];
+    if (varying)
+        for (npy_intp j = 0; j < s; j++) {
+            const double *T = at(q->T, node(q, k, j));
+            for (npy_intp c = 0; c < n; c++)
+                for (npy_intp b = 0; b < d; b++)
+                    q->together[c * m + j * d + b] = T[c * d + b];
+        }
+    for (npy_intp i = 0; i < s; i++) {
+        const npy_intp point = node(q, k, i);
+        const double *A = at(q->A, point), *D = q->D + i * s;
+        if (q->T.from != NULL) {
+            multiply(q->AT, A, at(q->T, point), d, n, d);
+            A = q->AT;
+        }
+        double start = 0.0;
+        for (npy_intp j = 0; j < s; j++)
+            start += D[j] / h;
+        for (npy_intp a = 0; a < d; a++) {
+            double *restrict row = W + (i * d + a) * length;
+            double *restrict response = row + m;
+            if (q->E.from == NULL) {
+                memset(row, 0, (m + n) * sizeof(double));
+                for (npy_intp j = 0; j < s; j++)
+                    row[j * d + a] = D[j] / h;
+                response[a] = start;
+            } else {
+                const double *E = at(q->E, point) + a * n, *restrict coupled = q->coupling;
+                if (varying)
+                    multiply(q->coupling, E, q->together, 1, n, m);
+                else if (q->T.from != NULL)
+                    multiply(q->coupling, E, q->T.from, 1, n, d);
+                else
+                    coupled = E;
+                const npy_intp step = varying ? d : 0;
+                for (npy_intp j = 0; j < s; j++) {
+                    const double factor = D[j] / h;
+                    for (npy_intp b = 0; b < d; b++)
+                        row[j * d + b] = factor * coupled[j * step + b];
+                }
+                for (npy_intp c = 0; c < n; c++)
+                    response[c] = start * E[c];
+            }
+            for (npy_intp b = 0; b < d; b++)
+                row[i * d + b] -= A[a * d + b];
+        }
+    }
+}
+
+/* What drives z at the nodes of element k, f + A p − E (D p)/h, into columns of W from `place`. */
+static inline void drive(const Equation *q, npy_intp k, double *W, npy_intp length, npy_intp place)
+{
+    const npy_intp s = q->s, d = q->d, n = q->n, columns = q->columns, size = n * columns;
+    const double h = q->h[k];
+    for (npy_intp i = 0; i < s; i++) {
+        const npy_intp point = node(q, k, i);
+        const double *f = at(q->f, point);
+        if (q->p.from != NULL) {
+            memset(q->slope, 0, size * sizeof(double));
+            for (npy_intp j = 0; j < s; j++) {
+                const double factor = q->D[i * s + j] / h;
+                const double *restrict p = at(q->p, node(q, k, j));
+                for (npy_intp c = 0; c < size; c++)
+                    q->slope[c] += factor * p[c];
+            }
+        }
+        for (npy_intp a = 0; a < d; a++) {
+            double *restrict right = W + (i * d + a) * length + place;
+            for (npy_intp c = 0; c < columns; c++)
+                right[c] = f[a * columns + c];
+            if (q->p.from == NULL)
+                continue;
+            const double *A = at(q->A, point) + a * n, *p = at(q->p, point);
+            const double *E = q->E.from == NULL ? NULL : at(q->E, point) + a * n;
+            for (npy_intp e = 0; e < n; e++)
+                for (npy_intp c = 0; c < columns; c++)
+                    right[c] += A[e] * p[e * columns + c];
+            if (E == NULL)
+                for (npy_intp c = 0; c < columns; c++)
+                    right[c] -= q->slope[a * columns + c];
+            else
+                for (npy_intp e = 0; e < n; e++)
+                    for (npy_intp c = 0; c < columns; c++)
+                        right[c] -= E[e] * q->slope[e * columns + c];
+        }
+    }
+}
+
+/* out (s, n, width) = T_i z_i (+ p_i where it is `added`), z_i (d, width) in W from `place` on. */
+static inline void expand(const Equation *q, npy_intp k, const double *W, npy_intp length,
+                          npy_intp place, npy_intp width, int added, double *restrict out)
+{
+    const npy_intp s = q->s, d = q->d, n = q->n;
+    for (npy_intp i = 0; i < s; i++) {
+        const npy_intp point = node(q, k, i);
+        const double *z = W + i * d * length + place;
+        const double *p = added && q->p.from != NULL ? at(q->p, point) : NULL;
+        for (npy_intp c = 0; c < n; c++, out += width) {
+            if (q->T.from == NULL) {
+                memcpy(out, z + c * length, width * sizeof(double));
+            } else {
+                const double *T = at(q->T, point) + c * d;
+                for (npy_intp j = 0; j < width; j++)
+                    out[j] = 0.0;
+                for (npy_intp e = 0; e < d; e++)
+                    for (npy_intp j = 0; j < width; j++)
+                        out[j] += T[e] * z[e * length + j];
+            }
+            if (p != NULL)
+                for (npy_intp j = 0; j < width; j++)
+                    out[j] += p[c * width + j];
+        }
+    }
+}
+
+/* Elements 0 … count − 1, one system each; 0 if one is singular. */
+EVERY_WIDTH static int distinct_elements(const Equation *q, npy_intp count, double *W,
+                                         double *homogeneous, double *particular)
+{
+    const npy_intp m = q->s * q->d, n = q->n, sides = n + q->columns;
+    const npy_intp length = row_length(m, sides);
+    for (npy_intp k = 0; k < count; k++) {
+        for (npy_intp i = 0; i < m; i++)
+            for (npy_intp j = m + sides; j < length; j++)
+                W[i * length + j] = 0.0;
+        assemble(q, k, W, length);
+        drive(q, k, W, length, m + n);
+        if (!eliminate(W, m, sides))
+            return 0;
+        expand(q, k, W, length, m, n, 0, homogeneous + k * q->s * n * n);
+        expand(q, k, W, length, m + n, q->columns, 1, particular + k * q->s * n * q->columns);
+    }
+    return 1;
+}
+
+/* Elements of one length under constant E, A and T: one system for all, whose responses to the
+   left end are the same; 0 if it is singular. */
+EVERY_WIDTH static int equal_elements(const Equation *q, const int *members, npy_intp count,
+                                      double *W, double *homogeneous, double *particular)
+{
+    const npy_intp m = q->s * q->d, n = q->n, columns = q->columns, sides = n + count * columns;
+    const npy_intp length = row_length(m, sides);
+    for (npy_intp i = 0; i < m; i++)
+        for (npy_intp j = m + sides; j < length; j++)
+            W[i * length + j] = 0.0;
+    assemble(q, members[0], W, length);
+    for (npy_intp k = 0; k < count; k++)
+        drive(q, members[k], W, length, m + n + k * columns);
+    if (!eliminate(W, m, sides))
+        return 0;
+    expand(q, members[0], W, length, m, n, 0, homogeneous);
+    for (npy_intp k = 0; k < count; k++)
+        expand(q, members[k], W, length, m + n + k * columns, columns, 1,
+               particular + members[k] * q->s * n * columns);
+    return 1;
+}
+
+/* An argument with values at points, or None; 0, with an exception, if it is neither, or has not
+   `rows` rows and `columns` columns at each of `points` points or at one for all. */
+static int moving(Call *call, Py_ssize_t place, const char *what, npy_intp points, npy_intp rows,
+                  npy_intp columns, Moving *out)
+{
+    *out = (Moving){NULL, 0};
+    if (call->given[place] == Py_None)
+        return 1;
+    PyArrayObject *array = doubles(call, place, 3);
+    if (array == NULL || !same(what, size(array, 1), rows) || !same(what, size(array, 2), columns))
+        return 0;
+    const int constant = size(array, 0) == 1;
+    if (!constant && !same(what, size(array, 0), points))
+        return 0;
+    *out = (Moving){data(array), constant ? 0 : rows * columns};
+    return 1;
+}
+
+/* element_maps(D (s, s), h (K,), E or None, A, f, T or None, p or None, equal)
+
+   E, A (N or 1, d, n) and f (N or 1, d, columns) at the N = K (s + 1) points of K elements; with
+   constraints T (N or 1, n, d) and p (N or 1, n, columns), else d = n. Where E, A and T are
+   constant, lengths that differ by `equal` times the longest, or less, count as equal.
+
+   Returns the responses to the left end (K or 1, s, n, n), one for all elements if they are the
+   same, and the particular solutions (K, s, n, columns); None if a system is singular. */
+static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 8))
+        return NULL;
+    PyArrayObject *D = doubles(&call, 0, 2), *h = D ? doubles(&call, 1, 1) : NULL;
+    PyArrayObject *A = h ? doubles(&call, 3, 3) : NULL, *f = A ? doubles(&call, 4, 3) : NULL;
+    const double equal = PyFloat_AsDouble(given[7]);
+    if (f == NULL || PyErr_Occurred() || !same("rows and columns of D", size(D, 0), size(D, 1)))
+        return failed(&call);
+    Equation q = {.s = size(D, 0), .d = size(A, 1), .n = size(A, 2), .columns = size(f, 2)};
+    const npy_intp K = size(h, 0), s = q.s, d = q.d, n = q.n, columns = q.columns, m = s * d;
+    const npy_intp points = K * (s + 1);
+    if (!moving(&call, 2, "points, rows or columns of E", points, d, n, &q.E) ||
+        !moving(&call, 3, "points, rows or columns of A", points, d, n, &q.A) ||
+        !moving(&call, 4, "points, rows or columns of f", points, d, columns, &q.f) ||
+        !moving(&call, 5, "points, rows or columns of T", points, n, d, &q.T) ||
+        !moving(&call, 6, "points, rows or columns of p", points, n, columns, &q.p))
+        return failed(&call);
+    if ((q.T.from == NULL && !same("rows and columns of A", d, n)) ||
+        (q.T.from != NULL && q.E.from == NULL && !same("constraints without E", 1, 0)))
+        return failed(&call);
+    q.D = data(D);
+    q.h = data(h);
+    double longest = 0.0;
+    for (npy_intp k = 0; k < K; k++)
+        longest = q.h[k] > longest ? q.h[k] : longest;
+    const int constant = q.A.step == 0 && q.E.step == 0 && q.T.step == 0;
+    const npy_intp sides = n + columns * (constant ? K : 1);
+    q.together = scratch(&call, n * m + m + n * columns + d * d);
+    double *W = q.together ? scratch(&call, m * row_length(m, sides)) : NULL;
+    int *members = W ? integers(&call, 2 * K) : NULL;
+    PyArrayObject *particular =
+        members ? fresh(&call, 4, (npy_intp[]){K, s, n, columns}) : NULL;
+    if (particular == NULL)
+        return failed(&call);
+    q.coupling = q.together + n * m;
+    q.slope = q.coupling + m;
+    q.AT = q.slope + n * columns;
+    /* The group of one length that each element belongs to, the first element of each group. */
+    int groups = 0, *group = members + K;
+    for (npy_intp k = 0; constant && k < K; k++) {
+        group[k] = 0;
+        while (group[k] < groups && !(fabs(q.h[k] - q.h[members[group[k]]]) <= equal * longest))
+            group[k]++;
+        if (group[k] == groups)
+            members[groups++] = (int)k;
+    }
+    const npy_intp own = constant && groups == 1 ? 1 : K, block = s * n * n;
+    PyArrayObject *homogeneous = fresh(&call, 4, (npy_intp[]){own, s, n, n});
+    if (homogeneous == NULL)
+        return failed(&call);
+    int solved = 1;
+    if (!constant)
+        solved = distinct_elements(&q, K, W, data(homogeneous), data(particular));
+    for (int g = 0; solved && constant && g < groups; g++) {
+        npy_intp found = 0;
+        for (npy_intp k = 0; k < K; k++)
+            if (group[k] == g)
+                members[found++] = (int)k;
+        double *first = data(homogeneous) + (own == 1 ? 0 : members[0]) * block;
+        solved = equal_elements(&q, members, found, W, first, data(particular));
+        for (npy_intp i = 1; own != 1 && i < found; i++)
+            memcpy(data(homogeneous) + members[i] * block, first, block * sizeof(double));
+    }
+    if (!solved) {
+        failed(&call);
+        Py_RETURN_NONE;
+    }
+    return results(&call, 2, homogeneous, particular);
+}
+
+/* --- chaining ----------------------------------------------------------------------------- */
+
+/* out (rows, columns) = a (rows, n) x (n, columns) + b (rows, columns). */
+static inline void affine(double *restrict out, const double *restrict a, const double *restrict x,
+                          const double *restrict b, npy_intp rows, npy_intp n, npy_intp columns)
+{
+    if (columns == 1) {
+        for (npy_intp i = 0; i < rows; i++) {
+            double sum = 0.0;
+            for (npy_intp e = 0; e < n; e++)
+                sum += a[i * n + e] * x[e];
+            out[i] = sum + b[i];
+        }
+        return;
+    }
+    for (npy_intp i = 0; i < rows; i++, out += columns) {
+        for (npy_intp c = 0; c < columns; c++)
+            out[c] = 0.0;
+        for (npy_intp e = 0; e < n; e++)
+            for (npy_intp c = 0; c < columns; c++)
+                out[c] += a[i * n + e] * x[e * columns + c];
+        for (npy_intp c = 0; c < columns; c++)
+            out[c] += b[i * columns + c];
+    }
+}
+
+/* Whether all numbers are finite. */
+static inline int all_finite(const double *values, npy_intp count)
+{
+    int bad = 0;
+    for (npy_intp i = 0; i < count; i++)
+        bad |= !(fabs(values[i]) <= DBL_MAX);
+    return !bad;
+}
+
+/* chain(homogeneous (K or 1, s, n, n), particular (K, s, n, columns), start (n, columns))
+
+   Returns the values (K, s + 1, n, columns), and how many elements in front are finite. */
+static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 3))
+        return NULL;
+    PyArrayObject *H = doubles(&call, 0, 4), *P = H ? doubles(&call, 1, 4) : NULL;
+    PyArrayObject *start = P ? doubles(&call, 2, 2) : NULL;
+    if (start == NULL)
+        return failed(&call);
+    const npy_intp K = size(P, 0), s = size(P, 1), n = size(P, 2), columns = size(P, 3);
+    const npy_intp constant = size(H, 0) == 1, block = n * columns;
+    if ((!constant && !same("elements", size(H, 0), K)) || !same("stages", size(H, 1), s) ||
+        !same("components", size(H, 2), n) || !same("components", size(H, 3), n) ||
+        !same("components of the start", size(start, 0), n) ||
+        !same("columns of the start", size(start, 1), columns))
+        return failed(&call);
+    PyArrayObject *values = fresh(&call, 4, (npy_intp[]){K, s + 1, n, columns});
+    if (values == NULL)
+        return failed(&call);
+    const double *state = data(start);
+    double *out = data(values);
+    npy_intp whole = 0;
+    for (npy_intp k = 0; k < K; k++, out += (s + 1) * block) {
+        const double *h = data(H) + (constant ? 0 : k * s * n * n);
+        memcpy(out, state, block * sizeof(double));
+        affine(out + block, h, out, data(P) + k * s * block, s * n, n, columns);
+        whole += whole == k && all_finite(out, (s + 1) * block);
+        state = out + s * block;
+    }
+    PyObject *answer = Py_BuildValue("(On)", (PyObject *)values, (Py_ssize_t)whole);
+    failed(&call); /* gives back what was held */
+    return answer;
+}
+
+/* --- error estimates ---------------------------------------------------------------------- */
+
+#define LAST 4 /* Legendre coefficients that are looked at */
+
+/* The larger one; what is not a number stays. */
+static inline double larger(double a, double b)
+{
+    return a >= b || a != a ? a : b;
+}
+
+/* |last Legendre coefficients| (rows, C) of the point values (points, C) of one element. */
+static inline void coefficients(double *restrict out, const double *to_legendre,
+                                const double *values, npy_intp rows, npy_intp points, npy_intp C)
+{
+    for (npy_intp j = 0; j < rows; j++) {
+        double *restrict row = out + j * C;
+        for (npy_intp c = 0; c < C; c++)
+            row[c] = 0.0;
+        for (npy_intp i = 0; i < points; i++) {
+            const double weight = to_legendre[j * points + i];
+            const double *restrict v = values + i * C;
+            for (npy_intp c = 0; c < C; c++)
+                row[c] += weight * v[c];
+        }
+        for (npy_intp c = 0; c < C; c++)
+            row[c] = fabs(row[c]);
+    }
+}
+
+/* scale (C,) = size (C,), but not below `share` of the largest, nor below `floor`. */
+static void floored(double *scale, const double *size, npy_intp C, double share, double floor)
+{
+    double largest = 0.0;
+    for (npy_intp c = 0; c < C; c++)
+        largest = larger(largest, size[c]);
+    const double least = larger(larger(share * largest, floor), DBL_MIN);
+    for (npy_intp c = 0; c < C; c++)
+        scale[c] = larger(size[c], least);
+}
+
+/* Local errors (C,) of the right end of an element from its last Legendre coefficients (used, C),
+   see :func:`_propagated_error`. */
+static void local_errors(double *local, const double *last, const double *size,
+                         const double *scale, npy_intp s, npy_intp used, npy_intp C)
+{
+    const double half = 0.5 * (double)(s - 1) / (double)s;
+    for (npy_intp c = 0; c < C; c++) {
+        double worst = -INFINITY; /* logarithm of tail/scale */
+        for (npy_intp j = 0; j < used; j++) {
+            const double ratio = last[j * C + c] / scale[c];
+            const double power = (double)(s + 1) / (double)(s + 1 - used + j);
+            worst = larger(worst, ratio > 1.0 ? 0.0 : power * log(ratio));
+        }
+        const double own = larger(size[c], DBL_MIN);
+        const double decay = worst + log(scale[c] / own);
+        const double rounding = 4 * DBL_EPSILON * larger(size[c], scale[c] * DBL_EPSILON);
+        local[c] = scale[c] * exp(worst + half * (decay > 0.0 ? 0.0 : decay)) + rounding;
+    }
+}
+
+/* estimates(homogeneous (K or 1, s, n, n), values (K, s + 1, n, columns), to_legendre, used,
+   amplification (n, n + 1) or None, floor, share, level)
+
+   Of finite values: the largest accumulated error of an end point, the visible noise, and
+   rounding, each relative to the component's size; the last ones of to_legendre (s + 1, s + 1)
+   are looked at, `used` of them for tails. */
+static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 8))
+        return NULL;
+    PyArrayObject *H = doubles(&call, 0, 4), *V = H ? doubles(&call, 1, 4) : NULL;
+    PyArrayObject *L = V ? doubles(&call, 2, 2) : NULL, *amplified = NULL;
+    if (L == NULL)
+        return failed(&call);
+    const npy_intp used = PyLong_AsSsize_t(given[3]);
+    const double floor = PyFloat_AsDouble(given[5]), share = PyFloat_AsDouble(given[6]);
+    const double level = PyFloat_AsDouble(given[7]);
+    if (PyErr_Occurred())
+        return failed(&call);
+    const npy_intp K = size(V, 0), s = size(V, 1) - 1, n = size(V, 2), columns = size(V, 3);
+    const npy_intp constant = size(H, 0) == 1, C = n * columns, points = s + 1;
+    if ((!constant && !same("elements", size(H, 0), K)) || !same("stages", size(H, 1), s) ||
+        !same("components", size(H, 2), n) || !same("components", size(H, 3), n) ||
+        !same("rows of to_legendre", size(L, 0), points) ||
+        !same("columns of to_legendre", size(L, 1), points))
+        return failed(&call);
+    const npy_intp rows = points < LAST ? points : LAST;
+    if (used < 0 || used > rows) {
+        PyErr_SetString(PyExc_ValueError, "more Legendre coefficients used than there are");
+        return failed(&call);
+    }
+    if (given[4] != Py_None) {
+        amplified = doubles(&call, 4, 2);
+        if (amplified == NULL || !same("rows of amplification", size(amplified, 0), n) ||
+            !same("columns of amplification", size(amplified, 1), n + 1))
+            return failed(&call);
+    }
+    double *work = scratch(&call, (size_t)(C * (K + 11 + LAST)));
+    if (work == NULL)
+        return failed(&call);
+    double *sizes = work, *whole = sizes + K * C, *scale = whole + C, *last = scale + C;
+    double *noise = last + LAST * C, *local = noise + C, *error = local + C;
+    double *before = error + 2 * C, *worst = before + 2 * C, *brought = worst + C;
+    for (npy_intp c = 0; c < C; c++)
+        whole[c] = noise[c] = worst[c] = brought[c] = 0.0;
+    for (npy_intp k = 0; k < K; k++) {
+        double *restrict own = sizes + k * C;
+        const double *restrict v = data(V) + k * points * C;
+        for (npy_intp c = 0; c < C; c++)
+            own[c] = 0.0;
+        for (npy_intp i = 0; i < points; i++, v += C)
+            for (npy_intp c = 0; c < C; c++) {
+                const double one = fabs(v[c]);
+                own[c] = one > own[c] ? one : own[c];
+            }
+        for (npy_intp c = 0; c < C; c++)
+            whole[c] = own[c] > whole[c] ? own[c] : whole[c];
+    }
+    floored(scale, whole, C, share, 0.0);
+    const double *to_legendre = data(L) + (points - rows) * points;
+    for (npy_intp k = 0; k < K; k++) {
+        coefficients(last, to_legendre, data(V) + k * points * C, rows, points, C);
+        for (npy_intp c = 0; s >= LAST && c < C; c++) {
+            const double earlier = larger(last[c], last[C + c]);
+            const double after = larger(last[2 * C + c], last[3 * C + c]);
+            if (after >= level * earlier)
+                noise[c] = larger(noise[c], after);
+        }
+        local_errors(local, last + (rows - used) * C, sizes + k * C, scale, s, used, C);
+        /* All signs equal, and alternating. */
+        for (int e = 0; e < 2; e++) {
+            const double sign = e && k % 2 ? -1.0 : 1.0;
+            double *own = error + e * C;
+            for (npy_intp c = 0; c < C; c++)
+                brought[c] = sign * local[c];
+            if (k == 0) {
+                memcpy(own, brought, C * sizeof(double));
+            } else {
+                const double *h = data(H) + ((constant ? 0 : k * s) + s - 1) * n * n;
+                memcpy(before + e * C, own, C * sizeof(double));
+                affine(own, h, before + e * C, brought, n, n, columns);
+            }
+            for (npy_intp c = 0; c < C; c++)
+                worst[c] = larger(worst[c], fabs(own[c]));
+        }
+    }
+    double propagated = 0.0, visible = 0.0, rounding = 0.0, largest = 0.0;
+    for (npy_intp c = 0; c < C; c++) {
+        propagated = larger(propagated, worst[c] / scale[c]);
+        visible = larger(visible, noise[c] / scale[c]);
+        largest = larger(largest, whole[c]);
+        brought[c] = 0.0;
+    }
+    for (npy_intp i = 0; amplified != NULL && i < n; i++)
+        for (npy_intp c = 0; c < columns; c++) {
+            const double *by = data(amplified) + i * (n + 1);
+            double sum = 0.0;
+            for (npy_intp e = 0; e < n; e++)
+                sum += by[e] * whole[e * columns + c];
+            brought[i * columns + c] = DBL_EPSILON * (sum + by[n]);
+        }
+    floored(scale, whole, C, share, floor);
+    for (npy_intp c = 0; c < C; c++)
+        rounding = larger(rounding, (DBL_EPSILON * largest + brought[c]) / scale[c]);
+    failed(&call); /* gives back what was held */
+    return Py_BuildValue("(ddd)", propagated, visible, rounding);
+}
 
 PyMethodDef collocation_kernels[] = {
+    {"element_maps", (PyCFunction)(void (*)(void))element_maps, METH_FASTCALL, NULL},
+    {"chain", (PyCFunction)(void (*)(void))chain, METH_FASTCALL, NULL},
+    {"estimates", (PyCFunction)(void (*)(void))estimates, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL},
 };

@@ -1,6 +1,421 @@
 /* gpebo_cli/collocation/mesh.py: signals on a mesh, how well it resolves them, sampling, filters. */
-#include "common.h"
+#include "elimination.h"
+
+#include <float.h>
+
+/* The larger one; what is not a number stays. */
+static inline double larger(double a, double b)
+{
+    return a >= b || a != a ? a : b;
+}
+
+/* --- how well a mesh resolves signals ----------------------------------------------------- */
+
+/* Adds to worst (used,) one kind's values (points, c) of one element: its last Legendre
+   coefficients, relative to the components' scale (c,). */
+static inline void add_ratios(double *worst, const double *to_legendre, npy_intp used,
+                              npy_intp points, const double *values, const double *scale,
+                              double *restrict row, npy_intp c)
+{
+    for (npy_intp j = 0; j < used; j++) {
+        for (npy_intp b = 0; b < c; b++)
+            row[b] = 0.0;
+        for (npy_intp i = 0; i < points; i++) {
+            const double weight = to_legendre[j * points + i];
+            const double *restrict v = values + i * c;
+            for (npy_intp b = 0; b < c; b++)
+                row[b] += weight * v[b];
+        }
+        for (npy_intp b = 0; b < c; b++)
+            worst[j] = larger(worst[j], fabs(row[b]) / scale[b]);
+    }
+}
+
+/* worst (K, used) of one kind, values (K, points, c); `work` holds (K + 2) c numbers. */
+EVERY_WIDTH static void tails_of_kind(double *worst, const double *to_legendre, npy_intp used,
+                                      npy_intp K, npy_intp points, const double *values,
+                                      npy_intp c, double floor, double foot, double share,
+                                      double *work)
+{
+    double *scale = work + K * c, *row = scale + c;
+    for (npy_intp k = 0; k < K; k++) { /* largest value of each component so far */
+        double *restrict own = work + k * c;
+        const double *restrict v = values + k * points * c;
+        for (npy_intp b = 0; b < c; b++)
+            own[b] = k ? work[(k - 1) * c + b] : 0.0;
+        for (npy_intp i = 0; i < points; i++, v += c)
+            for (npy_intp b = 0; b < c; b++)
+                own[b] = larger(own[b], fabs(v[b]));
+    }
+    const double *final = work + (K - 1) * c;
+    for (npy_intp k = 0; k < K; k++) {
+        double largest = 0.0;
+        for (npy_intp b = 0; b < c; b++) {
+            scale[b] = larger(work[k * c + b], foot * final[b]);
+            largest = larger(largest, scale[b]);
+        }
+        const double level = larger(share * largest, floor);
+        for (npy_intp b = 0; b < c; b++)
+            scale[b] = larger(scale[b], level);
+        add_ratios(worst + k * used, to_legendre, used, points, values + k * points * c, scale,
+                   row, c);
+    }
+}
+
+/* tails(to_legendre (s + 1, s + 1), used, foot, share, values (K, s + 1, c), floor, …)
+
+   The tail (K,) of signals of several kinds, see :func:`unresolved_kinds`. */
+static PyObject *tails(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, count < 6 ? 6 : count - count % 2))
+        return NULL;
+    PyArrayObject *L = doubles(&call, 0, 2);
+    const npy_intp used = L ? PyLong_AsSsize_t(given[1]) : 0;
+    const double foot = L ? PyFloat_AsDouble(given[2]) : 0.0;
+    const double share = L ? PyFloat_AsDouble(given[3]) : 0.0;
+    if (PyErr_Occurred() || !same("rows and columns of to_legendre", size(L, 0), size(L, 1)))
+        return failed(&call);
+    const npy_intp points = size(L, 0), s = points - 1;
+    if (used < 0 || used > s) {
+        PyErr_SetString(PyExc_ValueError, "more Legendre coefficients used than there are");
+        return failed(&call);
+    }
+    npy_intp K = -1, most = 0;
+    PyArrayObject *kinds[MOST_HELD];
+    double floors[MOST_HELD];
+    int found = 0;
+    for (Py_ssize_t place = 4; place < count; place += 2, found++) {
+        PyArrayObject *kind = doubles(&call, place, 3);
+        if (kind == NULL)
+            return failed(&call);
+        floors[found] = larger(PyFloat_AsDouble(given[place + 1]), DBL_MIN);
+        K = K < 0 ? size(kind, 0) : K;
+        if (PyErr_Occurred() || !same("elements", size(kind, 0), K) ||
+            !same("points", size(kind, 1), points))
+            return failed(&call);
+        kinds[found] = kind;
+        most = size(kind, 2) > most ? size(kind, 2) : most;
+    }
+    PyArrayObject *tail = fresh(&call, 1, &K);
+    double *work = tail ? scratch(&call, (size_t)((K + 2) * most + K * used)) : NULL;
+    if (work == NULL)
+        return failed(&call);
+    double *worst = work + (K + 2) * most;
+    for (npy_intp i = 0; i < K * used; i++)
+        worst[i] = 0.0;
+    const double *rows = data(L) + (points - used) * points;
+    for (int kind = 0; kind < found; kind++)
+        if (K > 0 && size(kinds[kind], 2) > 0)
+            tails_of_kind(worst, rows, used, K, points, data(kinds[kind]), size(kinds[kind], 2),
+                          floors[kind], foot, share, work);
+    for (npy_intp k = 0; k < K; k++) {
+        double most_of_all = 0.0;
+        for (npy_intp j = 0; j < used; j++) {
+            const double ratio = worst[k * used + j];
+            const double power = (double)(s + 1) / (double)(s + 1 - used + j);
+            most_of_all = larger(most_of_all, ratio > 1.0 ? 1.0 : pow(ratio, power));
+        }
+        data(tail)[k] = most_of_all;
+    }
+    return results(&call, 1, tail);
+}
+
+/* --- points and sampling ------------------------------------------------------------------ */
+
+/* mesh_points(edges (K + 1,), places (s + 1,), inside)
+
+   The points (K, s + 1) of all elements; and the same with both ends `inside` times the length
+   within the element. */
+static PyObject *mesh_points(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 3))
+        return NULL;
+    PyArrayObject *edges = doubles(&call, 0, 1), *places = edges ? doubles(&call, 1, 1) : NULL;
+    const double off = places ? PyFloat_AsDouble(given[2]) : 0.0;
+    if (PyErr_Occurred())
+        return failed(&call);
+    const npy_intp K = size(edges, 0) - 1, width = size(places, 0);
+    if (K < 0 || width < 2) {
+        PyErr_SetString(PyExc_ValueError, "no edge, or fewer than two places");
+        return failed(&call);
+    }
+    PyArrayObject *points = fresh(&call, 2, (npy_intp[]){K, width});
+    PyArrayObject *within = points ? fresh(&call, 2, (npy_intp[]){K, width}) : NULL;
+    if (within == NULL)
+        return failed(&call);
+    double *p = data(points), *w = data(within);
+    for (npy_intp k = 0; k < K; k++, p += width, w += width) {
+        const double left = data(edges)[k], right = data(edges)[k + 1], step = right - left;
+        for (npy_intp i = 0; i < width; i++)
+            p[i] = left + step * data(places)[i];
+        p[width - 1] = right;
+        memcpy(w, p, width * sizeof(double));
+        w[0] += off * step;
+        w[width - 1] -= off * step;
+    }
+    return results(&call, 2, points, within);
+}
+
+/* sampler(edges (K + 1,), places (s + 1,), barycentric (s + 1,), t (N,), inside (N,) or None,
+   snap, exact)
+
+   The elements (N,) that contain `inside`, or t moved to the right by `snap` |t|, and the weights
+   (N, s + 1) of interpolation at t; nearer than `exact` a point's own value is taken. */
+static PyObject *sampler(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 7))
+        return NULL;
+    PyArrayObject *edges = doubles(&call, 0, 1), *places = edges ? doubles(&call, 1, 1) : NULL;
+    PyArrayObject *barycentric = places ? doubles(&call, 2, 1) : NULL;
+    PyArrayObject *t = barycentric ? doubles(&call, 3, 1) : NULL, *inside = NULL;
+    if (t == NULL || (given[4] != Py_None && (inside = doubles(&call, 4, 1)) == NULL))
+        return failed(&call);
+    const double snap = PyFloat_AsDouble(given[5]), exact = PyFloat_AsDouble(given[6]);
+    const npy_intp K = size(edges, 0) - 1, width = size(places, 0), N = size(t, 0);
+    if (PyErr_Occurred() || !same("places and weights", width, size(barycentric, 0)) ||
+        (inside != NULL && !same("times and where they are decided", N, size(inside, 0))))
+        return failed(&call);
+    if (K < 1) {
+        PyErr_SetString(PyExc_ValueError, "no element");
+        return failed(&call);
+    }
+    PyArrayObject *weights = fresh(&call, 2, (npy_intp[]){N, width});
+    PyObject *chosen = weights ? PyArray_SimpleNew(1, (npy_intp[]){N}, NPY_INTP) : NULL;
+    if (chosen == NULL)
+        return failed(&call);
+    npy_intp *element = (npy_intp *)PyArray_DATA((PyArrayObject *)chosen), e = 0;
+    const double *edge = data(edges);
+    for (npy_intp i = 0; i < N; i++) {
+        const double when = data(t)[i];
+        const double belongs = inside ? data(inside)[i] : when + snap * fabs(when);
+        if (!(edge[e] <= belongs && (e == K - 1 || belongs < edge[e + 1]))) {
+            npy_intp above = K; /* the first edge beyond, but one of 1 … K; NaN: the last */
+            for (e = 0; above - e > 1;) {
+                const npy_intp middle = e + (above - e) / 2;
+                if (edge[middle] > belongs)
+                    above = middle;
+                else
+                    e = middle;
+            }
+        }
+        element[i] = e;
+        const double local = (when - edge[e]) / (edge[e + 1] - edge[e]);
+        double *restrict row = data(weights) + i * width, sum = 0.0;
+        int hits = 0;
+        for (npy_intp j = 0; j < width; j++) {
+            const double distance = local - data(places)[j];
+            if (fabs(distance) < exact)
+                hits++;
+            row[j] = data(barycentric)[j] / distance;
+        }
+        for (npy_intp j = 0; hits && j < width; j++)
+            row[j] = fabs(local - data(places)[j]) < exact ? 1.0 : 0.0;
+        for (npy_intp j = 0; j < width; j++)
+            sum += row[j];
+        for (npy_intp j = 0; j < width; j++)
+            row[j] /= sum;
+    }
+    PyObject *answer = Py_BuildValue("(NO)", chosen, (PyObject *)weights);
+    failed(&call); /* gives back what was held */
+    return answer;
+}
+
+/* out (N, c): each the weighted sum of the point values (points, c) of its element. */
+EVERY_WIDTH static void weighted_sums(double *out, const npy_intp *element, const double *weights,
+                                      const double *values, npy_intp N, npy_intp points,
+                                      npy_intp c)
+{
+    for (npy_intp i = 0; i < N; i++, weights += points, out += c) {
+        const double *v = values + element[i] * points * c;
+        if (c == 1) {
+            double sum = 0.0;
+            for (npy_intp j = 0; j < points; j++)
+                sum += weights[j] * v[j];
+            out[0] = sum;
+            continue;
+        }
+        double *restrict row = out;
+        for (npy_intp b = 0; b < c; b++)
+            row[b] = 0.0;
+        for (npy_intp j = 0; j < points; j++, v += c) {
+            const double weight = weights[j];
+            const double *restrict own = v;
+            for (npy_intp b = 0; b < c; b++)
+                row[b] += weight * own[b];
+        }
+    }
+}
+
+/* sample(element (N,), weights (N, s + 1), values (K, s + 1, c)): their weighted sums (N, c). */
+static PyObject *sample(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 3))
+        return NULL;
+    PyArrayObject *element = indices(&call, 0, 1), *weights = element ? doubles(&call, 1, 2) : NULL;
+    PyArrayObject *values = weights ? doubles(&call, 2, 3) : NULL;
+    if (values == NULL || !same("elements and weights", size(element, 0), size(weights, 0)) ||
+        !same("weights and points", size(weights, 1), size(values, 1)))
+        return failed(&call);
+    const npy_intp N = size(element, 0), K = size(values, 0), c = size(values, 2);
+    const npy_intp *which = (const npy_intp *)PyArray_DATA(element);
+    for (npy_intp i = 0; i < N; i++)
+        if (which[i] < 0 || which[i] >= K) {
+            PyErr_Format(PyExc_ValueError, "element %zd of %zd", (Py_ssize_t)which[i],
+                         (Py_ssize_t)K);
+            return failed(&call);
+        }
+    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){N, c});
+    if (out == NULL)
+        return failed(&call);
+    weighted_sums(data(out), which, data(weights), data(values), N, size(weights, 1), c);
+    return results(&call, 1, out);
+}
+
+/* --- integrals and filters ---------------------------------------------------------------- */
+
+/* integral(R (s, s), steps (K,), values (K, s + 1, c), on)
+
+   Integrals (K, s + 1, c) from the left end of each element, or, if `on`, of the first one. */
+static PyObject *integral(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 4))
+        return NULL;
+    PyArrayObject *R = doubles(&call, 0, 2), *steps = R ? doubles(&call, 1, 1) : NULL;
+    PyArrayObject *values = steps ? doubles(&call, 2, 3) : NULL;
+    const int on = values ? PyObject_IsTrue(given[3]) : -1;
+    if (on < 0)
+        return failed(&call);
+    const npy_intp K = size(values, 0), s = size(values, 1) - 1, c = size(values, 2);
+    if (!same("steps and elements", size(steps, 0), K) || !same("rows of R", size(R, 0), s) ||
+        !same("columns of R", size(R, 1), s))
+        return failed(&call);
+    PyArrayObject *integrals = fresh(&call, 3, PyArray_DIMS(values));
+    double *before = integrals ? scratch(&call, 2 * c) : NULL;
+    if (before == NULL)
+        return failed(&call);
+    double *restrict total = before, *restrict sum = before + c;
+    for (npy_intp b = 0; b < c; b++)
+        total[b] = 0.0;
+    const double *v = data(values);
+    double *out = data(integrals);
+    for (npy_intp k = 0; k < K; k++, v += (s + 1) * c, out += (s + 1) * c) {
+        const double step = data(steps)[k];
+        memcpy(out, total, c * sizeof(double));
+        for (npy_intp i = 0; i < s; i++) {
+            double *restrict row = out + (i + 1) * c;
+            for (npy_intp b = 0; b < c; b++)
+                sum[b] = 0.0;
+            for (npy_intp j = 0; j < s; j++) {
+                const double weight = data(R)[i * s + j];
+                const double *restrict own = v + (j + 1) * c;
+                for (npy_intp b = 0; b < c; b++)
+                    sum[b] += weight * own[b];
+            }
+            for (npy_intp b = 0; b < c; b++)
+                row[b] = step * sum[b] + total[b];
+        }
+        for (npy_intp b = 0; on && b < c; b++)
+            total[b] = out[s * c + b];
+    }
+    return results(&call, 1, integrals);
+}
+
+/* low_pass(D (s, s), steps (K,), values (K, s + 1, c), rates (c,), start (c,))
+
+   Z (K, s + 1, c) of Z' = −λ (Z − S) with a rate for each column; None if a system is singular.
+   Columns that share a rate share a factorisation. */
+static PyObject *low_pass(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 5))
+        return NULL;
+    PyArrayObject *D = doubles(&call, 0, 2), *steps = D ? doubles(&call, 1, 1) : NULL;
+    PyArrayObject *values = steps ? doubles(&call, 2, 3) : NULL;
+    PyArrayObject *rates = values ? doubles(&call, 3, 1) : NULL;
+    PyArrayObject *start = rates ? doubles(&call, 4, 1) : NULL;
+    if (start == NULL)
+        return failed(&call);
+    const npy_intp K = size(values, 0), s = size(values, 1) - 1, c = size(values, 2);
+    if (!same("steps and elements", size(steps, 0), K) || !same("rows of D", size(D, 0), s) ||
+        !same("columns of D", size(D, 1), s) || !same("rates", size(rates, 0), c) ||
+        !same("columns of the start", size(start, 0), c))
+        return failed(&call);
+    PyArrayObject *filtered = fresh(&call, 3, PyArray_DIMS(values));
+    double *W = filtered ? scratch(&call, s * row_length(s, 1 + c)) : NULL;
+    double *state = W ? scratch(&call, c + s) : NULL;
+    int *columns = state ? integers(&call, 2 * c) : NULL;
+    if (columns == NULL)
+        return failed(&call);
+    double *from_left = state + c;
+    for (npy_intp i = 0; i < s; i++) {
+        from_left[i] = 0.0;
+        for (npy_intp j = 0; j < s; j++)
+            from_left[i] += data(D)[i * s + j];
+    }
+    int *done = columns + c;
+    memset(done, 0, c * sizeof(int));
+    for (npy_intp first = 0; first < c; first++) {
+        if (done[first])
+            continue;
+        const double rate = data(rates)[first];
+        npy_intp found = 0;
+        for (npy_intp b = first; b < c; b++)
+            if (b == first || data(rates)[b] == rate) {
+                done[b] = 1;
+                columns[found++] = (int)b;
+            }
+        for (npy_intp b = 0; b < found; b++)
+            state[b] = data(start)[columns[b]];
+        const npy_intp length = row_length(s, 1 + found);
+        for (npy_intp k = 0; k < K; k++) {
+            const double hl = rate * data(steps)[k];
+            const double *v = data(values) + k * (s + 1) * c;
+            double *out = data(filtered) + k * (s + 1) * c;
+            for (npy_intp i = 0; i < s; i++) {
+                double *row = W + i * length;
+                memcpy(row, data(D) + i * s, s * sizeof(double));
+                row[i] += hl;
+                row[s] = from_left[i];
+                for (npy_intp b = 0; b < found; b++)
+                    row[s + 1 + b] = hl * v[(i + 1) * c + columns[b]];
+                for (npy_intp b = s + 1 + found; b < length; b++)
+                    row[b] = 0.0;
+            }
+            if (!eliminate(W, s, 1 + found)) {
+                failed(&call);
+                Py_RETURN_NONE;
+            }
+            for (npy_intp b = 0; b < found; b++)
+                out[columns[b]] = state[b];
+            for (npy_intp i = 0; i < s; i++) {
+                const double *row = W + i * length + s;
+                for (npy_intp b = 0; b < found; b++)
+                    out[(i + 1) * c + columns[b]] = row[0] * state[b] + row[1 + b];
+            }
+            for (npy_intp b = 0; b < found; b++)
+                state[b] = out[s * c + columns[b]];
+        }
+    }
+    return results(&call, 1, filtered);
+}
 
 PyMethodDef mesh_kernels[] = {
+    {"tails", (PyCFunction)(void (*)(void))tails, METH_FASTCALL, NULL},
+    {"mesh_points", (PyCFunction)(void (*)(void))mesh_points, METH_FASTCALL, NULL},
+    {"sampler", (PyCFunction)(void (*)(void))sampler, METH_FASTCALL, NULL},
+    {"sample", (PyCFunction)(void (*)(void))sample, METH_FASTCALL, NULL},
+    {"integral", (PyCFunction)(void (*)(void))integral, METH_FASTCALL, NULL},
+    {"low_pass", (PyCFunction)(void (*)(void))low_pass, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL},
 };
