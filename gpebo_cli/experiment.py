@@ -11,14 +11,15 @@ from time import perf_counter
 
 import numpy as np
 
-from gpebo_cli import estimators, sources
+from gpebo_cli import estimators, kernels, sources
 from gpebo_cli.assumptions import of_observation, warnings
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.excitation import WINDOWS, assess, sampled_window_level
 from gpebo_cli.measurement import noise_levels
-from gpebo_cli.metrics import settling_time, time_rms
-from gpebo_cli.observers import Observation, check_remedy, observe, signal_noise
+from gpebo_cli.metrics import SETTLED, settling_time, time_rms
+from gpebo_cli.observers import Observation, StateMap, check_remedy, observe, signal_noise
+from gpebo_cli.observers.observation import AffineStateMap
 from gpebo_cli.realisations import check_seeds, over_seeds
 from gpebo_cli.regression import SampledRegression
 from gpebo_cli.result import (
@@ -31,7 +32,7 @@ from gpebo_cli.result import (
 )
 from gpebo_cli.sampled import SampledRun
 from gpebo_cli.settings import Settings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.verdict import verdict
 
 _SAMPLES_AT_ONCE = 2048
@@ -245,23 +246,20 @@ def _estimate(
     regression, state_map = observation.regression, observation.state_map
     cases = estimator.cases
     kept = t[sources.kept_samples(len(cases), len(t), settings.output.max_rows)]
-    grid = np.unique(np.concatenate([regression.mesh.points.ravel(), state_map.times, kept]))
+    grid = _union(regression.mesh.points.ravel(), state_map.times, kept)
     estimates = estimators.estimate(estimator, regression, grid)
     chosen = np.searchsorted(grid, kept)
 
-    reconstruct = state_map.at(grid)
     x = source.states(grid)
     truth = observation.truth(grid, source.theta(grid), source.states)
+    evaluate = _evaluation(state_map, grid, truth, x, source.judged, chosen)
     size, p, n = len(cases), truth.shape[1], x.shape[1]
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
     numbers = np.empty((5, size))
     batch = max(1, _BATCH // (len(grid) * (2 * p + n)))
     for first in range(0, size, batch):
         part = slice(first, min(first + batch, size))
-        eta = estimates.parameters(part)
-        x_hat = reconstruct(eta)
-        parameters[part], estimated[part] = eta[:, chosen], x_hat[:, chosen]
-        numbers[:, part] = _measure(grid, (eta - truth)[..., source.judged], x_hat - x)
+        numbers[:, part], parameters[part], estimated[part] = evaluate(estimates.parameters(part))
     result = EstimationResult(
         cases=cases,
         t=kept,
@@ -274,6 +272,49 @@ def _estimate(
         requirement=estimates.requirement,
     )
     return result, Metrics(*numbers)
+
+
+def _union(*times: Array) -> Array:
+    """All of several sets of times, ascending, each once."""
+    every = np.concatenate(times)
+    every.sort()
+    first = np.empty(len(every), dtype=bool)
+    first[:1] = True
+    np.not_equal(every[1:], every[:-1], out=first[1:])
+    return every[first]
+
+
+# η̂ (g, M, p) on the grid -> the five columns of ``cases.csv`` (5, g), and η̂ (g, k, p) and
+# x̂ (g, k, n) at the samples that are kept
+_Evaluation = Callable[[Array], tuple[Array, Array, Array]]
+
+
+def _evaluation(
+    state_map: StateMap, grid: Array, truth: Array, x: Array, judged: slice, chosen: IntArray
+) -> _Evaluation:
+    """How a batch of cases is measured on the grid (M,) against η (M, p) and x (M, n)."""
+    if kernels.compiled is None or not isinstance(state_map, AffineStateMap):
+        reconstruct = state_map.at(grid)
+
+        def evaluate(eta: Array) -> tuple[Array, Array, Array]:
+            x_hat = reconstruct(eta)
+            numbers = _measure(grid, (eta - truth)[..., judged], x_hat - x)
+            return numbers, eta[:, chosen], x_hat[:, chosen]
+
+        return evaluate
+
+    measured, columns = kernels.compiled.measured, np.arange(truth.shape[1])[judged]
+    sampler = state_map.offset.mesh.sampler(grid)
+    offset, gain = sampler(state_map.offset.values), sampler(state_map.gain.values)
+
+    def evaluate_affine(eta: Array) -> tuple[Array, Array, Array]:
+        """The same in one pass over the estimates: x̂ is formed where it is needed."""
+        found: tuple[Array, Array, Array] = measured(
+            grid, eta, truth, columns, offset, gain, x, chosen, SETTLED
+        )
+        return found
+
+    return evaluate_affine
 
 
 def _measure(grid: Array, parameter_error: Array, state_error: Array) -> Array:

@@ -10,10 +10,10 @@ import numpy as np
 
 from gpebo_cli.systems.descriptor import Array
 
-_ONE_PERCENT = 0.01
+SETTLED = 0.01  # share of an error at the start, below which it has settled
 
 
-def settling_time(t: Array, error: Array, fraction: float = _ONE_PERCENT) -> Array:
+def settling_time(t: Array, error: Array, fraction: float = SETTLED) -> Array:
     """Time after which a nonnegative error stays below a fraction of its initial value.
 
     Between two times the logarithm of the error is taken as linear, which is exact where it

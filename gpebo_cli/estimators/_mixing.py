@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.linalg import determinant_and_adjugate_action
@@ -12,6 +13,7 @@ from gpebo_cli.systems.descriptor import Array, BoolArray
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not
 # needed there either: its weight in every law is ∫Δ².
 SINGULAR = 1e-14
+_SMALL = 16  # parameters, up to which elimination without LAPACK is the faster one
 
 
 def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
@@ -29,13 +31,18 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     def determinant(t: Array) -> Array:
         return np.asarray(np.linalg.det(extended(t)[..., :p]))
 
-    delta, quotient, usable = determinant_and_quotient(
-        extended.values[..., :p], extended.values[..., p:]
-    )
-    quotient = quotient.reshape(*delta.shape, -1)
-    return scalar_path(
-        extended.mesh, signals, delta, filled(quotient, usable), t, determinant, floor
-    )
+    delta, quotient = mixed_points(extended.values)
+    return scalar_path(extended.mesh, signals, delta, quotient, t, determinant, floor)
+
+
+def mixed_points(extended: Array) -> tuple[Array, Array]:
+    """Δ (K, s + 1) and η̄ = 𝐘/Δ, usable everywhere, (K, s + 1, p c) of [Ω | 𝒴] (.., p, p + c)."""
+    p = extended.shape[-2]
+    if kernels.compiled is not None and p <= _SMALL:
+        delta, quotient = kernels.compiled.mixed_points(extended, SINGULAR)
+        return delta, quotient
+    delta, quotient, usable = determinant_and_quotient(extended[..., :p], extended[..., p:])
+    return delta, filled(quotient.reshape(*delta.shape, -1), usable)
 
 
 def determinant_and_quotient(omega: Array, rhs: Array) -> tuple[Array, Array, BoolArray]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.errors import SolverError
 from gpebo_cli.linalg import affine_scan
@@ -59,19 +60,12 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     Raises:
         SolverError: the law cannot be resolved.
     """
-    length = np.maximum(np.diff(path.energy, axis=1), 0.0)
-    weight = np.minimum(1.0, float(gains.max(initial=0.0)) * length)
-    change = np.diff(path.quotient, axis=1)
-    size = max(float(np.abs(path.quotient[-1]).max(initial=0.0)), float(np.abs(start).max()))
-    size = max(size, path.floor)
-    variation = float((weight[..., None] * np.abs(change)).max(initial=0.0))
+    variation, last = law_variation(path.energy, path.quotient, float(gains.max(initial=0.0)))
+    size = max(last, float(np.abs(start).max()), path.floor)
     if variation <= _CONSTANT * size:
-        final = path.quotient[-1, -1]
-        decay = np.exp(-gains[:, None, :] * path.energy_at_t[:, None])  # (g, M, p or 1)
-        distance = start - final if start.ndim == 1 else (start - final)[:, None]
-        return np.asarray(final + decay * distance)
+        return constant_law(path, start, gains)
     if variation <= _SMALL * size:
-        return _closed_form(path, length, change, start, gains)
+        return linear_law(path, start, gains)
     lanes = path.mesh.points.size * path.quotient.shape[2] * path.mesh.rule.stages
     batch = max(1, _LANES // lanes)
     starts = np.broadcast_to(start, (len(gains), start.shape[-1]))
@@ -81,14 +75,53 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     ])
 
 
-def _closed_form(
-    path: ScalarPath, length: Array, change: Array, start: Array, gains: Array
-) -> Array:
+def law_variation(energy: Array, quotient: Array, gain: float) -> tuple[float, float]:
+    """How much η̄ (K, s + 1, p) varies from a point to the next, weighted by what that can do.
+
+    The weight is the share min(1, γδI) of a step of I (K, s + 1) that η̂ goes to meet η̄.
+
+    Returns:
+        the largest variation, and the largest |η̄| of the last element.
+    """
+    if kernels.compiled is not None:
+        variation, last = kernels.compiled.law_variation(energy, quotient, gain).tolist()
+        return variation, last
+    length = np.maximum(np.diff(energy, axis=1), 0.0)
+    weight = np.minimum(1.0, gain * length)
+    change = np.abs(np.diff(quotient, axis=1))
+    return (
+        float((weight[..., None] * change).max(initial=0.0)),
+        float(np.abs(quotient[-1]).max(initial=0.0)),
+    )
+
+
+def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:
+    """η̄ constant: η̂ = η̄ + e^{−γI} (η̂(0) − η̄), as :func:`scalar_law`."""
+    final = path.quotient[-1, -1]
+    if kernels.compiled is not None:
+        eta: Array = kernels.compiled.constant_law(
+            path.energy_at_t, final, np.atleast_2d(start), gains
+        )
+        return eta
+    decay = np.exp(-gains[:, None, :] * path.energy_at_t[:, None])  # (g, M, p or 1)
+    distance = start - final if start.ndim == 1 else (start - final)[:, None]
+    return np.asarray(final + decay * distance)
+
+
+def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     """η̄ linear in I between neighbouring points: what little it varies is second order.
 
     A step x = γ δI of the distance ε = η̂ − η̄, which stays accurate after convergence, is
-    ε₊ = e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄).
+    ε₊ = e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄). Arguments and result are :func:`scalar_law`'s.
     """
+    if kernels.compiled is not None:
+        estimates: Array = kernels.compiled.linear_law(
+            path.energy, path.quotient, path.mesh.edges, path.mesh.rule.points, path.t,
+            path.mesh.sampler(path.t).element, path.energy_at_t, np.atleast_2d(start), gains,
+        )
+        return estimates
+    length = np.maximum(np.diff(path.energy, axis=1), 0.0)
+    change = np.diff(path.quotient, axis=1)
     s, p = change.shape[1:]
     x = gains * length.reshape(-1, 1, 1)  # (N, g, p or 1)
     following = np.concatenate([path.quotient[1:, 0], path.quotient[-1:, -1]])
@@ -177,10 +210,18 @@ def scalar_path(
 
     ``determinant`` gives Δ at any times, where that is cheaper than ``signals``.
     """
-    energy = np.maximum.accumulate(Trajectory(mesh, delta**2).integral().values.ravel())
-    energy = energy.reshape(delta.shape)
+    energy = integral_of_square(mesh, delta)
     at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
     if determinant is None:
         def determinant(t: Array) -> Array:
             return signals(t, t)[0]
     return ScalarPath(mesh, signals, determinant, quotient, energy, t, at_t, floor)
+
+
+def integral_of_square(mesh: Mesh, delta: Array) -> Array:
+    """I = ∫Δ² of Δ (K, s + 1) at the points of its mesh, (K, s + 1); rounding lets it never fall."""
+    if kernels.compiled is not None:
+        energy: Array = kernels.compiled.energy(delta, mesh.steps, mesh.rule.integration)
+        return energy
+    integral = Trajectory(mesh, delta**2).integral().values.ravel()
+    return np.asarray(np.maximum.accumulate(integral).reshape(delta.shape))

@@ -1,6 +1,749 @@
-/* gpebo_cli/estimators, metrics.py, experiment.py. */
+/* gpebo_cli/estimators, metrics.py and experiment.py: mixing, the scalar law of DREM, and what is
+   measured of estimates. */
 #include "common.h"
 
+#include <float.h>
+#include <limits.h>
+#include <stdint.h>
+
+/* Cases side by side: recurrences that do not wait for one another, in as many registers. */
+#define LANES 8
+#define TOGETHER 32 /* times at once when errors are measured */
+
+/* An argument that is a number; 0 with an exception if it is none. */
+static int number(Call *call, Py_ssize_t place, double *value)
+{
+    *value = PyFloat_AsDouble(call->given[place]);
+    return !(*value == -1.0 && PyErr_Occurred());
+}
+
+/* How far apart the values of two times are: 0 for an array (1, …) that is constant in time. */
+static npy_intp stride(npy_intp times, npy_intp numbers) { return times == 1 ? 0 : numbers; }
+
+/* Whether an array of `given` times goes with `wanted` ones; an exception that names it if not. */
+static int timed(const char *what, npy_intp given, npy_intp wanted)
+{
+    return given == 1 || same(what, given, wanted);
+}
+
+/* The larger one, NaN if one of them is. */
+static inline double larger(double one, double other)
+{
+    return other > one || isnan(other) ? other : one;
+}
+
+/* Solves A X = B as solve_in_place does, and gives det A, without under- or overflow on the way;
+   0 for a pivot of zero, and then there is no X. A (n, n) is destroyed, B (n, columns) becomes X. */
+static double solve_and_determinant(double *A, double *B, npy_intp n, npy_intp columns)
+{
+    double mantissa = 1.0;
+    long exponent = 0;
+    for (npy_intp k = 0; k < n; k++) {
+        npy_intp best = k;
+        for (npy_intp i = k + 1; i < n; i++)
+            if (fabs(A[i * n + k]) > fabs(A[best * n + k]))
+                best = i;
+        if (A[best * n + k] == 0.0)
+            return 0.0;
+        if (best != k) {
+            mantissa = -mantissa;
+            for (npy_intp j = k; j < n; j++) {
+                const double kept = A[k * n + j];
+                A[k * n + j] = A[best * n + j];
+                A[best * n + j] = kept;
+            }
+            for (npy_intp j = 0; j < columns; j++) {
+                const double kept = B[k * columns + j];
+                B[k * columns + j] = B[best * columns + j];
+                B[best * columns + j] = kept;
+            }
+        }
+        const double *restrict pivot = A + k * n, *restrict known = B + k * columns;
+        if (isfinite(pivot[k]) && isfinite(mantissa)) {
+            int own;
+            mantissa *= frexp(pivot[k], &own);
+            exponent += own;
+        } else {
+            mantissa *= pivot[k];
+        }
+        for (npy_intp i = k + 1; i < n; i++) {
+            double *restrict row = A + i * n, *restrict right = B + i * columns;
+            if (row[k] == 0.0)
+                continue;
+            const double factor = row[k] / pivot[k];
+            for (npy_intp j = k + 1; j < n; j++)
+                row[j] -= factor * pivot[j];
+            for (npy_intp j = 0; j < columns; j++)
+                right[j] -= factor * known[j];
+        }
+    }
+    for (npy_intp k = n - 1; k >= 0; k--) {
+        double *restrict solved = B + k * columns;
+        for (npy_intp i = k + 1; i < n; i++) {
+            const double a = A[k * n + i];
+            const double *restrict later = B + i * columns;
+            for (npy_intp j = 0; j < columns; j++)
+                solved[j] -= a * later[j];
+        }
+        const double one = 1.0 / A[k * n + k];
+        /* Of a tiny pivot there is no reciprocal. */
+        for (npy_intp j = 0; j < columns; j++)
+            solved[j] = isfinite(one) ? solved[j] * one : solved[j] / A[k * n + k];
+    }
+    if (exponent > INT_MAX / 2 || exponent < -(INT_MAX / 2))
+        exponent = exponent > 0 ? INT_MAX / 2 : -(INT_MAX / 2);
+    return ldexp(mantissa, (int)exponent);
+}
+
+/* Frobenius norm of the first n columns of A (rows, columns). */
+static double frobenius(const double *A, npy_intp rows, npy_intp columns, npy_intp n)
+{
+    double sum = 0.0;
+    for (npy_intp i = 0; i < rows; i++)
+        for (npy_intp j = 0; j < n; j++)
+            sum += A[i * columns + j] * A[i * columns + j];
+    return sqrt(sum);
+}
+
+/* Rows (points, numbers) that are no good become the next good one, the last good one at the end,
+   zero if there is none. */
+static void fill(double *rows, const int *good, npy_intp points, npy_intp numbers)
+{
+    npy_intp last = points - 1;
+    while (last >= 0 && !good[last])
+        last--;
+    if (last < 0) {
+        memset(rows, 0, points * numbers * sizeof(double));
+        return;
+    }
+    for (npy_intp i = last + 1; i < points; i++)
+        memcpy(rows + i * numbers, rows + last * numbers, numbers * sizeof(double));
+    for (npy_intp i = last - 1; i >= 0; i--)
+        if (!good[i])
+            memcpy(rows + i * numbers, rows + (i + 1) * numbers, numbers * sizeof(double));
+}
+
+/* [Ω | 𝒴] (K, s + 1, p, p + c), reciprocal condition below which Ω is singular
+   -> Δ = det Ω (K, s + 1), η̄ = Ω⁻¹𝒴 (K, s + 1, p c), filled where Ω is singular. */
+static PyObject *mixed_points(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    double singular;
+    if (!begin(&call, given, count, 2))
+        return NULL;
+    PyArrayObject *extended = doubles(&call, 0, 4);
+    if (extended == NULL || !number(&call, 1, &singular))
+        return failed(&call);
+    const npy_intp elements = size(extended, 0), each = size(extended, 1), p = size(extended, 2);
+    const npy_intp c = size(extended, 3) - p, width = p + c, points = elements * each;
+    if (c < 0) {
+        same("rows and columns of the extension", p, width);
+        return failed(&call);
+    }
+    PyArrayObject *delta = fresh(&call, 2, (npy_intp[]){elements, each});
+    PyArrayObject *quotient = delta ? fresh(&call, 3, (npy_intp[]){elements, each, p * c}) : NULL;
+    double *omega = quotient ? scratch(&call, p * p + p * width) : NULL;
+    int *good = omega ? integers(&call, points) : NULL;
+    if (good == NULL)
+        return failed(&call);
+    double *both = omega + p * p;
+    for (npy_intp k = 0; k < points; k++) {
+        const double *values = data(extended) + k * p * width;
+        double *out = data(quotient) + k * p * c;
+        /* Ω⁻¹ beside Ω⁻¹𝒴: ‖Ω‖ ‖Ω⁻¹‖ is at most p times the condition number. */
+        for (npy_intp i = 0; i < p; i++) {
+            memcpy(omega + i * p, values + i * width, p * sizeof(double));
+            for (npy_intp j = 0; j < p; j++)
+                both[i * width + j] = i == j;
+            memcpy(both + i * width + p, values + i * width + p, c * sizeof(double));
+        }
+        const double determinant = solve_and_determinant(omega, both, p, width);
+        data(delta)[k] = determinant;
+        good[k] = 0;
+        if (determinant != 0.0) {
+            const double condition = frobenius(values, p, width, p) * frobenius(both, p, width, p);
+            good[k] = condition * singular < 1.0; /* not if it is NaN */
+        }
+        if (good[k])
+            for (npy_intp i = 0; i < p; i++)
+                memcpy(out + i * c, both + i * width + p, c * sizeof(double));
+    }
+    fill(data(quotient), good, points, p * c);
+    return results(&call, 2, delta, quotient);
+}
+
+/* Ω (N, p, p) -> det Ω (N,). */
+static PyObject *determinants(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 1))
+        return NULL;
+    PyArrayObject *omega = doubles(&call, 0, 3);
+    if (omega == NULL || !same("rows and columns", size(omega, 1), size(omega, 2)))
+        return failed(&call);
+    const npy_intp points = size(omega, 0), p = size(omega, 1);
+    PyArrayObject *delta = fresh(&call, 1, &points);
+    double *own = delta ? scratch(&call, p * p) : NULL;
+    if (own == NULL)
+        return failed(&call);
+    for (npy_intp k = 0; k < points; k++) {
+        memcpy(own, data(omega) + k * p * p, p * p * sizeof(double));
+        data(delta)[k] = solve_and_determinant(own, own, p, 0);
+    }
+    return results(&call, 1, delta);
+}
+
+/* Δ (K, s + 1), lengths of the elements (K,), integration of the rule (s, s)
+   -> I = ∫Δ² (K, s + 1), which never falls. */
+static PyObject *energy(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 3))
+        return NULL;
+    PyArrayObject *delta = doubles(&call, 0, 2), *steps = delta ? doubles(&call, 1, 1) : NULL;
+    PyArrayObject *rule = steps ? doubles(&call, 2, 2) : NULL;
+    if (rule == NULL || !same("elements", size(delta, 0), size(steps, 0)) ||
+        !same("stages", size(delta, 1), size(rule, 0) + 1) ||
+        !same("rows and columns of the rule", size(rule, 0), size(rule, 1)))
+        return failed(&call);
+    const npy_intp elements = size(delta, 0), s = size(rule, 0);
+    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){elements, s + 1});
+    if (out == NULL)
+        return failed(&call);
+    double left = 0.0, largest = 0.0;
+    for (npy_intp k = 0; k < elements; k++) {
+        const double *d = data(delta) + k * (s + 1) + 1;
+        double *E = data(out) + k * (s + 1), local = 0.0;
+        E[0] = largest = larger(largest, left);
+        for (npy_intp i = 0; i < s; i++) {
+            local = 0.0;
+            for (npy_intp j = 0; j < s; j++)
+                local += data(rule)[i * s + j] * (d[j] * d[j]);
+            local *= data(steps)[k];
+            E[i + 1] = largest = larger(largest, local + left);
+        }
+        left += local;
+    }
+    return results(&call, 1, out);
+}
+
+/* The length of a step of I from a point to the next, not below zero. */
+static inline double step_length(const double *E) { return E[1] - E[0] < 0.0 ? 0.0 : E[1] - E[0]; }
+
+/* I (K, s + 1), η̄ (K, s + 1, p), the largest γ -> (2,): the largest change of η̄ from a point to
+   the next times min(1, γδI), and the largest |η̄| of the last element. */
+static PyObject *law_variation(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    double gain;
+    if (!begin(&call, given, count, 3))
+        return NULL;
+    PyArrayObject *energies = doubles(&call, 0, 2);
+    PyArrayObject *quotient = energies ? doubles(&call, 1, 3) : NULL;
+    if (quotient == NULL || !number(&call, 2, &gain) ||
+        !same("elements", size(energies, 0), size(quotient, 0)) ||
+        !same("points", size(energies, 1), size(quotient, 1)))
+        return failed(&call);
+    const npy_intp elements = size(energies, 0), each = size(energies, 1), p = size(quotient, 2);
+    PyArrayObject *out = zeros(&call, 1, (npy_intp[]){2});
+    if (out == NULL)
+        return failed(&call);
+    double variation = 0.0, largest = 0.0;
+    for (npy_intp k = 0; k < elements; k++)
+        for (npy_intp i = 0; i + 1 < each; i++) {
+            const double x = gain * step_length(data(energies) + k * each + i);
+            const double weight = x > 1.0 ? 1.0 : x;
+            const double *one = data(quotient) + (k * each + i) * p;
+            for (npy_intp j = 0; j < p; j++)
+                variation = larger(variation, weight * fabs(one[p + j] - one[j]));
+        }
+    for (npy_intp i = elements ? (elements - 1) * each * p : 0; i < elements * each * p; i++)
+        largest = larger(largest, fabs(data(quotient)[i]));
+    data(out)[0] = variation;
+    data(out)[1] = largest;
+    return results(&call, 1, out);
+}
+
+/* I at the times (M,), η̄ (p,), η̂ at the start (1 or g, p), γ (g, 1 or p)
+   -> η̂ = η̄ + e^{−γI} (η̂(0) − η̄) (g, M, p). */
+static PyObject *constant_law(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 4))
+        return NULL;
+    PyArrayObject *at = doubles(&call, 0, 1), *final = at ? doubles(&call, 1, 1) : NULL;
+    PyArrayObject *start = final ? doubles(&call, 2, 2) : NULL;
+    PyArrayObject *gains = start ? doubles(&call, 3, 2) : NULL;
+    if (gains == NULL)
+        return failed(&call);
+    const npy_intp times = size(at, 0), p = size(final, 0), g = size(gains, 0);
+    const npy_intp own = size(gains, 1);
+    if (!same("parameters at the start", size(start, 1), p) ||
+        !timed("cases at the start", size(start, 0), g) ||
+        !(own == 1 || same("parameters with a gain", own, p)))
+        return failed(&call);
+    PyArrayObject *out = fresh(&call, 3, (npy_intp[]){g, times, p});
+    if (out == NULL)
+        return failed(&call);
+    double *eta = data(out);
+    for (npy_intp b = 0; b < g; b++) {
+        const double *from = data(start) + b * stride(size(start, 0), p);
+        const double *gamma = data(gains) + b * own;
+        for (npy_intp m = 0; m < times; m++, eta += p) {
+            double decay = 1.0;
+            for (npy_intp j = 0; j < p; j++) {
+                if (j < own)
+                    decay = exp(-gamma[j] * data(at)[m]);
+                eta[j] = data(final)[j] + decay * (from[j] - data(final)[j]);
+            }
+        }
+    }
+    return results(&call, 1, out);
+}
+
+#define LOG2_E 1.4426950408889634
+/* ln 2 in two parts, the first with so few digits that k times it is exact. */
+#define LN2_HIGH 6.93147180369123816490e-01
+#define LN2_LOW 1.90821492927058770002e-10
+/* From LEAST down x is as good as 0, from MOST up e^{−x} is next to the smallest number. */
+#define LEAST 1e-300
+#define MOST 708.0
+
+/* 2^−k for 0 ≤ k ≤ 1022. */
+static inline double power(int k)
+{
+    const uint64_t bits = (uint64_t)(1023 - k) << 52;
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+/* e^{−x} of LANES values x = γδ ≥ 0, and its mean (1 − e^{−x})/x over a step, 1 at x = 0; both to
+   about one unit in the last place.
+
+   x = k ln 2 − r, |r| ≤ ln(2)/2, and q = e^r − 1 by its series, which is good to 1e-17 q. Then
+   e^{−x} = 2^−k (1 + q), and 1 − e^{−x} = (1 − 2^−k) − 2^−k q loses nothing: for k = 0 it is −q.
+   The library's exp and expm1 take one value at a time; these loops become vector instructions. */
+static inline void decays_of_one(const double *restrict gamma, double length,
+                                 double *restrict end, double *restrict mean)
+{
+    double x[LANES], r[LANES], q[LANES], shrunk[LANES];
+    for (int b = 0; b < LANES; b++)
+        x[b] = gamma[b] * length < LEAST ? LEAST : gamma[b] * length;
+    for (int b = 0; b < LANES; b++)
+        r[b] = x[b] > MOST ? MOST : x[b];
+    for (int b = 0; b < LANES; b++) {
+        const int k = r[b] <= MOST ? (int)(r[b] * LOG2_E + 0.5) : 0; /* NaN remains in r */
+        r[b] = (k * LN2_HIGH - r[b]) + k * LN2_LOW;
+        shrunk[b] = power(k);
+    }
+    for (int b = 0; b < LANES; b++) {
+        const double v = r[b];
+        double sum = 1.0 / 6227020800.0;
+        sum = sum * v + 1.0 / 479001600.0;
+        sum = sum * v + 1.0 / 39916800.0;
+        sum = sum * v + 1.0 / 3628800.0;
+        sum = sum * v + 1.0 / 362880.0;
+        sum = sum * v + 1.0 / 40320.0;
+        sum = sum * v + 1.0 / 5040.0;
+        sum = sum * v + 1.0 / 720.0;
+        sum = sum * v + 1.0 / 120.0;
+        sum = sum * v + 1.0 / 24.0;
+        sum = sum * v + 1.0 / 6.0;
+        sum = sum * v + 0.5;
+        q[b] = shrunk[b] * ((sum * v) * v + v);
+    }
+    for (int b = 0; b < LANES; b++) {
+        end[b] = shrunk[b] + q[b];
+        mean[b] = ((1.0 - shrunk[b]) - q[b]) / x[b];
+    }
+}
+
+/* The same for LANES cases with a gain for each of `own` parameters: all (own, LANES). */
+static void decays(const double *gamma, double length, npy_intp own, double *end, double *mean)
+{
+    for (npy_intp i = 0; i < own * LANES; i += LANES)
+        decays_of_one(gamma + i, length, end + i, mean + i);
+}
+
+/* Where the times are between the points of a path: the point before each (M,), I from there on
+   (M,) and its share in the step (M,). */
+typedef struct {
+    npy_intp *point;
+    double *partial, *share;
+} Places;
+
+/* The law for LANES cases with η̄ linear in I between the points: the distances η̂ − η̄ at the
+   left end of every step, (N, p, LANES), from those at the start (p, LANES). */
+static void distances(const double *E, const double *Q, npy_intp elements, npy_intp each,
+                      npy_intp p, const double *gamma, npy_intp own, double *end, double *mean,
+                      double *distance)
+{
+    for (npy_intp k = 0; k < elements; k++)
+        for (npy_intp i = 0; i + 1 < each; i++, distance += p * LANES) {
+            const double *left = Q + (k * each + i) * p;
+            const int jumps = i + 2 == each && k + 1 < elements; /* η̂ does not, where η̄ does */
+            if (i + 2 == each && k + 1 == elements)
+                return;
+            decays(gamma, step_length(E + k * each + i), own, end, mean);
+            for (npy_intp j = 0; j < p; j++) {
+                const double change = left[p + j] - left[j];
+                const double jump = jumps ? left[2 * p + j] - left[p + j] : 0.0;
+                const npy_intp lane = own == 1 ? 0 : j * LANES;
+                double *restrict d = distance + j * LANES, *restrict next = d + p * LANES;
+                for (int b = 0; b < LANES; b++)
+                    next[b] = end[lane + b] * d[b] + (-mean[lane + b] * change - jump);
+            }
+        }
+}
+
+/* Where in the steps of I (K, s + 1) the times are, from the element of each (M,), its place in
+   it and I there (M,); 0 with an exception for an element that there is not. */
+static int find_places(const double *E, npy_intp elements, const double *edges,
+                       const double *points, npy_intp each, const double *t,
+                       const npy_intp *element, const double *at, npy_intp times, Places places)
+{
+    for (npy_intp m = 0; m < times; m++) {
+        const npy_intp k = element[m];
+        if (k < 0 || k >= elements) {
+            PyErr_Format(PyExc_ValueError, "element %zd of %zd", (Py_ssize_t)k,
+                         (Py_ssize_t)elements);
+            return 0;
+        }
+        const double local = (t[m] - edges[k]) / (edges[k + 1] - edges[k]);
+        npy_intp i = 0;
+        while (i + 2 < each && !(points[i + 1] > local))
+            i++;
+        const double step = step_length(E + k * each + i);
+        double partial = at[m] - E[k * each + i];
+        partial = partial < 0.0 ? 0.0 : partial > step ? step : partial;
+        if (partial == step && i + 2 < each) { /* the next point itself: nothing to go there */
+            i++;
+            partial = 0.0;
+        }
+        places.point[m] = k * each + i;
+        places.partial[m] = partial;
+        places.share[m] = partial > 0.0 ? partial / step : 0.0;
+    }
+    return 1;
+}
+
+/* I (K, s + 1), η̄ (K, s + 1, p), edges (K + 1,), points of the rule (s + 1,), times (M,), their
+   elements (M,), I there (M,), η̂ at the start (1 or g, p), γ (g, 1 or p)
+   -> η̂ (g, M, p) of the law with η̄ linear in I between neighbouring points. */
+static PyObject *linear_law(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 9))
+        return NULL;
+    PyArrayObject *energies = doubles(&call, 0, 2);
+    PyArrayObject *quotient = energies ? doubles(&call, 1, 3) : NULL;
+    PyArrayObject *edges = quotient ? doubles(&call, 2, 1) : NULL;
+    PyArrayObject *points = edges ? doubles(&call, 3, 1) : NULL;
+    PyArrayObject *t = points ? doubles(&call, 4, 1) : NULL;
+    PyArrayObject *element = t ? indices(&call, 5, 1) : NULL;
+    PyArrayObject *at = element ? doubles(&call, 6, 1) : NULL;
+    PyArrayObject *start = at ? doubles(&call, 7, 2) : NULL;
+    PyArrayObject *gains = start ? doubles(&call, 8, 2) : NULL;
+    if (gains == NULL)
+        return failed(&call);
+    const npy_intp elements = size(energies, 0), each = size(energies, 1);
+    const npy_intp p = size(quotient, 2), times = size(t, 0), g = size(gains, 0);
+    const npy_intp own = size(gains, 1);
+    if (!same("elements", size(quotient, 0), elements) ||
+        !same("points", size(quotient, 1), each) || !same("edges", size(edges, 0), elements + 1) ||
+        !same("points of the rule", size(points, 0), each) ||
+        !same("elements of the times", size(element, 0), times) ||
+        !same("energies at the times", size(at, 0), times) ||
+        !same("parameters at the start", size(start, 1), p) ||
+        !timed("cases at the start", size(start, 0), g) ||
+        !(own == 1 || same("parameters with a gain", own, p)))
+        return failed(&call);
+    if (elements < 1 || each < 2) {
+        PyErr_SetString(PyExc_ValueError, "a path needs a step");
+        return failed(&call);
+    }
+    const npy_intp steps = elements * (each - 1);
+    PyArrayObject *out = fresh(&call, 3, (npy_intp[]){g, times, p});
+    double *work = out ? scratch(&call, 2 * times + (steps * p + 3 * own) * LANES) : NULL;
+    PyArrayObject *where = work ? fresh(&call, 1, &times) : NULL; /* as wide as an index */
+    if (where == NULL)
+        return failed(&call);
+    Places places = {(npy_intp *)PyArray_DATA(where), work, work + times};
+    double *gamma = work + 2 * times, *end = gamma + own * LANES, *mean = end + own * LANES;
+    double *distance = mean + own * LANES;
+    const double *E = data(energies), *Q = data(quotient);
+    if (!find_places(E, elements, data(edges), data(points), each, data(t),
+                     (const npy_intp *)PyArray_DATA(element), data(at), times, places))
+        return failed(&call);
+    for (npy_intp first = 0; first < g; first += LANES) {
+        const npy_intp some = g - first < LANES ? g - first : LANES;
+        for (npy_intp b = 0; b < LANES; b++) {
+            const npy_intp one = first + (b < some ? b : some - 1);
+            const double *from = data(start) + one * stride(size(start, 0), p);
+            for (npy_intp i = 0; i < own; i++)
+                gamma[i * LANES + b] = data(gains)[one * own + i];
+            for (npy_intp j = 0; j < p; j++)
+                distance[j * LANES + b] = from[j] - Q[j];
+        }
+        distances(E, Q, elements, each, p, gamma, own, end, mean, distance);
+        for (npy_intp m = 0; m < times; m++) {
+            const double *left = Q + places.point[m] * p;
+            const npy_intp step = places.point[m] - places.point[m] / each;
+            const double *d = distance + step * p * LANES;
+            if (places.partial[m] == 0.0) {
+                for (npy_intp b = 0; b < some; b++)
+                    for (npy_intp j = 0; j < p; j++)
+                        data(out)[((first + b) * times + m) * p + j] =
+                            left[j] + d[j * LANES + b];
+                continue;
+            }
+            decays(gamma, places.partial[m], own, end, mean);
+            for (npy_intp j = 0; j < p; j++) {
+                const double change = places.share[m] * (left[p + j] - left[j]);
+                const npy_intp lane = own == 1 ? 0 : j * LANES;
+                double *eta = data(out) + (first * times + m) * p + j;
+                for (npy_intp b = 0; b < some; b++)
+                    eta[b * times * p] = left[j] + end[lane + b] * d[j * LANES + b] +
+                                         (1.0 - mean[lane + b]) * change;
+            }
+        }
+    }
+    return results(&call, 1, out);
+}
+
+/* What is known of the error norms of LANES cases as time goes on; squares, because roots cost
+   more. */
+typedef struct {
+    double level[LANES];  /* the square that counts as settled */
+    double above[LANES];  /* the last square above it */
+    double below[LANES];  /* the one after */
+    npy_intp last[LANES]; /* index of the last one above, −1 if there is none */
+    double before[LANES]; /* the last square of all */
+    double sum[LANES];    /* twice the integral of the squares, by trapezoids */
+} Course;
+
+/* Takes the squares (count, LANES) at the times from index `first` on. */
+static void follow(Course *course, const double *squares, const double *t, npy_intp first,
+                   npy_intp count, double fraction)
+{
+    if (first == 0)
+        for (int b = 0; b < LANES; b++) {
+            course->level[b] = fraction * fraction * squares[b];
+            course->last[b] = -1;
+            course->before[b] = squares[b];
+            course->sum[b] = 0.0;
+        }
+    for (npy_intp m = 0; m < count; m++) {
+        const double step = first + m > 0 ? t[first + m] - t[first + m - 1] : 0.0;
+        const double *square = squares + m * LANES;
+        for (int b = 0; b < LANES; b++)
+            course->sum[b] += step * (square[b] + course->before[b]);
+        for (int b = 0; b < LANES; b++)
+            course->before[b] = square[b];
+    }
+    for (int b = 0; b < LANES; b++) {
+        if (first > 0 && course->last[b] == first - 1)
+            course->below[b] = squares[b];
+        npy_intp m = count - 1;
+        while (m >= 0 && !(squares[m * LANES + b] > course->level[b]))
+            m--;
+        if (m < 0)
+            continue;
+        course->last[b] = first + m;
+        course->above[b] = squares[m * LANES + b];
+        if (m + 1 < count)
+            course->below[b] = squares[(m + 1) * LANES + b];
+    }
+}
+
+/* Logarithm of an error from its square, not below that of the smallest number. */
+static double logarithm(double square)
+{
+    const double error = sqrt(square);
+    return log(error < DBL_MIN ? DBL_MIN : error);
+}
+
+/* When the error has settled, counted from the first time; see metrics.settling_time. */
+static double settled(const Course *course, npy_intp b, const double *t, npy_intp times)
+{
+    const npy_intp last = course->last[b];
+    if (last < 0)
+        return 0.0;
+    if (last == times - 1)
+        return NAN;
+    const double high = logarithm(course->above[b]), low = logarithm(course->below[b]);
+    const double fall = high - low < DBL_MIN ? DBL_MIN : high - low;
+    double share = (high - logarithm(course->level[b])) / fall;
+    share = share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share;
+    return t[last] + share * (t[last + 1] - t[last]) - t[0];
+}
+
+/* x̂_i = offset_i + Σ_j gain_ij η̂_j of LANES cases, η̂ (p, LANES). */
+static inline void state(double offset, const double *gain, const double *eta, npy_intp p,
+                         double *x)
+{
+    double sum[LANES] = {0.0};
+    for (npy_intp j = 0; j < p; j++)
+        for (int b = 0; b < LANES; b++)
+            sum[b] += gain[j] * eta[j * LANES + b];
+    for (int b = 0; b < LANES; b++)
+        x[b] = offset + sum[b];
+}
+
+/* Adds the squares of the errors of LANES values, and notes their sizes if asked to. */
+static inline void add_error(const double *value, double truth, double *restrict square,
+                             double *restrict worst)
+{
+    for (int b = 0; b < LANES; b++)
+        square[b] += (value[b] - truth) * (value[b] - truth);
+    if (worst != NULL)
+        for (int b = 0; b < LANES; b++)
+            worst[b] = larger(worst[b], fabs(value[b] - truth));
+}
+
+/* Times (M,), η̂ (g, M, p), η (1 or M, p), columns of η that are judged (c,), offset (1 or M, n)
+   and gain (1 or M, n, p) of x̂ = offset + gain η̂, x (1 or M, n), indices of the times that are
+   kept (k,), fraction at which an error has settled
+   -> numbers (5, g), η̂ and x̂ at the times that are kept, (g, k, p) and (g, k, n).
+
+   The numbers are those of experiment._measure, its definition: NaN at the end of the first case
+   is what nobody knows and does not count. */
+static PyObject *measured(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    double fraction;
+    if (!begin(&call, given, count, 9))
+        return NULL;
+    PyArrayObject *t = doubles(&call, 0, 1), *estimates = t ? doubles(&call, 1, 3) : NULL;
+    PyArrayObject *truth = estimates ? doubles(&call, 2, 2) : NULL;
+    PyArrayObject *judged = truth ? indices(&call, 3, 1) : NULL;
+    PyArrayObject *offset = judged ? doubles(&call, 4, 2) : NULL;
+    PyArrayObject *gain = offset ? doubles(&call, 5, 3) : NULL;
+    PyArrayObject *true_x = gain ? doubles(&call, 6, 2) : NULL;
+    PyArrayObject *chosen = true_x ? indices(&call, 7, 1) : NULL;
+    if (chosen == NULL || !number(&call, 8, &fraction))
+        return failed(&call);
+    const npy_intp g = size(estimates, 0), times = size(t, 0), p = size(estimates, 2);
+    const npy_intp n = size(offset, 1), kept = size(chosen, 0), columns = size(judged, 0);
+    if (!same("times of the estimates", size(estimates, 1), times) ||
+        !timed("times of the truth", size(truth, 0), times) ||
+        !timed("times of the offset", size(offset, 0), times) ||
+        !timed("times of the gain", size(gain, 0), times) ||
+        !timed("times of the states", size(true_x, 0), times) ||
+        !same("parameters of the truth", size(truth, 1), p) ||
+        !same("parameters of the gain", size(gain, 2), p) ||
+        !same("states of the gain", size(gain, 1), n) || !same("states", size(true_x, 1), n))
+        return failed(&call);
+    const npy_intp *column = (const npy_intp *)PyArray_DATA(judged);
+    const npy_intp *keep = (const npy_intp *)PyArray_DATA(chosen);
+    npy_intp outside = times < 1;
+    for (npy_intp i = 0; i < columns; i++)
+        outside |= column[i] < 0 || column[i] >= p;
+    for (npy_intp i = 0; i < kept; i++)
+        outside |= keep[i] < 0 || keep[i] >= times;
+    if (outside) {
+        PyErr_SetString(PyExc_ValueError, "an index of a parameter or a time that there is not");
+        return failed(&call);
+    }
+    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){5, g});
+    PyArrayObject *kept_eta = out ? fresh(&call, 3, (npy_intp[]){g, kept, p}) : NULL;
+    PyArrayObject *kept_x = kept_eta ? fresh(&call, 3, (npy_intp[]){g, kept, n}) : NULL;
+    double *eta = kept_x ? scratch(&call, TOGETHER * p * LANES) : NULL;
+    int *known = eta ? integers(&call, columns + n) : NULL;
+    if (known == NULL)
+        return failed(&call);
+    const npy_intp truth_stride = stride(size(truth, 0), p), x_stride = stride(size(true_x, 0), n);
+    const npy_intp offset_stride = stride(size(offset, 0), n);
+    const npy_intp gain_stride = stride(size(gain, 0), n * p), last = times - 1;
+    int *known_x = known + columns, of_eta = columns == 0, of_x = 0;
+    for (npy_intp i = 0; g && i < columns; i++) { /* what is known */
+        const double end = data(estimates)[last * p + column[i]];
+        known[i] = !isnan(end - data(truth)[last * truth_stride + column[i]]);
+        of_eta |= known[i];
+    }
+    for (npy_intp i = 0; g && i < n; i++) {
+        double end = data(offset)[last * offset_stride + i];
+        for (npy_intp j = 0; j < p; j++)
+            end += data(gain)[last * gain_stride + i * p + j] * data(estimates)[last * p + j];
+        known_x[i] = !isnan(end - data(true_x)[last * x_stride + i]);
+        of_x |= known_x[i];
+    }
+    for (npy_intp first = 0; first < g; first += LANES) {
+        const npy_intp some = g - first < LANES ? g - first : LANES;
+        Course of[2];
+        double worst[2][LANES] = {{0.0}}, x[LANES];
+        for (npy_intp from = 0; from < times; from += TOGETHER) {
+            const npy_intp now = times - from < TOGETHER ? times - from : TOGETHER;
+            double squares[2][TOGETHER * LANES] = {{0.0}};
+            for (npy_intp b = 0; b < LANES; b++) {
+                const npy_intp one = first + (b < some ? b : some - 1);
+                const double *own = data(estimates) + (one * times + from) * p;
+                for (npy_intp i = 0; i < now * p; i++)
+                    eta[i * LANES + b] = own[i];
+            }
+            for (npy_intp i = 0; i < now; i++) {
+                const npy_intp m = from + i;
+                const double *G = data(gain) + m * gain_stride, *all = eta + i * p * LANES;
+                const double *H = data(truth) + m * truth_stride;
+                const double *o = data(offset) + m * offset_stride;
+                const double *X = data(true_x) + m * x_stride;
+                double *square = squares[0] + i * LANES, *square_x = squares[1] + i * LANES;
+                for (npy_intp j = 0; j < columns; j++)
+                    if (known[j])
+                        add_error(all + column[j] * LANES, H[column[j]], square,
+                                  m == last ? worst[0] : NULL);
+                for (npy_intp j = 0; j < n; j++)
+                    if (known_x[j]) {
+                        state(o[j], G + j * p, all, p, x);
+                        add_error(x, X[j], square_x, m == last ? worst[1] : NULL);
+                    }
+            }
+            follow(of, squares[0], data(t), from, now, fraction);
+            follow(of + 1, squares[1], data(t), from, now, fraction);
+        }
+        for (npy_intp b = 0; b < some; b++) {
+            double *one = data(out) + first + b;
+            const double span = data(t)[last] - data(t)[0];
+            one[0] = of_eta ? settled(of, b, data(t), times) : NAN;
+            one[g] = of_x ? settled(of + 1, b, data(t), times) : NAN;
+            one[2 * g] = of_eta ? worst[0][b] : NAN;
+            one[3 * g] = of_x ? worst[1][b] : NAN;
+            one[4 * g] = of_x ? sqrt(0.5 * of[1].sum[b] / span) : NAN;
+        }
+        for (npy_intp k = 0; k < kept; k++) {
+            const double *o = data(offset) + keep[k] * offset_stride;
+            const double *G = data(gain) + keep[k] * gain_stride;
+            for (npy_intp b = 0; b < some; b++) {
+                const double *own = data(estimates) + ((first + b) * times + keep[k]) * p;
+                double *to = data(kept_eta) + ((first + b) * kept + k) * p;
+                for (npy_intp j = 0; j < p; j++)
+                    to[j] = eta[j * LANES + b] = own[j];
+            }
+            for (npy_intp i = 0; i < n; i++) {
+                state(o[i], G + i * p, eta, p, x);
+                for (npy_intp b = 0; b < some; b++)
+                    data(kept_x)[((first + b) * kept + k) * n + i] = x[b];
+            }
+        }
+    }
+    return results(&call, 3, out, kept_eta, kept_x);
+}
+
 PyMethodDef estimation_kernels[] = {
+    {"mixed_points", (PyCFunction)(void (*)(void))mixed_points, METH_FASTCALL, NULL},
+    {"determinants", (PyCFunction)(void (*)(void))determinants, METH_FASTCALL, NULL},
+    {"energy", (PyCFunction)(void (*)(void))energy, METH_FASTCALL, NULL},
+    {"law_variation", (PyCFunction)(void (*)(void))law_variation, METH_FASTCALL, NULL},
+    {"constant_law", (PyCFunction)(void (*)(void))constant_law, METH_FASTCALL, NULL},
+    {"linear_law", (PyCFunction)(void (*)(void))linear_law, METH_FASTCALL, NULL},
+    {"measured", (PyCFunction)(void (*)(void))measured, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL},
 };
