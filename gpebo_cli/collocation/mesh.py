@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.radau import RadauRule
 from gpebo_cli.linalg import affine_scan
 from gpebo_cli.systems.descriptor import Array, IntArray
@@ -19,6 +20,8 @@ from gpebo_cli.systems.descriptor import Array, IntArray
 _INSIDE = 1e-3
 _CHUNK = 1 << 22  # numbers gathered at once when sampling
 _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
+SHARE = 1e-3  # of the largest component: what is smaller is measured against that
+_FOOT = 1e-8  # of its final size: what a component was before may be that wrong
 _MANY = 2000  # times, from which on sampling them by element pays
 _KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
 _JOINED = (2, 4, 8)  # as many elements become one
@@ -72,14 +75,15 @@ class Mesh:
         return Mesh(edges, self.rule), np.where(parts[parent] == 1, parent, -1)
 
     def joined(
-        self, kinds: Sequence[Array], tol: float, keep: Array, longest: float = np.inf
+        self, values: Array, counts: IntArray, tol: float, keep: Array, longest: float = np.inf
     ) -> Mesh:
         """Neighbours of equal length joined where a polynomial over all of them does as well.
 
         Compared at all points of the short elements, so that nothing they have seen is lost.
 
         Args:
-            kinds: point values (K, s + 1, c) of signals of one kind each.
+            values: point values (K, s + 1, c) of signals.
+            counts: how many of them are of one kind (kinds,), one kind after the other.
             tol: by how much a value may change, relative to the signal's own size so far.
             keep: edges (B,) that stay.
             longest: no element is joined to one that is longer.
@@ -87,13 +91,18 @@ class Mesh:
         Returns:
             this mesh itself, where nothing is joined.
         """
-        cuts = np.searchsorted(self.edges, keep).tolist()
-        pieces = list(pairwise([0, *sorted(set(cuts) - {0, self.size}), self.size]))
-        values = np.concatenate([np.zeros((*self.points.shape, 0)), *kinds], axis=2)
-        counts = np.array([0, *(kind.shape[2] for kind in kinds)])
-        if len(pieces) > _MANY_PIECES:
+        inner = set(np.searchsorted(self.edges, keep).tolist()) if len(keep) else set()
+        bounds = [0, *sorted(inner - {0, self.size}), self.size]
+        if len(bounds) > _MANY_PIECES + 1:
             return self
-        scale = _scale_so_far(values, counts[1:], np.full(len(kinds), _TINY))[:, None]
+        if kernels.compiled is not None:
+            edges = kernels.compiled.joined(
+                values, counts, self.edges, np.array(bounds), tol, longest, _FOOT, SHARE, _TINY,
+                *_all_joining(self.rule),
+            )
+            return self if len(edges) == len(self.edges) else Mesh(edges, self.rule)
+        pieces = list(pairwise(bounds))
+        scale = _scale_so_far(values, counts, np.full(len(counts), _TINY))[:, None]
         stays = np.ones(self.size + 1, dtype=bool)
         for count in _JOINED:
             first = np.concatenate([np.arange(a, b - count + 1, count) for a, b in pieces])
@@ -158,13 +167,28 @@ def joining_change(rule: RadauRule, count: int) -> Array:
     Values at the points of the joined element are read from the polynomials of the short ones.
     Shape (count (s + 1), count (s + 1)), for the point values one element after the other.
     """
+    there, back = _joining(rule, count)
+    return np.asarray((there @ back).T - np.eye(len(there)))
+
+
+def _joining(rule: RadauRule, count: int) -> tuple[Array, Array]:
+    """From the points of ``count`` equal elements to those of one over all of them, and back.
+
+    Weights of shapes (count (s + 1), s + 1) and (s + 1, count (s + 1)), applied from the right.
+    """
     short = Mesh(np.arange(count + 1) / count, rule)
     joined = Mesh(np.array([0.0, 1.0]), rule)
     size = count * len(rule.points)
     unit = np.eye(size).reshape(count, len(rule.points), size)
-    sampled = short.sampler(joined.points.ravel(), joined.inside.ravel())(unit)
-    there = joined.sampler(short.points.ravel())(sampled[None])
-    return np.asarray(there - np.eye(size))
+    there = short.sampler(joined.points.ravel(), joined.inside.ravel())(unit)
+    back = joined.sampler(short.points.ravel()).weights
+    return np.ascontiguousarray(there.T), np.ascontiguousarray(back.T)
+
+
+@lru_cache(maxsize=16)
+def _all_joining(rule: RadauRule) -> tuple[Array, ...]:
+    """What :func:`joining_change` is made of, for each of _JOINED: for the kernel."""
+    return tuple(matrix for count in _JOINED for matrix in _joining(rule, count))
 
 
 def _same(known: Array | None, asked: Array | None) -> bool:
@@ -368,13 +392,13 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
 def _scale_so_far(values: Array, counts: IntArray, floors: Array) -> Array:
     """Size of each component up to each element, (K, c), floored as in :func:`signal_scale`.
 
-    Also floored at 1e-8 of the final size, so that the foot of a pulse costs nothing. Components
+    Also floored at a share of the final size, so that the foot of a pulse costs nothing. Components
     of one kind, ``counts`` of them, stand together and share a floor.
     """
     size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
-    size = np.maximum(size, 1e-8 * size[-1])
+    size = np.maximum(size, _FOOT * size[-1])
     largest = np.maximum.reduceat(size, np.cumsum(counts) - counts, axis=1)
-    level = np.maximum(1e-3 * largest, floors)
+    level = np.maximum(SHARE * largest, floors)
     return np.asarray(np.maximum(size, np.repeat(level, counts, axis=1)))
 
 
@@ -385,12 +409,19 @@ def signal_scale(values: Array, floor: float = 0.0) -> Array:
     against that: rounding in the large ones reaches it.
     """
     size = np.abs(values).max(axis=(0, 1))
-    return np.asarray(np.maximum(size, max(1e-3 * float(size.max(initial=0.0)), floor, _TINY)))
+    return np.asarray(np.maximum(size, max(SHARE * float(size.max(initial=0.0)), floor, _TINY)))
 
 
 def initial_mesh(start: float, stop: float, breakpoints: Sequence[float] | Array,
                  elements: int, rule: RadauRule) -> Mesh:
     """About ``elements`` equal elements, with every breakpoint (B,), in seconds, an edge."""
+    if not len(breakpoints):
+        # The same numbers as np.linspace without its end.
+        edges: Array = np.arange(elements + 1, dtype=np.float64)
+        edges *= (stop - start) / elements
+        edges += start
+        edges[-1] = stop
+        return Mesh(edges, rule)
     cuts = np.unique(np.concatenate([[start], np.asarray(breakpoints, dtype=float), [stop]]))
     cuts = cuts[(cuts >= start) & (cuts <= stop)]
     counts = np.maximum(1, np.rint(elements * np.diff(cuts) / (stop - start))).astype(int)
