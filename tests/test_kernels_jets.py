@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kernel_paths import COMPILED, by_both, needs_kernels
 
 from gpebo_cli.collocation.mesh import _JOINED, Mesh, _joining, initial_mesh, joining_change
 from gpebo_cli.collocation.radau import radau_rule
@@ -17,7 +18,6 @@ from gpebo_cli.expressions import parse, record
 from gpebo_cli.simulation import simulate
 from gpebo_cli.systems.descriptor import MATRIX_NAMES
 from gpebo_cli.systems.plant import plant_from_mapping
-from kernel_paths import COMPILED, by_both, needs_kernels
 
 pytestmark = needs_kernels
 

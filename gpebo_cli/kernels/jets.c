@@ -415,6 +415,15 @@ EVERY_WIDTH static void column(const double *from, npy_intp stride, npy_intp cou
     }
 }
 
+/* Whether a column, every `stride` numbers, is one number throughout. */
+static int still(const double *from, npy_intp stride, npy_intp count)
+{
+    npy_intp i = 1;
+    while (i < count && from[i * stride] == from[0])
+        i++;
+    return i >= count;
+}
+
 /* out[j] = Σ_i weights[i] matrix[i, j]; matrix (inner, columns). */
 static inline void combine(double *restrict out, const double *restrict matrix,
                            const double *restrict weights, npy_intp inner, npy_intp columns)
@@ -485,13 +494,14 @@ static PyObject *missed_between(PyObject *module, PyObject *const *given, Py_ssi
             return failed(&call);
         npy_intp different = 0;
         for (npy_intp e = 0; e < entries; e++) {
+            if (still(data(nodal) + e, entries, elements * points) &&
+                still(data(seen) + e, entries, elements * looks))
+                continue;
             double *here = memory + different % REMEMBERED * length;
             double low, high, least, most;
             column(data(nodal) + e, entries, elements * points, here, &low, &high);
             column(data(seen) + e, entries, elements * looks, here + elements * points, &least,
                    &most);
-            if (!(high > low || most > least))
-                continue;
             npy_intp known = different < REMEMBERED ? different : REMEMBERED;
             while (known && (memory + (known - 1) * length == here ||
                              memcmp(memory + (known - 1) * length, here, length * sizeof(double))))
@@ -546,15 +556,16 @@ static PyObject *known_kinds(PyObject *module, PyObject *const *given, Py_ssize_
         const npy_intp orders = size(values[m], 0);
         npy_intp moving = 0, inverted = 0;
         for (npy_intp e = 0; orders && e < entries[m]; e++) {
-            double low, high;
-            column(data(values[m]) + e, entries[m], times, one, &low, &high);
-            moves[at + e] = high > low;
+            moves[at + e] = !still(data(values[m]) + e, entries[m], times);
             moving += moves[at + e];
-            double nearest = INFINITY;
+            away[at + e] = 0;
+            if (!moves[at + e] || m != (npy_intp)of_reciprocals)
+                continue;
+            double nearest = INFINITY, low, high;
+            column(data(values[m]) + e, entries[m], times, one, &low, &high);
             for (npy_intp i = 0; i < times; i++)
                 nearest = fabs(one[i]) < nearest ? fabs(one[i]) : nearest;
-            away[at + e] = moves[at + e] && m == (npy_intp)of_reciprocals &&
-                           nearest > near_zero * larger(fabs(low), fabs(high));
+            away[at + e] = nearest > near_zero * larger(fabs(low), fabs(high));
             inverted += away[at + e];
         }
         for (npy_intp k = 0; moving && k < orders; k++, columns += moving)
@@ -636,10 +647,7 @@ static void skip_known(const Signals *s, const npy_intp *counts, npy_intp kinds)
     for (npy_intp kind = 0; kind < kinds; first += counts[kind++])
         for (npy_intp j = first; j < first + counts[kind]; j++) {
             const double *here = s->values + j * length;
-            npy_intp i = 1;
-            while (i < length && here[i] == here[0])
-                i++;
-            s->skipped[j] = i >= length;
+            s->skipped[j] = still(here, 1, length);
             const npy_intp from = j - REMEMBERED < first ? first : j - REMEMBERED;
             for (npy_intp other = from; other < j && !s->skipped[j]; other++)
                 s->skipped[j] = !memcmp(s->values + other * length, here, length * sizeof(double));

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from math import isfinite
 
 import numpy as np
 
@@ -36,6 +37,7 @@ _LOOKS = 40  # times within each first element at which known functions are look
 _MOST_LOOKS = 1 << 16
 _SURPRISE = 100.0  # times what the nodes let expect: then something stands between them
 _LOOK_ROUNDS = 8
+_TINY = float(np.finfo(float).tiny)
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
 
 
@@ -97,7 +99,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         return [(u, 0.0), (y, 1e-3 * max(size, floor))]
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
-    floor = 1e-3 * float(np.abs(system.initial_state).max(initial=0.0))
+    floor = 1e-3 * max(map(abs, system.initial_state.tolist()), default=0.0)
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor, first.amplification
     )
@@ -136,7 +138,7 @@ def _known_resolved(
     def evaluated(mesh: Mesh) -> ModelCoefficients:
         return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
 
-    longest = _SHORT / max(structure.rate, float(np.finfo(float).tiny))
+    longest = _SHORT / max(structure.rate, _TINY)
     if solver.name != "ivp" and mesh.steps.max() > longest:
         mesh = _growth_resolved(structure, mesh, solver)
     c = evaluated(mesh)
@@ -149,9 +151,11 @@ def _known_resolved(
             break
         mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
         c = evaluated(mesh)
-    before = np.full(mesh.size, np.inf)
+    before: Array | float = np.inf
     while system.m and "u" not in system.coefficients.constant:
         tail = unresolved(c.u[0].reshape(*mesh.points.shape, -1), mesh.rule)
+        if tail.max() <= solver.tol:
+            break
         poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
         parts = wanted_parts(tail, poor, solver.tol, mesh.rule.stages)
         too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
@@ -223,6 +227,8 @@ def _growth_resolved(structure: Structure, mesh: Mesh, solver: SolverSettings) -
     never be seen to grow again: its error is invisible beside the size it once had.
     """
     parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / _SHORT)))
+    if parts.max() == 1.0:
+        return mesh
     n = structure.d + structure.a
     if parts.sum() > min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements / 2):
         return mesh
@@ -274,7 +280,7 @@ def _equations(reduced: StrangenessFree) -> Coefficients:
 def _initial_state(system: DescriptorSystem, reduced: StrangenessFree) -> Array:
     """The consistent state at the start, from the equations at times of which it is the first."""
     x0 = consistent_state(reduced, system.initial_state)
-    if not np.isfinite(x0).all():
+    if not all(map(isfinite, x0.tolist())):
         raise ModelError(
             f"plant {system.name}: no finite consistent state at the start; look for entries that "
             "are huge or infinite there"
