@@ -76,6 +76,27 @@ def test_taylor_coefficients(lines, order, count, off):
     np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * size)
 
 
+@pytest.mark.parametrize("size", [1e-300, 1e-9, 1.0, 30.0, 1e3, 9e4, 1e6, 1e15])
+def test_sine_and_cosine_to_the_last_place(size):
+    """Also next to multiples of π/2, where a sloppy reduction of the angle leaves nothing."""
+    rng = np.random.default_rng(0)
+    t = rng.uniform(-size, size, 20_000)
+    t[::2] = np.rint(t[::2] / (np.pi / 2)) * (np.pi / 2)
+    t[::4] = np.nextafter(t[::4], np.inf)
+    t[0] = 0.0
+    sine = tape_of("sin(t)").taylor(t, 1)[..., 0]
+    cosine = tape_of("cos(t)").taylor(t, 0)[0, :, 0]
+    both = tape_of("cos(t)", "sin(t)").taylor(t, 1)
+    exact = np.sin(t.astype(np.longdouble)), np.cos(t.astype(np.longdouble))
+    units = 1.01 if np.finfo(np.longdouble).eps < np.finfo(float).eps else 2.01
+    for value, truth in zip([sine[0], cosine], exact, strict=True):
+        close = units * np.finfo(float).eps
+        np.testing.assert_allclose(value, truth.astype(float), rtol=close, atol=0)
+    np.testing.assert_array_equal(both[0], np.stack([cosine, sine[0]], axis=1))
+    np.testing.assert_array_equal(both[1], np.stack([-sine[0], cosine], axis=1))
+    np.testing.assert_array_equal(sine[1], cosine)
+
+
 @pytest.mark.parametrize("text", [
     "1/t", "log(t)", "sqrt(t)", "1/(1 + exp(500*t))", "d(log(t))", "exp(exp(10*t))", "t**-2",
     "abs(t)/t", "t**0.5", "sinh(800*t)", "sign(log(t))", "1e308*t*10", "log(t - abs(t) - 1)",
