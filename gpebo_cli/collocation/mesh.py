@@ -88,14 +88,15 @@ class Mesh:
         return Mesh(edges, self.rule), np.where(parts[parent] == 1, parent, -1)
 
     def joined(
-        self, kinds: Sequence[Array], tol: float, keep: Array, longest: float = np.inf
+        self, values: Array, counts: IntArray, tol: float, keep: Array, longest: float = np.inf
     ) -> Mesh:
         """Neighbours of equal length joined where a polynomial over all of them does as well.
 
         Compared at all points of the short elements, so that nothing they have seen is lost.
 
         Args:
-            kinds: point values (K, s + 1, c) of signals of one kind each.
+            values: point values (K, s + 1, c) of signals.
+            counts: how many of them are of one kind (kinds,), one kind after the other.
             tol: by how much a value may change, relative to the signal's own size so far.
             keep: edges (B,) that stay.
             longest: no element is joined to one that is longer.
@@ -103,13 +104,18 @@ class Mesh:
         Returns:
             this mesh itself, where nothing is joined.
         """
-        cuts = np.searchsorted(self.edges, keep).tolist()
-        pieces = list(pairwise([0, *sorted(set(cuts) - {0, self.size}), self.size]))
-        values = np.concatenate([np.zeros((*self.points.shape, 0)), *kinds], axis=2)
-        counts = np.array([0, *(kind.shape[2] for kind in kinds)])
-        if len(pieces) > _MANY_PIECES:
+        inner = set(np.searchsorted(self.edges, keep).tolist()) if len(keep) else set()
+        bounds = [0, *sorted(inner - {0, self.size}), self.size]
+        if len(bounds) > _MANY_PIECES + 1:
             return self
-        scale = _scale_so_far(values, counts[1:], np.full(len(kinds), _TINY))[:, None]
+        if kernels.compiled is not None:
+            edges = kernels.compiled.joined(
+                values, counts, self.edges, np.array(bounds), tol, longest, _FOOT, SHARE, _TINY,
+                *_all_joining(self.rule),
+            )
+            return self if len(edges) == len(self.edges) else Mesh(edges, self.rule)
+        pieces = list(pairwise(bounds))
+        scale = _scale_so_far(values, counts, np.full(len(counts), _TINY))[:, None]
         stays = np.ones(self.size + 1, dtype=bool)
         for count in _JOINED:
             first = np.concatenate([np.arange(a, b - count + 1, count) for a, b in pieces])
@@ -180,13 +186,28 @@ def joining_change(rule: RadauRule, count: int) -> Array:
     Values at the points of the joined element are read from the polynomials of the short ones.
     Shape (count (s + 1), count (s + 1)), for the point values one element after the other.
     """
+    there, back = _joining(rule, count)
+    return np.asarray((there @ back).T - np.eye(len(there)))
+
+
+def _joining(rule: RadauRule, count: int) -> tuple[Array, Array]:
+    """From the points of ``count`` equal elements to those of one over all of them, and back.
+
+    Weights of shapes (count (s + 1), s + 1) and (s + 1, count (s + 1)), applied from the right.
+    """
     short = Mesh(np.arange(count + 1) / count, rule)
     joined = Mesh(np.array([0.0, 1.0]), rule)
     size = count * len(rule.points)
     unit = np.eye(size).reshape(count, len(rule.points), size)
-    sampled = short.sampler(joined.points.ravel(), joined.inside.ravel())(unit)
-    there = joined.sampler(short.points.ravel())(sampled[None])
-    return np.asarray(there - np.eye(size))
+    there = short.sampler(joined.points.ravel(), joined.inside.ravel())(unit)
+    back = joined.sampler(short.points.ravel()).weights
+    return np.ascontiguousarray(there.T), np.ascontiguousarray(back.T)
+
+
+@lru_cache(maxsize=16)
+def _all_joining(rule: RadauRule) -> tuple[Array, ...]:
+    """What :func:`joining_change` is made of, for each of _JOINED: for the kernel."""
+    return tuple(matrix for count in _JOINED for matrix in _joining(rule, count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,6 +464,13 @@ def signal_scale(values: Array, floor: float = 0.0) -> Array:
 def initial_mesh(start: float, stop: float, breakpoints: Sequence[float] | Array,
                  elements: int, rule: RadauRule) -> Mesh:
     """About ``elements`` equal elements, with every breakpoint (B,), in seconds, an edge."""
+    if not len(breakpoints):
+        # The same numbers as np.linspace without its end.
+        edges: Array = np.arange(elements + 1, dtype=np.float64)
+        edges *= (stop - start) / elements
+        edges += start
+        edges[-1] = stop
+        return Mesh(edges, rule)
     cuts = np.unique(np.concatenate([[start], np.asarray(breakpoints, dtype=float), [stop]]))
     cuts = cuts[(cuts >= start) & (cuts <= stop)]
     counts = np.maximum(1, np.rint(elements * np.diff(cuts) / (stop - start))).astype(int)

@@ -33,6 +33,8 @@ def breakpoints_of_tape(tape: Tape, start: float, stop: float) -> Array:
     Raises:
         ConfigError: an argument that is not finite at some time.
     """
+    if not tape.jumps:
+        return np.zeros(0)
     steps = [i.value for i in tape.instructions if i.operation == "step"]
     affine = [s.affine for s in tape.switches if s.affine is not None]
     instants = np.array([*steps, *(-offset / slope for offset, slope in affine)], dtype=float)

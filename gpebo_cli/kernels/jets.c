@@ -1,7 +1,19 @@
-/* gpebo_cli/expressions: Taylor coefficients of all entries of a plant. */
+/* Known functions of time: gpebo_cli/expressions, their Taylor coefficients; simulation/simulate.py
+   and Mesh.joined, the mesh that they ask for. */
 #include "common.h"
 
 #include <fenv.h>
+
+/* One version of a function for each width of the processor's registers, chosen when the module
+   is loaded. All round alike: no loop adds up in another order, nothing is contracted. */
+#if defined(__has_attribute) && defined(__x86_64__) && defined(__GLIBC__) && !defined(GPEBO_PLAIN)
+#if __has_attribute(target_clones)
+#define EVERY_WIDTH __attribute__((target_clones("avx512f", "avx2", "default")))
+#endif
+#endif
+#ifndef EVERY_WIDTH
+#define EVERY_WIDTH
+#endif
 
 #define MOST_MATRICES 8
 #define MOST_AXES 8
@@ -25,6 +37,7 @@ typedef struct {
     const double *given[GIVEN];
     double *memory; /* rows GIVEN, GIVEN + 1, … of `length` numbers each */
     npy_intp length;
+    double *unread; /* one more */
     const double *constants;
 } Rows;
 
@@ -62,8 +75,8 @@ static inline const double *row_of(const Rows *rows, npy_intp index)
             z[i] = value;                                                                          \
     } while (0)
 
-/* Does one operation for `count` times. */
-static void operate(const Rows *rows, const Operation *operation, npy_intp count)
+/* Does one operation for `count` times; sine and cosine have their own, below. */
+EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, npy_intp count)
 {
     const npy_intp left = operation->left, right = operation->right;
     double *restrict z = rows->memory + (operation->result - GIVEN) * rows->length;
@@ -78,8 +91,6 @@ static void operate(const Rows *rows, const Operation *operation, npy_intp count
     case SQRT: UNARY(sqrt(x[i])); break;
     case EXP: UNARY(exp(x[i])); break;
     case LOG: UNARY(log(x[i])); break;
-    case SIN: UNARY(sin(x[i])); break;
-    case COS: UNARY(cos(x[i])); break;
     case TAN: UNARY(tan(x[i])); break;
     case SINH: UNARY(sinh(x[i])); break;
     case COSH: UNARY(cosh(x[i])); break;
@@ -88,30 +99,80 @@ static void operate(const Rows *rows, const Operation *operation, npy_intp count
     }
 }
 
-/* Sine and cosine of the same row: together they cost as much as one of them. */
-static void sine_and_cosine(const Rows *rows, const Operation *sine, const Operation *cosine,
-                            npy_intp count)
+#define FAR 1e5 /* angles up to here are reduced exactly: fewer than 2^20 quarters of a turn */
+
+/* Sine and cosine of angles up to FAR, to less than a unit in the last place, several at a time,
+   where the C library takes one after the other: each known function asks for a thousand.
+
+   The angle less k quarters of a turn, as y + rest: π/2 in three parts, the first two of 33 bits,
+   so that k times them is exact. There sin y = y + y z S(z) and cos y = 1 − z/2 + z² C(z) with
+   z = y², S and C of degree 5 through Chebyshev's points of 0 ≤ z ≤ (π/4)². */
+EVERY_WIDTH static void turn(const double *restrict angle, double *restrict s, double *restrict c,
+                             npy_intp count)
 {
-    const double *restrict x = row_of(rows, sine->left);
-    double *restrict s = rows->memory + (sine->result - GIVEN) * rows->length;
-    double *restrict c = rows->memory + (cosine->result - GIVEN) * rows->length;
+    const double to_integer = 6755399441055744.0; /* 1.5 · 2^52: its last bit counts ones */
     for (npy_intp i = 0; i < count; i++) {
-        const double angle = x[i];
-        s[i] = sin(angle);
-        c[i] = cos(angle);
+        const double shifted = angle[i] * 0.6366197723675814 + to_integer;
+        const double k = shifted - to_integer;
+        npy_int64 quarter;
+        memcpy(&quarter, &shifted, sizeof quarter);
+        const double first = angle[i] - k * 1.5707963267341256, second = k * 6.077100506303966e-11;
+        const double y = first - second;
+        const double rest = ((first - y) - second) - k * 2.0222662487959506e-21;
+        const double z = y * y, cube = z * y;
+        const double S = 0.008333333333330948 +
+                         z * (-0.00019841269836756774 +
+                              z * (2.7557316101617874e-06 +
+                                   z * (-2.505113165023518e-08 + z * 1.5918115263265974e-10)));
+        const double C =
+            z * (0.041666666666666664 +
+                 z * (-0.0013888888888887398 +
+                      z * (2.480158729876456e-05 +
+                           z * (-2.7557317271145144e-07 +
+                                z * (2.087614614655861e-09 + z * -1.1382623647474604e-11)))));
+        const double sine =
+            y - ((z * (0.5 * rest - cube * S) - rest) - cube * -0.16666666666666666);
+        const double half = 0.5 * z, most = 1.0 - half;
+        const double cosine = most + (((1.0 - most) - half) + (z * C - y * rest));
+        const double one = quarter & 1 ? cosine : sine, other = quarter & 1 ? sine : cosine;
+        s[i] = quarter & 2 ? -one : one;
+        c[i] = (quarter + 1) & 2 ? -other : other;
     }
 }
 
+/* Sine and cosine of the row `left`, into either of two rows. */
+static void sine_and_cosine(const Rows *rows, npy_intp left, double *s, double *c, npy_intp count)
+{
+    const double *angle = row_of(rows, left);
+    int near = 1;
+    for (npy_intp i = 0; i < count; i++)
+        near &= fabs(angle[i]) <= FAR;
+    if (near) {
+        turn(angle, s, c, count);
+        return;
+    }
+    for (npy_intp i = 0; i < count; i++) {
+        s[i] = sin(angle[i]);
+        c[i] = cos(angle[i]);
+    }
+}
+
+/* Does all operations for `count` times; of a sine and a cosine of the same row, which stand side
+   by side, each is a by-product of the other. */
 static void run(const Rows *rows, const Operation *code, npy_intp operations, npy_intp count)
 {
     for (npy_intp k = 0; k < operations; k++) {
-        if (code[k].what == SIN && k + 1 < operations && code[k + 1].what == COS &&
-            code[k + 1].left == code[k].left) {
-            sine_and_cosine(rows, code + k, code + k + 1, count);
-            k++;
-        } else {
+        const int sine = code[k].what == SIN;
+        if (!sine && code[k].what != COS) {
             operate(rows, code + k, count);
+            continue;
         }
+        double *one = rows->memory + (code[k].result - GIVEN) * rows->length, *other = rows->unread;
+        const npy_intp left = code[k].left;
+        if (k + 1 < operations && code[k + 1].what == (sine ? COS : SIN) &&
+            code[k + 1].left == left)
+            other = rows->memory + (code[++k].result - GIVEN) * rows->length;
+        sine_and_cosine(rows, left, sine ? one : other, sine ? other : one, count);
     }
 }
 
@@ -278,9 +339,11 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
     npy_intp block = IN_CACHE / used;
     block = block < 32 ? 32 : block > 512 ? 512 : block;
     block = block > times ? times : block;
-    Rows rows = {{NULL, NULL}, scratch(&call, (used - GIVEN) * block), block, data(constants)};
+    Rows rows = {{NULL, NULL}, scratch(&call, (used - GIVEN + 1) * block), block, NULL,
+                 data(constants)};
     if (rows.memory == NULL)
         return failed(&call);
+    rows.unread = rows.memory + (used - GIVEN) * block;
     double *out[MOST_MATRICES] = {NULL};
     PyObject *answer = PyTuple_New(matrices);
     for (npy_intp m = 0; answer != NULL && m < matrices; m++) {
@@ -330,7 +393,481 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
     return answer;
 }
 
+/* --- the mesh that known functions ask for --- */
+
+#define REMEMBERED 16 /* columns with which the next ones are compared */
+
+/* A number among the arguments. 0 with an exception if it is none. */
+static int number(const Call *call, Py_ssize_t place, double *value)
+{
+    *value = PyFloat_AsDouble(call->given[place]);
+    return *value != -1.0 || PyErr_Occurred() == NULL;
+}
+
+/* An argument as an array of float64 with at least two axes. */
+static PyArrayObject *values_of(Call *call, Py_ssize_t place)
+{
+    PyObject *given = call->given[place];
+    const int axes = PyArray_Check(given) ? PyArray_NDIM((PyArrayObject *)given) : 0;
+    return doubles(call, place, axes < 2 ? 2 : axes);
+}
+
+/* The product of all axes but the first two. */
+static npy_intp entries_of(PyArrayObject *values)
+{
+    npy_intp entries = 1;
+    for (int axis = 2; axis < PyArray_NDIM(values); axis++)
+        entries *= size(values, axis);
+    return entries;
+}
+
+enum { LANES = 4 }; /* running largest numbers that do not wait for each other */
+
+/* The larger one; fmax is a call. */
+static inline double larger(double one, double other) { return one > other ? one : other; }
+
+/* The largest |x| of some numbers, 0 of none. */
+EVERY_WIDTH static double largest_size(const double *x, npy_intp count)
+{
+    double most[LANES] = {0.0};
+    npy_intp i = 0;
+    for (; i + LANES <= count; i += LANES)
+        for (int l = 0; l < LANES; l++)
+            most[l] = larger(fabs(x[i + l]), most[l]);
+    for (; i < count; i++)
+        most[0] = larger(fabs(x[i]), most[0]);
+    return larger(larger(most[0], most[1]), larger(most[2], most[3]));
+}
+
+/* Copies a column, every `stride` numbers, and says its smallest and largest number. */
+EVERY_WIDTH static void column(const double *from, npy_intp stride, npy_intp count, double *to, double *low,
+                   double *high)
+{
+    double least[LANES] = {INFINITY, INFINITY, INFINITY, INFINITY}, most[LANES];
+    for (npy_intp i = 0; i < count; i++)
+        to[i] = from[i * stride];
+    for (int l = 0; l < LANES; l++)
+        most[l] = -INFINITY;
+    npy_intp i = 0;
+    for (; i + LANES <= count; i += LANES)
+        for (int l = 0; l < LANES; l++) {
+            least[l] = to[i + l] < least[l] ? to[i + l] : least[l];
+            most[l] = larger(to[i + l], most[l]);
+        }
+    for (; i < count; i++) {
+        least[0] = to[i] < least[0] ? to[i] : least[0];
+        most[0] = larger(to[i], most[0]);
+    }
+    *low = least[0];
+    *high = most[0];
+    for (int l = 1; l < LANES; l++) {
+        *low = least[l] < *low ? least[l] : *low;
+        *high = larger(most[l], *high);
+    }
+}
+
+/* Whether a column, every `stride` numbers, is one number throughout. */
+static int still(const double *from, npy_intp stride, npy_intp count)
+{
+    npy_intp i = 1;
+    while (i < count && from[i * stride] == from[0])
+        i++;
+    return i >= count;
+}
+
+/* out[j] = Σ_i weights[i] matrix[i, j]; matrix (inner, columns). */
+static inline void combine(double *restrict out, const double *restrict matrix,
+                           const double *restrict weights, npy_intp inner, npy_intp columns)
+{
+    for (npy_intp j = 0; j < columns; j++)
+        out[j] = 0.0;
+    npy_intp i = 0;
+    for (; i + 4 <= inner; i += 4) {
+        const double *restrict m = matrix + i * columns, *restrict w = weights + i;
+        for (npy_intp j = 0; j < columns; j++)
+            out[j] += (w[0] * m[j] + w[1] * m[columns + j]) +
+                      (w[2] * m[2 * columns + j] + w[3] * m[3 * columns + j]);
+    }
+    for (; i < inner; i++)
+        for (npy_intp j = 0; j < columns; j++)
+            out[j] += weights[i] * matrix[i * columns + j];
+}
+
+/* Raises `missed` (elements,) to how far each element's polynomial is from the values `seen`
+   (elements, looks) in between, relative to `largest`; nodal (elements, points). */
+EVERY_WIDTH static void raise_missed(double *missed, const double *between, const double *nodal,
+                         const double *seen, double largest, npy_intp elements, npy_intp points,
+                         npy_intp looks, double *expected)
+{
+    for (npy_intp k = 0; k < elements; k++, nodal += points, seen += looks) {
+        combine(expected, between, nodal, points, looks);
+        for (npy_intp l = 0; l < looks; l++)
+            expected[l] -= seen[l];
+        missed[k] = larger(largest_size(expected, looks) / largest, missed[k]);
+    }
+}
+
+/* missed_between(between (points, looks), nodal (·, elements * points, …),
+                  seen (·, elements * looks, …), nodal, seen, …)
+
+   For each pair, shape (pairs, elements): how far what is seen between the nodes is from the
+   polynomial through the nodes, relative to the largest value of that entry; of the entries that
+   move at all the largest. Of the first axes only the first member counts. */
+static PyObject *missed_between(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    const npy_intp pairs = (count - 1) / 2;
+    if (!begin(&call, given, count, pairs < 1 || pairs > MOST_MATRICES ? 3 : 1 + 2 * pairs))
+        return NULL;
+    PyArrayObject *between = doubles(&call, 0, 2), *out = NULL;
+    if (between == NULL)
+        return failed(&call);
+    const npy_intp points = size(between, 0), looks = size(between, 1);
+    double *memory = NULL, *expected = scratch(&call, looks);
+    npy_intp elements = 0, length = 0;
+    for (npy_intp pair = 0; expected != NULL && pair < pairs; pair++) {
+        PyArrayObject *nodal = values_of(&call, 1 + 2 * pair);
+        PyArrayObject *seen = nodal ? values_of(&call, 2 + 2 * pair) : NULL;
+        if (seen == NULL)
+            return failed(&call);
+        if (pair == 0) {
+            elements = points ? size(nodal, 1) / points : 0;
+            length = elements * (points + looks);
+            out = zeros(&call, 2, (npy_intp[]){pairs, elements});
+            memory = out ? scratch(&call, REMEMBERED * length) : NULL;
+        }
+        const npy_intp entries = entries_of(nodal);
+        if (memory == NULL || !same("nodes", size(nodal, 1), elements * points) ||
+            !same("looks", size(seen, 1), elements * looks) ||
+            !same("entries", entries, entries_of(seen)) ||
+            (entries && (!size(nodal, 0) || !size(seen, 0)) && !outside("orders", 0)))
+            return failed(&call);
+        npy_intp different = 0;
+        for (npy_intp e = 0; e < entries; e++) {
+            if (still(data(nodal) + e, entries, elements * points) &&
+                still(data(seen) + e, entries, elements * looks))
+                continue;
+            double *here = memory + different % REMEMBERED * length;
+            double low, high, least, most;
+            column(data(nodal) + e, entries, elements * points, here, &low, &high);
+            column(data(seen) + e, entries, elements * looks, here + elements * points, &least,
+                   &most);
+            npy_intp known = different < REMEMBERED ? different : REMEMBERED;
+            while (known && (memory + (known - 1) * length == here ||
+                             memcmp(memory + (known - 1) * length, here, length * sizeof(double))))
+                known--;
+            if (known)
+                continue;
+            different++;
+            const double largest = larger(larger(fabs(low), fabs(high)),
+                                          larger(fabs(least), fabs(most)));
+            raise_missed(data(out) + pair * elements, data(between), here,
+                         here + elements * points, largest, elements, points, looks, expected);
+        }
+    }
+    return expected == NULL ? failed(&call) : results(&call, 1, out);
+}
+
+/* known_kinds(E, near_zero, values (orders, N, …), …)
+
+   What of the known functions moves in time: columns (N, c), and how many of them are of each kind
+   (kinds,), one kind after the other. A kind is one order of one matrix; after those of matrix E
+   come its reciprocals, of the entries whose smallest size is more than near_zero times its
+   largest. */
+static PyObject *known_kinds(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    const npy_intp matrices = count - 2;
+    if (!begin(&call, given, count, matrices < 1 || matrices > MOST_MATRICES ? 3 : count))
+        return NULL;
+    double near_zero, of_reciprocals;
+    if (!number(&call, 0, &of_reciprocals) || !number(&call, 1, &near_zero))
+        return failed(&call);
+    PyArrayObject *values[MOST_MATRICES];
+    npy_intp entries[MOST_MATRICES], times = 0, all = 0, most_kinds = 1;
+    for (npy_intp m = 0; m < matrices; m++) {
+        if ((values[m] = values_of(&call, 2 + m)) == NULL)
+            return failed(&call);
+        times = m ? times : size(values[m], 1);
+        entries[m] = entries_of(values[m]);
+        if (!same("times of the matrices", size(values[m], 1), times))
+            return failed(&call);
+        all += entries[m];
+        most_kinds += size(values[m], 0);
+    }
+    double *one = scratch(&call, times);
+    int *moves = one ? integers(&call, all) : NULL, *away = moves ? integers(&call, all) : NULL;
+    int *counts = away ? integers(&call, most_kinds) : NULL;
+    if (counts == NULL)
+        return failed(&call);
+    npy_intp kinds = 0, columns = 0;
+    for (npy_intp m = 0, at = 0; m < matrices; at += entries[m++]) {
+        const npy_intp orders = size(values[m], 0);
+        npy_intp moving = 0, inverted = 0;
+        for (npy_intp e = 0; orders && e < entries[m]; e++) {
+            moves[at + e] = !still(data(values[m]) + e, entries[m], times);
+            moving += moves[at + e];
+            away[at + e] = 0;
+            if (!moves[at + e] || m != (npy_intp)of_reciprocals)
+                continue;
+            double nearest = INFINITY, low, high;
+            column(data(values[m]) + e, entries[m], times, one, &low, &high);
+            for (npy_intp i = 0; i < times; i++)
+                nearest = fabs(one[i]) < nearest ? fabs(one[i]) : nearest;
+            away[at + e] = nearest > near_zero * larger(fabs(low), fabs(high));
+            inverted += away[at + e];
+        }
+        for (npy_intp k = 0; moving && k < orders; k++, columns += moving)
+            counts[kinds++] = (int)moving;
+        if (inverted) {
+            counts[kinds++] = (int)inverted;
+            columns += inverted;
+        }
+    }
+    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){times, columns});
+    PyObject *sizes = out ? PyArray_SimpleNew(1, &kinds, NPY_INTP) : NULL;
+    if (sizes == NULL)
+        return failed(&call);
+    for (npy_intp kind = 0; kind < kinds; kind++)
+        ((npy_intp *)PyArray_DATA((PyArrayObject *)sizes))[kind] = counts[kind];
+    double *to = data(out);
+    for (npy_intp m = 0, at = 0; m < matrices; at += entries[m++]) {
+        for (npy_intp k = 0; k < size(values[m], 0); k++)
+            for (npy_intp e = 0; e < entries[m]; e++)
+                if (moves[at + e]) {
+                    const double *from = data(values[m]) + k * times * entries[m] + e;
+                    for (npy_intp i = 0; i < times; i++)
+                        to[i * columns] = from[i * entries[m]];
+                    to++;
+                }
+        for (npy_intp e = 0; size(values[m], 0) && e < entries[m]; e++)
+            if (away[at + e]) {
+                for (npy_intp i = 0; i < times; i++)
+                    to[i * columns] = 1.0 / data(values[m])[i * entries[m] + e];
+                to++;
+            }
+    }
+    PyObject *answer = PyTuple_Pack(2, (PyObject *)out, sizes);
+    Py_DECREF(sizes);
+    failed(&call); /* gives back what the call holds */
+    return answer;
+}
+
+/* Signals that one polynomial may replace on several elements, column after column. */
+typedef struct {
+    double *values; /* (columns, elements, points) */
+    double *scale;  /* (columns, elements) */
+    int *skipped;   /* (columns,) those of which nothing new is to be learned */
+    npy_intp columns, elements, points;
+} Signals;
+
+/* Size of each column up to each element, as _scale_so_far in collocation/mesh.py defines it:
+   at least `foot` times the final size, at least `share` times the largest of its kind. */
+static void scale_so_far(const Signals *s, const npy_intp *counts, npy_intp kinds, double foot,
+                         double share, double tiny, double *largest)
+{
+    npy_intp first = 0;
+    for (npy_intp kind = 0; kind < kinds; first += counts[kind++]) {
+        for (npy_intp k = 0; k < s->elements; k++)
+            largest[k] = 0.0;
+        for (npy_intp j = first; j < first + counts[kind]; j++) {
+            double *scale = s->scale + j * s->elements, so_far = 0.0;
+            const double *value = s->values + j * s->elements * s->points;
+            for (npy_intp k = 0; k < s->elements; k++, value += s->points)
+                scale[k] = so_far = larger(largest_size(value, s->points), so_far);
+            for (npy_intp k = 0; k < s->elements; k++) {
+                scale[k] = larger(scale[k], foot * so_far);
+                largest[k] = larger(largest[k], scale[k]);
+            }
+        }
+        for (npy_intp j = first; j < first + counts[kind]; j++)
+            for (npy_intp k = 0; k < s->elements; k++) {
+                double *scale = s->scale + j * s->elements + k;
+                *scale = larger(*scale, larger(share * largest[k], tiny));
+            }
+    }
+}
+
+/* Columns that do not move, and those equal to an earlier one of their kind. */
+static void skip_known(const Signals *s, const npy_intp *counts, npy_intp kinds)
+{
+    const npy_intp length = s->elements * s->points;
+    npy_intp first = 0;
+    for (npy_intp kind = 0; kind < kinds; first += counts[kind++])
+        for (npy_intp j = first; j < first + counts[kind]; j++) {
+            const double *here = s->values + j * length;
+            s->skipped[j] = still(here, 1, length);
+            const npy_intp from = j - REMEMBERED < first ? first : j - REMEMBERED;
+            for (npy_intp other = from; other < j && !s->skipped[j]; other++)
+                s->skipped[j] = !memcmp(s->values + other * length, here, length * sizeof(double));
+        }
+}
+
+/* Whether one polynomial over `together` elements from `first` on stays within tol of all signals.
+   From the points of the short elements there (together * points, points) leads to its own, and
+   back (points, together * points) from those to theirs. */
+EVERY_WIDTH static int one_does(const Signals *s, npy_intp first, npy_intp together,
+                                const double *there, const double *back, double tol,
+                                double *sampled, double *replaced)
+{
+    const npy_intp points = s->points;
+    for (npy_intp j = 0; j < s->columns; j++) {
+        if (s->skipped[j])
+            continue;
+        const double *seen = s->values + (j * s->elements + first) * points;
+        combine(sampled, there, seen, together * points, points);
+        combine(replaced, back, sampled, points, together * points);
+        for (npy_intp k = 0; k < together; k++) {
+            const double allowed = tol * s->scale[j * s->elements + first + k];
+            int fits = 1;
+            for (npy_intp i = k * points; i < (k + 1) * points; i++)
+                fits &= fabs(replaced[i] - seen[i]) <= allowed;
+            if (!fits)
+                return 0;
+        }
+    }
+    return 1;
+}
+
+/* joined(values (elements, points, c), counts (kinds,), edges (elements + 1,), bounds (pieces + 1,),
+          tol, longest, foot, share, tiny, there (count * points, points),
+          back (points, count * points), …)
+
+   The edges that stay, see Mesh.joined in collocation/mesh.py. The last two arguments, for each
+   count of elements that may become one, are those of `one_does`. */
+static PyObject *joined(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    enum { FIRST = 9 };
+    Call call;
+    const npy_intp ways = (count - FIRST) / 2;
+    if (!begin(&call, given, count, ways < 1 || ways > 4 ? FIRST + 2 : FIRST + 2 * ways))
+        return NULL;
+    PyArrayObject *values = doubles(&call, 0, 3), *counts = values ? indices(&call, 1, 1) : NULL;
+    PyArrayObject *edges = counts ? doubles(&call, 2, 1) : NULL;
+    PyArrayObject *bounds = edges ? indices(&call, 3, 1) : NULL;
+    double tol, longest, foot, share, tiny;
+    if (bounds == NULL || !number(&call, 4, &tol) || !number(&call, 5, &longest) ||
+        !number(&call, 6, &foot) || !number(&call, 7, &share) || !number(&call, 8, &tiny))
+        return failed(&call);
+    Signals s = {NULL, NULL, NULL, size(values, 2), size(values, 0), size(values, 1)};
+    const npy_intp *counted = PyArray_DATA(counts), *bound = PyArray_DATA(bounds);
+    npy_intp total = 0;
+    for (npy_intp kind = 0; kind < size(counts, 0); kind++) {
+        if (counted[kind] < 0)
+            total = -1;
+        total += total < 0 ? 0 : counted[kind];
+    }
+    if (!same("signals and the sum of the kinds", s.columns, total) ||
+        !same("elements and edges", s.elements + 1, size(edges, 0)))
+        return failed(&call);
+    for (npy_intp b = 0; b < size(bounds, 0); b++)
+        if (bound[b] < (b ? bound[b - 1] : 0) || bound[b] > s.elements) {
+            outside("bounds", bound[b]);
+            return failed(&call);
+        }
+    const npy_intp length = s.elements * s.points;
+    s.values = scratch(&call, s.columns * length);
+    s.scale = s.values ? scratch(&call, s.columns * s.elements) : NULL;
+    s.skipped = s.scale ? integers(&call, s.columns) : NULL;
+    int *stays = s.skipped ? integers(&call, s.elements + 1) : NULL;
+    double *largest = stays ? scratch(&call, s.elements) : NULL;
+    double *sampled = largest ? scratch(&call, s.points) : NULL;
+    if (sampled == NULL)
+        return failed(&call);
+    for (npy_intp j = 0; j < s.columns; j++)
+        for (npy_intp i = 0; i < length; i++)
+            s.values[j * length + i] = data(values)[i * s.columns + j];
+    scale_so_far(&s, counted, size(counts, 0), foot, share, tiny, largest);
+    skip_known(&s, counted, size(counts, 0));
+    for (npy_intp k = 0; k <= s.elements; k++)
+        stays[k] = 1;
+
+    npy_intp left = s.elements + 1, found = 1;
+    for (npy_intp way = 0; way < ways && found; way++) {
+        PyArrayObject *there = doubles(&call, FIRST + 2 * way, 2);
+        PyArrayObject *back = there ? doubles(&call, FIRST + 1 + 2 * way, 2) : NULL;
+        if (back == NULL || !same("points there", size(there, 1), s.points) ||
+            !same("points on the way back", size(back, 0), s.points) ||
+            !same("points of the short elements", size(there, 0), size(back, 1)))
+            return failed(&call);
+        const npy_intp together = s.points ? size(back, 1) / s.points : 0, half = together / 2;
+        if (together < 2 || !same("points of all elements", size(back, 1), together * s.points)) {
+            if (together < 2)
+                outside("counts of elements", together);
+            return failed(&call);
+        }
+        double *replaced = scratch(&call, together * s.points);
+        if (replaced == NULL)
+            return failed(&call);
+        found = 0;
+        for (npy_intp piece = 0; piece + 1 < size(bounds, 0); piece++)
+            for (npy_intp k = bound[piece]; k + together <= bound[piece + 1]; k += together) {
+                /* What could not be joined to less will not be joined to more. */
+                int ready = together * (data(edges)[k + 1] - data(edges)[k]) <= longest;
+                for (npy_intp i = 1; i < half; i++)
+                    ready &= !stays[k + i] && !stays[k + half + i];
+                if (!ready || !one_does(&s, k, together, data(there), data(back), tol, sampled,
+                                        replaced))
+                    continue;
+                for (npy_intp i = 1; i < together; i++) {
+                    left -= stays[k + i];
+                    stays[k + i] = 0;
+                }
+                found = 1;
+            }
+    }
+    PyArrayObject *out = fresh(&call, 1, &left);
+    if (out == NULL)
+        return failed(&call);
+    double *to = data(out);
+    for (npy_intp k = 0; k <= s.elements; k++)
+        if (stays[k])
+            *to++ = data(edges)[k];
+    return results(&call, 1, out);
+}
+
+/* outputs(C (points or 1, r, n), x (points, n))
+
+   y = C x (points, r), and the largest |C| times the largest |x|. */
+static PyObject *outputs(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 2))
+        return NULL;
+    PyArrayObject *C = doubles(&call, 0, 3), *x = C ? doubles(&call, 1, 2) : NULL;
+    if (x == NULL || !same("states in C and x", size(C, 2), size(x, 1)) ||
+        (size(C, 0) != 1 && !same("points of C and x", size(C, 0), size(x, 0))))
+        return failed(&call);
+    const npy_intp points = size(x, 0), r = size(C, 1), n = size(C, 2);
+    const npy_intp stride = size(C, 0) == 1 ? 0 : r * n;
+    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){points, r});
+    if (out == NULL)
+        return failed(&call);
+    double *y = data(out);
+    for (npy_intp k = 0; k < points; k++)
+        for (npy_intp i = 0; i < r; i++, y++) {
+            const double *row = data(C) + k * stride + i * n, *state = data(x) + k * n;
+            *y = 0.0;
+            for (npy_intp j = 0; j < n; j++)
+                *y += row[j] * state[j];
+        }
+    PyObject *largest = PyFloat_FromDouble(largest_size(data(C), PyArray_SIZE(C)) *
+                                           largest_size(data(x), PyArray_SIZE(x)));
+    PyObject *answer = largest ? PyTuple_Pack(2, (PyObject *)out, largest) : NULL;
+    Py_XDECREF(largest);
+    failed(&call); /* gives back what the call holds */
+    return answer;
+}
+
 PyMethodDef jets_kernels[] = {
     {"jets", (PyCFunction)(void (*)(void))jets, METH_FASTCALL, NULL},
+    {"missed_between", (PyCFunction)(void (*)(void))missed_between, METH_FASTCALL, NULL},
+    {"known_kinds", (PyCFunction)(void (*)(void))known_kinds, METH_FASTCALL, NULL},
+    {"joined", (PyCFunction)(void (*)(void))joined, METH_FASTCALL, NULL},
+    {"outputs", (PyCFunction)(void (*)(void))outputs, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL},
 };

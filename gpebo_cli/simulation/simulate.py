@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from math import isfinite
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.linear import (
     Coefficients,
     Constraints,
@@ -16,13 +19,13 @@ from gpebo_cli.collocation.linear import (
     wanted_parts,
 )
 from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh, unresolved
-from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli.collocation.radau import RadauRule, radau_rule
 from gpebo_cli.errors import ModelError
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.consistency import Jump, consistent_state, jump
 from gpebo_cli.simulation.derivative_array import StrangenessFree, Structure, analyse, reduce
-from gpebo_cli.systems.descriptor import MATRIX_NAMES, Array, BoolArray, DescriptorSystem
+from gpebo_cli.systems.descriptor import MATRIX_NAMES, Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.systems.descriptor import Coefficients as ModelCoefficients
 
 _FIRST_ELEMENTS = 24  # of the first mesh: enough nodes to notice a pulse, few enough to be free
@@ -34,6 +37,7 @@ _LOOKS = 40  # times within each first element at which known functions are look
 _MOST_LOOKS = 1 << 16
 _SURPRISE = 100.0  # times what the nodes let expect: then something stands between them
 _LOOK_ROUNDS = 8
+_TINY = float(np.finfo(float).tiny)
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
 
 
@@ -89,14 +93,13 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
         u, C = extras
-        y = _outputs(C, values[..., 0])
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
-        size = float(np.abs(C).max(initial=0.0)) * float(np.abs(values).max(initial=0.0))
+        y, size = _outputs(C, values[..., 0])
         return [(u, 0.0), (y, 1e-3 * max(size, floor))]
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
-    floor = 1e-3 * float(np.abs(system.initial_state).max(initial=0.0))
+    floor = 1e-3 * max(map(abs, system.initial_state.tolist()), default=0.0)
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor, first.amplification
     )
@@ -110,7 +113,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
     u, C = solution.extras
-    y = _outputs(C, x)
+    y, _ = _outputs(C, x)
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
         structure=structure,
@@ -135,7 +138,7 @@ def _known_resolved(
     def evaluated(mesh: Mesh) -> ModelCoefficients:
         return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
 
-    longest = _SHORT / max(structure.rate, float(np.finfo(float).tiny))
+    longest = _SHORT / max(structure.rate, _TINY)
     if solver.name != "ivp" and mesh.steps.max() > longest:
         mesh = _growth_resolved(structure, mesh, solver)
     c = evaluated(mesh)
@@ -148,9 +151,11 @@ def _known_resolved(
             break
         mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
         c = evaluated(mesh)
-    before = np.full(mesh.size, np.inf)
+    before: Array | float = np.inf
     while system.m and "u" not in system.coefficients.constant:
         tail = unresolved(c.u[0].reshape(*mesh.points.shape, -1), mesh.rule)
+        if tail.max() <= solver.tol:
+            break
         poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
         parts = wanted_parts(tail, poor, solver.tol, mesh.rule.stages)
         too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
@@ -163,8 +168,8 @@ def _known_resolved(
         return mesh, c
     if 2.0 * float(mesh.steps.min()) > longest:
         return mesh, c
-    kinds = _known_kinds(system, c, mesh)
-    joined = mesh.joined(kinds, _MARGIN * solver.tol, cuts, longest)
+    values, counts = _known_kinds(system, c, mesh)
+    joined = mesh.joined(values, counts, _MARGIN * solver.tol, cuts, longest)
     return (mesh, c) if joined is mesh else (joined, evaluated(joined))
 
 
@@ -182,10 +187,18 @@ def _overlooked(
     found = np.zeros(mesh.size, dtype=bool)
     if looks == 0 or not names:
         return found
-    places = (np.arange(looks) + 0.5) / looks
-    between = mesh.rule.interpolation(places)
+    places, between = _looks(mesh.rule, looks)
     t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
     seen = system.coefficients.taylor(t.ravel(), 0)
+    least = max(tol, 1e-12)
+    if kernels.compiled is not None:
+        pairs = [array for name in names for array in (getattr(c, name), getattr(seen, name))]
+        missed = kernels.compiled.missed_between(between, *pairs)
+        suspected = [name for name, far in zip(names, missed, strict=True)
+                     if far.max() > _SURPRISE * least]
+        if not suspected:
+            return found
+        names = suspected
     for name in names:
         nodal = getattr(c, name)[0].reshape(*mesh.points.shape, -1)
         actual = getattr(seen, name)[0].reshape(mesh.size, looks, -1)
@@ -194,10 +207,17 @@ def _overlooked(
         if not nodal.size:
             continue
         size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodal).max(axis=(0, 1)))
-        missed = (np.abs(between @ nodal - actual).max(axis=1) / size).max(axis=1)
-        expected = np.maximum(unresolved(nodal, mesh.rule), max(tol, 1e-12))
+        missed = (np.abs(between.T @ nodal - actual).max(axis=1) / size).max(axis=1)
+        expected = np.maximum(unresolved(nodal, mesh.rule), least)
         found |= missed > _SURPRISE * expected
     return found
+
+
+@lru_cache(maxsize=16)
+def _looks(rule: RadauRule, looks: int) -> tuple[Array, Array]:
+    """Places (looks,) in an element, and the polynomial there from its points (s + 1, looks)."""
+    places = (np.arange(looks) + 0.5) / looks
+    return places, np.ascontiguousarray(rule.interpolation(places).T)
 
 
 def _growth_resolved(structure: Structure, mesh: Mesh, solver: SolverSettings) -> Mesh:
@@ -207,22 +227,33 @@ def _growth_resolved(structure: Structure, mesh: Mesh, solver: SolverSettings) -
     never be seen to grow again: its error is invisible beside the size it once had.
     """
     parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / _SHORT)))
+    if parts.max() == 1.0:
+        return mesh
     n = structure.d + structure.a
     if parts.sum() > min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements / 2):
         return mesh
     return mesh.split(parts.astype(np.intp))[0]
 
 
-def _known_kinds(system: DescriptorSystem, c: ModelCoefficients, mesh: Mesh) -> list[Array]:
-    """Every function of the model with its derivatives, (K, s + 1, c) each.
+def _known_kinds(
+    system: DescriptorSystem, c: ModelCoefficients, mesh: Mesh
+) -> tuple[Array, IntArray]:
+    """Every function of the model with its derivatives, (K, s + 1, c), and how many of each kind.
 
     Reciprocals of what E holds are among them: the state sees those, and they may be harder to
     resolve by far.
     """
+    names = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
+    if kernels.compiled is not None and names:
+        E = names.index("E") if "E" in names else -1
+        values, counts = kernels.compiled.known_kinds(
+            E, _NEAR_ZERO, *(getattr(c, name) for name in names)
+        )
+        return values.reshape(*mesh.points.shape, counts.sum()), counts
     kinds: list[Array] = []
-    for name in MATRIX_NAMES:
+    for name in names:
         values = getattr(c, name)
-        if name in system.coefficients.constant or not values[0].size:
+        if not values[0].size:
             continue
         flat = values.reshape(len(values), *mesh.points.shape, -1)
         size = np.abs(flat[0])
@@ -231,7 +262,9 @@ def _known_kinds(system: DescriptorSystem, c: ModelCoefficients, mesh: Mesh) -> 
         if name == "E":
             away = moving & (size.min(axis=(0, 1)) > _NEAR_ZERO * size.max(axis=(0, 1)))
             kinds.append(1.0 / flat[0][..., away])
-    return [kind for kind in kinds if kind.shape[2]]
+    kinds = [kind for kind in kinds if kind.shape[2]]
+    values = np.concatenate([np.zeros((*mesh.points.shape, 0)), *kinds], axis=2)
+    return values, np.array([kind.shape[2] for kind in kinds], dtype=np.intp)
 
 
 def _equations(reduced: StrangenessFree) -> Coefficients:
@@ -247,7 +280,7 @@ def _equations(reduced: StrangenessFree) -> Coefficients:
 def _initial_state(system: DescriptorSystem, reduced: StrangenessFree) -> Array:
     """The consistent state at the start, from the equations at times of which it is the first."""
     x0 = consistent_state(reduced, system.initial_state)
-    if not np.isfinite(x0).all():
+    if not all(map(isfinite, x0.tolist())):
         raise ModelError(
             f"plant {system.name}: no finite consistent state at the start; look for entries that "
             "are huge or infinite there"
@@ -273,9 +306,17 @@ def _restart(
     return restart
 
 
-def _outputs(C: Array, x: Array) -> Array:
-    """y = C x at points (K, s + 1)."""
-    return np.asarray(np.matmul(C, x[..., None])[..., 0])
+def _outputs(C: Array, x: Array) -> tuple[Array, float]:
+    """y = C x at points (K, s + 1), and how large it could be: the largest of C times that of x."""
+    if kernels.compiled is not None:
+        K, points, n = x.shape
+        r = C.shape[2]
+        y, size = kernels.compiled.outputs(
+            C.reshape(C.shape[0] * C.shape[1], r, n), x.reshape(K * points, n)
+        )
+        return y.reshape(K, points, r), size
+    size = float(np.abs(C).max(initial=0.0)) * float(np.abs(x).max(initial=0.0))
+    return np.asarray(np.matmul(C, x[..., None])[..., 0]), size
 
 
 def _integrate(

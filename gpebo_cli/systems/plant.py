@@ -90,7 +90,7 @@ class TextCoefficients:
     tape: Tape
     layouts: Mapping[str, _Layout]  # by the names in MATRIX_NAMES
 
-    @property
+    @cached_property
     def constant(self) -> frozenset[str]:
         """Those of ``MATRIX_NAMES`` that do not depend on time."""
         return frozenset(k for k, layout in self.layouts.items() if not len(layout.positions))
