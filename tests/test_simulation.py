@@ -109,6 +109,17 @@ def test_a_rank_drop_of_E_that_the_model_tolerates_is_no_error():
         simulate(singular, TimeSettings(horizon=1.0), SOLVER)
 
 
+@pytest.mark.parametrize("where", [0.5001, 0.50003, 0.7, 0.123456])
+def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
+    """A probe next to the zero may lie lower than all times of the first closer look."""
+    singular = plant(
+        states=["a", "b"], E=[[1, 0], [0, f"t - {where}"]], A=[[-1, 0], [0, -1]],
+        initial_state=[1, 1],
+    )
+    with pytest.raises(ModelError, match=rf"rank of the derivative array changes at t = {where}"):
+        simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+
+
 def test_index_above_the_limit_is_refused():
     n = 6  # a chain of 6: index 6
     E = [[1 if j == i + 1 else 0 for j in range(n)] for i in range(n)]

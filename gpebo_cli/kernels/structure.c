@@ -392,7 +392,9 @@ static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank
     triangularise(look->A2, a, n, look->mirrors, look->order);
     if (!triangular_values(look->A2, a, n, look->square, look->sigma))
         return 0;
-    const double of_N = norm(look->a, n * size);
+    const double of_N = norm(look->a, n * size), of_E = norm(look->e, n * n);
+    if (!(of_N < DBL_MAX && of_E < DBL_MAX))
+        return 0;
     for (npy_intp i = 0; i < a; i++)
         if (look->sigma[i] / of_N < look->smallest[1])
             look->smallest[1] = look->sigma[i] / of_N;
@@ -410,7 +412,7 @@ static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank
         for (npy_intp i = 0; look->sigma[j] > 0.0 && i < n; i++)
             look->Z1[j * n + i] /= look->sigma[j];
     if (d)
-        look->smallest[2] = look->sigma[d - 1] / norm(look->e, n * n);
+        look->smallest[2] = look->sigma[d - 1] / of_E;
     return 1;
 }
 

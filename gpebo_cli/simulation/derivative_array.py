@@ -29,7 +29,7 @@ _DIP_ROUNDS = 14
 _FALL = 1e-2  # towards an end of the horizon, singular values may fall to this share
 _DIP_POINTS = 17
 _MOST_DIPS = 6  # of each kind
-# Largest derivative array for the compiled kernels; beyond it LAPACK's blocks are worth their calls.
+# Largest derivative array for the compiled kernels: beyond it LAPACK's blocks are worth its calls.
 _SMALL = 32
 
 
@@ -288,7 +288,7 @@ def _judged_compiled(
     if not trusted:
         return None
     at = t[middle : middle + 1]
-    failure = _too_many(a, n, at) if a > n else _why_not(a, at, smallest, rank_tol)
+    failure = _too_many(a, n, at) if a > n else _why_not(at, smallest, rank_tol)
     if failure:
         return _Levels(a, smallest, failure), None
     if invariant:
@@ -357,13 +357,13 @@ def _levels(
     s3 = s3 / _norm(e[0])[:, None]
     if a < n:
         smallest[:, 2] = s3[:, -1]
-    failure = _why_not(a, t, smallest, rank_tol)
+    failure = _why_not(t, smallest, rank_tol)
     if failure:
         return _Levels(a, smallest, failure)
     return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)), Z2, T2)
 
 
-def _why_not(a: int, t: Array, smallest: Array, rank_tol: float) -> str:
+def _why_not(t: Array, smallest: Array, rank_tol: float) -> str:
     """What the singular values of Â2 or E T2 (N, 3) say against this μ, or nothing."""
     for column, what in ((1, "constraints are linearly dependent"),
                          (2, "some states are in no equation's derivative and in no constraint")):
@@ -481,8 +481,10 @@ def _follow_dips(
     """Follow local minima of the decisive singular values between the probes.
 
     A rank that drops at an isolated time is never hit by a grid: |sin t| is 1e-2 at the nearest
-    probe and looks harmless. Each deep local minimum is bracketed and cut by 8 per round; a value
-    that shrinks with its bracket all the way to rank_tol is a rank change.
+    probe and looks harmless. Each deep local minimum is bracketed and cut by 8 per round, for as
+    long as the value is far below those at the ends of its bracket: so it is on the way to zero,
+    and not at the flat bottom of a harmless dip. Comparing with the round before would not do: a
+    probe may by luck be nearer to the zero than the times of the first round.
     """
     names = ("derivative array", "constraints", "differential part")
     for column, k in dips:
@@ -495,10 +497,11 @@ def _follow_dips(
             line = _line(grid, c, mu, scaling, rank_tol, levels.a, column)
             best = int(line.argmin())
             value = float(line[best])
-            shrinking = value < 0.5 * lowest
             lowest, where = min(lowest, value), grid[best]
-            left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-            if lowest <= rank_tol or not shrinking:
+            before, after = max(best - 1, 0), min(best + 1, len(grid) - 1)
+            left, right = grid[before], grid[after]
+            flat = value >= 0.5 * max(line[before], line[after])
+            if lowest <= rank_tol or flat:
                 break
         if lowest <= max(rank_tol, 1e-9):
             raise ModelError(
@@ -644,9 +647,10 @@ def _reduced_compiled(
 ) -> StrangenessFree | None:
     """:func:`reduce`; None where the reference will not do at some time."""
     compiled: Any = kernels.compiled
-    s, reference = structure.scaling, structure.reference
+    s, reference, E = structure.scaling, structure.reference, c.E[0]
     model = (c.E, c.A, s.rows, s.columns, s.time, structure.mu, c.B, c.F, c.u, c.theta)
     if isinstance(reference, Bases):
+        E = E[:1]
         found = compiled.reduced_constant(*model, reference.Z1, reference.Z2, _every(count))
     else:
         found = compiled.reduced(
@@ -659,7 +663,7 @@ def _reduced_compiled(
     if not structure.a:
         basis = offset = None
     return StrangenessFree(
-        E1, A1, f1, A2, f2, basis, offset, amplification, c.E[0], c.u[0], c.C[0]
+        E1, A1, f1, A2, f2, basis, offset, amplification, E, c.u[0], c.C[0]
     )
 
 

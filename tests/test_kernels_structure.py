@@ -1,0 +1,481 @@
+"""The kernels of derivative arrays and consistent states against the NumPy they stand for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import comb
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from kernel_paths import COMPILED, by_both, needs_kernels
+from plants import DATA, problem, shipped
+
+from gpebo_cli import kernels
+from gpebo_cli.errors import ModelError
+from gpebo_cli.simulation import consistency, derivative_array
+from gpebo_cli.simulation.consistency import consistent_state
+from gpebo_cli.simulation.derivative_array import (
+    Bases,
+    Pivots,
+    Structure,
+    analyse,
+    balance,
+    reduce,
+)
+from gpebo_cli.systems.descriptor import Coefficients, DescriptorSystem
+
+pytestmark = needs_kernels
+
+SEEDS = st.integers(0, 2**32 - 1)
+FILES = sorted((DATA / "problems").glob("*.json"))
+
+
+class Polynomials:
+    """Matrices Σ_k c_k t^k, given as (K + 1, rows, columns)."""
+
+    def __init__(self, **given):
+        self.given = given
+
+    @property
+    def constant(self):
+        return frozenset(name for name, c in self.given.items() if len(c) == 1)
+
+    def breakpoints(self, start, stop):
+        return np.zeros(0)
+
+    def taylor(self, t, order, inside=None):
+        out = {}
+        for name, c in self.given.items():
+            at = 1 if len(c) == 1 else len(t)
+            values = np.zeros((order + 1, at, *c.shape[1:]))
+            for k in range(order + 1):
+                for j in range(k, len(c)):
+                    powers = (t[:at] ** (j - k)).reshape(-1, *[1] * (c.ndim - 1))
+                    values[k] += comb(j, k) * powers * c[j]
+            out[name] = np.broadcast_to(values, (order + 1, len(t), *c.shape[1:]))
+        return Coefficients(**out)
+
+
+def product(x, y):
+    """Coefficients of the product of two matrix polynomials."""
+    out = np.zeros((len(x) + len(y) - 1, *(x[0] @ y[0]).shape))
+    for i, a in enumerate(x):
+        for j, b in enumerate(y):
+            out[i + j] += a @ b
+    return out
+
+
+def random_system(seed, d, blocks, varying=True, m=1, q=2):
+    """A system with d differential states and nilpotent blocks of these sizes, mixed over time."""
+    rng = np.random.default_rng(seed)
+    n = d + sum(blocks)
+    E, A = np.eye(n)[None], np.eye(n)[None].copy()
+    A[0, :d, :d] = rng.normal(size=(d, d))
+    at = d
+    for size in blocks:
+        E[0, at : at + size, at : at + size] = np.eye(size, k=1)
+        at += size
+    P, Q = (np.eye(n) + 0.4 * rng.normal(size=(2 if varying else 1, n, n)) for _ in range(2))
+    P[1:] *= 0.2
+    Q[1:] -= np.eye(n)
+    Q[1:] *= 0.2
+    # x = Q z: E z' = A z becomes E Q⁻¹ x' = …; with Q as the inverse, (E Q) x' = (A Q − E Q') x.
+    dQ = Q[1:]
+    left = product(P, product(E, Q))
+    right = product(P, product(A, Q))
+    if varying:
+        change = product(P, product(E, dQ))
+        right[: len(change)] -= change
+    source = Polynomials(
+        E=left, A=right, B=rng.normal(size=(2, n, m)), F=rng.normal(size=(1, n, q)),
+        C=np.ones((1, 1, n)), u=rng.normal(size=(3, m)), theta=rng.normal(size=(1, q)),
+    )
+    names = tuple(f"x{i}" for i in range(n))
+    return DescriptorSystem("random", names, source, rng.normal(size=n))
+
+
+SYSTEMS = st.tuples(
+    SEEDS, st.integers(0, 3), st.lists(st.integers(1, 3), max_size=2), st.booleans(),
+    st.integers(0, 2), st.integers(0, 2),
+).filter(lambda s: s[1] + sum(s[2]) > 0)
+
+
+def outcome(system, start=0.0, stop=1.0):
+    """Its structure, or what is said against it."""
+    try:
+        return analyse(system, start, stop, max_mu=3, rank_tol=1e-10)
+    except ModelError as error:
+        return str(error)
+
+
+def assert_same_structure(one, other):
+    if isinstance(one, str) or isinstance(other, str):
+        assert isinstance(one, str)
+        assert isinstance(other, str)
+        assert one.split("singular value")[0] == other.split("singular value")[0]
+        return
+    assert (one.mu, one.a, one.d, one.time_invariant, one.steady) == (
+        other.mu, other.a, other.d, other.time_invariant, other.steady
+    )
+    assert one.scaling.time == other.scaling.time
+    np.testing.assert_array_equal(one.scaling.rows, other.scaling.rows)
+    np.testing.assert_array_equal(one.scaling.columns, other.scaling.columns)
+    assert one.smallest_singular_value == pytest.approx(
+        other.smallest_singular_value, rel=1e-6, abs=1e-13
+    )
+    assert type(one.reference) is type(other.reference)
+    if isinstance(one.reference, Pivots):
+        assert one.reference.rank == other.reference.rank
+        assert sorted(one.reference.rows) == sorted(other.reference.rows)
+    projectors = [s.reference.Z1 @ np.swapaxes(s.reference.Z1, -1, -2) for s in (one, other)]
+    np.testing.assert_allclose(*projectors, atol=1e-7)
+    assert (one.dynamics is None) == (other.dynamics is None)
+    assert one.rate == pytest.approx(other.rate, rel=1e-6)
+    assert one.growth == pytest.approx(other.growth, rel=1e-5, abs=1e-5 * max(1.0, one.rate))
+
+
+@settings(max_examples=150, deadline=None)
+@given(SYSTEMS)
+def test_the_same_structure(drawn):
+    assert_same_structure(*by_both(lambda: outcome(random_system(*drawn))))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_same_structure_of_published_problems(path):
+    data, system = problem(path)
+    assert_same_structure(*by_both(lambda: outcome(system, *data["tspan"])))
+
+
+@pytest.mark.parametrize("name", ["circuit", "descriptor", "canonical"])
+def test_the_same_structure_of_shipped_plants(name):
+    assert_same_structure(*by_both(lambda: outcome(shipped(name), 0.0, 20.0)))
+
+
+@pytest.mark.parametrize("power", [1, 2])
+@pytest.mark.parametrize("where", [0.3712, 0.5001, 0.7, 0.123456])
+@pytest.mark.parametrize("kind", ["array", "constraints", "differential"])
+def test_the_same_is_said_of_a_rank_that_drops(power, where, kind):
+    zero = np.poly1d([1.0, -where]) ** power
+    c = np.zeros((power + 1, 2, 2))
+    c[:, 0, 0] = zero.coeffs[::-1]
+    c[0, 1, 1] = 1.0
+    fixed = np.diag([1.0, 0.0])[None] if kind == "constraints" else np.eye(2)[None]
+    E, A = {
+        "array": (c, -np.eye(2)[None]),  # a differential equation is lost
+        "differential": (product(c, np.ones((1, 2, 2)) + np.eye(2)[None]), -np.eye(2)[None]),
+        "constraints": (fixed, c[:, ::-1, ::-1].copy()),
+    }[kind]
+    nothing = {"B": np.zeros((1, 2, 0)), "F": np.zeros((1, 2, 0)), "C": np.zeros((1, 0, 2)),
+               "u": np.zeros((1, 0)), "theta": np.zeros((1, 0))}
+    source = Polynomials(E=E, A=A, **nothing)
+    system = DescriptorSystem("singular", ("x", "z"), source, np.zeros(2))
+    one, other = by_both(lambda: outcome(system))
+    assert isinstance(one, str)
+    assert_same_structure(one, other)
+
+
+@settings(max_examples=150, deadline=None)
+@given(SYSTEMS, st.integers(1, 80))
+def test_the_same_equations(drawn, count):
+    system = random_system(*drawn)
+    structure = outcome(system)
+    assume(isinstance(structure, Structure))
+    t = np.linspace(0.0, 1.0, count)
+    one, other = by_both(lambda: reduce(system, structure, t, t))
+    assert_same_equations(one, other)
+
+
+def assert_same_equations(one, other):
+    for name, value in vars(other).items():
+        found = getattr(one, name)
+        if value is None:
+            assert found is None
+            continue
+        assert found.shape == value.shape, name
+        size = max(1e-300, np.abs(value).max(initial=0.0))
+        np.testing.assert_allclose(found, value, rtol=0, atol=1e-10 * size, err_msg=name)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_same_equations_of_published_problems(path):
+    data, system = problem(path)
+    structure = outcome(system, *data["tspan"])
+    if isinstance(structure, str):
+        return
+    t = np.linspace(*data["tspan"], 101)
+    one, other = by_both(lambda: reduce(system, structure, t, t))
+    assert_same_equations(one, other)
+    np.testing.assert_allclose(
+        *by_both(lambda: consistent_state(one, system.initial_state + 0.3)), atol=1e-12
+    )
+
+
+def test_small_plants_need_no_lapack(monkeypatch):
+    """What the kernels leave to NumPy they leave to it everywhere; so they must not, here."""
+    for name in ("_levels", "_all_levels", "_by_elimination", "forcing", "_inverse"):
+        monkeypatch.setattr(derivative_array, name, None)
+    monkeypatch.setattr(np.linalg, "svd", None)
+    for path in FILES:
+        data, system = problem(path)
+        structure = outcome(system, *data["tspan"])
+        if isinstance(structure, Structure):
+            reduced = reduce(system, structure, np.zeros(3) + data["tspan"][0], np.zeros(3))
+            assert np.isfinite(consistent_state(reduced, system.initial_state)).all()
+
+
+def test_large_plants_use_lapack(monkeypatch):
+    system = random_system(8, 3, [2, 1])
+    expected = outcome(system)
+    assert isinstance(expected, Structure)
+    monkeypatch.setattr(derivative_array, "_SMALL", 5)
+    monkeypatch.setattr(consistency, "_SMALL", 5)
+    monkeypatch.setattr(kernels, "compiled", Without("start", "all_levels", "levels", "reduced"))
+    structure = outcome(system)
+    assert_same_structure(structure, expected)
+    t = np.linspace(0, 1, 9)
+    assert np.isfinite(consistent_state(reduce(system, structure, t, t), np.ones(6))).all()
+
+
+class Without:
+    """The kernels without some of them."""
+
+    def __init__(self, *names):
+        self.names = names
+
+    def __getattr__(self, name):
+        assert name not in self.names
+        return getattr(COMPILED, name)
+
+
+def test_times_at_which_the_pivots_will_not_do():
+    """Near t = −0.02 the pivot of the middle vanishes: there, singular vectors take over."""
+    nothing = {"B": np.ones((1, 2, 1)), "F": np.zeros((1, 2, 0)), "C": np.zeros((1, 0, 2)),
+               "u": np.ones((3, 1)), "theta": np.zeros((1, 0))}
+    turn = np.array([[[0.98, -0.02], [0.02, 0.98]], [[-1.0, -1.0], [1.0, -1.0]]])
+    E = product(turn, np.array([[[1.0, 0.0], [0.0, 0.0]]]))
+    A = product(turn, np.array([[[-1.0, 2.0], [0.5, 1.0]], [[0.0, 0.0], [1.0, 0.0]]]))
+    system = DescriptorSystem("turning", ("x", "z"), Polynomials(E=E, A=A, **nothing), np.ones(2))
+    structure = outcome(system, 0.0, 0.9)
+    assert isinstance(structure, Structure)
+    for t in (np.linspace(-0.12, 0.88, 51), np.linspace(-0.021, -0.0201, 20)):
+        one, other = by_both(lambda t=t: reduce(system, structure, t, t))
+        assert_same_equations(one, other)
+        x, E, f = one.offset, one.E, np.einsum("nij,nj->ni", np.ones((len(t), 2, 1)), one.u)
+        lost = np.linalg.svd(E)[0][:, :, 1:]
+        A = system.coefficients.taylor(t, 0).A[0]
+        left = np.einsum("nia,ni->na", lost, np.einsum("nij,nj->ni", A, x) + f)
+        np.testing.assert_allclose(left, 0.0, atol=1e-11)
+    near = np.array([0.5, -0.03, -0.02, -0.02 + 1e-5])
+    model = system.coefficients.taylor(near, 0)
+    s, pivots = structure.scaling, structure.reference
+    for t, trusted in ((0, True), (1, True), (2, False), (3, False)):
+        c = {name: value[:, t : t + 1] for name, value in vars(model).items()}
+        known = COMPILED.reduced(
+            c["E"], c["A"], s.rows, s.columns, s.time, 0, c["B"], c["F"], c["u"], c["theta"],
+            pivots.rows, pivots.columns, pivots.rank, pivots.Z1, 1, 300.0, 1e-13,
+        )[0]
+        assert bool(known[0]) == trusted
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(1, 6), st.integers(1, 5), st.booleans(), st.sampled_from([1.0, 0.0]))
+def test_balance(seed, n, count, constant, of_E):
+    rng = np.random.default_rng(seed)
+    scales = 10.0 ** rng.uniform(-6, 6, (2, n))
+    E, A = (rng.normal(size=(1, count, n, n)) * scales[0][:, None] * scales[1] for _ in range(2))
+    E = of_E * E * (rng.random((n, n)) < 0.5)
+    if constant:
+        E = np.broadcast_to(E[:, :1], E.shape)
+    c = Coefficients(E, A, *[np.zeros((1, count, n, 0))] * 3, *[np.zeros((1, count, 0))] * 2)
+    one, other = by_both(lambda: balance(c))
+    np.testing.assert_array_equal(one.rows, other.rows)
+    np.testing.assert_array_equal(one.columns, other.columns)
+    assert one.time == other.time
+
+
+@given(SEEDS, st.integers(1, 40), st.booleans())
+def test_dips(seed, count, infinite):
+    rng = np.random.default_rng(seed)
+    values = np.round(10.0 ** rng.uniform(-4, 0, (count, 3)), 3)
+    if infinite:
+        values[:, rng.integers(3)] = np.inf
+    one, other = by_both(lambda: derivative_array._dips(values))
+    assert one[0] == other[0]
+    # Equal ones may come in any order, and the last of them may be another.
+    assert [(c, values[k, c]) for c, k in one[1]] == [(c, values[k, c]) for c, k in other[1]]
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(0, 4), st.lists(st.integers(1, 3), min_size=1, max_size=2),
+       st.booleans())
+def test_consistent_states(seed, d, blocks, near):
+    system = random_system(seed, d, blocks)
+    structure = outcome(system)
+    assume(isinstance(structure, Structure))
+    reduced = reduce(system, structure, np.array([0.2, 0.4]), np.array([0.2, 0.4]))
+    x0 = np.random.default_rng(seed).normal(size=system.n)
+    if near:
+        x0 = consistent_state(reduced, x0)
+    one, other = by_both(lambda: consistent_state(reduced, x0))
+    size = np.abs(other).max()
+    np.testing.assert_allclose(one, other, atol=1e-9 * size)
+    residual = np.abs(reduced.A2[0] @ one + reduced.f2[0]).max()
+    assert residual <= 1e-12 * (np.abs(reduced.A2[0]).max() * size + 1.0)
+    if near:
+        assert (one == x0).sum() == (other == x0).sum()
+
+
+def test_a_consistent_state_of_dependent_constraints_is_left_to_singular_values():
+    E, A2, f2, x0 = np.eye(3), np.array([[1.0, 2, 3], [1, 2, 3]]), np.zeros(2), np.ones(3)
+    known, _ = COMPILED.consistent(E, A2, f2, x0, 1e-8, 0.0)
+    assert not known[0]
+    known, x = COMPILED.consistent(E, A2[:1], f2[:1], x0, 1e-8, 0.0)
+    assert known[0]
+    assert A2[0] @ x == pytest.approx(0.0, abs=1e-14)
+
+
+@given(SEEDS, st.integers(1, 3), st.integers(1, 5))
+def test_growth_in_closed_form(seed, d, count):
+    matrices = np.random.default_rng(seed).normal(size=(count, d, d))
+    expected = np.linalg.eigvals(matrices).real.max(axis=1)
+    found = derivative_array._largest_real_parts(matrices)
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(1, 6), st.integers(0, 2), st.integers(0, 3))
+def test_singular_values(seed, n, mu, lost):
+    """Of any matrices, also where the rank of E is not full; LAPACK says what they are."""
+    rng = np.random.default_rng(seed)
+    E, A = rng.normal(size=(2, mu + 1, 5, n, n))
+    E[..., : min(lost, n)] = 0.0
+    E *= 10.0 ** rng.uniform(-3, 0, n)
+    c = Coefficients(E, A, *[np.zeros((mu + 1, 5, n, 0))] * 3, *[np.zeros((mu + 1, 5, 0))] * 2)
+    plain = derivative_array.Scaling(np.ones(n), np.ones(n), 0.5)
+    t = np.arange(5.0)
+    for a in range(n + 1):
+        for column in range(3):
+            one, other = by_both(
+                lambda a=a, k=column: derivative_array._line(t, c, mu, plain, 1e-10, a, k)
+            )
+            if column == 0:
+                known = other > 1e-6  # else the left kernel is not, and its constraints are not
+            np.testing.assert_allclose(
+                one[known | (column == 0)], other[known | (column == 0)], rtol=1e-6, atol=1e-13
+            )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
+def test_numbers_too_large_for_squares_are_left_to_lapack(value):
+    E, A = np.zeros((1, 3, 2, 2)) + np.eye(2), np.zeros((1, 3, 2, 2)) + np.eye(2)
+    A[0, 1, 0, 0] = value
+    model = (E, A, np.ones(2), np.ones(2), 1.0, 0)
+    assert COMPILED.start(*model, 0, 1e-10)[0][0]
+    assert not COMPILED.start(*model, 1, 1e-10)[0][0]
+    assert not COMPILED.levels(*model, 0, 2)[0][0]
+    _, _, rows, columns, Z1, *_ = COMPILED.start(*model, 0, 1e-10)
+    pivots = (rows, columns, 2, Z1)
+    assert not COMPILED.all_levels(*model, *pivots, 1e-10, 1e-5, 1e-13)[0][0]
+    forces = (np.zeros((1, 3, 2, 0)),) * 2 + (np.zeros((1, 3, 0)),) * 2
+    assert COMPILED.reduced(*model, *forces, *pivots, 1, 300.0, 1e-13)[0][0]
+    E[0, 1, 0, 0] = value
+    found = COMPILED.reduced(*model, *forces, *pivots, 1, 300.0, 1e-13)
+    assert found[0][0] == np.isfinite(value)
+    found = COMPILED.reduced_constant(*(x[:, 1:2] for x in model[:2]), *model[2:], *forces,
+                                      Z1[None], np.zeros((1, 2, 0)), 1)
+    assert found[0][0] == np.isfinite(value)
+
+
+def fitting():
+    """Arguments that fit: one model, then forces, pivots, bases."""
+    model = [np.zeros((2, 3, 2, 2)), np.zeros((2, 1, 2, 2)), np.ones(2), np.ones(2), 1.0, 1]
+    forces = [np.zeros((2, 3, 2, 1)), np.zeros((2, 1, 2, 2)), np.zeros((2, 3, 1)),
+              np.zeros((2, 1, 2))]
+    pivots = [np.arange(4), np.arange(4), 3, np.zeros((2, 1))]
+    bases = [np.zeros((1, 2, 1)), np.zeros((1, 4, 1))]
+    return model, forces, pivots, bases
+
+
+KERNELS = {
+    "start": lambda m, f, p, b: [*m, 0, 1e-10],
+    "levels": lambda m, f, p, b: [*m, 1, 0],
+    "all_levels": lambda m, f, p, b: [*m, *p, 1e-10, 1e-5, 1e-13],
+    "reduced": lambda m, f, p, b: [*m, *f, *p, 1, 300.0, 1e-13],
+    "reduced_constant": lambda m, f, p, b: [*m, *f, *b, 1],
+    "balance": lambda m, f, p, b: m[:2],
+    "dips": lambda m, f, p, b: [np.ones((4, 3)), 0.2, 0.01, 6],
+    "consistent": lambda m, f, p, b: [np.eye(3), np.ones((1, 3)), np.ones(1), np.ones(3), 0.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_a_kernel_refuses_what_does_not_fit(name):
+    """Every array with another length of any axis, or one axis less; every number out of range."""
+    kernel = getattr(COMPILED, name)
+    given = KERNELS[name](*fitting())
+    kernel(*given)
+    with pytest.raises(TypeError):
+        kernel(*given[:-1])
+    for i, value in enumerate(given):
+        if not isinstance(value, np.ndarray):
+            continue
+        with pytest.raises(TypeError):
+            kernel(*given[:i], value.astype(np.float32), *given[i + 1 :])
+        for axis in range(value.ndim):
+            for longer in (True, False):
+                if (name, i, axis) in FREE:
+                    continue
+                shape = list(value.shape)
+                shape[axis] = shape[axis] + 7 if longer else shape[axis] - 1
+                fits_anyway = axis == 0 and value.ndim > 2 and longer and value.shape[0] == 2
+                if fits_anyway:  # more Taylor coefficients than needed
+                    continue
+                other = np.zeros(shape, dtype=value.dtype)
+                with pytest.raises(ValueError, match=r".+"):
+                    kernel(*given[:i], other, *given[i + 1 :])
+
+
+# Lengths of axes that nothing else says: numbers of times.
+FREE = {("balance", 0, 0), ("balance", 1, 0), ("balance", 0, 1), ("balance", 1, 1), ("dips", 0, 0)}
+FREE |= {(name, 0, 1) for name in ("start", "levels", "all_levels", "reduced", "reduced_constant")}
+
+
+def test_numbers_out_of_range_are_refused():
+    model, forces, pivots, bases = fitting()
+    wrong = {
+        "start": [[*model, 3, 1e-10], [*model, -1, 1e-10], [*model[:5], 2, 0, 1e-10]],
+        "levels": [[*model, 3, 0], [*model, -1, 0], [*model, 1, 3], [*model, 1, -1]],
+        "all_levels": [[*model, *pivots[:2], r, pivots[3], 1e-10, 1e-5, 1e-13] for r in (1, 2, 5)],
+        "reduced": [
+            [*model, *forces, *pivots, 0, 300.0, 1e-13],
+            [*model, *forces, np.arange(1, 5), *pivots[1:], 1, 300.0, 1e-13],
+            [*model, *forces, pivots[0], np.arange(-1, 3), *pivots[2:], 1, 300.0, 1e-13],
+        ],
+        "reduced_constant": [[*model, *forces, *bases, 0]],
+        "consistent": [[np.eye(1), np.ones((2, 1)), np.ones(2), np.ones(1), 0.0, 0.0]],
+    }
+    for name, calls in wrong.items():
+        for given_arguments in calls:
+            with pytest.raises(ValueError, match=r".+"):
+                getattr(COMPILED, name)(*given_arguments)
+
+
+def test_matrices_may_lie_anywhere():
+    """Transposed, reversed in time, every other one: strides are no kernel's excuse."""
+    system = random_system(8, 2, [2])
+    structure = outcome(system)
+    assert isinstance(structure, Structure)
+    assert not isinstance(structure.reference, Bases)
+    t = np.linspace(0, 1, 21)
+    c = system.coefficients.taylor(t, structure.mu)
+    expected = reduce(system, structure, t, t, c)
+    turned = {name: np.asfortranarray(value) for name, value in vars(c).items()}
+    assert_same_equations(reduce(system, structure, t, t, Coefficients(**turned)), expected)
+    twice = {name: np.repeat(value, 2, axis=1)[:, ::2] for name, value in vars(c).items()}
+    assert_same_equations(reduce(system, structure, t, t, Coefficients(**twice)), expected)
+    back = {name: value[:, ::-1].copy()[:, ::-1] for name, value in vars(c).items()}
+    assert_same_equations(
+        reduce(system, replace(structure), t, t, Coefficients(**back)), expected
+    )
