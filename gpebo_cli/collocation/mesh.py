@@ -411,7 +411,8 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     scale ρ^(s+1); the largest prediction counts. Several, because single coefficients vanish by
     accident, two of them where the signal is odd or even.
     """
-    last = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))  # degrees s + 1 − used … s
+    # Of degrees s + 1 − used … s:
+    last = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
     predicted = size * np.minimum(last / size, 1.0) ** _to_next(rule)[:, None]
     return np.asarray(predicted.max(axis=1))

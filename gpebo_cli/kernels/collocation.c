@@ -1,5 +1,5 @@
 /* gpebo_cli/collocation/linear.py: element systems, chaining, error estimates. */
-#include "elimination.h"
+#include "elements.h"
 
 #include <float.h>
 
@@ -22,10 +22,12 @@ typedef struct {
     const double *D; /* (s, s) */
     Moving E, A, f, T, p;
     double *h;        /* lengths (K,) */
+    double *Dh;       /* (s, s): D/h of an element */
     double *together; /* (n, s d): T at all nodes of an element, side by side */
     double *coupling; /* (s d,): a row of E times that */
-    double *slope;    /* (n, columns): (D p)_i / h */
+    double *slope;    /* (s, n, columns): D p/h */
     double *AT;       /* (d, d) */
+    double *taken;    /* (columns,) */
 } Equation;
 
 /* Node i of element k among all points. */
@@ -36,50 +38,46 @@ static inline npy_intp node(const Equation *q, npy_intp k, npy_intp i)
 
 /* (D_ij/h E_i T_j − δ_ij A_i T_i) of element k into the first s d columns of W, and the response
    to the left end, (D𝟙)_i/h E_i, into the next n. */
-static inline void assemble(const Equation *q, npy_intp k, double *W, npy_intp length)
+EVERY_WIDTH static void assemble(const Equation *q, npy_intp k, double *W, npy_intp length)
 {
     const npy_intp s = q->s, d = q->d, n = q->n, m = s * d;
     const int varying = q->T.from != NULL && q->T.step != 0;
-    const double h = q->h[k];
-    if (varying)
-        for (npy_intp j = 0; j < s; j++) {
-            const double *T = at(q->T, node(q, k, j));
-            for (npy_intp c = 0; c < n; c++)
-                for (npy_intp b = 0; b < d; b++)
-                    q->together[c * m + j * d + b] = T[c * d + b];
-        }
+    const npy_intp apart = varying ? d : 0; /* what couples to the next node */
+    for (npy_intp j = 0; varying && j < s; j++) {
+        const double *T = at(q->T, node(q, k, j));
+        for (npy_intp c = 0; c < n; c++)
+            for (npy_intp b = 0; b < d; b++)
+                q->together[c * m + j * d + b] = T[c * d + b];
+    }
     for (npy_intp i = 0; i < s; i++) {
         const npy_intp point = node(q, k, i);
-        const double *A = at(q->A, point), *D = q->D + i * s;
+        const double *A = at(q->A, point), *Dh = q->Dh + i * s;
         if (q->T.from != NULL) {
-            multiply(q->AT, A, at(q->T, point), d, n, d);
+            for (npy_intp a = 0; a < d; a++)
+                combine(q->AT + a * d, NULL, A + a * n, n, at(q->T, point), d, d);
             A = q->AT;
         }
         double start = 0.0;
         for (npy_intp j = 0; j < s; j++)
-            start += D[j] / h;
+            start += Dh[j];
         for (npy_intp a = 0; a < d; a++) {
-            double *restrict row = W + (i * d + a) * length;
-            double *restrict response = row + m;
+            double *row = W + (i * d + a) * length, *response = row + m;
             if (q->E.from == NULL) {
                 memset(row, 0, (m + n) * sizeof(double));
                 for (npy_intp j = 0; j < s; j++)
-                    row[j * d + a] = D[j] / h;
+                    row[j * d + a] = Dh[j];
                 response[a] = start;
             } else {
-                const double *E = at(q->E, point) + a * n, *restrict coupled = q->coupling;
+                const double *E = at(q->E, point) + a * n, *coupled = q->coupling;
                 if (varying)
-                    multiply(q->coupling, E, q->together, 1, n, m);
+                    combine(q->coupling, NULL, E, n, q->together, m, m);
                 else if (q->T.from != NULL)
-                    multiply(q->coupling, E, q->T.from, 1, n, d);
+                    combine(q->coupling, NULL, E, n, q->T.from, d, d);
                 else
                     coupled = E;
-                const npy_intp step = varying ? d : 0;
-                for (npy_intp j = 0; j < s; j++) {
-                    const double factor = D[j] / h;
+                for (npy_intp j = 0; j < s; j++)
                     for (npy_intp b = 0; b < d; b++)
-                        row[j * d + b] = factor * coupled[j * step + b];
-                }
+                        row[j * d + b] = Dh[j] * coupled[j * apart + b];
                 for (npy_intp c = 0; c < n; c++)
                     response[c] = start * E[c];
             }
@@ -90,47 +88,45 @@ static inline void assemble(const Equation *q, npy_intp k, double *W, npy_intp l
 }
 
 /* What drives z at the nodes of element k, f + A p − E (D p)/h, into columns of W from `place`. */
-static inline void drive(const Equation *q, npy_intp k, double *W, npy_intp length, npy_intp place)
+EVERY_WIDTH static void drive(const Equation *q, npy_intp k, double *W, npy_intp length,
+                              npy_intp place)
 {
     const npy_intp s = q->s, d = q->d, n = q->n, columns = q->columns, size = n * columns;
-    const double h = q->h[k];
+    if (q->p.from != NULL)
+        for (npy_intp i = 0; i < s; i++)
+            combine(q->slope + i * size, NULL, q->Dh + i * s, s, at(q->p, node(q, k, 0)),
+                    q->p.step, size);
     for (npy_intp i = 0; i < s; i++) {
         const npy_intp point = node(q, k, i);
-        const double *f = at(q->f, point);
-        if (q->p.from != NULL) {
-            memset(q->slope, 0, size * sizeof(double));
-            for (npy_intp j = 0; j < s; j++) {
-                const double factor = q->D[i * s + j] / h;
-                const double *restrict p = at(q->p, node(q, k, j));
-                for (npy_intp c = 0; c < size; c++)
-                    q->slope[c] += factor * p[c];
-            }
-        }
-        for (npy_intp a = 0; a < d; a++) {
-            double *restrict right = W + (i * d + a) * length + place;
-            for (npy_intp c = 0; c < columns; c++)
-                right[c] = f[a * columns + c];
-            if (q->p.from == NULL)
+        const double *f = at(q->f, point), *slope = q->slope + i * size;
+        for (npy_intp a = 0; a < d; a++, f += columns) {
+            double *right = W + (i * d + a) * length + place;
+            if (q->p.from == NULL) {
+                memcpy(right, f, columns * sizeof(double));
                 continue;
-            const double *A = at(q->A, point) + a * n, *p = at(q->p, point);
-            const double *E = q->E.from == NULL ? NULL : at(q->E, point) + a * n;
-            for (npy_intp e = 0; e < n; e++)
-                for (npy_intp c = 0; c < columns; c++)
-                    right[c] += A[e] * p[e * columns + c];
-            if (E == NULL)
-                for (npy_intp c = 0; c < columns; c++)
-                    right[c] -= q->slope[a * columns + c];
-            else
-                for (npy_intp e = 0; e < n; e++)
-                    for (npy_intp c = 0; c < columns; c++)
-                        right[c] -= E[e] * q->slope[e * columns + c];
+            }
+            combine(right, f, at(q->A, point) + a * n, n, at(q->p, point), columns, columns);
+            if (q->E.from != NULL) {
+                combine(q->taken, NULL, at(q->E, point) + a * n, n, slope, columns, columns);
+                slope = q->taken;
+            }
+            for (npy_intp c = 0; c < columns; c++)
+                right[c] -= slope[c];
+            slope = q->slope + i * size;
         }
     }
 }
 
+/* D/h of element k. */
+static inline void lengthen(const Equation *q, npy_intp k)
+{
+    for (npy_intp i = 0; i < q->s * q->s; i++)
+        q->Dh[i] = q->D[i] / q->h[k];
+}
+
 /* out (s, n, width) = T_i z_i (+ p_i where it is `added`), z_i (d, width) in W from `place` on. */
-static inline void expand(const Equation *q, npy_intp k, const double *W, npy_intp length,
-                          npy_intp place, npy_intp width, int added, double *restrict out)
+EVERY_WIDTH static void expand(const Equation *q, npy_intp k, const double *W, npy_intp length,
+                               npy_intp place, npy_intp width, int added, double *out)
 {
     const npy_intp s = q->s, d = q->d, n = q->n;
     for (npy_intp i = 0; i < s; i++) {
@@ -138,25 +134,17 @@ static inline void expand(const Equation *q, npy_intp k, const double *W, npy_in
         const double *z = W + i * d * length + place;
         const double *p = added && q->p.from != NULL ? at(q->p, point) : NULL;
         for (npy_intp c = 0; c < n; c++, out += width) {
-            if (q->T.from == NULL) {
+            const double *offset = p == NULL ? NULL : p + c * width;
+            if (q->T.from == NULL)
                 memcpy(out, z + c * length, width * sizeof(double));
-            } else {
-                const double *T = at(q->T, point) + c * d;
-                for (npy_intp j = 0; j < width; j++)
-                    out[j] = 0.0;
-                for (npy_intp e = 0; e < d; e++)
-                    for (npy_intp j = 0; j < width; j++)
-                        out[j] += T[e] * z[e * length + j];
-            }
-            if (p != NULL)
-                for (npy_intp j = 0; j < width; j++)
-                    out[j] += p[c * width + j];
+            else
+                combine(out, offset, at(q->T, point) + c * d, d, z, length, width);
         }
     }
 }
 
 /* Elements 0 … count − 1, one system each; 0 if one is singular. */
-EVERY_WIDTH static int distinct_elements(const Equation *q, npy_intp count, double *W,
+static int distinct_elements(const Equation *q, npy_intp count, double *W,
                                          double *homogeneous, double *particular)
 {
     const npy_intp m = q->s * q->d, n = q->n, sides = n + q->columns;
@@ -165,6 +153,7 @@ EVERY_WIDTH static int distinct_elements(const Equation *q, npy_intp count, doub
         for (npy_intp i = 0; i < m; i++)
             for (npy_intp j = m + sides; j < length; j++)
                 W[i * length + j] = 0.0;
+        lengthen(q, k);
         assemble(q, k, W, length);
         drive(q, k, W, length, m + n);
         if (!eliminate(W, m, sides))
@@ -177,7 +166,7 @@ EVERY_WIDTH static int distinct_elements(const Equation *q, npy_intp count, doub
 
 /* Elements of one length under constant E, A and T: one system for all, whose responses to the
    left end are the same; 0 if it is singular. */
-EVERY_WIDTH static int equal_elements(const Equation *q, const int *members, npy_intp count,
+static int equal_elements(const Equation *q, const int *members, npy_intp count,
                                       double *W, double *homogeneous, double *particular)
 {
     const npy_intp m = q->s * q->d, n = q->n, columns = q->columns, sides = n + count * columns;
@@ -185,9 +174,12 @@ EVERY_WIDTH static int equal_elements(const Equation *q, const int *members, npy
     for (npy_intp i = 0; i < m; i++)
         for (npy_intp j = m + sides; j < length; j++)
             W[i * length + j] = 0.0;
+    lengthen(q, members[0]);
     assemble(q, members[0], W, length);
-    for (npy_intp k = 0; k < count; k++)
+    for (npy_intp k = 0; k < count; k++) {
+        lengthen(q, members[k]);
         drive(q, members[k], W, length, m + n + k * columns);
+    }
     if (!eliminate(W, m, sides))
         return 0;
     expand(q, members[0], W, length, m, n, 0, homogeneous);
@@ -244,7 +236,8 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
         !moving(&call, 6, "points, rows or columns of p", points, n, columns, &q.p))
         return failed(&call);
     if ((q.T.from == NULL && !same("rows and columns of A", d, n)) ||
-        (q.T.from != NULL && q.E.from == NULL && !same("constraints without E", 1, 0)))
+        !same("constraints with an offset", q.T.from != NULL, q.p.from != NULL) ||
+        (q.T.from != NULL && !same("constraints with E", 1, q.E.from != NULL)))
         return failed(&call);
     q.D = data(D);
     q.h = data(h);
@@ -253,7 +246,7 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
         longest = q.h[k] > longest ? q.h[k] : longest;
     const int constant = q.A.step == 0 && q.E.step == 0 && q.T.step == 0;
     const npy_intp sides = n + columns * (constant ? K : 1);
-    q.together = scratch(&call, n * m + m + n * columns + d * d);
+    q.together = scratch(&call, (n + 1) * m + s * n * columns + d * d + s * s + columns);
     double *W = q.together ? scratch(&call, m * row_length(m, sides)) : NULL;
     int *members = W ? integers(&call, 2 * K) : NULL;
     PyArrayObject *particular =
@@ -262,7 +255,9 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
         return failed(&call);
     q.coupling = q.together + n * m;
     q.slope = q.coupling + m;
-    q.AT = q.slope + n * columns;
+    q.AT = q.slope + s * n * columns;
+    q.Dh = q.AT + d * d;
+    q.taken = q.Dh + s * s;
     /* The group of one length that each element belongs to, the first element of each group. */
     int groups = 0, *group = members + K;
     for (npy_intp k = 0; constant && k < K; k++) {
@@ -299,27 +294,11 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
 /* --- chaining ----------------------------------------------------------------------------- */
 
 /* out (rows, columns) = a (rows, n) x (n, columns) + b (rows, columns). */
-static inline void affine(double *restrict out, const double *restrict a, const double *restrict x,
-                          const double *restrict b, npy_intp rows, npy_intp n, npy_intp columns)
+static inline void affine(double *out, const double *a, const double *x,
+                          const double *b, npy_intp rows, npy_intp n, npy_intp columns)
 {
-    if (columns == 1) {
-        for (npy_intp i = 0; i < rows; i++) {
-            double sum = 0.0;
-            for (npy_intp e = 0; e < n; e++)
-                sum += a[i * n + e] * x[e];
-            out[i] = sum + b[i];
-        }
-        return;
-    }
-    for (npy_intp i = 0; i < rows; i++, out += columns) {
-        for (npy_intp c = 0; c < columns; c++)
-            out[c] = 0.0;
-        for (npy_intp e = 0; e < n; e++)
-            for (npy_intp c = 0; c < columns; c++)
-                out[c] += a[i * n + e] * x[e * columns + c];
-        for (npy_intp c = 0; c < columns; c++)
-            out[c] += b[i * columns + c];
-    }
+    for (npy_intp i = 0; i < rows; i++)
+        combine(out + i * columns, b + i * columns, a + i * n, n, x, columns, columns);
 }
 
 /* Whether all numbers are finite. */
@@ -372,31 +351,6 @@ static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t coun
 /* --- error estimates ---------------------------------------------------------------------- */
 
 #define LAST 4 /* Legendre coefficients that are looked at */
-
-/* The larger one; what is not a number stays. */
-static inline double larger(double a, double b)
-{
-    return a >= b || a != a ? a : b;
-}
-
-/* |last Legendre coefficients| (rows, C) of the point values (points, C) of one element. */
-static inline void coefficients(double *restrict out, const double *to_legendre,
-                                const double *values, npy_intp rows, npy_intp points, npy_intp C)
-{
-    for (npy_intp j = 0; j < rows; j++) {
-        double *restrict row = out + j * C;
-        for (npy_intp c = 0; c < C; c++)
-            row[c] = 0.0;
-        for (npy_intp i = 0; i < points; i++) {
-            const double weight = to_legendre[j * points + i];
-            const double *restrict v = values + i * C;
-            for (npy_intp c = 0; c < C; c++)
-                row[c] += weight * v[c];
-        }
-        for (npy_intp c = 0; c < C; c++)
-            row[c] = fabs(row[c]);
-    }
-}
 
 /* scale (C,) = size (C,), but not below `share` of the largest, nor below `floor`. */
 static void floored(double *scale, const double *size, npy_intp C, double share, double floor)
@@ -492,7 +446,7 @@ static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t 
     floored(scale, whole, C, share, 0.0);
     const double *to_legendre = data(L) + (points - rows) * points;
     for (npy_intp k = 0; k < K; k++) {
-        coefficients(last, to_legendre, data(V) + k * points * C, rows, points, C);
+        last_coefficients(last, to_legendre, data(V) + k * points * C, rows, points, C);
         for (npy_intp c = 0; s >= LAST && c < C; c++) {
             const double earlier = larger(last[c], last[C + c]);
             const double after = larger(last[2 * C + c], last[3 * C + c]);

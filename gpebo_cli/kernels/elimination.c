@@ -1,5 +1,5 @@
 /* Elimination for systems of some tens of unknowns: what LAPACK does, without its calls. */
-#include "elimination.h"
+#include "elements.h"
 
 #define PANEL 4 /* columns eliminated at once: so many rows are subtracted in one pass */
 
