@@ -89,7 +89,7 @@ def test_chain_and_estimates(equation, cut):
             problem.coefficients, problem.start, floor=0.1, amplification=amplification
         )
         one, other = by_both(lambda p=ending: linear._estimates(p, maps, values, mesh))
-        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-20)
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-15)
 
 
 @given(seeds, st.integers(1, 6), st.integers(4, 15))
@@ -161,29 +161,22 @@ def test_refinement_takes_the_same_way():
     assert one.error_estimate == pytest.approx(other.error_estimate, rel=1e-6)
 
 
-@pytest.mark.parametrize("m", [1, 2, 3, 4, 5, 7, 8, 33, 98])
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 20])
 @pytest.mark.parametrize("columns", [1, 7, 8, 9])
-def test_elimination_swaps_rows(m, columns):
-    """A permuted system, whose diagonal would be zero without row swaps; E = A of one element."""
-    rng = np.random.default_rng(m)
-    rule = radau_rule(2)
-    A = np.eye(m)[::-1] + 0.1 * rng.normal(size=(m, m)) / m
-    n = max(m // 2, 1)
+@pytest.mark.parametrize("stages", [2, 3, 5])
+def test_elimination_swaps_rows(n, columns, stages):
+    """With the equations in reverse order the diagonal of the first node is zero."""
+    rng = np.random.default_rng(n)
+    mesh = Mesh(np.array([0.0, 0.3, 0.5]), radau_rule(stages))
+    points = mesh.points.size
     c = Coefficients(
-        A[None, :n, :n], rng.normal(size=(6, n, n)) / n, rng.normal(size=(6, n, columns))
+        np.eye(n)[None, ::-1].copy(), 1e-3 * rng.normal(size=(points, n, n)),
+        rng.normal(size=(points, n, columns)),
     )
     problem = LinearProblem(lambda t, inside: c, rng.normal(size=(n, columns)))
-    mesh = Mesh(np.array([0.0, 0.3, 0.5]), rule)
-
-    def direct():
-        solved = COMPILED.element_maps(
-            rule.differentiation, mesh.steps, c.E, c.A, c.f, None, None, 0.0
-        )
-        return None if solved is None else solved[1]
-
-    maps = linear._solve_distinct_elements(rule, mesh.steps, c, n)
-    assert_close(direct(), maps[..., n:], rtol=1e-8)
-    assert problem.start.shape == (n, columns)
+    one, other = by_both(lambda: linear._element_maps(problem, mesh, None, c))
+    assert_close(one.homogeneous, other.homogeneous, rtol=1e-11)
+    assert_close(one.particular, other.particular, rtol=1e-11)
 
 
 # --- signals on a mesh -----------------------------------------------------------------------
