@@ -310,6 +310,22 @@ static inline int all_finite(const double *values, npy_intp count)
     return !bad;
 }
 
+/* Values (K, s + 1, n, columns) by :func:`chain`; returns how many elements in front are finite. */
+EVERY_WIDTH static npy_intp link_up(double *out, const double *H, npy_intp apart, const double *P,
+                                    const double *state, npy_intp K, npy_intp s, npy_intp n,
+                                    npy_intp columns)
+{
+    const npy_intp block = n * columns;
+    npy_intp whole = 0;
+    for (npy_intp k = 0; k < K; k++, out += (s + 1) * block) {
+        memcpy(out, state, block * sizeof(double));
+        affine(out + block, H + k * apart, out, P + k * s * block, s * n, n, columns);
+        whole += whole == k && all_finite(out, (s + 1) * block);
+        state = out + s * block;
+    }
+    return whole;
+}
+
 /* chain(homogeneous (K or 1, s, n, n), particular (K, s, n, columns), start (n, columns))
 
    Returns the values (K, s + 1, n, columns), and how many elements in front are finite. */
@@ -324,7 +340,7 @@ static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t coun
     if (start == NULL)
         return failed(&call);
     const npy_intp K = size(P, 0), s = size(P, 1), n = size(P, 2), columns = size(P, 3);
-    const npy_intp constant = size(H, 0) == 1, block = n * columns;
+    const npy_intp constant = size(H, 0) == 1;
     if ((!constant && !same("elements", size(H, 0), K)) || !same("stages", size(H, 1), s) ||
         !same("components", size(H, 2), n) || !same("components", size(H, 3), n) ||
         !same("components of the start", size(start, 0), n) ||
@@ -333,16 +349,8 @@ static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t coun
     PyArrayObject *values = fresh(&call, 4, (npy_intp[]){K, s + 1, n, columns});
     if (values == NULL)
         return failed(&call);
-    const double *state = data(start);
-    double *out = data(values);
-    npy_intp whole = 0;
-    for (npy_intp k = 0; k < K; k++, out += (s + 1) * block) {
-        const double *h = data(H) + (constant ? 0 : k * s * n * n);
-        memcpy(out, state, block * sizeof(double));
-        affine(out + block, h, out, data(P) + k * s * block, s * n, n, columns);
-        whole += whole == k && all_finite(out, (s + 1) * block);
-        state = out + s * block;
-    }
+    const npy_intp whole = link_up(data(values), data(H), constant ? 0 : s * n * n, data(P),
+                                   data(start), K, s, n, columns);
     PyObject *answer = Py_BuildValue("(On)", (PyObject *)values, (Py_ssize_t)whole);
     failed(&call); /* gives back what was held */
     return answer;
@@ -381,6 +389,89 @@ static void local_errors(double *local, const double *last, const double *size,
         const double rounding = 4 * DBL_EPSILON * larger(size[c], scale[c] * DBL_EPSILON);
         local[c] = scale[c] * exp(worst + half * (decay > 0.0 ? 0.0 : decay)) + rounding;
     }
+}
+
+/* What :func:`estimates` is of: the arguments, and memory for (K + 14) n columns numbers. */
+typedef struct {
+    npy_intp K, s, n, columns, used, apart; /* apart: numbers between the maps of two elements */
+    const double *H, *V, *to_legendre, *amplified;
+    double floor, share, level;
+    double *work;
+} Ending;
+
+/* Accumulated error, visible noise and rounding into found (3,). */
+EVERY_WIDTH static void judge(const Ending *q, double *found)
+{
+    const npy_intp K = q->K, s = q->s, n = q->n, columns = q->columns, used = q->used;
+    const npy_intp C = n * columns, points = s + 1, rows = points < LAST ? points : LAST;
+    double *work = q->work;
+    double *sizes = work, *whole = sizes + K * C, *scale = whole + C, *last = scale + C;
+    double *noise = last + LAST * C, *local = noise + C, *error = local + C;
+    double *before = error + 2 * C, *worst = before + 2 * C, *brought = worst + C;
+    for (npy_intp c = 0; c < C; c++)
+        whole[c] = noise[c] = worst[c] = brought[c] = 0.0;
+    for (npy_intp k = 0; k < K; k++) {
+        double *restrict own = sizes + k * C;
+        const double *restrict v = q->V + k * points * C;
+        for (npy_intp c = 0; c < C; c++)
+            own[c] = 0.0;
+        for (npy_intp i = 0; i < points; i++, v += C)
+            for (npy_intp c = 0; c < C; c++) {
+                const double one = fabs(v[c]);
+                own[c] = one > own[c] ? one : own[c];
+            }
+        for (npy_intp c = 0; c < C; c++)
+            whole[c] = own[c] > whole[c] ? own[c] : whole[c];
+    }
+    floored(scale, whole, C, q->share, 0.0);
+    const double *to_legendre = q->to_legendre + (points - rows) * points;
+    for (npy_intp k = 0; k < K; k++) {
+        last_coefficients(last, to_legendre, q->V + k * points * C, rows, points, C);
+        for (npy_intp c = 0; s >= LAST && c < C; c++) {
+            const double earlier = larger(last[c], last[C + c]);
+            const double after = larger(last[2 * C + c], last[3 * C + c]);
+            if (after >= q->level * earlier)
+                noise[c] = larger(noise[c], after);
+        }
+        local_errors(local, last + (rows - used) * C, sizes + k * C, scale, s, used, C);
+        /* All signs equal, and alternating. */
+        for (int e = 0; e < 2; e++) {
+            const double sign = e && k % 2 ? -1.0 : 1.0;
+            double *own = error + e * C;
+            for (npy_intp c = 0; c < C; c++)
+                brought[c] = sign * local[c];
+            if (k == 0) {
+                memcpy(own, brought, C * sizeof(double));
+            } else {
+                const double *h = q->H + k * q->apart + (s - 1) * n * n;
+                memcpy(before + e * C, own, C * sizeof(double));
+                affine(own, h, before + e * C, brought, n, n, columns);
+            }
+            for (npy_intp c = 0; c < C; c++)
+                worst[c] = larger(worst[c], fabs(own[c]));
+        }
+    }
+    double propagated = 0.0, visible = 0.0, rounding = 0.0, largest = 0.0;
+    for (npy_intp c = 0; c < C; c++) {
+        propagated = larger(propagated, worst[c] / scale[c]);
+        visible = larger(visible, noise[c] / scale[c]);
+        largest = larger(largest, whole[c]);
+        brought[c] = 0.0;
+    }
+    for (npy_intp i = 0; q->amplified != NULL && i < n; i++)
+        for (npy_intp c = 0; c < columns; c++) {
+            const double *by = q->amplified + i * (n + 1);
+            double sum = 0.0;
+            for (npy_intp e = 0; e < n; e++)
+                sum += by[e] * whole[e * columns + c];
+            brought[i * columns + c] = DBL_EPSILON * (sum + by[n]);
+        }
+    floored(scale, whole, C, q->share, q->floor);
+    for (npy_intp c = 0; c < C; c++)
+        rounding = larger(rounding, (DBL_EPSILON * largest + brought[c]) / scale[c]);
+    found[0] = propagated;
+    found[1] = visible;
+    found[2] = rounding;
 }
 
 /* estimates(homogeneous (K or 1, s, n, n), values (K, s + 1, n, columns), to_legendre, used,
@@ -422,75 +513,18 @@ static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t 
             !same("columns of amplification", size(amplified, 1), n + 1))
             return failed(&call);
     }
-    double *work = scratch(&call, (size_t)(C * (K + 11 + LAST)));
+    double found[3], *work = scratch(&call, (size_t)(C * (K + 14)));
     if (work == NULL)
         return failed(&call);
-    double *sizes = work, *whole = sizes + K * C, *scale = whole + C, *last = scale + C;
-    double *noise = last + LAST * C, *local = noise + C, *error = local + C;
-    double *before = error + 2 * C, *worst = before + 2 * C, *brought = worst + C;
-    for (npy_intp c = 0; c < C; c++)
-        whole[c] = noise[c] = worst[c] = brought[c] = 0.0;
-    for (npy_intp k = 0; k < K; k++) {
-        double *restrict own = sizes + k * C;
-        const double *restrict v = data(V) + k * points * C;
-        for (npy_intp c = 0; c < C; c++)
-            own[c] = 0.0;
-        for (npy_intp i = 0; i < points; i++, v += C)
-            for (npy_intp c = 0; c < C; c++) {
-                const double one = fabs(v[c]);
-                own[c] = one > own[c] ? one : own[c];
-            }
-        for (npy_intp c = 0; c < C; c++)
-            whole[c] = own[c] > whole[c] ? own[c] : whole[c];
-    }
-    floored(scale, whole, C, share, 0.0);
-    const double *to_legendre = data(L) + (points - rows) * points;
-    for (npy_intp k = 0; k < K; k++) {
-        last_coefficients(last, to_legendre, data(V) + k * points * C, rows, points, C);
-        for (npy_intp c = 0; s >= LAST && c < C; c++) {
-            const double earlier = larger(last[c], last[C + c]);
-            const double after = larger(last[2 * C + c], last[3 * C + c]);
-            if (after >= level * earlier)
-                noise[c] = larger(noise[c], after);
-        }
-        local_errors(local, last + (rows - used) * C, sizes + k * C, scale, s, used, C);
-        /* All signs equal, and alternating. */
-        for (int e = 0; e < 2; e++) {
-            const double sign = e && k % 2 ? -1.0 : 1.0;
-            double *own = error + e * C;
-            for (npy_intp c = 0; c < C; c++)
-                brought[c] = sign * local[c];
-            if (k == 0) {
-                memcpy(own, brought, C * sizeof(double));
-            } else {
-                const double *h = data(H) + ((constant ? 0 : k * s) + s - 1) * n * n;
-                memcpy(before + e * C, own, C * sizeof(double));
-                affine(own, h, before + e * C, brought, n, n, columns);
-            }
-            for (npy_intp c = 0; c < C; c++)
-                worst[c] = larger(worst[c], fabs(own[c]));
-        }
-    }
-    double propagated = 0.0, visible = 0.0, rounding = 0.0, largest = 0.0;
-    for (npy_intp c = 0; c < C; c++) {
-        propagated = larger(propagated, worst[c] / scale[c]);
-        visible = larger(visible, noise[c] / scale[c]);
-        largest = larger(largest, whole[c]);
-        brought[c] = 0.0;
-    }
-    for (npy_intp i = 0; amplified != NULL && i < n; i++)
-        for (npy_intp c = 0; c < columns; c++) {
-            const double *by = data(amplified) + i * (n + 1);
-            double sum = 0.0;
-            for (npy_intp e = 0; e < n; e++)
-                sum += by[e] * whole[e * columns + c];
-            brought[i * columns + c] = DBL_EPSILON * (sum + by[n]);
-        }
-    floored(scale, whole, C, share, floor);
-    for (npy_intp c = 0; c < C; c++)
-        rounding = larger(rounding, (DBL_EPSILON * largest + brought[c]) / scale[c]);
+    const Ending ending = {
+        .K = K, .s = s, .n = n, .columns = columns, .used = used,
+        .apart = constant ? 0 : s * n * n, .H = data(H), .V = data(V), .to_legendre = data(L),
+        .amplified = amplified ? data(amplified) : NULL, .floor = floor, .share = share,
+        .level = level, .work = work,
+    };
+    judge(&ending, found);
     failed(&call); /* gives back what was held */
-    return Py_BuildValue("(ddd)", propagated, visible, rounding);
+    return Py_BuildValue("(ddd)", found[0], found[1], found[2]);
 }
 
 PyMethodDef collocation_kernels[] = {

@@ -21,38 +21,29 @@ static inline double larger(double a, double b)
     return a >= b || a != a ? a : b;
 }
 
+/* `combine` for a fixed number of columns. */
+#define COMBINE(block)                                                                             \
+    for (; j + block <= width; j += block) {                                                       \
+        double sum[block];                                                                         \
+        for (int c = 0; c < block; c++)                                                            \
+            sum[c] = initial ? initial[j + c] : 0.0;                                               \
+        for (npy_intp e = 0; e < inner; e++)                                                       \
+            for (int c = 0; c < block; c++)                                                        \
+                sum[c] += a[e] * b[e * step + j + c];                                              \
+        for (int c = 0; c < block; c++)                                                            \
+            out[j + c] = sum[c];                                                                   \
+    }
+
 /* out (width,) = initial (width,) or zero + the sum of a[e] times row e of b, rows `step` apart.
    Sums stay in registers: nearly all matrices here are narrow. */
 static inline void combine(double *out, const double *initial, const double *a, npy_intp inner,
                            const double *b, npy_intp step, npy_intp width)
 {
     npy_intp j = 0;
-    for (; j + 8 <= width; j += 8) {
-        double sum[8];
-        for (int c = 0; c < 8; c++)
-            sum[c] = initial ? initial[j + c] : 0.0;
-        for (npy_intp e = 0; e < inner; e++)
-            for (int c = 0; c < 8; c++)
-                sum[c] += a[e] * b[e * step + j + c];
-        for (int c = 0; c < 8; c++)
-            out[j + c] = sum[c];
-    }
-    for (; j + 4 <= width; j += 4) {
-        double sum[4];
-        for (int c = 0; c < 4; c++)
-            sum[c] = initial ? initial[j + c] : 0.0;
-        for (npy_intp e = 0; e < inner; e++)
-            for (int c = 0; c < 4; c++)
-                sum[c] += a[e] * b[e * step + j + c];
-        for (int c = 0; c < 4; c++)
-            out[j + c] = sum[c];
-    }
-    for (; j < width; j++) {
-        double sum = initial ? initial[j] : 0.0;
-        for (npy_intp e = 0; e < inner; e++)
-            sum += a[e] * b[e * step + j];
-        out[j] = sum;
-    }
+    COMBINE(16)
+    COMBINE(8)
+    COMBINE(4)
+    COMBINE(1)
 }
 
 /* |last Legendre coefficients| (rows, C) of the point values (points, C) of one element. */
@@ -65,13 +56,15 @@ static inline void last_coefficients(double *out, const double *to_legendre, con
         out[c] = fabs(out[c]);
 }
 
-/* Right-hand sides are solved for this many at once; their number is rounded up to a multiple. */
+/* Columns are eliminated in panels of so many, and right-hand sides solved for so many at once. */
+#define PANEL 4
 #define SIDES 8
 
-/* Length of the rows of [A | B] for A (m, m) and B (m, columns). */
+/* Length of the rows of [A | B] for A (m, m) and B (m, columns): whole blocks of both. */
 static inline npy_intp row_length(npy_intp m, npy_intp columns)
 {
-    return m + (columns + SIDES - 1) / SIDES * SIDES;
+    const npy_intp sides = (columns + SIDES - 1) / SIDES * SIDES;
+    return (m + sides + PANEL - 1) / PANEL * PANEL;
 }
 
 /* Solves A X = B by elimination with row pivoting. W holds [A | B | 0] in m rows of
