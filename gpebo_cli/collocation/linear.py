@@ -72,9 +72,11 @@ _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are no
 _EPS = float(np.finfo(float).eps)
 _ROUNDING = 64 * _EPS
 _EQUAL = 1e-11  # relative difference of lengths that is rounding
-# Up to here the kernels are faster than LAPACK's and BLAS's products, see test_kernels_collocation
+# Up to these sizes the kernels are faster than LAPACK's and BLAS's calls: measured, with 24
+# elements of 14 stages, at half of them to twice as much.
 _SMALL_SYSTEM = 100  # unknowns of an element
-_SMALL_STATE = 24  # components and columns
+_SMALL_STATE = 16  # components, and
+_SMALL_VALUE = 200  # components times columns
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.
 np.empty(_CHUNK // 4)
@@ -233,7 +235,7 @@ def _estimates(
 ) -> tuple[float, float, float]:
     """Visible noise, propagated error and rounding, relative to each component's size."""
     rule = mesh.rule
-    if kernels.compiled is not None and problem.renewal is None and _is_small(values):
+    if kernels.compiled is not None and problem.renewal is None and _is_small(*values.shape[2:]):
         propagated, noise, rounding = kernels.compiled.estimates(
             maps.homogeneous, values, rule.to_legendre, used_coefficients(rule),
             problem.amplification, problem.floor, SHARE, _LEVEL,
@@ -247,9 +249,9 @@ def _estimates(
     )
 
 
-def _is_small(values: Array) -> bool:
-    """Whether kernels are faster for values (K, s + 1, n, columns)."""
-    return bool(max(values.shape[2:]) <= _SMALL_STATE)
+def _is_small(n: int, columns: int) -> bool:
+    """Whether kernels are faster for a solution (n, columns)."""
+    return n <= _SMALL_STATE and n * columns <= _SMALL_VALUE
 
 
 def _rounding(problem: LinearProblem, values: Array) -> float:
@@ -414,8 +416,7 @@ def _is_small_system(c: Coefficients, s: int, n: int) -> bool:
     """Whether the kernel is faster."""
     return (
         s * c.A.shape[1] <= _SMALL_SYSTEM
-        and n <= _SMALL_STATE
-        and c.f.shape[2] <= _SMALL_STATE
+        and _is_small(n, c.f.shape[2])
         and (c.E is not None or c.constraints is None)
     )
 
@@ -550,7 +551,7 @@ def _chain(
     size, s, n = maps.particular.shape[:3]
     columns = problem.start.shape[1]
     renewal = problem.renewal
-    if kernels.compiled is not None and renewal is None and _is_small(maps.particular):
+    if kernels.compiled is not None and renewal is None and _is_small(n, columns):
         return _chain_stretches(maps, problem, mesh, restarts)
     homogeneous = np.broadcast_to(maps.homogeneous, (size, s, n, n))
     last_h, last_p = homogeneous[:, -1], maps.particular[:, -1]

@@ -24,6 +24,7 @@ _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
 SHARE = 1e-3  # of the largest component: what is smaller is measured against that
 _FOOT = 1e-8  # of its final size: what a component was before may be that wrong
 _MOST_KINDS = 24  # in one call of a kernel
+_WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
 _MANY = 2000  # times, from which on sampling them by element pays
 _KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
 _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
@@ -219,10 +220,10 @@ class Sampler:
 
     def __call__(self, values: Array) -> Array:
         """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
-        if kernels.compiled is not None:
-            sampled: Array = kernels.compiled.sample(self.element, self.weights, _flat(values))
+        flat = _flat(values)
+        if kernels.compiled is not None and (flat.shape[2] <= _WIDE or self._grouped is None):
+            sampled: Array = kernels.compiled.sample(self.element, self.weights, flat)
             return sampled.reshape(len(sampled), *values.shape[2:])
-        flat = values.reshape(*values.shape[:2], -1)
         out = np.empty((len(self.element), flat.shape[2]))
         if self._grouped is not None:
             self._by_element(flat, out)
@@ -285,29 +286,23 @@ class Trajectory:
 
     def local_integral(self) -> Trajectory:
         """∫ from the left end of each element, starting at zero again in the next one."""
-        rule, mesh = self.mesh.rule, self.mesh
-        if kernels.compiled is not None:
-            return self._integral(on=False)
-        flat = self.values.reshape(mesh.size, rule.stages + 1, -1)
-        out = np.zeros_like(flat)
-        out[:, 1:] = mesh.steps[:, None, None] * np.matmul(rule.integration, flat[:, 1:])
-        return Trajectory(mesh, out.reshape(self.values.shape))
+        return self._integral(on=False)
 
     def integral(self) -> Trajectory:
         """∫ from the start of the mesh, by the mesh's own quadrature (order 2s − 1 at the ends)."""
-        if kernels.compiled is not None:
-            return self._integral(on=True)
-        local = self.local_integral().values
-        total = np.cumsum(local[:, -1], axis=0)
-        local[1:] += total[:-1, None]
-        return Trajectory(self.mesh, local)
+        return self._integral(on=True)
 
     def _integral(self, *, on: bool) -> Trajectory:
-        """Either of them in C: on from the elements before, or from each left end."""
-        mesh = self.mesh
-        out = kernels.compiled.integral(  # type: ignore[union-attr]
-            mesh.rule.integration, mesh.steps, _flat(self.values), on
-        )
+        """On from the elements before, or from each left end."""
+        rule, mesh, flat = self.mesh.rule, self.mesh, _flat(self.values)
+        if kernels.compiled is not None and flat.shape[2] <= _WIDE:
+            out = kernels.compiled.integral(rule.integration, mesh.steps, flat, on)
+            return Trajectory(mesh, out.reshape(self.values.shape))
+        out = np.zeros(flat.shape)
+        out[:, 1:] = mesh.steps[:, None, None] * np.matmul(rule.integration, flat[:, 1:])
+        if on:
+            total = np.cumsum(out[:, -1], axis=0)
+            out[1:] += total[:-1, None]
         return Trajectory(mesh, out.reshape(self.values.shape))
 
     def low_pass(self, rate: Array | float, start: Array | None = None) -> Trajectory:
@@ -432,7 +427,8 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     scale ρ^(s+1); the largest prediction counts. Several, because single coefficients vanish by
     accident, two of them where the signal is odd or even.
     """
-    last = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))  # degrees s + 1 − used … s
+    # Of degrees s + 1 − used … s:
+    last = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
     predicted = size * np.minimum(last / size, 1.0) ** _to_next(rule)[:, None]
     return np.asarray(predicted.max(axis=1))

@@ -1,5 +1,5 @@
 /* gpebo_cli/collocation/linear.py: element systems, chaining, error estimates. */
-#include "elimination.h"
+#include "elements.h"
 
 #include <float.h>
 
@@ -22,10 +22,12 @@ typedef struct {
     const double *D; /* (s, s) */
     Moving E, A, f, T, p;
     double *h;        /* lengths (K,) */
+    double *Dh;       /* (s, s): D/h of an element */
     double *together; /* (n, s d): T at all nodes of an element, side by side */
     double *coupling; /* (s d,): a row of E times that */
-    double *slope;    /* (n, columns): (D p)_i / h */
+    double *slope;    /* (s, n, columns): D p/h */
     double *AT;       /* (d, d) */
+    double *taken;    /* (columns,) */
 } Equation;
 
 /* Node i of element k among all points. */
@@ -36,50 +38,46 @@ static inline npy_intp node(const Equation *q, npy_intp k, npy_intp i)
 
 /* (D_ij/h E_i T_j − δ_ij A_i T_i) of element k into the first s d columns of W, and the response
    to the left end, (D𝟙)_i/h E_i, into the next n. */
-static inline void assemble(const Equation *q, npy_intp k, double *W, npy_intp length)
+EVERY_WIDTH static void assemble(const Equation *q, npy_intp k, double *W, npy_intp length)
 {
     const npy_intp s = q->s, d = q->d, n = q->n, m = s * d;
     const int varying = q->T.from != NULL && q->T.step != 0;
-    const double h = q->h[k];
-    if (varying)
-        for (npy_intp j = 0; j < s; j++) {
-            const double *T = at(q->T, node(q, k, j));
-            for (npy_intp c = 0; c < n; c++)
-                for (npy_intp b = 0; b < d; b++)
-                    q->together[c * m + j * d + b] = T[c * d + b];
-        }
+    const npy_intp apart = varying ? d : 0; /* what couples to the next node */
+    for (npy_intp j = 0; varying && j < s; j++) {
+        const double *T = at(q->T, node(q, k, j));
+        for (npy_intp c = 0; c < n; c++)
+            for (npy_intp b = 0; b < d; b++)
+                q->together[c * m + j * d + b] = T[c * d + b];
+    }
     for (npy_intp i = 0; i < s; i++) {
         const npy_intp point = node(q, k, i);
-        const double *A = at(q->A, point), *D = q->D + i * s;
+        const double *A = at(q->A, point), *Dh = q->Dh + i * s;
         if (q->T.from != NULL) {
-            multiply(q->AT, A, at(q->T, point), d, n, d);
+            for (npy_intp a = 0; a < d; a++)
+                combine(q->AT + a * d, NULL, A + a * n, n, at(q->T, point), d, d);
             A = q->AT;
         }
         double start = 0.0;
         for (npy_intp j = 0; j < s; j++)
-            start += D[j] / h;
+            start += Dh[j];
         for (npy_intp a = 0; a < d; a++) {
-            double *restrict row = W + (i * d + a) * length;
-            double *restrict response = row + m;
+            double *row = W + (i * d + a) * length, *response = row + m;
             if (q->E.from == NULL) {
                 memset(row, 0, (m + n) * sizeof(double));
                 for (npy_intp j = 0; j < s; j++)
-                    row[j * d + a] = D[j] / h;
+                    row[j * d + a] = Dh[j];
                 response[a] = start;
             } else {
-                const double *E = at(q->E, point) + a * n, *restrict coupled = q->coupling;
+                const double *E = at(q->E, point) + a * n, *coupled = q->coupling;
                 if (varying)
-                    multiply(q->coupling, E, q->together, 1, n, m);
+                    combine(q->coupling, NULL, E, n, q->together, m, m);
                 else if (q->T.from != NULL)
-                    multiply(q->coupling, E, q->T.from, 1, n, d);
+                    combine(q->coupling, NULL, E, n, q->T.from, d, d);
                 else
                     coupled = E;
-                const npy_intp step = varying ? d : 0;
-                for (npy_intp j = 0; j < s; j++) {
-                    const double factor = D[j] / h;
+                for (npy_intp j = 0; j < s; j++)
                     for (npy_intp b = 0; b < d; b++)
-                        row[j * d + b] = factor * coupled[j * step + b];
-                }
+                        row[j * d + b] = Dh[j] * coupled[j * apart + b];
                 for (npy_intp c = 0; c < n; c++)
                     response[c] = start * E[c];
             }
@@ -90,47 +88,45 @@ static inline void assemble(const Equation *q, npy_intp k, double *W, npy_intp l
 }
 
 /* What drives z at the nodes of element k, f + A p − E (D p)/h, into columns of W from `place`. */
-static inline void drive(const Equation *q, npy_intp k, double *W, npy_intp length, npy_intp place)
+EVERY_WIDTH static void drive(const Equation *q, npy_intp k, double *W, npy_intp length,
+                              npy_intp place)
 {
     const npy_intp s = q->s, d = q->d, n = q->n, columns = q->columns, size = n * columns;
-    const double h = q->h[k];
+    if (q->p.from != NULL)
+        for (npy_intp i = 0; i < s; i++)
+            combine(q->slope + i * size, NULL, q->Dh + i * s, s, at(q->p, node(q, k, 0)),
+                    q->p.step, size);
     for (npy_intp i = 0; i < s; i++) {
         const npy_intp point = node(q, k, i);
-        const double *f = at(q->f, point);
-        if (q->p.from != NULL) {
-            memset(q->slope, 0, size * sizeof(double));
-            for (npy_intp j = 0; j < s; j++) {
-                const double factor = q->D[i * s + j] / h;
-                const double *restrict p = at(q->p, node(q, k, j));
-                for (npy_intp c = 0; c < size; c++)
-                    q->slope[c] += factor * p[c];
-            }
-        }
-        for (npy_intp a = 0; a < d; a++) {
-            double *restrict right = W + (i * d + a) * length + place;
-            for (npy_intp c = 0; c < columns; c++)
-                right[c] = f[a * columns + c];
-            if (q->p.from == NULL)
+        const double *f = at(q->f, point), *slope = q->slope + i * size;
+        for (npy_intp a = 0; a < d; a++, f += columns) {
+            double *right = W + (i * d + a) * length + place;
+            if (q->p.from == NULL) {
+                memcpy(right, f, columns * sizeof(double));
                 continue;
-            const double *A = at(q->A, point) + a * n, *p = at(q->p, point);
-            const double *E = q->E.from == NULL ? NULL : at(q->E, point) + a * n;
-            for (npy_intp e = 0; e < n; e++)
-                for (npy_intp c = 0; c < columns; c++)
-                    right[c] += A[e] * p[e * columns + c];
-            if (E == NULL)
-                for (npy_intp c = 0; c < columns; c++)
-                    right[c] -= q->slope[a * columns + c];
-            else
-                for (npy_intp e = 0; e < n; e++)
-                    for (npy_intp c = 0; c < columns; c++)
-                        right[c] -= E[e] * q->slope[e * columns + c];
+            }
+            combine(right, f, at(q->A, point) + a * n, n, at(q->p, point), columns, columns);
+            if (q->E.from != NULL) {
+                combine(q->taken, NULL, at(q->E, point) + a * n, n, slope, columns, columns);
+                slope = q->taken;
+            }
+            for (npy_intp c = 0; c < columns; c++)
+                right[c] -= slope[c];
+            slope = q->slope + i * size;
         }
     }
 }
 
+/* D/h of element k. */
+static inline void lengthen(const Equation *q, npy_intp k)
+{
+    for (npy_intp i = 0; i < q->s * q->s; i++)
+        q->Dh[i] = q->D[i] / q->h[k];
+}
+
 /* out (s, n, width) = T_i z_i (+ p_i where it is `added`), z_i (d, width) in W from `place` on. */
-static inline void expand(const Equation *q, npy_intp k, const double *W, npy_intp length,
-                          npy_intp place, npy_intp width, int added, double *restrict out)
+EVERY_WIDTH static void expand(const Equation *q, npy_intp k, const double *W, npy_intp length,
+                               npy_intp place, npy_intp width, int added, double *out)
 {
     const npy_intp s = q->s, d = q->d, n = q->n;
     for (npy_intp i = 0; i < s; i++) {
@@ -138,25 +134,17 @@ static inline void expand(const Equation *q, npy_intp k, const double *W, npy_in
         const double *z = W + i * d * length + place;
         const double *p = added && q->p.from != NULL ? at(q->p, point) : NULL;
         for (npy_intp c = 0; c < n; c++, out += width) {
-            if (q->T.from == NULL) {
+            const double *offset = p == NULL ? NULL : p + c * width;
+            if (q->T.from == NULL)
                 memcpy(out, z + c * length, width * sizeof(double));
-            } else {
-                const double *T = at(q->T, point) + c * d;
-                for (npy_intp j = 0; j < width; j++)
-                    out[j] = 0.0;
-                for (npy_intp e = 0; e < d; e++)
-                    for (npy_intp j = 0; j < width; j++)
-                        out[j] += T[e] * z[e * length + j];
-            }
-            if (p != NULL)
-                for (npy_intp j = 0; j < width; j++)
-                    out[j] += p[c * width + j];
+            else
+                combine(out, offset, at(q->T, point) + c * d, d, z, length, width);
         }
     }
 }
 
 /* Elements 0 … count − 1, one system each; 0 if one is singular. */
-EVERY_WIDTH static int distinct_elements(const Equation *q, npy_intp count, double *W,
+static int distinct_elements(const Equation *q, npy_intp count, double *W,
                                          double *homogeneous, double *particular)
 {
     const npy_intp m = q->s * q->d, n = q->n, sides = n + q->columns;
@@ -165,6 +153,7 @@ EVERY_WIDTH static int distinct_elements(const Equation *q, npy_intp count, doub
         for (npy_intp i = 0; i < m; i++)
             for (npy_intp j = m + sides; j < length; j++)
                 W[i * length + j] = 0.0;
+        lengthen(q, k);
         assemble(q, k, W, length);
         drive(q, k, W, length, m + n);
         if (!eliminate(W, m, sides))
@@ -177,7 +166,7 @@ EVERY_WIDTH static int distinct_elements(const Equation *q, npy_intp count, doub
 
 /* Elements of one length under constant E, A and T: one system for all, whose responses to the
    left end are the same; 0 if it is singular. */
-EVERY_WIDTH static int equal_elements(const Equation *q, const int *members, npy_intp count,
+static int equal_elements(const Equation *q, const int *members, npy_intp count,
                                       double *W, double *homogeneous, double *particular)
 {
     const npy_intp m = q->s * q->d, n = q->n, columns = q->columns, sides = n + count * columns;
@@ -185,9 +174,12 @@ EVERY_WIDTH static int equal_elements(const Equation *q, const int *members, npy
     for (npy_intp i = 0; i < m; i++)
         for (npy_intp j = m + sides; j < length; j++)
             W[i * length + j] = 0.0;
+    lengthen(q, members[0]);
     assemble(q, members[0], W, length);
-    for (npy_intp k = 0; k < count; k++)
+    for (npy_intp k = 0; k < count; k++) {
+        lengthen(q, members[k]);
         drive(q, members[k], W, length, m + n + k * columns);
+    }
     if (!eliminate(W, m, sides))
         return 0;
     expand(q, members[0], W, length, m, n, 0, homogeneous);
@@ -244,7 +236,8 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
         !moving(&call, 6, "points, rows or columns of p", points, n, columns, &q.p))
         return failed(&call);
     if ((q.T.from == NULL && !same("rows and columns of A", d, n)) ||
-        (q.T.from != NULL && q.E.from == NULL && !same("constraints without E", 1, 0)))
+        !same("constraints with an offset", q.T.from != NULL, q.p.from != NULL) ||
+        (q.T.from != NULL && !same("constraints with E", 1, q.E.from != NULL)))
         return failed(&call);
     q.D = data(D);
     q.h = data(h);
@@ -253,7 +246,7 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
         longest = q.h[k] > longest ? q.h[k] : longest;
     const int constant = q.A.step == 0 && q.E.step == 0 && q.T.step == 0;
     const npy_intp sides = n + columns * (constant ? K : 1);
-    q.together = scratch(&call, n * m + m + n * columns + d * d);
+    q.together = scratch(&call, (n + 1) * m + s * n * columns + d * d + s * s + columns);
     double *W = q.together ? scratch(&call, m * row_length(m, sides)) : NULL;
     int *members = W ? integers(&call, 2 * K) : NULL;
     PyArrayObject *particular =
@@ -262,7 +255,9 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
         return failed(&call);
     q.coupling = q.together + n * m;
     q.slope = q.coupling + m;
-    q.AT = q.slope + n * columns;
+    q.AT = q.slope + s * n * columns;
+    q.Dh = q.AT + d * d;
+    q.taken = q.Dh + s * s;
     /* The group of one length that each element belongs to, the first element of each group. */
     int groups = 0, *group = members + K;
     for (npy_intp k = 0; constant && k < K; k++) {
@@ -299,27 +294,11 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
 /* --- chaining ----------------------------------------------------------------------------- */
 
 /* out (rows, columns) = a (rows, n) x (n, columns) + b (rows, columns). */
-static inline void affine(double *restrict out, const double *restrict a, const double *restrict x,
-                          const double *restrict b, npy_intp rows, npy_intp n, npy_intp columns)
+static inline void affine(double *out, const double *a, const double *x,
+                          const double *b, npy_intp rows, npy_intp n, npy_intp columns)
 {
-    if (columns == 1) {
-        for (npy_intp i = 0; i < rows; i++) {
-            double sum = 0.0;
-            for (npy_intp e = 0; e < n; e++)
-                sum += a[i * n + e] * x[e];
-            out[i] = sum + b[i];
-        }
-        return;
-    }
-    for (npy_intp i = 0; i < rows; i++, out += columns) {
-        for (npy_intp c = 0; c < columns; c++)
-            out[c] = 0.0;
-        for (npy_intp e = 0; e < n; e++)
-            for (npy_intp c = 0; c < columns; c++)
-                out[c] += a[i * n + e] * x[e * columns + c];
-        for (npy_intp c = 0; c < columns; c++)
-            out[c] += b[i * columns + c];
-    }
+    for (npy_intp i = 0; i < rows; i++)
+        combine(out + i * columns, b + i * columns, a + i * n, n, x, columns, columns);
 }
 
 /* Whether all numbers are finite. */
@@ -329,6 +308,22 @@ static inline int all_finite(const double *values, npy_intp count)
     for (npy_intp i = 0; i < count; i++)
         bad |= !(fabs(values[i]) <= DBL_MAX);
     return !bad;
+}
+
+/* Values (K, s + 1, n, columns) by :func:`chain`; returns how many elements in front are finite. */
+EVERY_WIDTH static npy_intp link_up(double *out, const double *H, npy_intp apart, const double *P,
+                                    const double *state, npy_intp K, npy_intp s, npy_intp n,
+                                    npy_intp columns)
+{
+    const npy_intp block = n * columns;
+    npy_intp whole = 0;
+    for (npy_intp k = 0; k < K; k++, out += (s + 1) * block) {
+        memcpy(out, state, block * sizeof(double));
+        affine(out + block, H + k * apart, out, P + k * s * block, s * n, n, columns);
+        whole += whole == k && all_finite(out, (s + 1) * block);
+        state = out + s * block;
+    }
+    return whole;
 }
 
 /* chain(homogeneous (K or 1, s, n, n), particular (K, s, n, columns), start (n, columns))
@@ -345,7 +340,7 @@ static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t coun
     if (start == NULL)
         return failed(&call);
     const npy_intp K = size(P, 0), s = size(P, 1), n = size(P, 2), columns = size(P, 3);
-    const npy_intp constant = size(H, 0) == 1, block = n * columns;
+    const npy_intp constant = size(H, 0) == 1;
     if ((!constant && !same("elements", size(H, 0), K)) || !same("stages", size(H, 1), s) ||
         !same("components", size(H, 2), n) || !same("components", size(H, 3), n) ||
         !same("components of the start", size(start, 0), n) ||
@@ -354,16 +349,8 @@ static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t coun
     PyArrayObject *values = fresh(&call, 4, (npy_intp[]){K, s + 1, n, columns});
     if (values == NULL)
         return failed(&call);
-    const double *state = data(start);
-    double *out = data(values);
-    npy_intp whole = 0;
-    for (npy_intp k = 0; k < K; k++, out += (s + 1) * block) {
-        const double *h = data(H) + (constant ? 0 : k * s * n * n);
-        memcpy(out, state, block * sizeof(double));
-        affine(out + block, h, out, data(P) + k * s * block, s * n, n, columns);
-        whole += whole == k && all_finite(out, (s + 1) * block);
-        state = out + s * block;
-    }
+    const npy_intp whole = link_up(data(values), data(H), constant ? 0 : s * n * n, data(P),
+                                   data(start), K, s, n, columns);
     PyObject *answer = Py_BuildValue("(On)", (PyObject *)values, (Py_ssize_t)whole);
     failed(&call); /* gives back what was held */
     return answer;
@@ -372,31 +359,6 @@ static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t coun
 /* --- error estimates ---------------------------------------------------------------------- */
 
 #define LAST 4 /* Legendre coefficients that are looked at */
-
-/* The larger one; what is not a number stays. */
-static inline double larger(double a, double b)
-{
-    return a >= b || a != a ? a : b;
-}
-
-/* |last Legendre coefficients| (rows, C) of the point values (points, C) of one element. */
-static inline void coefficients(double *restrict out, const double *to_legendre,
-                                const double *values, npy_intp rows, npy_intp points, npy_intp C)
-{
-    for (npy_intp j = 0; j < rows; j++) {
-        double *restrict row = out + j * C;
-        for (npy_intp c = 0; c < C; c++)
-            row[c] = 0.0;
-        for (npy_intp i = 0; i < points; i++) {
-            const double weight = to_legendre[j * points + i];
-            const double *restrict v = values + i * C;
-            for (npy_intp c = 0; c < C; c++)
-                row[c] += weight * v[c];
-        }
-        for (npy_intp c = 0; c < C; c++)
-            row[c] = fabs(row[c]);
-    }
-}
 
 /* scale (C,) = size (C,), but not below `share` of the largest, nor below `floor`. */
 static void floored(double *scale, const double *size, npy_intp C, double share, double floor)
@@ -427,6 +389,89 @@ static void local_errors(double *local, const double *last, const double *size,
         const double rounding = 4 * DBL_EPSILON * larger(size[c], scale[c] * DBL_EPSILON);
         local[c] = scale[c] * exp(worst + half * (decay > 0.0 ? 0.0 : decay)) + rounding;
     }
+}
+
+/* What :func:`estimates` is of: the arguments, and memory for (K + 14) n columns numbers. */
+typedef struct {
+    npy_intp K, s, n, columns, used, apart; /* apart: numbers between the maps of two elements */
+    const double *H, *V, *to_legendre, *amplified;
+    double floor, share, level;
+    double *work;
+} Ending;
+
+/* Accumulated error, visible noise and rounding into found (3,). */
+EVERY_WIDTH static void judge(const Ending *q, double *found)
+{
+    const npy_intp K = q->K, s = q->s, n = q->n, columns = q->columns, used = q->used;
+    const npy_intp C = n * columns, points = s + 1, rows = points < LAST ? points : LAST;
+    double *work = q->work;
+    double *sizes = work, *whole = sizes + K * C, *scale = whole + C, *last = scale + C;
+    double *noise = last + LAST * C, *local = noise + C, *error = local + C;
+    double *before = error + 2 * C, *worst = before + 2 * C, *brought = worst + C;
+    for (npy_intp c = 0; c < C; c++)
+        whole[c] = noise[c] = worst[c] = brought[c] = 0.0;
+    for (npy_intp k = 0; k < K; k++) {
+        double *restrict own = sizes + k * C;
+        const double *restrict v = q->V + k * points * C;
+        for (npy_intp c = 0; c < C; c++)
+            own[c] = 0.0;
+        for (npy_intp i = 0; i < points; i++, v += C)
+            for (npy_intp c = 0; c < C; c++) {
+                const double one = fabs(v[c]);
+                own[c] = one > own[c] ? one : own[c];
+            }
+        for (npy_intp c = 0; c < C; c++)
+            whole[c] = own[c] > whole[c] ? own[c] : whole[c];
+    }
+    floored(scale, whole, C, q->share, 0.0);
+    const double *to_legendre = q->to_legendre + (points - rows) * points;
+    for (npy_intp k = 0; k < K; k++) {
+        last_coefficients(last, to_legendre, q->V + k * points * C, rows, points, C);
+        for (npy_intp c = 0; s >= LAST && c < C; c++) {
+            const double earlier = larger(last[c], last[C + c]);
+            const double after = larger(last[2 * C + c], last[3 * C + c]);
+            if (after >= q->level * earlier)
+                noise[c] = larger(noise[c], after);
+        }
+        local_errors(local, last + (rows - used) * C, sizes + k * C, scale, s, used, C);
+        /* All signs equal, and alternating. */
+        for (int e = 0; e < 2; e++) {
+            const double sign = e && k % 2 ? -1.0 : 1.0;
+            double *own = error + e * C;
+            for (npy_intp c = 0; c < C; c++)
+                brought[c] = sign * local[c];
+            if (k == 0) {
+                memcpy(own, brought, C * sizeof(double));
+            } else {
+                const double *h = q->H + k * q->apart + (s - 1) * n * n;
+                memcpy(before + e * C, own, C * sizeof(double));
+                affine(own, h, before + e * C, brought, n, n, columns);
+            }
+            for (npy_intp c = 0; c < C; c++)
+                worst[c] = larger(worst[c], fabs(own[c]));
+        }
+    }
+    double propagated = 0.0, visible = 0.0, rounding = 0.0, largest = 0.0;
+    for (npy_intp c = 0; c < C; c++) {
+        propagated = larger(propagated, worst[c] / scale[c]);
+        visible = larger(visible, noise[c] / scale[c]);
+        largest = larger(largest, whole[c]);
+        brought[c] = 0.0;
+    }
+    for (npy_intp i = 0; q->amplified != NULL && i < n; i++)
+        for (npy_intp c = 0; c < columns; c++) {
+            const double *by = q->amplified + i * (n + 1);
+            double sum = 0.0;
+            for (npy_intp e = 0; e < n; e++)
+                sum += by[e] * whole[e * columns + c];
+            brought[i * columns + c] = DBL_EPSILON * (sum + by[n]);
+        }
+    floored(scale, whole, C, q->share, q->floor);
+    for (npy_intp c = 0; c < C; c++)
+        rounding = larger(rounding, (DBL_EPSILON * largest + brought[c]) / scale[c]);
+    found[0] = propagated;
+    found[1] = visible;
+    found[2] = rounding;
 }
 
 /* estimates(homogeneous (K or 1, s, n, n), values (K, s + 1, n, columns), to_legendre, used,
@@ -468,75 +513,18 @@ static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t 
             !same("columns of amplification", size(amplified, 1), n + 1))
             return failed(&call);
     }
-    double *work = scratch(&call, (size_t)(C * (K + 11 + LAST)));
+    double found[3], *work = scratch(&call, (size_t)(C * (K + 14)));
     if (work == NULL)
         return failed(&call);
-    double *sizes = work, *whole = sizes + K * C, *scale = whole + C, *last = scale + C;
-    double *noise = last + LAST * C, *local = noise + C, *error = local + C;
-    double *before = error + 2 * C, *worst = before + 2 * C, *brought = worst + C;
-    for (npy_intp c = 0; c < C; c++)
-        whole[c] = noise[c] = worst[c] = brought[c] = 0.0;
-    for (npy_intp k = 0; k < K; k++) {
-        double *restrict own = sizes + k * C;
-        const double *restrict v = data(V) + k * points * C;
-        for (npy_intp c = 0; c < C; c++)
-            own[c] = 0.0;
-        for (npy_intp i = 0; i < points; i++, v += C)
-            for (npy_intp c = 0; c < C; c++) {
-                const double one = fabs(v[c]);
-                own[c] = one > own[c] ? one : own[c];
-            }
-        for (npy_intp c = 0; c < C; c++)
-            whole[c] = own[c] > whole[c] ? own[c] : whole[c];
-    }
-    floored(scale, whole, C, share, 0.0);
-    const double *to_legendre = data(L) + (points - rows) * points;
-    for (npy_intp k = 0; k < K; k++) {
-        coefficients(last, to_legendre, data(V) + k * points * C, rows, points, C);
-        for (npy_intp c = 0; s >= LAST && c < C; c++) {
-            const double earlier = larger(last[c], last[C + c]);
-            const double after = larger(last[2 * C + c], last[3 * C + c]);
-            if (after >= level * earlier)
-                noise[c] = larger(noise[c], after);
-        }
-        local_errors(local, last + (rows - used) * C, sizes + k * C, scale, s, used, C);
-        /* All signs equal, and alternating. */
-        for (int e = 0; e < 2; e++) {
-            const double sign = e && k % 2 ? -1.0 : 1.0;
-            double *own = error + e * C;
-            for (npy_intp c = 0; c < C; c++)
-                brought[c] = sign * local[c];
-            if (k == 0) {
-                memcpy(own, brought, C * sizeof(double));
-            } else {
-                const double *h = data(H) + ((constant ? 0 : k * s) + s - 1) * n * n;
-                memcpy(before + e * C, own, C * sizeof(double));
-                affine(own, h, before + e * C, brought, n, n, columns);
-            }
-            for (npy_intp c = 0; c < C; c++)
-                worst[c] = larger(worst[c], fabs(own[c]));
-        }
-    }
-    double propagated = 0.0, visible = 0.0, rounding = 0.0, largest = 0.0;
-    for (npy_intp c = 0; c < C; c++) {
-        propagated = larger(propagated, worst[c] / scale[c]);
-        visible = larger(visible, noise[c] / scale[c]);
-        largest = larger(largest, whole[c]);
-        brought[c] = 0.0;
-    }
-    for (npy_intp i = 0; amplified != NULL && i < n; i++)
-        for (npy_intp c = 0; c < columns; c++) {
-            const double *by = data(amplified) + i * (n + 1);
-            double sum = 0.0;
-            for (npy_intp e = 0; e < n; e++)
-                sum += by[e] * whole[e * columns + c];
-            brought[i * columns + c] = DBL_EPSILON * (sum + by[n]);
-        }
-    floored(scale, whole, C, share, floor);
-    for (npy_intp c = 0; c < C; c++)
-        rounding = larger(rounding, (DBL_EPSILON * largest + brought[c]) / scale[c]);
+    const Ending ending = {
+        .K = K, .s = s, .n = n, .columns = columns, .used = used,
+        .apart = constant ? 0 : s * n * n, .H = data(H), .V = data(V), .to_legendre = data(L),
+        .amplified = amplified ? data(amplified) : NULL, .floor = floor, .share = share,
+        .level = level, .work = work,
+    };
+    judge(&ending, found);
     failed(&call); /* gives back what was held */
-    return Py_BuildValue("(ddd)", propagated, visible, rounding);
+    return Py_BuildValue("(ddd)", found[0], found[1], found[2]);
 }
 
 PyMethodDef collocation_kernels[] = {

@@ -1,7 +1,7 @@
 /* Elimination for systems of some tens of unknowns: what LAPACK does, without its calls. */
-#include "elimination.h"
+#include "elements.h"
 
-#define PANEL 4 /* columns eliminated at once: so many rows are subtracted in one pass */
+#include <float.h>
 
 /* Rows a and b of W change places, from a column on. */
 static inline void swap_rows(double *restrict a, double *restrict b, npy_intp from, npy_intp length)
@@ -13,37 +13,60 @@ static inline void swap_rows(double *restrict a, double *restrict b, npy_intp fr
     }
 }
 
-/* Factors of columns k … k + width of W (m rows of `length`) below the diagonal, rows swapped as
-   a whole; only these columns are changed otherwise. 0 if a pivot is zero. */
-static inline int factor_panel(double *W, npy_intp m, npy_intp length, npy_intp k, npy_intp width)
+/* The row from `first` on with the largest number in a column of W. */
+static inline npy_intp largest_in(const double *column, npy_intp m, npy_intp length, npy_intp first)
 {
-    for (npy_intp c = k; c < k + width; c++) {
-        npy_intp best = c;
-        double largest = fabs(W[c * length + c]);
-        for (npy_intp i = c + 1; i < m; i++) {
-            const double one = fabs(W[i * length + c]);
-            if (one > largest) {
-                largest = one;
-                best = i;
-            }
-        }
-        if (largest == 0.0)
-            return 0;
-        if (best != c)
-            swap_rows(W + c * length, W + best * length, k, length);
-        const double *restrict pivot = W + c * length;
-        for (npy_intp i = c + 1; i < m; i++) {
-            double *restrict row = W + i * length;
-            const double factor = row[c] / pivot[c];
-            row[c] = factor;
-            for (npy_intp j = c + 1; j < k + width; j++)
-                row[j] -= factor * pivot[j];
-        }
+    double largest = fabs(column[first * length]), other = 0.0;
+    npy_intp best = first, i = first + 1, second = first;
+    for (; i + 1 < m; i += 2) { /* even and odd rows apart: one need not wait for the other */
+        const double one = fabs(column[i * length]), two = fabs(column[(i + 1) * length]);
+        best = one > largest ? i : best;
+        largest = one > largest ? one : largest;
+        second = two > other ? i + 1 : second;
+        other = two > other ? two : other;
+    }
+    if (i < m && fabs(column[i * length]) > largest) {
+        largest = fabs(column[i * length]);
+        best = i;
+    }
+    return other > largest ? second : best;
+}
+
+/* Eliminates column `c` of the panel at k (0 ≤ c < PANEL, a constant) from the rows below row
+   k + c, within the panel; 0 if its pivot is zero. Rows are swapped as a whole; factors stay where
+   zeros would be. */
+static inline int eliminate_column(double *W, npy_intp m, npy_intp length, npy_intp k, int c)
+{
+    double *pivot = W + (k + c) * length + k;
+    const npy_intp best = largest_in(W + k + c, m, length, k + c);
+    if (best != k + c)
+        swap_rows(pivot, W + best * length + k, 0, length - k);
+    if (pivot[c] == 0.0)
+        return 0;
+    const double reciprocal = 1.0 / pivot[c];
+    const int divide = !(fabs(reciprocal) <= DBL_MAX);
+    double taken[PANEL];
+    memcpy(taken, pivot, sizeof(taken));
+    for (npy_intp i = k + c + 1; i < m; i++) {
+        double *row = W + i * length + k;
+        const double factor = divide ? row[c] / taken[c] : row[c] * reciprocal;
+        row[c] = factor;
+        for (int j = c + 1; j < PANEL; j++)
+            row[j] -= factor * taken[j];
     }
     return 1;
 }
 
-/* The rows of a panel at k of `width`, right of it: each minus what those above take away. */
+/* The first `width` columns of the panel at k, all of whose columns are brought up to date. */
+static inline int factor_panel(double *W, npy_intp m, npy_intp length, npy_intp k, npy_intp width)
+{
+    return eliminate_column(W, m, length, k, 0) &&
+           (width < 2 || eliminate_column(W, m, length, k, 1)) &&
+           (width < 3 || eliminate_column(W, m, length, k, 2)) &&
+           (width < 4 || eliminate_column(W, m, length, k, 3));
+}
+
+/* The rows of the panel at k, right of it: each minus what those above take away. */
 static inline void finish_rows(double *W, npy_intp length, npy_intp k, npy_intp width)
 {
     for (npy_intp c = k + 1; c < k + width; c++) {
@@ -51,61 +74,74 @@ static inline void finish_rows(double *W, npy_intp length, npy_intp k, npy_intp 
         for (npy_intp e = k; e < c; e++) {
             const double factor = row[e];
             const double *restrict above = W + e * length;
-            for (npy_intp j = k + width; j < length; j++)
+            for (npy_intp j = k + PANEL; j < length; j++)
                 row[j] -= factor * above[j];
         }
     }
 }
 
-/* X of U X = B for `SIDES` columns of B from `place` on. */
-static inline void back_substitute(double *W, npy_intp m, npy_intp length, npy_intp place)
+/* Rows one and two minus what the rows u of the panel at k take away, from column `next` on. */
+static inline void take_away(double *restrict one, double *restrict two, const double *restrict u,
+                             npy_intp length, npy_intp k, npy_intp next)
 {
-    for (npy_intp i = m - 1; i >= 0; i--) {
-        const double *restrict row = W + i * length;
-        double sum[SIDES];
-        for (int c = 0; c < SIDES; c++)
-            sum[c] = row[place + c];
-        for (npy_intp j = i + 1; j < m; j++) {
-            const double factor = row[j];
-            const double *restrict later = W + j * length + place;
-            for (int c = 0; c < SIDES; c++)
-                sum[c] -= factor * later[c];
+    const double *restrict u1 = u + length, *restrict u2 = u1 + length, *restrict u3 = u2 + length;
+    const double a0 = one[k], a1 = one[k + 1], a2 = one[k + 2], a3 = one[k + 3];
+    const double b0 = two[k], b1 = two[k + 1], b2 = two[k + 2], b3 = two[k + 3];
+    for (npy_intp j = next; j < length; j++) {
+        one[j] = one[j] - a0 * u[j] - a1 * u1[j] - a2 * u2[j] - a3 * u3[j];
+        two[j] = two[j] - b0 * u[j] - b1 * u1[j] - b2 * u2[j] - b3 * u3[j];
+    }
+}
+
+/* The same for all rows first … last − 1. */
+static inline void take_all_away(double *W, npy_intp first, npy_intp last, npy_intp length,
+                                 npy_intp k, npy_intp next)
+{
+    npy_intp i = first;
+    for (; i + 1 < last; i += 2)
+        take_away(W + i * length, W + (i + 1) * length, W + k * length, length, k, next);
+    for (; i < last; i++)
+        for (npy_intp e = k; e < k + PANEL; e++) {
+            double *restrict row = W + i * length;
+            const double factor = row[e];
+            const double *restrict u = W + e * length;
+            for (npy_intp j = next; j < length; j++)
+                row[j] -= factor * u[j];
         }
-        for (int c = 0; c < SIDES; c++)
-            W[i * length + place + c] = sum[c] / row[i];
+}
+
+/* Rows k … k + width − 1 of X where U X = B and the rows below are solved and taken away. */
+static inline void solve_panel(double *W, npy_intp m, npy_intp length, npy_intp k, npy_intp width)
+{
+    for (npy_intp i = k + width - 1; i >= k; i--) {
+        double *restrict row = W + i * length;
+        for (npy_intp e = i + 1; e < k + width; e++) {
+            const double factor = row[e];
+            const double *restrict later = W + e * length;
+            for (npy_intp j = m; j < length; j++)
+                row[j] -= factor * later[j];
+        }
+        const double pivot = row[i];
+        for (npy_intp j = m; j < length; j++)
+            row[j] /= pivot;
     }
 }
 
 EVERY_WIDTH int eliminate(double *W, npy_intp m, npy_intp columns)
 {
     const npy_intp length = row_length(m, columns);
-    for (npy_intp k = 0; k < m; k += PANEL) {
-        const npy_intp width = m - k < PANEL ? m - k : PANEL, next = k + width;
+    for (npy_intp k = 0; k < m; k += PANEL) { /* the last panel may be narrow: nothing is below */
+        const npy_intp width = m - k < PANEL ? m - k : PANEL;
         if (!factor_panel(W, m, length, k, width))
             return 0;
         finish_rows(W, length, k, width);
-        if (width < PANEL)
-            break; /* the last one: nothing is below */
-        const double *restrict u0 = W + k * length, *restrict u1 = u0 + length;
-        const double *restrict u2 = u1 + length, *restrict u3 = u2 + length;
-        npy_intp i = next;
-        for (; i + 1 < m; i += 2) {
-            double *restrict one = W + i * length, *restrict two = one + length;
-            const double a0 = one[k], a1 = one[k + 1], a2 = one[k + 2], a3 = one[k + 3];
-            const double b0 = two[k], b1 = two[k + 1], b2 = two[k + 2], b3 = two[k + 3];
-            for (npy_intp j = next; j < length; j++) {
-                one[j] = one[j] - a0 * u0[j] - a1 * u1[j] - a2 * u2[j] - a3 * u3[j];
-                two[j] = two[j] - b0 * u0[j] - b1 * u1[j] - b2 * u2[j] - b3 * u3[j];
-            }
-        }
-        for (; i < m; i++) {
-            double *restrict row = W + i * length;
-            const double a0 = row[k], a1 = row[k + 1], a2 = row[k + 2], a3 = row[k + 3];
-            for (npy_intp j = next; j < length; j++)
-                row[j] = row[j] - a0 * u0[j] - a1 * u1[j] - a2 * u2[j] - a3 * u3[j];
-        }
+        take_all_away(W, k + PANEL, m, length, k, k + PANEL);
     }
-    for (npy_intp place = m; place < length; place += SIDES)
-        back_substitute(W, m, length, place);
+    npy_intp k = m;
+    for (; k >= PANEL; k -= PANEL) {
+        solve_panel(W, m, length, k - PANEL, PANEL);
+        take_all_away(W, 0, k - PANEL, length, k - PANEL, m);
+    }
+    solve_panel(W, m, length, 0, k);
     return 1;
 }

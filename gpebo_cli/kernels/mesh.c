@@ -1,43 +1,17 @@
 /* gpebo_cli/collocation/mesh.py: signals on a mesh, how well it resolves them, sampling, filters. */
-#include "elimination.h"
+#include "elements.h"
 
 #include <float.h>
 
-/* The larger one; what is not a number stays. */
-static inline double larger(double a, double b)
-{
-    return a >= b || a != a ? a : b;
-}
-
 /* --- how well a mesh resolves signals ----------------------------------------------------- */
 
-/* Adds to worst (used,) one kind's values (points, c) of one element: its last Legendre
-   coefficients, relative to the components' scale (c,). */
-static inline void add_ratios(double *worst, const double *to_legendre, npy_intp used,
-                              npy_intp points, const double *values, const double *scale,
-                              double *restrict row, npy_intp c)
-{
-    for (npy_intp j = 0; j < used; j++) {
-        for (npy_intp b = 0; b < c; b++)
-            row[b] = 0.0;
-        for (npy_intp i = 0; i < points; i++) {
-            const double weight = to_legendre[j * points + i];
-            const double *restrict v = values + i * c;
-            for (npy_intp b = 0; b < c; b++)
-                row[b] += weight * v[b];
-        }
-        for (npy_intp b = 0; b < c; b++)
-            worst[j] = larger(worst[j], fabs(row[b]) / scale[b]);
-    }
-}
-
-/* worst (K, used) of one kind, values (K, points, c); `work` holds (K + 2) c numbers. */
+/* worst (K, used) of one kind, values (K, points, c); `work` holds (K + 1 + used) c numbers. */
 EVERY_WIDTH static void tails_of_kind(double *worst, const double *to_legendre, npy_intp used,
                                       npy_intp K, npy_intp points, const double *values,
                                       npy_intp c, double floor, double foot, double share,
                                       double *work)
 {
-    double *scale = work + K * c, *row = scale + c;
+    double *scale = work + K * c, *last = scale + c;
     for (npy_intp k = 0; k < K; k++) { /* largest value of each component so far */
         double *restrict own = work + k * c;
         const double *restrict v = values + k * points * c;
@@ -57,8 +31,13 @@ EVERY_WIDTH static void tails_of_kind(double *worst, const double *to_legendre, 
         const double level = larger(share * largest, floor);
         for (npy_intp b = 0; b < c; b++)
             scale[b] = larger(scale[b], level);
-        add_ratios(worst + k * used, to_legendre, used, points, values + k * points * c, scale,
-                   row, c);
+        last_coefficients(last, to_legendre, values + k * points * c, used, points, c);
+        for (npy_intp j = 0; j < used; j++) {
+            double most = worst[k * used + j];
+            for (npy_intp b = 0; b < c; b++)
+                most = larger(most, last[j * c + b] / scale[b]);
+            worst[k * used + j] = most;
+        }
     }
 }
 
@@ -99,10 +78,10 @@ static PyObject *tails(PyObject *module, PyObject *const *given, Py_ssize_t coun
         most = size(kind, 2) > most ? size(kind, 2) : most;
     }
     PyArrayObject *tail = fresh(&call, 1, &K);
-    double *work = tail ? scratch(&call, (size_t)((K + 2) * most + K * used)) : NULL;
+    double *work = tail ? scratch(&call, (size_t)((K + 1 + used) * most + K * used)) : NULL;
     if (work == NULL)
         return failed(&call);
-    double *worst = work + (K + 2) * most;
+    double *worst = work + (K + 1 + used) * most;
     for (npy_intp i = 0; i < K * used; i++)
         worst[i] = 0.0;
     const double *rows = data(L) + (points - used) * points;
@@ -233,22 +212,7 @@ EVERY_WIDTH static void weighted_sums(double *out, const npy_intp *element, cons
 {
     for (npy_intp i = 0; i < N; i++, weights += points, out += c) {
         const double *v = values + element[i] * points * c;
-        if (c == 1) {
-            double sum = 0.0;
-            for (npy_intp j = 0; j < points; j++)
-                sum += weights[j] * v[j];
-            out[0] = sum;
-            continue;
-        }
-        double *restrict row = out;
-        for (npy_intp b = 0; b < c; b++)
-            row[b] = 0.0;
-        for (npy_intp j = 0; j < points; j++, v += c) {
-            const double weight = weights[j];
-            const double *restrict own = v;
-            for (npy_intp b = 0; b < c; b++)
-                row[b] += weight * own[b];
-        }
+        combine(out, NULL, weights, points, v, c, c);
     }
 }
 
@@ -281,6 +245,26 @@ static PyObject *sample(PyObject *module, PyObject *const *given, Py_ssize_t cou
 
 /* --- integrals and filters ---------------------------------------------------------------- */
 
+/* Integrals (K, s + 1, c) of :func:`integral`; `total` (c,) is zero, and NULL for each element's
+   own. */
+EVERY_WIDTH static void integrate(double *out, const double *R, const double *steps,
+                                  const double *values, npy_intp K, npy_intp s, npy_intp c,
+                                  double *total)
+{
+    for (npy_intp k = 0; k < K; k++, values += (s + 1) * c, out += (s + 1) * c) {
+        for (npy_intp b = 0; b < c; b++)
+            out[b] = total ? total[b] : 0.0;
+        for (npy_intp i = 0; i < s; i++) {
+            double *row = out + (i + 1) * c;
+            combine(row, NULL, R + i * s, s, values + c, c, c);
+            for (npy_intp b = 0; b < c; b++)
+                row[b] = steps[k] * row[b] + out[b];
+        }
+        for (npy_intp b = 0; total && b < c; b++)
+            total[b] = out[s * c + b];
+    }
+}
+
 /* integral(R (s, s), steps (K,), values (K, s + 1, c), on)
 
    Integrals (K, s + 1, c) from the left end of each element, or, if `on`, of the first one. */
@@ -300,33 +284,12 @@ static PyObject *integral(PyObject *module, PyObject *const *given, Py_ssize_t c
         !same("columns of R", size(R, 1), s))
         return failed(&call);
     PyArrayObject *integrals = fresh(&call, 3, PyArray_DIMS(values));
-    double *before = integrals ? scratch(&call, 2 * c) : NULL;
-    if (before == NULL)
+    double *total = integrals ? scratch(&call, c) : NULL;
+    if (total == NULL)
         return failed(&call);
-    double *restrict total = before, *restrict sum = before + c;
     for (npy_intp b = 0; b < c; b++)
         total[b] = 0.0;
-    const double *v = data(values);
-    double *out = data(integrals);
-    for (npy_intp k = 0; k < K; k++, v += (s + 1) * c, out += (s + 1) * c) {
-        const double step = data(steps)[k];
-        memcpy(out, total, c * sizeof(double));
-        for (npy_intp i = 0; i < s; i++) {
-            double *restrict row = out + (i + 1) * c;
-            for (npy_intp b = 0; b < c; b++)
-                sum[b] = 0.0;
-            for (npy_intp j = 0; j < s; j++) {
-                const double weight = data(R)[i * s + j];
-                const double *restrict own = v + (j + 1) * c;
-                for (npy_intp b = 0; b < c; b++)
-                    sum[b] += weight * own[b];
-            }
-            for (npy_intp b = 0; b < c; b++)
-                row[b] = step * sum[b] + total[b];
-        }
-        for (npy_intp b = 0; on && b < c; b++)
-            total[b] = out[s * c + b];
-    }
+    integrate(data(integrals), data(R), data(steps), data(values), K, s, c, on ? total : NULL);
     return results(&call, 1, integrals);
 }
 

@@ -1,0 +1,74 @@
+/* What collocation.c and mesh.c share: short sums, and systems of some tens of unknowns. */
+#ifndef GPEBO_ELEMENTS_H
+#define GPEBO_ELEMENTS_H
+
+#include "common.h"
+
+/* One version of a function for each width of the processor's registers, chosen when the module
+   is loaded. All round alike: no loop adds up in another order, nothing is contracted. */
+#if defined(__has_attribute) && defined(__x86_64__) && defined(__GLIBC__) && !defined(GPEBO_PLAIN)
+#if __has_attribute(target_clones)
+#define EVERY_WIDTH __attribute__((target_clones("avx512f", "avx2", "default")))
+#endif
+#endif
+#ifndef EVERY_WIDTH
+#define EVERY_WIDTH
+#endif
+
+/* The larger one; what is not a number stays. */
+static inline double larger(double a, double b)
+{
+    return a >= b || a != a ? a : b;
+}
+
+/* `combine` for a fixed number of columns. */
+#define COMBINE(block)                                                                             \
+    for (; j + block <= width; j += block) {                                                       \
+        double sum[block];                                                                         \
+        for (int c = 0; c < block; c++)                                                            \
+            sum[c] = initial ? initial[j + c] : 0.0;                                               \
+        for (npy_intp e = 0; e < inner; e++)                                                       \
+            for (int c = 0; c < block; c++)                                                        \
+                sum[c] += a[e] * b[e * step + j + c];                                              \
+        for (int c = 0; c < block; c++)                                                            \
+            out[j + c] = sum[c];                                                                   \
+    }
+
+/* out (width,) = initial (width,) or zero + the sum of a[e] times row e of b, rows `step` apart.
+   Sums stay in registers: nearly all matrices here are narrow. */
+static inline void combine(double *out, const double *initial, const double *a, npy_intp inner,
+                           const double *b, npy_intp step, npy_intp width)
+{
+    npy_intp j = 0;
+    COMBINE(16)
+    COMBINE(8)
+    COMBINE(4)
+    COMBINE(1)
+}
+
+/* |last Legendre coefficients| (rows, C) of the point values (points, C) of one element. */
+static inline void last_coefficients(double *out, const double *to_legendre, const double *values,
+                                     npy_intp rows, npy_intp points, npy_intp C)
+{
+    for (npy_intp j = 0; j < rows; j++)
+        combine(out + j * C, NULL, to_legendre + j * points, points, values, C, C);
+    for (npy_intp c = 0; c < rows * C; c++)
+        out[c] = fabs(out[c]);
+}
+
+/* Columns are eliminated in panels of so many, and right-hand sides solved for so many at once. */
+#define PANEL 4
+#define SIDES 8
+
+/* Length of the rows of [A | B] for A (m, m) and B (m, columns): whole blocks of both. */
+static inline npy_intp row_length(npy_intp m, npy_intp columns)
+{
+    const npy_intp sides = (columns + SIDES - 1) / SIDES * SIDES;
+    return (m + sides + PANEL - 1) / PANEL * PANEL;
+}
+
+/* Solves A X = B by elimination with row pivoting. W holds [A | B | 0] in m rows of
+   row_length(m, columns) numbers; A is destroyed and B becomes X. 0 if a pivot is exactly zero. */
+int eliminate(double *W, npy_intp m, npy_intp columns);
+
+#endif
