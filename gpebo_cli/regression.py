@@ -176,7 +176,7 @@ def outer_products(psi: Array, Y: Array) -> Array:
     """[ψᵀψ | ψᵀY] of shape (..., p, p + c) from ψ (..., rows, p) and Y (..., rows[, c])."""
     Y = with_realisations(psi, Y)
     if (
-        kernels.compiled is not None and psi.ndim == 4  # noqa: PLR2004  on a mesh
+        kernels.compiled is not None and psi.ndim == 4  # on a mesh
         and psi.shape[3] + Y.shape[3] <= _FEW_COLUMNS
     ):
         products: Array = kernels.compiled.outer_products(psi, Y)

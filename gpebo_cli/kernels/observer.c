@@ -89,6 +89,11 @@ static void store(double *to, npy_intp times, npy_intp first, const Lane *from, 
                   npy_intp width, npy_intp column, npy_intp columns)
 {
     const npy_intp count = times - first < LANES ? times - first : LANES;
+    if (columns == width) { /* all of it */
+        columns *= rows;
+        width *= rows;
+        rows = 1;
+    }
     for (npy_intp l = 0; l < count; l++) {
         double *one = to + (first + l) * rows * columns;
         for (npy_intp i = 0; i < rows; i++)
@@ -234,12 +239,16 @@ typedef struct {
     Lane most, sum;
 } Largest;
 
-static inline void look_at(Largest *so_far, const double *restrict value)
+static void look_at(Largest *restrict so_far, const Lane *restrict values, npy_intp numbers)
 {
-    for (int l = 0; l < LANES; l++) {
-        const double size = fabs(value[l]);
-        so_far->most[l] = size > so_far->most[l] ? size : so_far->most[l];
-        so_far->sum[l] += size;
+    for (npy_intp i = 0; i < numbers; i++) {
+        if (all_zero(values[i]))
+            continue;
+        for (int l = 0; l < LANES; l++) {
+            const double size = fabs(values[i][l]);
+            so_far->most[l] = size > so_far->most[l] ? size : so_far->most[l];
+            so_far->sum[l] += size;
+        }
     }
 }
 
@@ -258,14 +267,11 @@ static double largest_of(const Largest *so_far)
 static double largest_in(const double *restrict from, npy_intp numbers)
 {
     Largest so_far = {{0}, {0}};
-    npy_intp i = 0;
-    for (; i + LANES <= numbers; i += LANES)
-        look_at(&so_far, from + i);
-    if (i < numbers) {
-        Lane rest = {0};
-        memcpy(rest, from + i, (numbers - i) * sizeof(double));
-        look_at(&so_far, rest);
-    }
+    const npy_intp whole = numbers / LANES;
+    look_at(&so_far, (const Lane *)from, whole);
+    Lane rest = {0};
+    memcpy(rest, from + whole * LANES, (numbers - whole * LANES) * sizeof(double));
+    look_at(&so_far, &rest, 1);
     return largest_of(&so_far);
 }
 
@@ -295,18 +301,21 @@ static PyObject *entry_sizes(PyObject *module, PyObject *const *given, Py_ssize_
         return failed(&call);
     const npy_intp n = size(matrices, 1), m = size(matrices, 2);
     PyArrayObject *out = zeros(&call, 2, (npy_intp[]){n, m});
-    if (out == NULL)
+    double *restrict sum = out == NULL ? NULL : scratch(&call, n * m);
+    if (sum == NULL)
         return failed(&call);
-    double *most = data(out);
-    const double *one = data(matrices);
+    memset(sum, 0, n * m * sizeof(double));
+    double *restrict most = data(out);
+    const double *restrict one = data(matrices);
     for (npy_intp k = 0; k < size(matrices, 0); k++, one += n * m)
         for (npy_intp i = 0; i < n * m; i++) {
             const double entry = fabs(one[i]);
-            if (entry > most[i] || entry != entry)
-                most[i] = entry;
-            else if (most[i] != most[i])
-                most[i] = NAN;
+            most[i] = entry > most[i] ? entry : most[i];
+            sum[i] += entry;
         }
+    for (npy_intp i = 0; i < n * m; i++)
+        if (sum[i] != sum[i])
+            most[i] = NAN;
     return results(&call, 1, out);
 }
 
@@ -350,13 +359,13 @@ typedef struct {
 } Frame;
 
 /* E, A, B, F, C, rows (n,), scale (r,), domain (n, d), range (n, d), kernel (n, b), equations
-   (e, n) -> sizes (4,): the largest entry of E outside the frame and of E itself, the largest
-   norm of UᵀE B and of its inverse; then, as fields of ObserverMatrices and of its split, pinv,
-   algebraic, on_basis, g_signals, G, range, elimination, injectivity, dynamics, from_unknowns,
+   (e, n) -> sizes (5,): the largest entry of E outside the frame; if that is not 0, the largest of
+   E itself; the largest norm of UᵀE B and of its inverse; the smallest injectivity; then, as fields of ObserverMatrices
+   and of its split, pinv, algebraic, on_basis, g_signals, G, range, elimination, injectivity, dynamics, from_unknowns,
    from_signals.
 
    For e + r >= b; the first five are (N or 1, …). Where UᵀE B or 𝒜 on the kernel is singular, the
-   norms and the injectivity are no numbers, infinite or zero. */
+   inverse's norm and the injectivity are infinite, zero or no numbers. */
 static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
@@ -400,7 +409,7 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
     const npy_intp NE = E.times, NA = A.times > C.times ? A.times : C.times;
     const npy_intp NG = B.times > F.times ? B.times : F.times, ND = NE > NA ? NE : NA;
 
-    PyArrayObject *sizes = zeros(&call, 1, (npy_intp[]){4});
+    PyArrayObject *sizes = zeros(&call, 1, (npy_intp[]){5});
     PyArrayObject *pinv = fresh(&call, 3, (npy_intp[]){NE, d, n});
     PyArrayObject *algebraic = fresh(&call, 3, (npy_intp[]){NA, all, n});
     PyArrayObject *on_basis = fresh(&call, 3, (npy_intp[]){NA, all, d});
@@ -435,7 +444,7 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
         next += lengths[i];
     }
 
-    Largest outside = {{0}, {0}}, whole_E = {{0}, {0}}, inner = {{0}, {0}}, inverse = {{0}, {0}};
+    Largest outside = {{0}, {0}}, inner = {{0}, {0}}, inverse = {{0}, {0}};
     for (npy_intp first = 0; first < N; first += LANES) {
         const int new_E = first == 0 || NE > 1, new_A = first == 0 || NA > 1;
         const int new_G = first == 0 || NG > 1, new_D = first == 0 || ND > 1;
@@ -446,10 +455,12 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
             load(to, each[i], first);
             const npy_intp columns = last(each[i], 1);
             for (npy_intp k = 0; k < n; k++)
-                if (rows[k] != 1.0)
+                if (rows[k] != 1.0) {
+                    const double factor = 1.0 / rows[k]; /* powers of two: no rounding */
                     for (npy_intp j = 0; j < columns; j++)
                         for (int l = 0; l < LANES; l++)
-                            to[k * columns + j][l] /= rows[k];
+                            to[k * columns + j][l] *= factor;
+                }
         }
         if (first == 0 || C.times > 1) {
             load(f.C, &C, first);
@@ -460,14 +471,11 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
                             f.C[k * n + j][l] *= scale[k];
         }
         if (new_E) {
-            for (npy_intp i = 0; i < n * n; i++)
-                look_at(&whole_E, f.E[i]);
             Lane *beyond = f.work;
             clear(beyond, n * b + e * n);
             times_constant(beyond, b, f.E, kernel, n, n, b);
             constant_times(beyond + n * b, n, equations, 0, f.E, e, n, n);
-            for (npy_intp i = 0; i < n * b + e * n; i++)
-                look_at(&outside, beyond[i]);
+            look_at(&outside, beyond, n * b + e * n);
             clear(f.work, d * n);
             constant_times(f.work, n, range, 1, f.E, d, n, n);
             clear(f.Q, d * d);
@@ -476,12 +484,12 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
             squares(size_of, f.Q, d * d);
             for (int l = 0; l < LANES; l++)
                 size_of[l] = sqrt(size_of[l]);
-            look_at(&inner, size_of);
+            look_at(&inner, &size_of, 1);
             factorise(f.Q, f.R, f.X, d, d);
             squares(size_of, f.X, d * d);
             for (int l = 0; l < LANES; l++)
                 size_of[l] = sqrt(size_of[l]);
-            look_at(&inverse, size_of);
+            look_at(&inverse, &size_of, 1);
             /* E⁺ = R⁻¹Qᵀ Uᵀ */
             clear(f.work, d * n);
             for (npy_intp i = 0; i < n; i++)
@@ -556,9 +564,21 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
         store(data(signals), N, first, f.whole, d, width, d + q, m + r);
     }
     data(sizes)[0] = largest_of(&outside);
-    data(sizes)[1] = largest_of(&whole_E);
+    if (data(sizes)[0] != 0.0)
+        for (npy_intp k = 0; k < NE * n; k++) {
+            const double most = largest_in(E.at + k * n, n) / rows[k % n];
+            data(sizes)[1] = most > data(sizes)[1] ? most : data(sizes)[1];
+        }
     data(sizes)[2] = largest_of(&inner);
     data(sizes)[3] = largest_of(&inverse);
+    double lowest = INFINITY;
+    for (npy_intp k = 0; k < NA; k++) {
+        const double one = data(injectivity)[k];
+        lowest = one < lowest || one != one ? one : lowest; /* NaN stays: it is below nothing */
+        if (one != one)
+            break;
+    }
+    data(sizes)[4] = lowest;
     return results(&call, 12, sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity,
                    dynamics, unknowns, signals);
 }
@@ -680,15 +700,14 @@ static PyObject *regression_signals(PyObject *module, PyObject *const *given, Py
         lanes_add(terms, columns, left, k, 0, signed_z, columns, rows, k, columns, 1.0);
         for (npy_intp i = 0; i < rows; i++) {
             Lane *row = terms + i * columns;
-            look_at(&in_Y, row[0]);
-            look_at(&in_Y, known[i]);
+            look_at(&in_Y, row, 1);
+            look_at(&in_Y, known + i, 1);
             for (int l = 0; l < LANES; l++)
                 row[0][l] += known[i][l];
             for (npy_intp j = 0; j < q; j++)
                 for (int l = 0; l < LANES; l++)
                     row[1 + j][l] -= of_theta[i * q + j][l];
-            for (npy_intp j = 1; j < columns; j++)
-                look_at(&in_psi, row[j]);
+            look_at(&in_psi, row + 1, columns - 1);
         }
         clear(seen, b * columns);
         lanes_add(seen, columns, range, b, 1, terms, columns, b, rows, columns, 1.0);
@@ -781,7 +800,7 @@ static PyObject *outer_products(PyObject *module, PyObject *const *given, Py_ssi
 }
 
 /* psi (N, rows, p), Y (N, rows) -> the largest entry of each row of them, (rows,) both. */
-static PyObject *row_sizes(PyObject *module, PyObject *const *given, Py_ssize_t count)
+static PyObject *residual_sizes(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
     Call call;
@@ -1385,7 +1404,7 @@ PyMethodDef observer_kernels[] = {
     KERNEL(regression_signals),
     KERNEL(products),
     KERNEL(outer_products),
-    KERNEL(row_sizes),
+    KERNEL(residual_sizes),
     KERNEL(eigenvalues),
     KERNEL(sampled_eigenvalues),
     KERNEL(spectral_norm),

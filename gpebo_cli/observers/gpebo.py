@@ -29,6 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -83,6 +84,11 @@ class Frame:
     range: Array  # (n, n_a) orthonormal, of range E
     kernel: Array  # (n, n_b)
     equations: Array  # (e, n)
+
+    @cached_property
+    def projector(self) -> Array:
+        """P, (n, n)."""
+        return np.asarray(self.domain @ self.domain.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +170,16 @@ class ObserverMatrices:
 Injection = Callable[[ObserverMatrices, Array, Array], Array]
 
 
-def row_sizes(E: Array) -> Array:
-    """Size of each row of E (N, n, n) over the times, shape (n,), one for rows that are zero.
+def row_sizes(entries: Array) -> Array:
+    """Size of each row of E over the times, shape (n,), one for rows that are zero.
 
     Dividing equations by constants changes nothing, but an equation in picofarads would else look
     like a rank deficiency of E. Powers of two: no rounding.
+
+    Args:
+        entries: the size of each entry of E over the times, (n, n).
     """
-    size = _entry_sizes(E).max(axis=1, initial=0.0)
+    size = entries.max(axis=1, initial=0.0)
     return np.asarray(np.exp2(np.rint(np.log2(np.where(size > 0, size, 1.0)))))
 
 
@@ -214,13 +223,14 @@ def observer_matrices(
     if like is not None:
         rows, scale = like.rows, like.output_scale
     else:
-        rows = row_sizes(model.E) if normalise else np.ones(system.n)
+        entries = _entry_sizes(model.E)
+        rows = row_sizes(entries) if normalise else np.ones(system.n)
         scale = np.ones(system.r)
     if output_scale is not None:
         scale = output_scale
-    frame = _axes_frame(model.E) if like is None else like.split.frame
-    if frame is not None and kernels.compiled is not None and system.n <= _SMALL:
-        found = _in_frame(model, rows, scale, frame, rank_tol)
+    if kernels.compiled is not None and system.n <= _SMALL:
+        frame = _axes_frame(entries) if like is None else like.split.frame
+        found = None if frame is None else _in_frame(model, rows, scale, frame, rank_tol)
         if found is not None:
             return found
 
@@ -253,8 +263,8 @@ def _in_frame(
         *model, rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
     )
     rank = frame.domain.shape[1]
-    outside, size, inner, inverse = sizes.tolist()
-    if not (_fits(outside, size, rank, inner, inverse, rank_tol) and injectivity.min() > rank_tol):
+    outside, size, inner, inverse, weakest = sizes.tolist()
+    if not (_fits(outside, size, rank, inner, inverse, rank_tol) and weakest > rank_tol):
         return None
     return ObserverMatrices(
         _split(frame, pinv), rows, scale, dynamics, from_unknowns, from_signals, algebraic,
@@ -318,16 +328,19 @@ def _by_steps(
     )
 
 
-def _axes_frame(E: Array) -> Frame | None:
-    """Coordinate axes where E (N, n, n) has columns and rows that are exactly zero.
+def _axes_frame(entries: Array) -> Frame | None:
+    """Coordinate axes where E has columns and rows that are exactly zero.
 
     As in E = diag(E_a(t), 0); None where there are more of the ones than of the others.
+
+    Args:
+        entries: the size of each entry of E over the times, (n, n).
     """
-    used = _entry_sizes(E) != 0.0  # NaN is not zero
+    used = entries != 0.0  # NaN is not zero
     rows, columns = used.any(axis=1), used.any(axis=0)
-    if rows.sum() != columns.sum():
+    if np.count_nonzero(rows) != np.count_nonzero(columns):
         return None
-    axes = np.eye(E.shape[1])
+    axes = np.eye(len(entries))
     return Frame(axes[:, columns], axes[:, rows], axes[:, ~columns], axes[~rows])
 
 
@@ -337,7 +350,7 @@ def _constant_split(E: Array, states: tuple[str, ...], rank_tol: float) -> Split
     Coordinate axes where columns and rows are exactly zero; else from the singular vectors at the
     first time.
     """
-    frame = _axes_frame(E)
+    frame = _axes_frame(_entry_sizes(E))
     if frame is not None:
         split = split_in_frame(E, frame, rank_tol)
         if split is not None:
@@ -392,10 +405,10 @@ def _fits(
 
 def _split(frame: Frame, pinv: Array) -> Split:
     """The split in a frame, with BᵀE⁺ (N, n_a, n)."""
-    B = frame.domain
     return Split(
-        rank=B.shape[1], basis=B, pinv=pinv, turn=None, equations=frame.equations[None],
-        kernel=frame.kernel[None], projector=(B @ B.T)[None], frame=frame,
+        rank=frame.domain.shape[1], basis=frame.domain, pinv=pinv, turn=None,
+        equations=frame.equations[None], kernel=frame.kernel[None],
+        projector=frame.projector[None], frame=frame,
     )
 
 
@@ -802,20 +815,19 @@ class Assembled:
 
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
+        if regression != "paper":
+            in_psi, in_Y = self._row_sizes()
+            large = (in_psi > _VANISHING * self.psi_scale) | (in_Y > _VANISHING * self.Y_scale)
+            kept: IntArray = large.nonzero()[0]
+            if len(kept):
+                return kept
         rows = self.Y.shape[1]
-        last = np.arange(rows - system.r, rows)
-        if regression == "paper":  # eq. (regpsi)
-            return last
-        in_psi, in_Y = self._row_sizes()
-        kept = np.flatnonzero(
-            (in_psi > _VANISHING * self.psi_scale) | (in_Y > _VANISHING * self.Y_scale)
-        )
-        return kept if len(kept) else last
+        return np.arange(rows - system.r, rows)  # eq. (regpsi)
 
     def _row_sizes(self) -> tuple[Array, Array]:
         """Largest entry of each row of ψ and of Y over the times, (e + r,) both."""
         if kernels.compiled is not None:
-            sizes: tuple[Array, Array] = kernels.compiled.row_sizes(self.psi, self.Y)
+            sizes: tuple[Array, Array] = kernels.compiled.residual_sizes(self.psi, self.Y)
             return sizes
         return np.abs(self.psi).max(axis=(0, 2), initial=0.0), np.abs(self.Y).max(axis=0)
 
