@@ -15,7 +15,7 @@ from gpebo_cli.recordings.load import Recording, load
 from gpebo_cli.result import Assumption, RecordingResult, SimulationResult, StateChange
 from gpebo_cli.settings import Settings, TimeSettings
 from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.verdict import simulation_verdict
 
 _MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
@@ -222,7 +222,7 @@ def _refuse_impulses(system: DescriptorSystem, simulated: SimulationResult) -> N
         )
 
 
-def kept_samples(cases: int, samples: int, max_rows: int) -> Array:
+def kept_samples(cases: int, samples: int, max_rows: int) -> IntArray:
     """Indices of the samples that are kept, evenly spread, first and last among them."""
     count = min(samples, max(2, max_rows // max(cases, 1)))
     if count == samples:

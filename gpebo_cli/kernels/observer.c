@@ -1095,7 +1095,7 @@ static PyObject *weakest(PyObject *module, PyObject *const *given, Py_ssize_t co
         if (!(norm > 0.0) || !isfinite(exact))
             return nothing(&call);
         if (step < 0)
-            limit = exact;
+            limit = exact > bound.at[k] ? exact : bound.at[k];
         else if (exact < value) {
             value = exact;
             place = k;

@@ -499,7 +499,9 @@ def _weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
         return np.asarray(injectivity[which] * norms)
 
     first = np.array([int(np.argmin(injectivity))])
-    candidates = np.flatnonzero(injectivity <= exact(first)[0])
+    # Where n_b = 1 the norms are the same but for rounding, and the first remains a candidate.
+    limit = max(exact(first)[0], injectivity[first[0]])
+    candidates = np.flatnonzero(injectivity <= limit)
     values = exact(candidates)
     k = int(np.argmin(values))
     return float(values[k]), int(candidates[k])
