@@ -18,7 +18,7 @@ from gpebo_cli.systems.descriptor import Array
 
 _SINGULAR = 1e-14  # share of the largest singular value below which one is rounding
 _SYMMETRIC = 1e-8  # below this share of Ω, what is not symmetric is rounding
-SMALL_SPECTRUM = 5  # symmetric matrices up to this size are faster by Jacobi's rotations
+SMALL_SPECTRUM = 16  # size of symmetric matrices, up to which LAPACK's calls cost more than it does
 _FEW_COLUMNS = 32  # of a product, up to which BLAS costs more than what there is to add up
 SURPLUS = 1e4  # integrals: what is known may outweigh what one segment teaches by this factor
 

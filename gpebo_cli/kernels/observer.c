@@ -360,9 +360,9 @@ typedef struct {
 
 /* E, A, B, F, C, rows (n,), scale (r,), domain (n, d), range (n, d), kernel (n, b), equations
    (e, n) -> sizes (5,): the largest entry of E outside the frame; if that is not 0, the largest of
-   E itself; the largest norm of UᵀE B and of its inverse; the smallest injectivity; then, as fields of ObserverMatrices
-   and of its split, pinv, algebraic, on_basis, g_signals, G, range, elimination, injectivity, dynamics, from_unknowns,
-   from_signals.
+   E itself; the largest norm of UᵀE B and of its inverse; the smallest injectivity; then, as
+   fields of ObserverMatrices and of its split, pinv, algebraic, on_basis, g_signals, G, range,
+   elimination, injectivity, dynamics, from_unknowns, from_signals.
 
    For e + r >= b; the first five are (N or 1, …). Where UᵀE B or 𝒜 on the kernel is singular, the
    inverse's norm and the injectivity are infinite, zero or no numbers. */
@@ -842,12 +842,93 @@ static double unit(const double *A, npy_intp numbers)
     return ldexp(1.0, exponent > 1000 ? -1000 : exponent < -1000 ? 1000 : -exponent);
 }
 
-#define NEGLIGIBLE 1e-18 /* entries beside a diagonal, of matrices whose largest one is near 1 */
-#define SWEEPS 60
+/* A symmetric A (p, p), of which the lower triangle counts and is destroyed, made tridiagonal by
+   Householder's reflections, the last row first: diagonal d (p,), beside it e (p,) with e[i]
+   between i and i + 1. */
+static void tridiagonal(double *restrict A, npy_intp p, double *restrict d, double *restrict e)
+{
+    for (npy_intp i = p - 1; i > 0; i--) {
+        double *restrict v = A + i * p, square = 0.0;
+        for (npy_intp k = 0; k < i - 1; k++)
+            square += v[k] * v[k];
+        if (square == 0.0) { /* nothing to reflect */
+            e[i - 1] = v[i - 1];
+            continue;
+        }
+        const double edge = v[i - 1], norm = sqrt(square + edge * edge);
+        e[i - 1] = edge >= 0.0 ? -norm : norm;
+        v[i - 1] = edge - e[i - 1]; /* reflects along v, with vᵀv = 2 half */
+        const double half = norm * (norm + fabs(edge));
+        double along = 0.0;
+        for (npy_intp j = 0; j < i; j++) {
+            double sum = 0.0;
+            for (npy_intp k = 0; k <= j; k++)
+                sum += A[j * p + k] * v[k];
+            for (npy_intp k = j + 1; k < i; k++)
+                sum += A[k * p + j] * v[k];
+            d[j] = sum / half;
+            along += d[j] * v[j];
+        }
+        along /= 2.0 * half;
+        for (npy_intp j = 0; j < i; j++) {
+            d[j] -= along * v[j];
+            for (npy_intp k = 0; k <= j; k++)
+                A[j * p + k] -= v[j] * d[k] + d[j] * v[k];
+        }
+    }
+    for (npy_intp i = 0; i < p; i++)
+        d[i] = A[i * p + i];
+}
+
+#define STEPS 60 /* for one eigenvalue; two are what it takes */
+
+/* Eigenvalues of the tridiagonal matrix with diagonal d (p,), which they replace, and e (p,)
+   beside it, which is destroyed: the QL algorithm with implicit shifts. */
+static void tridiagonal_ql(double *restrict d, double *restrict e, npy_intp p)
+{
+    for (npy_intp low = 0; low < p; low++)
+        for (int step = 0; step < STEPS; step++) {
+            npy_intp high = low;
+            while (high < p - 1 && fabs(e[high]) > 0.5 * DBL_EPSILON * (fabs(d[high]) +
+                                                                        fabs(d[high + 1])))
+                high++;
+            if (high == low)
+                break;
+            double g = (d[low + 1] - d[low]) / (2.0 * e[low]), r = sqrt(g * g + 1.0);
+            g = d[high] - d[low] + e[low] / (g >= 0.0 ? g + r : g - r);
+            double sine = 1.0, cosine = 1.0, shift = 0.0;
+            npy_intp i = high - 1;
+            for (; i >= low; i--) {
+                const double f = sine * e[i], b = cosine * e[i];
+                r = sqrt(f * f + g * g);
+                if (i < p - 1)
+                    e[i + 1] = r;
+                if (r == 0.0) {
+                    d[i + 1] -= shift;
+                    e[high] = 0.0;
+                    break;
+                }
+                const double inverse = 1.0 / r;
+                sine = f * inverse;
+                cosine = g * inverse;
+                g = d[i + 1] - shift;
+                r = (d[i] - g) * sine + 2.0 * cosine * b;
+                shift = sine * r;
+                d[i + 1] = g + shift;
+                g = cosine * r - b;
+            }
+            if (i >= low)
+                continue;
+            d[low] -= shift;
+            e[low] = g;
+            e[high] = 0.0;
+        }
+}
 
 /* Eigenvalues of the symmetric A (p, p), of which the lower triangle counts, ascending to `out`
-   (p,): Jacobi's rotations, whose error is rounding in the largest. 0 if A is not finite. */
-static int eigenvalues_of(double *restrict A, npy_intp p, double *restrict out)
+   (p,), to rounding in the largest; A is destroyed, `beside` is (p,). 0 if A is not finite. */
+static int eigenvalues_of(double *restrict A, npy_intp p, double *restrict out,
+                          double *restrict beside)
 {
     for (npy_intp i = 0; i < p; i++)
         for (npy_intp j = 0; j < i; j++)
@@ -857,34 +938,11 @@ static int eigenvalues_of(double *restrict A, npy_intp p, double *restrict out)
         return 0;
     for (npy_intp i = 0; i < p * p; i++)
         A[i] *= scale;
-    int turned = 1;
-    for (int sweep = 0; turned && sweep < SWEEPS; sweep++) {
-        turned = 0;
-        for (npy_intp i = 1; i < p; i++)
-            for (npy_intp j = 0; j < i; j++) {
-                const double beside = A[i * p + j];
-                if (fabs(beside) <= NEGLIGIBLE)
-                    continue;
-                turned = 1;
-                const double theta = 0.5 * (A[i * p + i] - A[j * p + j]) / beside;
-                const double size = 1.0 / (fabs(theta) + sqrt(theta * theta + 1.0));
-                const double tangent = theta < 0.0 ? -size : size;
-                const double cosine = 1.0 / sqrt(tangent * tangent + 1.0);
-                const double sine = tangent * cosine;
-                A[j * p + j] -= tangent * beside;
-                A[i * p + i] += tangent * beside;
-                A[i * p + j] = A[j * p + i] = 0.0;
-                for (npy_intp k = 0; k < p; k++) {
-                    if (k == i || k == j)
-                        continue;
-                    const double one = A[k * p + j], other = A[k * p + i];
-                    A[k * p + j] = A[j * p + k] = cosine * one - sine * other;
-                    A[k * p + i] = A[i * p + k] = sine * one + cosine * other;
-                }
-            }
-    }
+    tridiagonal(A, p, out, beside);
+    tridiagonal_ql(out, beside, p);
+    const double back = 1.0 / scale; /* a power of two */
     for (npy_intp i = 0; i < p; i++) {
-        const double value = A[i * p + i] / scale;
+        const double value = out[i] * back;
         npy_intp j = i;
         for (; j > 0 && out[j - 1] > value; j--)
             out[j] = out[j - 1];
@@ -910,14 +968,14 @@ static PyObject *eigenvalues(PyObject *module, PyObject *const *given, Py_ssize_
         return failed(&call);
     }
     PyArrayObject *out = fresh(&call, 2, (npy_intp[]){N, p});
-    double *work = out == NULL ? NULL : scratch(&call, p * p);
+    double *work = out == NULL ? NULL : scratch(&call, p * p + p);
     if (work == NULL)
         return failed(&call);
     const double *one = data(A);
     for (npy_intp k = 0; k < N; k++, one += p * c) {
         for (npy_intp i = 0; i < p; i++)
             memcpy(work + i * p, one + i * c, p * sizeof(double));
-        if (!eigenvalues_of(work, p, data(out) + k * p))
+        if (!eigenvalues_of(work, p, data(out) + k * p, work + p * p))
             return nothing(&call);
     }
     return results(&call, 1, out);
@@ -961,13 +1019,13 @@ static PyObject *sampled_eigenvalues(PyObject *module, PyObject *const *given, P
         return failed(&call);
     }
     PyArrayObject *out = fresh(&call, 2, (npy_intp[]){N, p});
-    double *work = out == NULL ? NULL : scratch(&call, p * p);
+    double *work = out == NULL ? NULL : scratch(&call, p * p + p);
     if (work == NULL)
         return failed(&call);
     for (npy_intp k = 0; k < N; k++) {
         combined(work, data(weights) + k * points, data(values) + which[k] * points * p * c,
                  points, p, c);
-        if (!eigenvalues_of(work, p, data(out) + k * p))
+        if (!eigenvalues_of(work, p, data(out) + k * p, work + p * p))
             return nothing(&call);
     }
     return results(&call, 1, out);
@@ -975,7 +1033,7 @@ static PyObject *sampled_eigenvalues(PyObject *module, PyObject *const *given, P
 
 /* ‖A‖₂ of A (rows, columns), whose rows are `apart`, from the eigenvalues of AᵀA or A Aᵀ, of
    which the largest is exact to rounding. −1 if A is not finite. `work` holds rows · columns +
-   m² + m numbers with m = min(rows, columns). */
+   m² + 2 m numbers with m = min(rows, columns). */
 static double norm_of(const double *A, npy_intp rows, npy_intp columns, npy_intp apart,
                       double *work)
 {
@@ -998,7 +1056,7 @@ static double norm_of(const double *A, npy_intp rows, npy_intp columns, npy_intp
                 sum += scaled[i * across + k * along] * scaled[j * across + k * along];
             square[i * m + j] = sum;
         }
-    eigenvalues_of(square, m, values);
+    eigenvalues_of(square, m, values, values + m);
     return sqrt(values[m - 1] > 0.0 ? values[m - 1] : 0.0) / scale;
 }
 
@@ -1022,7 +1080,7 @@ static PyObject *spectral_norm(PyObject *module, PyObject *const *given, Py_ssiz
         return failed(&call);
     }
     const npy_intp m = rows < used ? rows : used;
-    double *work = scratch(&call, rows * used + m * m + m);
+    double *work = scratch(&call, rows * used + m * m + 2 * m);
     if (work == NULL)
         return failed(&call);
     double most = 0.0, frobenius = -1.0;
@@ -1071,7 +1129,7 @@ static PyObject *weakest(PyObject *module, PyObject *const *given, Py_ssize_t co
         return failed(&call);
     const npy_intp N = bound.times, n = last(&H, 2), b = last(&H, 1), m = n < b ? n : b;
     PyArrayObject *out = zeros(&call, 1, (npy_intp[]){2});
-    double *work = out == NULL ? NULL : scratch(&call, n * b + m * m + m);
+    double *work = out == NULL ? NULL : scratch(&call, n * b + m * m + 2 * m);
     if (work == NULL)
         return failed(&call);
     npy_intp lowest = 0;
@@ -1130,8 +1188,15 @@ typedef struct {
     const double *values, *nodes, *barycentric; /* (points, p, c), (points,), (points,) */
     npy_intp points, p, c;
     double left, right;
-    double *weights, *matrix, *eigenvalues; /* (points,), (p, p), (p,) */
+    double *weights, *matrix, *eigenvalues, *beside; /* (points,), (p, p), (p,), (p,) */
 } Element;
+
+/* λ_min of the element's matrix, which is destroyed; NaN if it is not finite. */
+static double smallest(const Element *one)
+{
+    const int found = eigenvalues_of(one->matrix, one->p, one->eigenvalues, one->beside);
+    return found ? one->eigenvalues[0] : NAN;
+}
 
 /* λ_min of the left squares of the values at a time; NaN if they are not finite. */
 static double smallest_at(const Element *one, double t)
@@ -1139,7 +1204,7 @@ static double smallest_at(const Element *one, double t)
     weights_at(one->weights, (t - one->left) / (one->right - one->left), one->nodes,
                one->barycentric, one->points);
     combined(one->matrix, one->weights, one->values, one->points, one->p, one->c);
-    return eigenvalues_of(one->matrix, one->p, one->eigenvalues) ? one->eigenvalues[0] : NAN;
+    return smallest(one);
 }
 
 /* The same at one of the element's points. */
@@ -1148,7 +1213,7 @@ static double smallest_at_point(const Element *one, npy_intp point)
     const double *from = one->values + point * one->p * one->c;
     for (npy_intp i = 0; i < one->p; i++)
         memcpy(one->matrix + i * one->p, from + i * one->c, one->p * sizeof(double));
-    return eigenvalues_of(one->matrix, one->p, one->eigenvalues) ? one->eigenvalues[0] : NAN;
+    return smallest(one);
 }
 
 /* values (K, points, p, c >= p), edges (K + 1,), nodes (points,) in [0, 1], barycentric (points,),
@@ -1183,15 +1248,15 @@ static PyObject *first_time(PyObject *module, PyObject *const *given, Py_ssize_t
         return failed(&call);
     }
     const npy_intp room = points > near ? points : near;
-    double *memory = scratch(&call, points + p * p + p + 3 * room);
+    double *memory = scratch(&call, points + p * p + 2 * p + room);
     if (memory == NULL)
         return failed(&call);
     Element one = {
         .values = data(values), .nodes = data(nodes), .barycentric = data(barycentric),
         .points = points, .p = p, .c = c, .weights = memory, .matrix = memory + points,
-        .eigenvalues = memory + points + p * p,
+        .eigenvalues = memory + points + p * p, .beside = memory + points + p * p + p,
     };
-    double *t = one.eigenvalues + p, *level = t + room;
+    double *t = one.beside + p;
     npy_intp k = 0;
     for (; k < K; k++, one.values += points * p * c) {
         const double reached = smallest_at_point(&one, points - 1);
@@ -1206,23 +1271,27 @@ static PyObject *first_time(PyObject *module, PyObject *const *given, Py_ssize_t
     one.right = data(edges)[k + 1];
     const double horizon = data(edges)[K] - data(edges)[0];
     npy_intp size_of = points;
-    for (npy_intp i = 0; i < points; i++) {
+    for (npy_intp i = 0; i < points; i++)
         t[i] = one.left + (one.right - one.left) * data(nodes)[i];
-        level[i] = smallest_at_point(&one, i) - rho;
-        if (level[i] != level[i])
-            return nothing(&call);
-    }
     t[points - 1] = one.right;
     double high = one.right;
     for (npy_intp round = 0; round < rounds; round++) {
         npy_intp j = 0;
-        while (j < size_of - 1 && !(level[j] >= 0.0))
-            j++;
+        double before = 0.0, here = 0.0; /* λ_min less the level, at j − 1 and j */
+        for (;; j++, before = here) {
+            here = (round == 0 ? smallest_at_point(&one, j) : smallest_at(&one, t[j])) - rho;
+            if (here != here)
+                return nothing(&call);
+            if (here >= 0.0 || j == size_of - 1)
+                break;
+        }
+        if (here < 0.0) /* rounding; it was reached there */
+            here = 0.0;
         const double low = t[j > 0 ? j - 1 : 0];
         high = t[j];
         if (high - low <= resolution * (fabs(high) > horizon ? fabs(high) : horizon))
             break;
-        const double share = level[j - 1] / (level[j - 1] - level[j]);
+        const double share = before / (before - here);
         const double guess = low + (high - low) * (share >= 0.0 && share <= 1.0 ? share : 0.5);
         size_of = 0;
         for (npy_intp i = 0; i < near; i++) {
@@ -1231,13 +1300,6 @@ static PyObject *first_time(PyObject *module, PyObject *const *given, Py_ssize_t
             if (size_of == 0 || at > t[size_of - 1])
                 t[size_of++] = at;
         }
-        for (npy_intp i = 0; i < size_of; i++) {
-            level[i] = smallest_at(&one, t[i]) - rho;
-            if (level[i] != level[i])
-                return nothing(&call);
-        }
-        if (level[size_of - 1] < 0.0) /* rounding; it was reached there */
-            level[size_of - 1] = 0.0;
     }
     return one_number(&call, high);
 }
