@@ -8,15 +8,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
-from gpebo_cli.regression import ExtensionState, LinearRegression, SampledRegression, largest
+from gpebo_cli import kernels
+from gpebo_cli.collocation.mesh import Mesh, Sampler, Trajectory
+from gpebo_cli.regression import (
+    SMALL_SPECTRUM,
+    ExtensionState,
+    LinearRegression,
+    SampledRegression,
+    largest,
+)
 from gpebo_cli.result import Direction, Excitation, Requirement
 from gpebo_cli.settings import ExcitationSettings
 from gpebo_cli.systems.descriptor import Array
 
 RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
 _ROUNDS, _SAME_TIME = 30, 1e-12
-_AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(10.0)])
+_AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -32,15 +39,15 @@ def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings)
     if rho is None:
         rho = RELATIVE_LEVEL * regression.scale**2 * horizon
     window = settings.window if settings.window is not None else horizon / WINDOWS
-    gram = Trajectory(mesh, regression.gram.values[..., :p])
-    eigenvalues = np.maximum(np.linalg.eigvalsh(gram(t)), 0.0)
-    values, vectors = np.linalg.eigh(gram.final)
-    weakest = vectors[:, 0] * np.sign(vectors[np.argmax(np.abs(vectors[:, 0])), 0])
+    gram = regression.gram
+    values, vectors = np.linalg.eigh(gram.final[:, :p])
+    direction = vectors[:, 0].tolist()
+    sign = 1.0 if max(direction, key=abs) >= 0.0 else -1.0
     smallest, largest = max(float(values[0]), 0.0), float(values[-1])
     t_c = _first_time(gram, rho)
     return Excitation(
         t=t,
-        gram_eigenvalues=eigenvalues,
+        gram_eigenvalues=np.maximum(_sampled_eigenvalues(gram, t), 0.0),
         pe_level=segment_level(regression, t, window),
         window=window,
         is_ie=t_c is not None,
@@ -49,24 +56,60 @@ def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings)
         lambda_min=smallest,
         condition=largest / smallest if smallest > 0 else float("inf"),
         weakest_direction=Direction(
-            dict(zip(regression.parameters, map(float, weakest), strict=True))
+            dict(zip(regression.parameters, (sign * part for part in direction), strict=True))
         ),
     )
+
+
+def eigenvalues(matrices: Array) -> Array:
+    """Of symmetric matrices (N, p, p), ascending (N, p); further columns are not looked at."""
+    p = matrices.shape[1]
+    if kernels.compiled is not None and p <= SMALL_SPECTRUM:
+        found: Array | None = kernels.compiled.eigenvalues(matrices)
+        if found is not None:  # else not all is finite
+            return found
+    return np.asarray(np.linalg.eigvalsh(matrices[..., :p]), dtype=np.float64)
+
+
+def _sampled_eigenvalues(gram: Trajectory, t: Array) -> Array:
+    """Of G at the times t (N,), (N, p), from [G | h] (p, p + c)."""
+    p = gram.values.shape[2]
+    if kernels.compiled is not None and p <= SMALL_SPECTRUM:
+        sampler = gram.mesh.sampler(t)
+        found: Array | None = kernels.compiled.sampled_eigenvalues(
+            gram.values, sampler.element, sampler.weights
+        )
+        if found is not None:
+            return found
+    return eigenvalues(Trajectory(gram.mesh, gram.values[..., :p])(t))
 
 
 def _first_time(gram: Trajectory, rho: float) -> float | None:
     """First time with λ_min(G) ≥ ρ: bracketed on the mesh (λ_min never falls), then narrowed.
 
     Each round looks where the secant points, and at distances around it that fall by fours.
+
+    Args:
+        gram: [G | h], shape (p, p + c).
+        rho: the level.
     """
-    mesh = gram.mesh
-    reached = np.flatnonzero(np.linalg.eigvalsh(gram.values[:, -1])[:, 0] >= rho)
-    if rho <= 0 or len(reached) == 0:
+    mesh, p = gram.mesh, gram.values.shape[2]
+    if rho <= 0:
+        return None
+    if kernels.compiled is not None and 0 < p <= SMALL_SPECTRUM:
+        found: float | None = kernels.compiled.first_time(
+            gram.values, mesh.edges, mesh.rule.points, mesh.rule.barycentric, _AROUND, float(rho),
+            _ROUNDS, _SAME_TIME,
+        )
+        if found is not None:  # else not all is finite
+            return found if found > -np.inf else None
+    reached = np.flatnonzero(eigenvalues(gram.values[:, -1])[:, 0] >= rho)
+    if len(reached) == 0:
         return None
     k = int(reached[0])
     points = mesh.points[k]
-    level = np.asarray(np.linalg.eigvalsh(gram.values[k])[:, 0] - rho, dtype=np.float64)
-    element = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
+    level = eigenvalues(gram.values[k])[:, 0] - rho
+    element = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1, :, :, :p])
     for _ in range(_ROUNDS):
         j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
         low, high = float(points[max(j - 1, 0)]), float(points[j])
@@ -75,7 +118,7 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
         share = level[j - 1] / (level[j - 1] - level[j])
         guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
         points = np.unique(np.clip(guess + (high - low) * _AROUND, low, high))
-        level = np.asarray(np.linalg.eigvalsh(element(points))[:, 0] - rho, dtype=np.float64)
+        level = eigenvalues(element(points))[:, 0] - rho
         level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
     return high
 
@@ -88,8 +131,7 @@ def segment_level(regression: LinearRegression, t: Array, window: float) -> Arra
     """
     p = regression.p
     if not regression.resets:
-        outer = Trajectory(regression.mesh, regression.outer.values[..., :p])
-        return window_level(outer, t, window)
+        return window_level(regression.outer, t, window)
     level = np.full(len(t), np.nan)
     start = t - window
     whole = np.flatnonzero(start >= regression.mesh.edges[0] - 1e-12 * max(1.0, window))
@@ -105,7 +147,7 @@ def segment_level(regression: LinearRegression, t: Array, window: float) -> Arra
         here = np.flatnonzero(b > a)
         gram[here] += between(segment.outer, a[here], b[here])
         before = segment
-    level[whole] = np.maximum(np.linalg.eigvalsh(gram[..., :p])[:, 0], 0.0)
+    level[whole] = np.maximum(eigenvalues(gram)[:, 0], 0.0)
     return level
 
 
@@ -114,6 +156,11 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
 
     Whole elements are summed afresh for every window. The difference G(t) − G(t − T) was
     rejected: once a regressor has died out, it is the rounding of two large numbers.
+
+    Args:
+        outer: ψᵀψ, shape (p, p); further columns are not looked at.
+        t: ends of the windows.
+        window: T, in seconds.
     """
     mesh = outer.mesh
     level = np.full(len(t), np.nan)
@@ -121,26 +168,43 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     whole = np.flatnonzero(start >= mesh.edges[0] - 1e-12 * max(1.0, window))
     if len(whole) == 0:
         return level
-    sums = between(outer, np.maximum(start[whole], mesh.edges[0]), t[whole])
-    level[whole] = np.maximum(np.linalg.eigvalsh(sums)[:, 0], 0.0)
+    from_there = mesh.sampler(np.maximum(start[whole], mesh.edges[0]))
+    to_there = mesh.sampler(t)
+    to_there = Sampler(to_there.element[whole], to_there.weights[whole])
+    sums = _window_sums(outer, from_there, to_there, outer.values.shape[2])
+    level[whole] = np.maximum(eigenvalues(sums)[:, 0], 0.0)
     return level
 
 
 def between(signal: Trajectory, a: Array, b: Array) -> Array:
-    """∫ of a signal from a to b ≥ a (N,) within its mesh, whole elements summed afresh."""
+    """∫ of a signal (rows, c) from a to b ≥ a (N,) within its mesh, whole elements summed afresh.
+
+    Returns:
+        shape (N, rows, c).
+    """
     mesh = signal.mesh
-    first = mesh.sampler(a).element
-    last = mesh.sampler(b).element
-    within = signal.local_integral()
-    totals = within.values[:, -1]
-    head = within(a)  # from the left end of a's element to a
-    tail = within(b)
+    return _window_sums(signal, mesh.sampler(a), mesh.sampler(b), signal.values.shape[3])
+
+
+def _window_sums(signal: Trajectory, start: Sampler, stop: Sampler, columns: int) -> Array:
+    """:func:`between` of the first columns, with the times where these samplers look."""
+    mesh = signal.mesh
+    if kernels.compiled is not None:
+        sums: Array = kernels.compiled.window_sums(
+            signal.values, mesh.steps, mesh.rule.integration, columns,
+            start.element, start.weights, stop.element, stop.weights,
+        )
+        return sums
+    within = Trajectory(mesh, signal.values[..., :columns]).local_integral().values
+    totals = within[:, -1]
+    head = start(within)  # from the left end of a's element to a
+    tail = stop(within)
     # Sums of totals[first:last] for every window: pairs of indices to reduceat.
     padded = np.concatenate([totals, np.zeros_like(totals[:1])])
-    pairs = np.stack([first, last], axis=1).ravel().astype(np.intp)
-    sums = np.add.reduceat(padded, pairs, axis=0)[::2]
-    whole = (first < last).reshape(-1, *(1,) * (sums.ndim - 1))
-    return np.asarray(np.where(whole, sums, 0.0) + tail - head)
+    pairs = np.stack([start.element, stop.element], axis=1).ravel().astype(np.intp)
+    whole = np.add.reduceat(padded, pairs, axis=0)[::2]
+    several = (start.element < stop.element)[:, None, None]
+    return np.asarray(np.where(several, whole, 0.0) + tail - head)
 
 
 def sampled_window_level(regression: SampledRegression, window: float) -> Array:
@@ -157,7 +221,7 @@ def sampled_window_level(regression: SampledRegression, window: float) -> Array:
     first = np.searchsorted(t, t[whole] - window + slack, side="right")
     pairs = np.stack([first, whole + 1], axis=1).ravel()
     sums = np.add.reduceat(steps, pairs, axis=0)[::2]
-    level[whole] = np.maximum(np.linalg.eigvalsh(sums)[:, 0], 0.0)
+    level[whole] = np.maximum(eigenvalues(sums)[:, 0], 0.0)
     return level
 
 

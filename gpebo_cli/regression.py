@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.moving import Dynamics, filtered
 from gpebo_cli.result import Requirement
@@ -17,6 +18,8 @@ from gpebo_cli.systems.descriptor import Array
 
 _SINGULAR = 1e-14  # share of the largest singular value below which one is rounding
 _SYMMETRIC = 1e-8  # below this share of Ω, what is not symmetric is rounding
+SMALL_SPECTRUM = 16  # size of symmetric matrices, up to which LAPACK's calls cost more than it does
+_FEW_COLUMNS = 32  # of a product, up to which BLAS costs more than what there is to add up
 SURPLUS = 1e4  # integrals: what is known may outweigh what one segment teaches by this factor
 
 
@@ -171,7 +174,14 @@ class LinearRegression:
 
 def outer_products(psi: Array, Y: Array) -> Array:
     """[ψᵀψ | ψᵀY] of shape (..., p, p + c) from ψ (..., rows, p) and Y (..., rows[, c])."""
-    both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
+    Y = with_realisations(psi, Y)
+    if (
+        kernels.compiled is not None and psi.ndim == 4  # on a mesh
+        and psi.shape[3] + Y.shape[3] <= _FEW_COLUMNS
+    ):
+        products: Array = kernels.compiled.outer_products(psi, Y)
+        return products
+    both = np.concatenate([psi, Y], axis=-1)
     return np.asarray(np.swapaxes(psi, -1, -2) @ both)
 
 
@@ -207,9 +217,19 @@ class SampledRegression:
 
 
 def largest(extended: Array) -> float:
-    """‖Ω‖₂ of [Ω | 𝒴] (..., p, p + 1), the largest of all."""
-    omega = extended[..., :-1]
-    return float(np.linalg.norm(omega, 2, axis=(-2, -1)).max(initial=0.0)) if omega.size else 0.0
+    """‖Ω‖₂ of [Ω | 𝒴] (..., p, p + c), the largest of all."""
+    p = extended.shape[-2]
+    return spectral_norm(extended, p) if extended.size else 0.0
+
+
+def spectral_norm(matrices: Array, columns: int) -> float:
+    """‖·‖₂ of the first columns of matrices (..., a, b), the largest of all."""
+    if kernels.compiled is not None and min(matrices.shape[-2], columns) <= SMALL_SPECTRUM:
+        found: float | None = kernels.compiled.spectral_norm(matrices, columns)
+        if found is not None:  # else not all is finite
+            return found
+    norms = np.linalg.norm(matrices[..., :columns], 2, axis=(-2, -1))
+    return float(norms.max(initial=0.0))
 
 
 class Estimates(Protocol):

@@ -15,7 +15,7 @@ from gpebo_cli.recordings.load import Recording, load
 from gpebo_cli.result import Assumption, RecordingResult, SimulationResult, StateChange
 from gpebo_cli.settings import Settings, TimeSettings
 from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+from gpebo_cli.systems.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.verdict import simulation_verdict
 
 _MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
@@ -203,10 +203,11 @@ def _sample_simulation(
 def _changes(
     system: DescriptorSystem, before: Array, after: Array, time: float
 ) -> list[StateChange]:
-    scale = max(float(np.abs(before).max(initial=0.0)), float(np.abs(after).max(initial=0.0)))
+    given, used = before.tolist(), after.tolist()
+    scale = max(map(abs, (0.0, *given, *used)))
     return [
-        StateChange(state, float(old), float(new), time)
-        for state, old, new in zip(system.states, before, after, strict=True)
+        StateChange(state, old, new, time)
+        for state, old, new in zip(system.states, given, used, strict=True)
         if abs(new - old) > _MOVED * scale
     ]
 
@@ -221,8 +222,10 @@ def _refuse_impulses(system: DescriptorSystem, simulated: SimulationResult) -> N
         )
 
 
-def kept_samples(cases: int, samples: int, max_rows: int) -> Array:
+def kept_samples(cases: int, samples: int, max_rows: int) -> IntArray:
     """Indices of the samples that are kept, evenly spread, first and last among them."""
     count = min(samples, max(2, max_rows // max(cases, 1)))
+    if count == samples:
+        return np.arange(samples)
     return np.unique(np.rint(np.linspace(0, samples - 1, count)).astype(np.intp))
 

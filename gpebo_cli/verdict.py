@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 
 import numpy as np
 
 from gpebo_cli.result import EstimationResult, Excitation, Fit, Metrics, SimulationResult
+from gpebo_cli.systems.descriptor import Array
 
 
 def verdict(
@@ -27,10 +29,11 @@ def verdict(
             f"{excitation.rho:.2g}; not excited: {excitation.weakest_direction}"
         )
     parts = [first]
-    if np.isfinite(metrics.final_error_states).any():
-        best = _best_case(metrics)
+    judged = _best_case(metrics)
+    if judged is not None:
+        best = judged
         seconds = metrics.seconds_to_1pct_states[best]
-        reached = f"below 1 % after {seconds:.4g} s" if np.isfinite(seconds) else "never below 1 %"
+        reached = f"below 1 % after {seconds:.4g} s" if isfinite(seconds) else "never below 1 %"
         parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end, {reached}")
     elif fit is not None:
         best = int(np.argmin(np.where(np.isfinite(fit.residual), fit.residual, np.inf)))
@@ -57,15 +60,25 @@ def simulation_verdict(simulated: SimulationResult) -> str:
     )
 
 
-def _best_case(metrics: Metrics) -> int:
+def _best_case(metrics: Metrics) -> int | None:
     """The first case below 1 % for good; if there is none, the one with the least final error.
 
-    By the final error alone, cases that have all converged would be told apart by rounding.
+    By the final error alone, cases that have all converged would be told apart by rounding. None
+    where the error of no case is a number.
     """
-    seconds, final = metrics.seconds_to_1pct_states, metrics.final_error_states
-    if np.isfinite(seconds).any():
-        return int(np.nanargmin(seconds))
-    return int(np.argmin(np.where(np.isfinite(final), final, np.inf)))
+    least_error = _least(metrics.final_error_states)
+    if least_error is None:
+        return None
+    first = _least(metrics.seconds_to_1pct_states)
+    return least_error if first is None else first
+
+
+def _least(values: Array) -> int | None:
+    """Place of the least finite value of (g,), None if there is none."""
+    if len(values) == 1:
+        return 0 if isfinite(values[0]) else None
+    place = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
+    return place if isfinite(values[place]) else None
 
 
 def _case_label(case: Mapping[str, float]) -> str:

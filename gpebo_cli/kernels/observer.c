@@ -1,6 +1,1478 @@
-/* gpebo_cli/observers, excitation.py, regression.py. */
+/* gpebo_cli/observers, excitation.py, regression.py.
+
+   Matrices at many times are worked on LANES times at once, entry by entry: the innermost loop has
+   a length that the compiler knows, and entries that are zero at all these times cost nothing.
+   "(N or 1, …)" is an argument that may be constant in time. */
 #include "common.h"
 
+#include <float.h>
+
+#define LANES 8
+typedef double Lane[LANES]; /* one entry at LANES times */
+
+/* A stack of matrices or vectors, one per time. */
+typedef struct {
+    PyArrayObject *array;
+    double *at;
+    npy_intp times;   /* product of the leading axes */
+    npy_intp numbers; /* per time */
+} Stack;
+
+/* The double that an argument is; 0 with an exception. */
+static int number(Call *call, Py_ssize_t place, double *value)
+{
+    *value = PyFloat_AsDouble(call->given[place]);
+    return !(*value == -1.0 && PyErr_Occurred() != NULL);
+}
+
+/* The integer that an argument is; 0 with an exception, also for a negative one. */
+static int count_of(Call *call, Py_ssize_t place, npy_intp *value)
+{
+    *value = PyLong_AsSsize_t(call->given[place]);
+    if (*value >= 0)
+        return 1;
+    if (PyErr_Occurred() == NULL)
+        PyErr_Format(PyExc_ValueError, "argument %zd is negative", place);
+    return 0;
+}
+
+/* An array with `axes` axes after those of time, which are one, (N, …), or two, (K, s + 1, …). */
+static int stack(Call *call, Py_ssize_t place, int axes, Stack *out)
+{
+    PyObject *given = call->given[place];
+    const int two = PyArray_Check(given) && PyArray_NDIM((PyArrayObject *)given) == axes + 2;
+    out->array = doubles(call, place, axes + 1 + two);
+    if (out->array == NULL)
+        return 0;
+    out->at = data(out->array);
+    out->times = size(out->array, 0) * (two ? size(out->array, 1) : 1);
+    out->numbers = 1;
+    for (int i = 0; i < axes; i++)
+        out->numbers *= size(out->array, 1 + two + i);
+    return 1;
+}
+
+/* Length of an axis after those of time, counted from the end: 1 is the last one. */
+static npy_intp last(const Stack *one, int axis)
+{
+    return size(one->array, PyArray_NDIM(one->array) - axis);
+}
+
+/* Whether a stack has as many times as it should, or one. */
+static int lasting(const char *what, const Stack *one, npy_intp times)
+{
+    return one->times == 1 || same(what, one->times, times);
+}
+
+/* The entries at the times first, first + 1, …; beyond the end, those at the end. */
+static void load(Lane *to, const Stack *from, npy_intp first)
+{
+    const npy_intp numbers = from->numbers;
+    for (int l = 0; l < LANES; l++) {
+        const npy_intp at = first + l < from->times ? first + l : from->times - 1;
+        const double *one = from->at + at * numbers;
+        for (npy_intp i = 0; i < numbers; i++)
+            to[i][l] = one[i];
+    }
+}
+
+/* :func:`load` of what depends on time, or of what does not, for the first block only. */
+static void refresh(Lane *to, const Stack *from, npy_intp first)
+{
+    if (first == 0 || from->times > 1)
+        load(to, from, first);
+}
+
+/* Writes `columns` of each row of (rows, width) entries from `column` on to (times, rows,
+   columns). */
+static void store(double *to, npy_intp times, npy_intp first, const Lane *from, npy_intp rows,
+                  npy_intp width, npy_intp column, npy_intp columns)
+{
+    const npy_intp count = times - first < LANES ? times - first : LANES;
+    if (columns == width) { /* all of it */
+        columns *= rows;
+        width *= rows;
+        rows = 1;
+    }
+    for (npy_intp l = 0; l < count; l++) {
+        double *one = to + (first + l) * rows * columns;
+        for (npy_intp i = 0; i < rows; i++)
+            for (npy_intp j = 0; j < columns; j++)
+                one[i * columns + j] = from[i * width + column + j][l];
+    }
+}
+
+static void clear(Lane *out, npy_intp numbers)
+{
+    memset(out, 0, numbers * sizeof(Lane));
+}
+
+static inline int all_zero(const double *restrict a)
+{
+    double any = 0.0;
+    for (int l = 0; l < LANES; l++)
+        any += fabs(a[l]); /* a NaN is not zero */
+    return any == 0.0;
+}
+
+/* C (rows, columns; row length c) += sign A B, with A (rows, inner; row length a) or, if
+   `turned`, Aᵀ of A (inner, rows; row length a), and B (inner, columns; row length b). */
+static void lanes_add(Lane *restrict C, npy_intp c, const Lane *restrict A, npy_intp a,
+                      int turned, const Lane *restrict B, npy_intp b, npy_intp rows,
+                      npy_intp inner, npy_intp columns, double sign)
+{
+    for (npy_intp i = 0; i < rows; i++)
+        for (npy_intp k = 0; k < inner; k++) {
+            const double *restrict factor = turned ? A[k * a + i] : A[i * a + k];
+            if (all_zero(factor))
+                continue;
+            Lane signed_factor;
+            for (int l = 0; l < LANES; l++)
+                signed_factor[l] = sign * factor[l];
+            for (npy_intp j = 0; j < columns; j++) {
+                double *restrict out = C[i * c + j];
+                const double *restrict right = B[k * b + j];
+                for (int l = 0; l < LANES; l++)
+                    out[l] += signed_factor[l] * right[l];
+            }
+        }
+}
+
+/* C (rows, columns; row length c) += A M for a constant M (inner, columns). */
+static void times_constant(Lane *restrict C, npy_intp c, const Lane *restrict A,
+                           const double *restrict M, npy_intp rows, npy_intp inner,
+                           npy_intp columns)
+{
+    for (npy_intp k = 0; k < inner; k++)
+        for (npy_intp j = 0; j < columns; j++) {
+            const double m = M[k * columns + j];
+            if (m == 0.0)
+                continue;
+            for (npy_intp i = 0; i < rows; i++) {
+                double *restrict out = C[i * c + j];
+                const double *restrict left = A[i * inner + k];
+                for (int l = 0; l < LANES; l++)
+                    out[l] += m * left[l];
+            }
+        }
+}
+
+/* C (rows, columns; row length c) += M A for a constant M (rows, inner), or Mᵀ of M (inner, rows)
+   if `turned`, and A (inner, columns). */
+static void constant_times(Lane *restrict C, npy_intp c, const double *restrict M, int turned,
+                           const Lane *restrict A, npy_intp rows, npy_intp inner,
+                           npy_intp columns)
+{
+    for (npy_intp i = 0; i < rows; i++)
+        for (npy_intp k = 0; k < inner; k++) {
+            const double m = turned ? M[k * rows + i] : M[i * inner + k];
+            if (m == 0.0)
+                continue;
+            for (npy_intp j = 0; j < columns; j++) {
+                double *restrict out = C[i * c + j];
+                const double *restrict right = A[k * columns + j];
+                for (int l = 0; l < LANES; l++)
+                    out[l] += m * right[l];
+            }
+        }
+}
+
+/* The sum of squares of some entries at each of the times. */
+static void squares(double *restrict out, const Lane *restrict A, npy_intp numbers)
+{
+    for (int l = 0; l < LANES; l++)
+        out[l] = 0.0;
+    for (npy_intp i = 0; i < numbers; i++)
+        for (int l = 0; l < LANES; l++)
+            out[l] += A[i][l] * A[i][l];
+}
+
+/* Q R = A with orthonormal Q (rows, columns) in the place of A and X = R⁻¹ (columns, columns).
+
+   Gram-Schmidt, twice: Q is orthonormal to rounding unless A is rank-deficient to rounding, which
+   a large X shows (or entries that are no numbers, where a column vanishes). */
+static void factorise(Lane *restrict A, Lane *restrict R, Lane *restrict X, npy_intp rows,
+                      npy_intp columns)
+{
+    clear(R, columns * columns);
+    clear(X, columns * columns);
+    for (npy_intp j = 0; j < columns; j++) {
+        for (int pass = 0; pass < 2; pass++)
+            for (npy_intp k = 0; k < j; k++) {
+                Lane along = {0};
+                for (npy_intp i = 0; i < rows; i++)
+                    for (int l = 0; l < LANES; l++)
+                        along[l] += A[i * columns + k][l] * A[i * columns + j][l];
+                if (all_zero(along))
+                    continue;
+                for (npy_intp i = 0; i < rows; i++)
+                    for (int l = 0; l < LANES; l++)
+                        A[i * columns + j][l] -= along[l] * A[i * columns + k][l];
+                for (int l = 0; l < LANES; l++)
+                    R[k * columns + j][l] += along[l];
+            }
+        Lane norm = {0};
+        for (npy_intp i = 0; i < rows; i++)
+            for (int l = 0; l < LANES; l++)
+                norm[l] += A[i * columns + j][l] * A[i * columns + j][l];
+        for (int l = 0; l < LANES; l++) {
+            norm[l] = sqrt(norm[l]);
+            X[j * columns + j][l] = 1.0 / norm[l];
+        }
+        for (npy_intp i = 0; i < rows; i++)
+            for (int l = 0; l < LANES; l++)
+                A[i * columns + j][l] /= norm[l];
+        /* Column j of R⁻¹ = −R⁻¹ (the columns before) R_j / R_jj. */
+        for (npy_intp i = 0; i < j; i++) {
+            Lane sum = {0};
+            for (npy_intp k = i; k < j; k++)
+                for (int l = 0; l < LANES; l++)
+                    sum[l] += X[i * columns + k][l] * R[k * columns + j][l];
+            for (int l = 0; l < LANES; l++)
+                X[i * columns + j][l] = -sum[l] / norm[l];
+        }
+    }
+}
+
+/* The largest of numbers so far, which is NaN once one of them was. */
+typedef struct {
+    Lane most, sum;
+} Largest;
+
+static void look_at(Largest *restrict so_far, const Lane *restrict values, npy_intp numbers)
+{
+    for (npy_intp i = 0; i < numbers; i++) {
+        if (all_zero(values[i]))
+            continue;
+        for (int l = 0; l < LANES; l++) {
+            const double size = fabs(values[i][l]);
+            so_far->most[l] = size > so_far->most[l] ? size : so_far->most[l];
+            so_far->sum[l] += size;
+        }
+    }
+}
+
+static double largest_of(const Largest *so_far)
+{
+    double most = 0.0;
+    for (int l = 0; l < LANES; l++) {
+        if (so_far->sum[l] != so_far->sum[l])
+            return NAN;
+        most = so_far->most[l] > most ? so_far->most[l] : most;
+    }
+    return most;
+}
+
+/* The largest of `numbers` doubles, NaN if one of them is. */
+static double largest_in(const double *restrict from, npy_intp numbers)
+{
+    Largest so_far = {{0}, {0}};
+    const npy_intp whole = numbers / LANES;
+    look_at(&so_far, (const Lane *)from, whole);
+    Lane rest = {0};
+    memcpy(rest, from + whole * LANES, (numbers - whole * LANES) * sizeof(double));
+    look_at(&so_far, &rest, 1);
+    return largest_of(&so_far);
+}
+
+/* Ends a call whose result is one double. */
+static PyObject *one_number(Call *call, double value)
+{
+    failed(call);
+    return PyFloat_FromDouble(value);
+}
+
+/* Ends a call that has no answer. */
+static PyObject *nothing(Call *call)
+{
+    failed(call);
+    Py_RETURN_NONE;
+}
+
+/* (N, n, m) -> max over N of |entry|, (n, m). */
+static PyObject *entry_sizes(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 1))
+        return NULL;
+    PyArrayObject *matrices = doubles(&call, 0, 3);
+    if (matrices == NULL)
+        return failed(&call);
+    const npy_intp n = size(matrices, 1), m = size(matrices, 2);
+    PyArrayObject *out = zeros(&call, 2, (npy_intp[]){n, m});
+    double *restrict sum = out == NULL ? NULL : scratch(&call, n * m);
+    if (sum == NULL)
+        return failed(&call);
+    memset(sum, 0, n * m * sizeof(double));
+    double *restrict most = data(out);
+    const double *restrict one = data(matrices);
+    for (npy_intp k = 0; k < size(matrices, 0); k++, one += n * m)
+        for (npy_intp i = 0; i < n * m; i++) {
+            const double entry = fabs(one[i]);
+            most[i] = entry > most[i] ? entry : most[i];
+            sum[i] += entry;
+        }
+    for (npy_intp i = 0; i < n * m; i++)
+        if (sum[i] != sum[i])
+            most[i] = NAN;
+    return results(&call, 1, out);
+}
+
+/* (…, columns), first -> max |entry| of the columns from `first` on, 0 if there are none. */
+static PyObject *largest_entry(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    Stack values;
+    npy_intp first;
+    if (!begin(&call, given, count, 2))
+        return NULL;
+    const int axes = PyArray_Check(given[0]) ? PyArray_NDIM((PyArrayObject *)given[0]) : 0;
+    if (!stack(&call, 0, axes > 1 ? axes - 1 : 1, &values) || !count_of(&call, 1, &first))
+        return failed(&call);
+    const npy_intp columns = last(&values, 1), all = values.times * values.numbers;
+    if (first == 0 || all == 0)
+        return one_number(&call, largest_in(values.at, all));
+    double most = 0.0;
+    for (npy_intp i = 0; i < all; i += columns)
+        for (npy_intp j = first; j < columns; j++) {
+            const double entry = fabs(values.at[i + j]);
+            if (entry != entry)
+                return one_number(&call, NAN);
+            if (entry > most)
+                most = entry;
+        }
+    return one_number(&call, most);
+}
+
+/* What `in_frame` works with at LANES times. */
+typedef struct {
+    Lane *E, *A, *B, *F, *C;            /* (n, n), (n, n), (n, m), (n, q), (r, n) */
+    Lane *Q, *R, *X;                    /* of U'E B: (d, d) each */
+    Lane *pinv;                         /* (d, n) */
+    Lane *algebraic;                    /* (e + r, n) */
+    Lane *through;                      /* (e + r, d + q + m + r): A B | G | g_signals */
+    Lane *Q1, *R1, *X1, *H;             /* (e + r, b), (b, b), (b, b), (n, b) */
+    Lane *Lambda, *whole, *LH, *seen;   /* (d, n), (d, d + q + m + r), (d, b), (b, ...) */
+    Lane *work;
+} Frame;
+
+/* E, A, B, F, C, rows (n,), scale (r,), domain (n, d), range (n, d), kernel (n, b), equations
+   (e, n) -> sizes (5,): the largest entry of E outside the frame; if that is not 0, the largest of
+   E itself; the largest norm of UᵀE B and of its inverse; the smallest injectivity; then, as
+   fields of ObserverMatrices and of its split, pinv, algebraic, on_basis, g_signals, G, range,
+   elimination, injectivity, dynamics, from_unknowns, from_signals.
+
+   For e + r >= b; the first five are (N or 1, …). Where UᵀE B or 𝒜 on the kernel is singular, the
+   inverse's norm and the injectivity are infinite, zero or no numbers. */
+static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    Stack E, A, B, F, C;
+    if (!begin(&call, given, count, 11) || !stack(&call, 0, 2, &E) || !stack(&call, 1, 2, &A) ||
+        !stack(&call, 2, 2, &B) || !stack(&call, 3, 2, &F) || !stack(&call, 4, 2, &C))
+        return failed(&call);
+    PyArrayObject *constants[6];
+    for (int i = 0; i < 6; i++)
+        if ((constants[i] = doubles(&call, 5 + i, i < 2 ? 1 : 2)) == NULL)
+            return failed(&call);
+    const npy_intp n = size(constants[0], 0), r = size(constants[1], 0);
+    const npy_intp d = size(constants[2], 1), b = size(constants[4], 1), e = size(constants[5], 0);
+    const npy_intp m = last(&B, 1), q = last(&F, 1), all = e + r, width = d + q + m + r;
+    npy_intp N = 1;
+    const Stack *each[] = {&E, &A, &B, &F, &C};
+    for (int i = 0; i < 5; i++) {
+        N = each[i]->times != 1 ? each[i]->times : N;
+        if (!same("states of the matrices", i < 4 ? last(each[i], 2) : last(each[i], 1), n))
+            return failed(&call);
+    }
+    for (int i = 0; i < 5; i++)
+        if (!lasting("times of the matrices", each[i], N))
+            return failed(&call);
+    if (!same("columns of E", last(&E, 1), n) || !same("columns of A", last(&A, 1), n) ||
+        !same("outputs of C and scale", last(&C, 2), r) ||
+        !same("states of the domain", size(constants[2], 0), n) ||
+        !same("states of the range", size(constants[3], 0), n) ||
+        !same("ranks of domain and range", size(constants[3], 1), d) ||
+        !same("states of the kernel", size(constants[4], 0), n) ||
+        !same("states of the equations", size(constants[5], 1), n))
+        return failed(&call);
+    if (all < b) {
+        PyErr_SetString(PyExc_ValueError, "fewer rows than the kernel has columns");
+        return failed(&call);
+    }
+    const double *rows = data(constants[0]), *scale = data(constants[1]);
+    const double *domain = data(constants[2]), *range = data(constants[3]);
+    const double *kernel = data(constants[4]), *equations = data(constants[5]);
+    const npy_intp NE = E.times, NA = A.times > C.times ? A.times : C.times;
+    const npy_intp NG = B.times > F.times ? B.times : F.times, ND = NE > NA ? NE : NA;
+
+    PyArrayObject *sizes = zeros(&call, 1, (npy_intp[]){5});
+    PyArrayObject *pinv = fresh(&call, 3, (npy_intp[]){NE, d, n});
+    PyArrayObject *algebraic = fresh(&call, 3, (npy_intp[]){NA, all, n});
+    PyArrayObject *on_basis = fresh(&call, 3, (npy_intp[]){NA, all, d});
+    PyArrayObject *g_signals = fresh(&call, 3, (npy_intp[]){NG, all, m + r});
+    PyArrayObject *G = fresh(&call, 3, (npy_intp[]){NG, all, q});
+    PyArrayObject *Q1 = fresh(&call, 3, (npy_intp[]){NA, all, b});
+    PyArrayObject *H = fresh(&call, 3, (npy_intp[]){b ? NA : 1, n, b});
+    PyArrayObject *injectivity = fresh(&call, 1, (npy_intp[]){NA});
+    PyArrayObject *dynamics = fresh(&call, 3, (npy_intp[]){ND, d, d});
+    PyArrayObject *unknowns = fresh(&call, 3, (npy_intp[]){N, d, q});
+    PyArrayObject *signals = fresh(&call, 3, (npy_intp[]){N, d, m + r});
+    const npy_intp lengths[] = {
+        n * n,   n * n,       n * m,         n * q,       r * n, d * d, d * d, d * d,
+        d * n,   all * n,     all * width,   all * b,     b * b, b * b, n * b, d * n,
+        d * width, d * b,     b * width,     n * (n + e + d),
+    };
+    npy_intp total = 0;
+    for (size_t i = 0; i < sizeof(lengths) / sizeof(lengths[0]); i++)
+        total += lengths[i];
+    double *memory = signals == NULL ? NULL : scratch(&call, total * LANES);
+    if (memory == NULL)
+        return failed(&call);
+    Frame f;
+    Lane **places[] = {
+        &f.E,    &f.A,         &f.B,       &f.F,  &f.C,  &f.Q,  &f.R, &f.X,
+        &f.pinv, &f.algebraic, &f.through, &f.Q1, &f.R1, &f.X1, &f.H, &f.Lambda,
+        &f.whole, &f.LH,       &f.seen,    &f.work,
+    };
+    Lane *next = (Lane *)memory;
+    for (size_t i = 0; i < sizeof(lengths) / sizeof(lengths[0]); i++) {
+        *places[i] = next;
+        next += lengths[i];
+    }
+
+    Largest outside = {{0}, {0}}, inner = {{0}, {0}}, inverse = {{0}, {0}};
+    for (npy_intp first = 0; first < N; first += LANES) {
+        const int new_E = first == 0 || NE > 1, new_A = first == 0 || NA > 1;
+        const int new_G = first == 0 || NG > 1, new_D = first == 0 || ND > 1;
+        for (int i = 0; i < 4; i++) {
+            Lane *to = (Lane *[]){f.E, f.A, f.B, f.F}[i];
+            if (first != 0 && each[i]->times == 1)
+                continue;
+            load(to, each[i], first);
+            const npy_intp columns = last(each[i], 1);
+            for (npy_intp k = 0; k < n; k++)
+                if (rows[k] != 1.0) {
+                    const double factor = 1.0 / rows[k]; /* powers of two: no rounding */
+                    for (npy_intp j = 0; j < columns; j++)
+                        for (int l = 0; l < LANES; l++)
+                            to[k * columns + j][l] *= factor;
+                }
+        }
+        if (first == 0 || C.times > 1) {
+            load(f.C, &C, first);
+            for (npy_intp k = 0; k < r; k++)
+                if (scale[k] != 1.0)
+                    for (npy_intp j = 0; j < n; j++)
+                        for (int l = 0; l < LANES; l++)
+                            f.C[k * n + j][l] *= scale[k];
+        }
+        if (new_E) {
+            Lane *beyond = f.work;
+            clear(beyond, n * b + e * n);
+            times_constant(beyond, b, f.E, kernel, n, n, b);
+            constant_times(beyond + n * b, n, equations, 0, f.E, e, n, n);
+            look_at(&outside, beyond, n * b + e * n);
+            clear(f.work, d * n);
+            constant_times(f.work, n, range, 1, f.E, d, n, n);
+            clear(f.Q, d * d);
+            times_constant(f.Q, d, f.work, domain, d, n, d);
+            Lane size_of;
+            squares(size_of, f.Q, d * d);
+            for (int l = 0; l < LANES; l++)
+                size_of[l] = sqrt(size_of[l]);
+            look_at(&inner, &size_of, 1);
+            factorise(f.Q, f.R, f.X, d, d);
+            squares(size_of, f.X, d * d);
+            for (int l = 0; l < LANES; l++)
+                size_of[l] = sqrt(size_of[l]);
+            look_at(&inverse, &size_of, 1);
+            /* E⁺ = R⁻¹Qᵀ Uᵀ */
+            clear(f.work, d * n);
+            for (npy_intp i = 0; i < n; i++)
+                for (npy_intp k = 0; k < d; k++) {
+                    const double u = range[i * d + k];
+                    if (u == 0.0)
+                        continue;
+                    for (npy_intp j = 0; j < d; j++)
+                        for (int l = 0; l < LANES; l++)
+                            f.work[j * n + i][l] += u * f.Q[k * d + j][l];
+                }
+            clear(f.pinv, d * n);
+            lanes_add(f.pinv, n, f.X, d, 0, f.work, n, d, d, n, 1.0);
+            store(data(pinv), NE, first, f.pinv, d, n, 0, n);
+        }
+        if (new_A) {
+            clear(f.algebraic, e * n);
+            constant_times(f.algebraic, n, equations, 0, f.A, e, n, n);
+            memcpy(f.algebraic + e * n, f.C, r * n * sizeof(Lane));
+            store(data(algebraic), NA, first, f.algebraic, all, n, 0, n);
+            for (npy_intp i = 0; i < all; i++)
+                clear(f.through + i * width, d);
+            times_constant(f.through, width, f.algebraic, domain, all, n, d);
+            store(data(on_basis), NA, first, f.through, all, width, 0, d);
+            clear(f.Q1, all * b);
+            times_constant(f.Q1, b, f.algebraic, kernel, all, n, b);
+            factorise(f.Q1, f.R1, f.X1, all, b);
+            store(data(Q1), NA, first, f.Q1, all, b, 0, b);
+            clear(f.H, n * b);
+            constant_times(f.H, b, kernel, 0, f.X1, n, b, b);
+            if (b)
+                store(data(H), NA, first, f.H, n, b, 0, b);
+            Lane norm, bound;
+            squares(norm, f.algebraic, all * n);
+            squares(bound, f.X1, b * b);
+            for (int l = 0; l < LANES; l++) {
+                const double size_of = sqrt(norm[l]) > DBL_MIN ? sqrt(norm[l]) : DBL_MIN;
+                bound[l] = b ? 1.0 / (sqrt(bound[l]) * size_of) : INFINITY;
+            }
+            store(data(injectivity), NA, first, &bound, 1, 1, 0, 1);
+        }
+        if (new_G) {
+            for (npy_intp i = 0; i < all; i++)
+                clear(f.through + i * width + d, q + m + r);
+            constant_times(f.through + d, width, equations, 0, f.F, e, n, q);
+            constant_times(f.through + d + q, width, equations, 0, f.B, e, n, m);
+            for (npy_intp i = 0; i < r; i++)
+                for (int l = 0; l < LANES; l++)
+                    f.through[(e + i) * width + d + q + m + i][l] = -scale[i];
+            store(data(G), NG, first, f.through, all, width, d, q);
+            store(data(g_signals), NG, first, f.through, all, width, d + q, m + r);
+        }
+        if (first == 0 || NE > 1 || A.times > 1) {
+            clear(f.Lambda, d * n);
+            lanes_add(f.Lambda, n, f.pinv, n, 0, f.A, n, d, n, n, 1.0);
+        }
+        if (new_D) {
+            clear(f.LH, d * b);
+            lanes_add(f.LH, b, f.Lambda, n, 0, f.H, b, d, n, b, 1.0);
+        }
+        /* [A_0 | D_0 | of u and y] = [Λ B | E⁺F | E⁺B, 0] − Λ H Q1ᵀ [𝒜 B | G | g_signals] */
+        clear(f.whole, d * width);
+        times_constant(f.whole, width, f.Lambda, domain, d, n, d);
+        lanes_add(f.whole + d, width, f.pinv, n, 0, f.F, q, d, n, q, 1.0);
+        lanes_add(f.whole + d + q, width, f.pinv, n, 0, f.B, m, d, n, m, 1.0);
+        clear(f.seen, b * width);
+        lanes_add(f.seen, width, f.Q1, b, 1, f.through, width, b, all, width, 1.0);
+        lanes_add(f.whole, width, f.LH, b, 0, f.seen, width, d, b, width, -1.0);
+        if (new_D)
+            store(data(dynamics), ND, first, f.whole, d, width, 0, d);
+        store(data(unknowns), N, first, f.whole, d, width, d, q);
+        store(data(signals), N, first, f.whole, d, width, d + q, m + r);
+    }
+    data(sizes)[0] = largest_of(&outside);
+    if (data(sizes)[0] != 0.0)
+        for (npy_intp k = 0; k < NE * n; k++) {
+            const double most = largest_in(E.at + k * n, n) / rows[k % n];
+            data(sizes)[1] = most > data(sizes)[1] ? most : data(sizes)[1];
+        }
+    data(sizes)[2] = largest_of(&inner);
+    data(sizes)[3] = largest_of(&inverse);
+    double lowest = INFINITY;
+    for (npy_intp k = 0; k < NA; k++) {
+        const double one = data(injectivity)[k];
+        lowest = one < lowest || one != one ? one : lowest; /* NaN stays: it is below nothing */
+        if (one != one)
+            break;
+    }
+    data(sizes)[4] = lowest;
+    return results(&call, 12, sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity,
+                   dynamics, unknowns, signals);
+}
+
+/* from_unknowns (N or 1, k, q), from_signals (N or 1, k, m + r), g_signals (N or 1, rows, m + r),
+   u (N, m), y (N, r), columns -> f (N, k, columns) = [from_signals [u; y] | from_unknowns | 0] and
+   g_y (N, rows) = g_signals [u; y]. */
+static PyObject *driven(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    Stack unknowns, from, g, u, y;
+    npy_intp columns;
+    if (!begin(&call, given, count, 6) || !stack(&call, 0, 2, &unknowns) ||
+        !stack(&call, 1, 2, &from) || !stack(&call, 2, 2, &g) || !stack(&call, 3, 1, &u) ||
+        !stack(&call, 4, 1, &y) || !count_of(&call, 5, &columns))
+        return failed(&call);
+    const npy_intp N = u.times, m = u.numbers, r = y.numbers, k = last(&from, 2);
+    const npy_intp q = last(&unknowns, 1), rows = last(&g, 2);
+    if (!same("times of u and y", N, y.times) || !same("signals", last(&from, 1), m + r) ||
+        !same("signals in g_y", last(&g, 1), m + r) ||
+        !same("coordinates", last(&unknowns, 2), k) ||
+        !lasting("times of from_unknowns", &unknowns, N) ||
+        !lasting("times of from_signals", &from, N) || !lasting("times of g_signals", &g, N))
+        return failed(&call);
+    if (columns < 1 + q) {
+        PyErr_SetString(PyExc_ValueError, "too few columns");
+        return failed(&call);
+    }
+    PyArrayObject *f = zeros(&call, 3, (npy_intp[]){N, k, columns});
+    PyArrayObject *g_y = f == NULL ? NULL : fresh(&call, 2, (npy_intp[]){N, rows});
+    if (g_y == NULL)
+        return failed(&call);
+    double *forcing = data(f), *seen = data(g_y);
+    for (npy_intp t = 0; t < N; t++, forcing += k * columns, seen += rows) {
+        const double *a = u.at + t * m, *b = y.at + t * r;
+        const double *matrix = from.at + (from.times == 1 ? 0 : t) * from.numbers;
+        const double *theta = unknowns.at + (unknowns.times == 1 ? 0 : t) * unknowns.numbers;
+        for (npy_intp i = 0; i < k; i++, matrix += m + r) {
+            double sum = 0.0;
+            for (npy_intp j = 0; j < m; j++)
+                sum += matrix[j] * a[j];
+            for (npy_intp j = 0; j < r; j++)
+                sum += matrix[m + j] * b[j];
+            forcing[i * columns] = sum;
+            for (npy_intp j = 0; j < q; j++)
+                forcing[i * columns + 1 + j] = theta[i * q + j];
+        }
+        matrix = g.at + (g.times == 1 ? 0 : t) * g.numbers;
+        for (npy_intp i = 0; i < rows; i++, matrix += m + r) {
+            double sum = 0.0;
+            for (npy_intp j = 0; j < m; j++)
+                sum += matrix[j] * a[j];
+            for (npy_intp j = 0; j < r; j++)
+                sum += matrix[m + j] * b[j];
+            seen[i] = sum;
+        }
+    }
+    return results(&call, 2, f, g_y);
+}
+
+/* z (N, k, 1 + p), q, basis (n, k), 𝒜B (N or 1, rows, k), g_y (N, rows), G (N or 1, rows, q),
+   Q1 (N or 1, rows, b), H (N or 1, n, b) -> Y (N, rows), psi (N, rows, p), offset (N, n), gain
+   (N, n, p), sizes (2,) of the terms of Y and of psi before they cancel. */
+static PyObject *regression_signals(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    Stack z, A, g, G, Q1, H;
+    npy_intp q;
+    PyArrayObject *basis;
+    if (!begin(&call, given, count, 8) || !stack(&call, 0, 2, &z) || !count_of(&call, 1, &q) ||
+        (basis = doubles(&call, 2, 2)) == NULL || !stack(&call, 3, 2, &A) ||
+        !stack(&call, 4, 1, &g) || !stack(&call, 5, 2, &G) || !stack(&call, 6, 2, &Q1) ||
+        !stack(&call, 7, 2, &H))
+        return failed(&call);
+    const npy_intp N = z.times, k = last(&z, 2), columns = last(&z, 1), p = columns - 1;
+    const npy_intp rows = last(&A, 2), b = last(&Q1, 1), n = size(basis, 0);
+    if (!same("coordinates of z and basis", k, size(basis, 1)) ||
+        !same("coordinates of z and A", k, last(&A, 1)) ||
+        !same("rows of g_y", last(&g, 1), rows) || !same("rows of G", last(&G, 2), rows) ||
+        !same("unknowns of G", last(&G, 1), q) || !same("rows of Q1", last(&Q1, 2), rows) ||
+        !same("states of H", last(&H, 2), n) || !same("columns of H and Q1", last(&H, 1), b) ||
+        !lasting("times of A", &A, N) || !lasting("times of g_y", &g, N) ||
+        !lasting("times of G", &G, N) || !lasting("times of Q1", &Q1, N) ||
+        !lasting("times of H", &H, N))
+        return failed(&call);
+    if (p < q) {
+        PyErr_SetString(PyExc_ValueError, "fewer columns than unknowns");
+        return failed(&call);
+    }
+    PyArrayObject *Y = fresh(&call, 2, (npy_intp[]){N, rows});
+    PyArrayObject *psi = fresh(&call, 3, (npy_intp[]){N, rows, p});
+    PyArrayObject *offset = fresh(&call, 2, (npy_intp[]){N, n});
+    PyArrayObject *gain = fresh(&call, 3, (npy_intp[]){N, n, p});
+    PyArrayObject *sizes = zeros(&call, 1, (npy_intp[]){2});
+    const npy_intp total = z.numbers + A.numbers + g.numbers + G.numbers + Q1.numbers +
+                           H.numbers + (rows + b + n) * columns;
+    double *memory = sizes == NULL ? NULL : scratch(&call, total * LANES);
+    if (memory == NULL)
+        return failed(&call);
+    Lane *signed_z = (Lane *)memory, *left = signed_z + z.numbers, *known = left + A.numbers;
+    Lane *of_theta = known + g.numbers, *range = of_theta + G.numbers;
+    Lane *elimination = range + Q1.numbers, *terms = elimination + H.numbers;
+    Lane *seen = terms + rows * columns, *state = seen + b * columns;
+    Largest in_Y = {{0}, {0}}, in_psi = {{0}, {0}};
+    for (npy_intp first = 0; first < N; first += LANES) {
+        load(signed_z, &z, first);
+        for (npy_intp i = 0; i < k; i++) /* w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ */
+            for (npy_intp j = 1; j < 1 + q; j++)
+                for (int l = 0; l < LANES; l++)
+                    signed_z[i * columns + j][l] = -signed_z[i * columns + j][l];
+        refresh(left, &A, first);
+        refresh(known, &g, first);
+        refresh(of_theta, &G, first);
+        refresh(range, &Q1, first);
+        refresh(elimination, &H, first);
+        clear(terms, rows * columns);
+        lanes_add(terms, columns, left, k, 0, signed_z, columns, rows, k, columns, 1.0);
+        for (npy_intp i = 0; i < rows; i++) {
+            Lane *row = terms + i * columns;
+            look_at(&in_Y, row, 1);
+            look_at(&in_Y, known + i, 1);
+            for (int l = 0; l < LANES; l++)
+                row[0][l] += known[i][l];
+            for (npy_intp j = 0; j < q; j++)
+                for (int l = 0; l < LANES; l++)
+                    row[1 + j][l] -= of_theta[i * q + j][l];
+            look_at(&in_psi, row + 1, columns - 1);
+        }
+        clear(seen, b * columns);
+        lanes_add(seen, columns, range, b, 1, terms, columns, b, rows, columns, 1.0);
+        lanes_add(terms, columns, range, b, 0, seen, columns, rows, b, columns, -1.0);
+        clear(state, n * columns);
+        constant_times(state, columns, data(basis), 0, signed_z, n, k, columns);
+        lanes_add(state, columns, elimination, b, 0, seen, columns, n, b, columns, -1.0);
+        for (npy_intp i = 0; i < n; i++)
+            for (npy_intp j = 1; j < columns; j++)
+                for (int l = 0; l < LANES; l++)
+                    state[i * columns + j][l] = -state[i * columns + j][l];
+        store(data(Y), N, first, terms, rows, columns, 0, 1);
+        store(data(psi), N, first, terms, rows, columns, 1, p);
+        store(data(offset), N, first, state, n, columns, 0, 1);
+        store(data(gain), N, first, state, n, columns, 1, p);
+    }
+    data(sizes)[0] = largest_of(&in_Y);
+    data(sizes)[1] = largest_of(&in_psi);
+    return results(&call, 5, Y, psi, offset, gain, sizes);
+}
+
+/* At N times, ψᵀψ (p, p) to `square` and ψᵀY (p, c) to `right`, whose rows are a and b apart and
+   whose matrices follow upon p rows. */
+static void add_products(double *square, npy_intp a, double *right, npy_intp b,
+                         const double *psi, const double *Y, npy_intp N, npy_intp rows,
+                         npy_intp p, npy_intp c)
+{
+    for (npy_intp t = 0; t < N; t++, square += p * a, right += p * b, psi += rows * p,
+                  Y += rows * c)
+        for (npy_intp i = 0; i < p; i++) {
+            double *restrict one = square + i * a, *restrict other = right + i * b;
+            for (npy_intp j = 0; j < i; j++)
+                one[j] = square[j * a + i];
+            for (npy_intp j = i; j < p; j++) {
+                double sum = 0.0;
+                for (npy_intp k = 0; k < rows; k++)
+                    sum += psi[k * p + i] * psi[k * p + j];
+                one[j] = sum;
+            }
+            for (npy_intp j = 0; j < c; j++)
+                other[j] = 0.0;
+            for (npy_intp k = 0; k < rows; k++) {
+                const double factor = psi[k * p + i];
+                const double *restrict row = Y + k * c;
+                for (npy_intp j = 0; j < c; j++)
+                    other[j] += factor * row[j];
+            }
+        }
+}
+
+/* psi (N, rows, p), Y (N, rows) -> ψᵀψ (N, p, p) and ψᵀY (N, p). */
+static PyObject *products(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 2))
+        return NULL;
+    PyArrayObject *psi = doubles(&call, 0, 3), *Y = psi == NULL ? NULL : doubles(&call, 1, 2);
+    if (Y == NULL || !same("times of psi and Y", size(psi, 0), size(Y, 0)) ||
+        !same("rows of psi and Y", size(psi, 1), size(Y, 1)))
+        return failed(&call);
+    const npy_intp N = size(psi, 0), rows = size(psi, 1), p = size(psi, 2);
+    PyArrayObject *square = fresh(&call, 3, (npy_intp[]){N, p, p});
+    PyArrayObject *right = square == NULL ? NULL : fresh(&call, 2, (npy_intp[]){N, p});
+    if (right == NULL)
+        return failed(&call);
+    add_products(data(square), p, data(right), 1, data(psi), data(Y), N, rows, p, 1);
+    return results(&call, 2, square, right);
+}
+
+/* psi (K, s + 1, rows, p), Y (K, s + 1, rows, c) -> [ψᵀψ | ψᵀY] (K, s + 1, p, p + c). */
+static PyObject *outer_products(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 2))
+        return NULL;
+    PyArrayObject *psi = doubles(&call, 0, 4), *Y = psi == NULL ? NULL : doubles(&call, 1, 4);
+    if (Y == NULL || !same("elements of psi and Y", size(psi, 0), size(Y, 0)) ||
+        !same("points of psi and Y", size(psi, 1), size(Y, 1)) ||
+        !same("rows of psi and Y", size(psi, 2), size(Y, 2)))
+        return failed(&call);
+    const npy_intp N = size(psi, 0) * size(psi, 1), p = size(psi, 3), c = size(Y, 3);
+    PyArrayObject *out = fresh(&call, 4, (npy_intp[]){size(psi, 0), size(psi, 1), p, p + c});
+    if (out == NULL)
+        return failed(&call);
+    add_products(data(out), p + c, data(out) + p, p + c, data(psi), data(Y), N, size(psi, 2), p,
+                 c);
+    return results(&call, 1, out);
+}
+
+/* psi (N, rows, p), Y (N, rows) -> the largest entry of each row of them, (rows,) both. */
+static PyObject *residual_sizes(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 2))
+        return NULL;
+    PyArrayObject *psi = doubles(&call, 0, 3), *Y = psi == NULL ? NULL : doubles(&call, 1, 2);
+    if (Y == NULL || !same("times of psi and Y", size(psi, 0), size(Y, 0)) ||
+        !same("rows of psi and Y", size(psi, 1), size(Y, 1)))
+        return failed(&call);
+    const npy_intp N = size(psi, 0), rows = size(psi, 1), p = size(psi, 2);
+    PyArrayObject *in_psi = zeros(&call, 1, &rows);
+    PyArrayObject *in_Y = in_psi == NULL ? NULL : zeros(&call, 1, &rows);
+    if (in_Y == NULL)
+        return failed(&call);
+    const double *one = data(psi), *other = data(Y);
+    for (npy_intp t = 0; t < N; t++)
+        for (npy_intp i = 0; i < rows; i++, other++) {
+            double most = data(in_psi)[i];
+            for (npy_intp j = 0; j < p; j++, one++)
+                most = fabs(*one) <= most || most != most ? most : fabs(*one);
+            data(in_psi)[i] = most;
+            most = data(in_Y)[i];
+            data(in_Y)[i] = fabs(*other) <= most || most != most ? most : fabs(*other);
+        }
+    return results(&call, 2, in_psi, in_Y);
+}
+
+/* The power of two that brings the largest of some numbers below one; 0 if one is not finite. */
+static double unit(const double *A, npy_intp numbers)
+{
+    double most = 0.0;
+    for (npy_intp i = 0; i < numbers; i++) {
+        if (!isfinite(A[i]))
+            return 0.0;
+        most = fabs(A[i]) > most ? fabs(A[i]) : most;
+    }
+    int exponent = 0;
+    frexp(most, &exponent);
+    return ldexp(1.0, exponent > 1000 ? -1000 : exponent < -1000 ? 1000 : -exponent);
+}
+
+/* A symmetric A (p, p), of which the lower triangle counts and is destroyed, made tridiagonal by
+   Householder's reflections, the last row first: diagonal d (p,), beside it e (p,) with e[i]
+   between i and i + 1. */
+static void tridiagonal(double *restrict A, npy_intp p, double *restrict d, double *restrict e)
+{
+    for (npy_intp i = p - 1; i > 0; i--) {
+        double *restrict v = A + i * p, square = 0.0;
+        for (npy_intp k = 0; k < i - 1; k++)
+            square += v[k] * v[k];
+        if (square == 0.0) { /* nothing to reflect */
+            e[i - 1] = v[i - 1];
+            continue;
+        }
+        const double edge = v[i - 1], norm = sqrt(square + edge * edge);
+        e[i - 1] = edge >= 0.0 ? -norm : norm;
+        v[i - 1] = edge - e[i - 1]; /* reflects along v, with vᵀv = 2 half */
+        const double half = norm * (norm + fabs(edge));
+        double along = 0.0;
+        for (npy_intp j = 0; j < i; j++) {
+            double sum = 0.0;
+            for (npy_intp k = 0; k <= j; k++)
+                sum += A[j * p + k] * v[k];
+            for (npy_intp k = j + 1; k < i; k++)
+                sum += A[k * p + j] * v[k];
+            d[j] = sum / half;
+            along += d[j] * v[j];
+        }
+        along /= 2.0 * half;
+        for (npy_intp j = 0; j < i; j++) {
+            d[j] -= along * v[j];
+            for (npy_intp k = 0; k <= j; k++)
+                A[j * p + k] -= v[j] * d[k] + d[j] * v[k];
+        }
+    }
+    for (npy_intp i = 0; i < p; i++)
+        d[i] = A[i * p + i];
+}
+
+#define STEPS 60 /* for one eigenvalue; two are what it takes */
+
+/* Eigenvalues of the tridiagonal matrix with diagonal d (p,), which they replace, and e (p,)
+   beside it, which is destroyed: the QL algorithm with implicit shifts. */
+static void tridiagonal_ql(double *restrict d, double *restrict e, npy_intp p)
+{
+    for (npy_intp low = 0; low < p; low++)
+        for (int step = 0; step < STEPS; step++) {
+            npy_intp high = low;
+            while (high < p - 1 && fabs(e[high]) > 0.5 * DBL_EPSILON * (fabs(d[high]) +
+                                                                        fabs(d[high + 1])))
+                high++;
+            if (high == low)
+                break;
+            double g = (d[low + 1] - d[low]) / (2.0 * e[low]), r = sqrt(g * g + 1.0);
+            g = d[high] - d[low] + e[low] / (g >= 0.0 ? g + r : g - r);
+            double sine = 1.0, cosine = 1.0, shift = 0.0;
+            npy_intp i = high - 1;
+            for (; i >= low; i--) {
+                const double f = sine * e[i], b = cosine * e[i];
+                r = sqrt(f * f + g * g);
+                if (i < p - 1)
+                    e[i + 1] = r;
+                if (r == 0.0) {
+                    d[i + 1] -= shift;
+                    e[high] = 0.0;
+                    break;
+                }
+                const double inverse = 1.0 / r;
+                sine = f * inverse;
+                cosine = g * inverse;
+                g = d[i + 1] - shift;
+                r = (d[i] - g) * sine + 2.0 * cosine * b;
+                shift = sine * r;
+                d[i + 1] = g + shift;
+                g = cosine * r - b;
+            }
+            if (i >= low)
+                continue;
+            d[low] -= shift;
+            e[low] = g;
+            e[high] = 0.0;
+        }
+}
+
+/* Eigenvalues of the symmetric A (p, p), of which the lower triangle counts, ascending to `out`
+   (p,), to rounding in the largest; A is destroyed, `beside` is (p,). 0 if A is not finite. */
+static int eigenvalues_of(double *restrict A, npy_intp p, double *restrict out,
+                          double *restrict beside)
+{
+    for (npy_intp i = 0; i < p; i++)
+        for (npy_intp j = 0; j < i; j++)
+            A[j * p + i] = A[i * p + j];
+    const double scale = unit(A, p * p);
+    if (scale == 0.0)
+        return 0;
+    for (npy_intp i = 0; i < p * p; i++)
+        A[i] *= scale;
+    tridiagonal(A, p, out, beside);
+    tridiagonal_ql(out, beside, p);
+    const double back = 1.0 / scale; /* a power of two */
+    for (npy_intp i = 0; i < p; i++) {
+        const double value = out[i] * back;
+        npy_intp j = i;
+        for (; j > 0 && out[j - 1] > value; j--)
+            out[j] = out[j - 1];
+        out[j] = value;
+    }
+    return 1;
+}
+
+/* A (N, p, c >= p) -> eigenvalues of the left squares, whose lower triangles count, ascending
+   (N, p); None if not all is finite. */
+static PyObject *eigenvalues(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 1))
+        return NULL;
+    PyArrayObject *A = doubles(&call, 0, 3);
+    if (A == NULL)
+        return failed(&call);
+    const npy_intp N = size(A, 0), p = size(A, 1), c = size(A, 2);
+    if (c < p) {
+        PyErr_SetString(PyExc_ValueError, "matrices are narrower than square");
+        return failed(&call);
+    }
+    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){N, p});
+    double *work = out == NULL ? NULL : scratch(&call, p * p + p);
+    if (work == NULL)
+        return failed(&call);
+    const double *one = data(A);
+    for (npy_intp k = 0; k < N; k++, one += p * c) {
+        for (npy_intp i = 0; i < p; i++)
+            memcpy(work + i * p, one + i * c, p * sizeof(double));
+        if (!eigenvalues_of(work, p, data(out) + k * p, work + p * p))
+            return nothing(&call);
+    }
+    return results(&call, 1, out);
+}
+
+/* The left squares (p, p) of Σ_i weights_i values_i to `out`, of values (points, p, c). */
+static void combined(double *restrict out, const double *restrict weights,
+                     const double *restrict values, npy_intp points, npy_intp p, npy_intp c)
+{
+    memset(out, 0, p * p * sizeof(double));
+    for (npy_intp k = 0; k < points; k++, values += p * c) {
+        const double weight = weights[k];
+        if (weight != 0.0)
+            for (npy_intp i = 0; i < p; i++)
+                for (npy_intp j = 0; j < p; j++)
+                    out[i * p + j] += weight * values[i * c + j];
+    }
+}
+
+/* values (K, points, p, c >= p), element (N,), weights (N, points) -> eigenvalues of the left
+   squares of the values sampled so, ascending (N, p); None if not all is finite. */
+static PyObject *sampled_eigenvalues(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 3))
+        return NULL;
+    PyArrayObject *values = doubles(&call, 0, 4);
+    PyArrayObject *element = values == NULL ? NULL : indices(&call, 1, 1);
+    PyArrayObject *weights = element == NULL ? NULL : doubles(&call, 2, 2);
+    if (weights == NULL || !same("times", size(element, 0), size(weights, 0)) ||
+        !same("points", size(values, 1), size(weights, 1)))
+        return failed(&call);
+    const npy_intp N = size(element, 0), points = size(values, 1), p = size(values, 2);
+    const npy_intp c = size(values, 3), *which = (npy_intp *)PyArray_DATA(element);
+    int fits = c >= p;
+    for (npy_intp k = 0; k < N; k++)
+        fits = fits && which[k] >= 0 && which[k] < size(values, 0);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "no such element, or matrices narrower than square");
+        return failed(&call);
+    }
+    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){N, p});
+    double *work = out == NULL ? NULL : scratch(&call, p * p + p);
+    if (work == NULL)
+        return failed(&call);
+    for (npy_intp k = 0; k < N; k++) {
+        combined(work, data(weights) + k * points, data(values) + which[k] * points * p * c,
+                 points, p, c);
+        if (!eigenvalues_of(work, p, data(out) + k * p, work + p * p))
+            return nothing(&call);
+    }
+    return results(&call, 1, out);
+}
+
+/* ‖A‖₂ of A (rows, columns), whose rows are `apart`, from the eigenvalues of AᵀA or A Aᵀ, of
+   which the largest is exact to rounding. −1 if A is not finite. `work` holds rows · columns +
+   m² + 2 m numbers with m = min(rows, columns). */
+static double norm_of(const double *A, npy_intp rows, npy_intp columns, npy_intp apart,
+                      double *work)
+{
+    const npy_intp m = rows < columns ? rows : columns, most = rows < columns ? columns : rows;
+    double *scaled = work, *square = work + rows * columns, *values = square + m * m;
+    if (m == 0)
+        return 0.0;
+    for (npy_intp i = 0; i < rows; i++)
+        memcpy(scaled + i * columns, A + i * apart, columns * sizeof(double));
+    const double scale = unit(scaled, rows * columns);
+    if (scale == 0.0)
+        return -1.0;
+    for (npy_intp i = 0; i < rows * columns; i++)
+        scaled[i] *= scale;
+    const npy_intp along = rows < columns ? 1 : columns, across = rows < columns ? columns : 1;
+    for (npy_intp i = 0; i < m; i++)
+        for (npy_intp j = 0; j <= i; j++) {
+            double sum = 0.0;
+            for (npy_intp k = 0; k < most; k++)
+                sum += scaled[i * across + k * along] * scaled[j * across + k * along];
+            square[i * m + j] = sum;
+        }
+    eigenvalues_of(square, m, values, values + m);
+    return sqrt(values[m - 1] > 0.0 ? values[m - 1] : 0.0) / scale;
+}
+
+/* A (…, rows, columns), used -> max over all of the norm ‖·‖₂ of the first `used` columns; None
+   if not all is finite. Only matrices whose Frobenius norm exceeds the largest ‖·‖₂ so far are
+   looked at. */
+static PyObject *spectral_norm(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    Stack A;
+    npy_intp used;
+    if (!begin(&call, given, count, 2))
+        return NULL;
+    const int axes = PyArray_Check(given[0]) ? PyArray_NDIM((PyArrayObject *)given[0]) : 0;
+    if (!stack(&call, 0, axes == 2 ? 1 : 2, &A) || !count_of(&call, 1, &used))
+        return failed(&call);
+    const npy_intp rows = last(&A, 2), columns = last(&A, 1), N = axes == 2 ? 1 : A.times;
+    if (used > columns) {
+        PyErr_SetString(PyExc_ValueError, "more columns asked for than there are");
+        return failed(&call);
+    }
+    const npy_intp m = rows < used ? rows : used;
+    double *work = scratch(&call, rows * used + m * m + 2 * m);
+    if (work == NULL)
+        return failed(&call);
+    double most = 0.0, frobenius = -1.0;
+    npy_intp start = 0; /* where the Frobenius norm is largest: the others have it hard */
+    for (int pass = 0; pass < 2; pass++) {
+        const double limit = most * most * (1.0 - 1e-12);
+        const double *one = A.at;
+        for (npy_intp k = 0; k < N; k++, one += rows * columns) {
+            double sum = 0.0;
+            for (npy_intp i = 0; i < rows; i++)
+                for (npy_intp j = 0; j < used; j++)
+                    sum += one[i * columns + j] * one[i * columns + j];
+            if (!(sum < INFINITY)) { /* squares beyond all numbers, or no numbers */
+                const double norm = norm_of(one, rows, used, columns, work);
+                if (norm < 0.0)
+                    return nothing(&call);
+                most = norm > most ? norm : most;
+            } else if (pass == 0) {
+                if (sum > frobenius) {
+                    frobenius = sum;
+                    start = k;
+                }
+            } else if (k != start && (sum >= limit || limit < 1e-250) && sum >= most * most) {
+                const double norm = norm_of(one, rows, used, columns, work);
+                most = norm > most ? norm : most;
+            }
+        }
+        if (pass == 0 && frobenius >= 0.0) {
+            const double *at = A.at + start * rows * columns;
+            const double norm = norm_of(at, rows, used, columns, work);
+            most = norm > most ? norm : most;
+        }
+    }
+    return one_number(&call, most);
+}
+
+/* injectivity (N,), H (N or 1, n, b) -> [value, place] (2,): the smallest injectivity ‖H‖_F/‖H‖₂
+   over all times and where it is, the first of equal ones; None if not all is finite. */
+static PyObject *weakest(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    Stack bound, H;
+    if (!begin(&call, given, count, 2) || !stack(&call, 0, 0, &bound) || !stack(&call, 1, 2, &H) ||
+        !lasting("times of H", &H, bound.times))
+        return failed(&call);
+    const npy_intp N = bound.times, n = last(&H, 2), b = last(&H, 1), m = n < b ? n : b;
+    PyArrayObject *out = zeros(&call, 1, (npy_intp[]){2});
+    double *work = out == NULL ? NULL : scratch(&call, n * b + m * m + 2 * m);
+    if (work == NULL)
+        return failed(&call);
+    npy_intp lowest = 0;
+    for (npy_intp k = 0; k < N; k++) {
+        if (!isfinite(bound.at[k]))
+            return nothing(&call);
+        lowest = bound.at[k] < bound.at[lowest] ? k : lowest;
+    }
+    double limit = INFINITY, value = INFINITY;
+    npy_intp place = 0;
+    for (npy_intp step = -1; step < N; step++) {
+        const npy_intp k = step < 0 ? lowest : step;
+        if (N == 0 || (step >= 0 && bound.at[k] > limit))
+            continue;
+        const double *one = H.at + (H.times == 1 ? 0 : k) * H.numbers;
+        const double norm = norm_of(one, n, b, b, work);
+        double sum = 0.0;
+        for (npy_intp i = 0; i < n * b; i++)
+            sum += one[i] * one[i];
+        const double exact = bound.at[k] * (sqrt(sum) / norm);
+        if (!(norm > 0.0) || !isfinite(exact))
+            return nothing(&call);
+        if (step < 0)
+            limit = exact > bound.at[k] ? exact : bound.at[k];
+        else if (exact < value) {
+            value = exact;
+            place = k;
+        }
+    }
+    data(out)[0] = value;
+    data(out)[1] = (double)place;
+    return results(&call, 1, out);
+}
+
+/* Barycentric weights (points,) of the place `at` in [0, 1]. */
+static void weights_at(double *restrict out, double at, const double *restrict nodes,
+                       const double *restrict barycentric, npy_intp points)
+{
+    double sum = 0.0;
+    for (npy_intp i = 0; i < points; i++) {
+        const double distance = at - nodes[i];
+        if (fabs(distance) < 4.0 * DBL_EPSILON) {
+            memset(out, 0, points * sizeof(double));
+            out[i] = 1.0;
+            return;
+        }
+        out[i] = barycentric[i] / distance;
+        sum += out[i];
+    }
+    for (npy_intp i = 0; i < points; i++)
+        out[i] /= sum;
+}
+
+/* What `first_time` looks at: one element of a mesh. */
+typedef struct {
+    const double *values, *nodes, *barycentric; /* (points, p, c), (points,), (points,) */
+    npy_intp points, p, c;
+    double left, right;
+    double *weights, *matrix, *eigenvalues, *beside; /* (points,), (p, p), (p,), (p,) */
+} Element;
+
+/* λ_min of the element's matrix, which is destroyed; NaN if it is not finite. */
+static double smallest(const Element *one)
+{
+    const int found = eigenvalues_of(one->matrix, one->p, one->eigenvalues, one->beside);
+    return found ? one->eigenvalues[0] : NAN;
+}
+
+/* λ_min of the left squares of the values at a time; NaN if they are not finite. */
+static double smallest_at(const Element *one, double t)
+{
+    weights_at(one->weights, (t - one->left) / (one->right - one->left), one->nodes,
+               one->barycentric, one->points);
+    combined(one->matrix, one->weights, one->values, one->points, one->p, one->c);
+    return smallest(one);
+}
+
+/* The same at one of the element's points. */
+static double smallest_at_point(const Element *one, npy_intp point)
+{
+    const double *from = one->values + point * one->p * one->c;
+    for (npy_intp i = 0; i < one->p; i++)
+        memcpy(one->matrix + i * one->p, from + i * one->c, one->p * sizeof(double));
+    return smallest(one);
+}
+
+/* values (K, points, p, c >= p), edges (K + 1,), nodes (points,) in [0, 1], barycentric (points,),
+   around (a,) ascending, level, rounds, resolution -> the first time at which λ_min of the left
+   squares reaches the level, or −inf; None if not all is finite.
+
+   The first element that ends at the level or above, its points, then `rounds` times the secant's
+   zero and distances `around` it, in bracket lengths, until the bracket is that short. */
+static PyObject *first_time(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    double rho, resolution;
+    npy_intp rounds;
+    if (!begin(&call, given, count, 8))
+        return NULL;
+    PyArrayObject *values = doubles(&call, 0, 4);
+    PyArrayObject *edges = values == NULL ? NULL : doubles(&call, 1, 1);
+    PyArrayObject *nodes = edges == NULL ? NULL : doubles(&call, 2, 1);
+    PyArrayObject *barycentric = nodes == NULL ? NULL : doubles(&call, 3, 1);
+    PyArrayObject *around = barycentric == NULL ? NULL : doubles(&call, 4, 1);
+    if (around == NULL || !number(&call, 5, &rho) || !count_of(&call, 6, &rounds) ||
+        !number(&call, 7, &resolution) ||
+        !same("elements and edges", size(values, 0) + 1, size(edges, 0)) ||
+        !same("points and nodes", size(values, 1), size(nodes, 0)) ||
+        !same("points and weights", size(values, 1), size(barycentric, 0)))
+        return failed(&call);
+    const npy_intp K = size(values, 0), points = size(values, 1), p = size(values, 2);
+    const npy_intp c = size(values, 3), near = size(around, 0);
+    if (c < p || p == 0 || points == 0 || near == 0) {
+        PyErr_SetString(PyExc_ValueError, "nothing to look at");
+        return failed(&call);
+    }
+    const npy_intp room = points > near ? points : near;
+    double *memory = scratch(&call, points + p * p + 2 * p + room);
+    if (memory == NULL)
+        return failed(&call);
+    Element one = {
+        .values = data(values), .nodes = data(nodes), .barycentric = data(barycentric),
+        .points = points, .p = p, .c = c, .weights = memory, .matrix = memory + points,
+        .eigenvalues = memory + points + p * p, .beside = memory + points + p * p + p,
+    };
+    double *t = one.beside + p;
+    npy_intp k = 0;
+    for (; k < K; k++, one.values += points * p * c) {
+        const double reached = smallest_at_point(&one, points - 1);
+        if (reached != reached)
+            return nothing(&call);
+        if (reached >= rho)
+            break;
+    }
+    if (k == K)
+        return one_number(&call, -INFINITY);
+    one.left = data(edges)[k];
+    one.right = data(edges)[k + 1];
+    const double horizon = data(edges)[K] - data(edges)[0];
+    npy_intp size_of = points;
+    for (npy_intp i = 0; i < points; i++)
+        t[i] = one.left + (one.right - one.left) * data(nodes)[i];
+    t[points - 1] = one.right;
+    double high = one.right;
+    for (npy_intp round = 0; round < rounds; round++) {
+        npy_intp j = 0;
+        double before = 0.0, here = 0.0; /* λ_min less the level, at j − 1 and j */
+        for (;; j++, before = here) {
+            here = (round == 0 ? smallest_at_point(&one, j) : smallest_at(&one, t[j])) - rho;
+            if (here != here)
+                return nothing(&call);
+            if (here >= 0.0 || j == size_of - 1)
+                break;
+        }
+        if (here < 0.0) /* rounding; it was reached there */
+            here = 0.0;
+        const double low = t[j > 0 ? j - 1 : 0];
+        high = t[j];
+        if (high - low <= resolution * (fabs(high) > horizon ? fabs(high) : horizon))
+            break;
+        const double share = before / (before - here);
+        const double guess = low + (high - low) * (share >= 0.0 && share <= 1.0 ? share : 0.5);
+        size_of = 0;
+        for (npy_intp i = 0; i < near; i++) {
+            double at = guess + (high - low) * data(around)[i];
+            at = at < low ? low : at > high ? high : at;
+            if (size_of == 0 || at > t[size_of - 1])
+                t[size_of++] = at;
+        }
+    }
+    return one_number(&call, high);
+}
+
+/* out (rows, used; row length used) += factor · values (rows, columns), the first `used` ones. */
+static void accumulate(double *restrict out, double factor, const double *restrict values,
+                       npy_intp rows, npy_intp columns, npy_intp used)
+{
+    for (npy_intp i = 0; i < rows; i++)
+        for (npy_intp j = 0; j < used; j++)
+            out[i * used + j] += factor * values[i * columns + j];
+}
+
+/* values (K, s + 1, rows, columns), steps (K,), integration (s, s), used, first (N,), its weights
+   (N, s + 1), last (N,), its weights -> (N, rows, used): ∫ of the first `used` columns from the
+   place in element `first` to that in element `last`, whole elements summed afresh. */
+static PyObject *window_sums(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    npy_intp used;
+    if (!begin(&call, given, count, 8))
+        return NULL;
+    PyArrayObject *values = doubles(&call, 0, 4);
+    PyArrayObject *steps = values == NULL ? NULL : doubles(&call, 1, 1);
+    PyArrayObject *rule = steps == NULL ? NULL : doubles(&call, 2, 2);
+    PyArrayObject *ends[2], *weights[2];
+    if (rule == NULL || !count_of(&call, 3, &used))
+        return failed(&call);
+    for (int i = 0; i < 2; i++)
+        if ((ends[i] = indices(&call, 4 + 2 * i, 1)) == NULL ||
+            (weights[i] = doubles(&call, 5 + 2 * i, 2)) == NULL)
+            return failed(&call);
+    const npy_intp K = size(values, 0), points = size(values, 1), s = points - 1;
+    const npy_intp rows = size(values, 2), columns = size(values, 3), N = size(ends[0], 0);
+    if (!same("elements and steps", K, size(steps, 0)) || !same("stages", size(rule, 0), s) ||
+        !same("stages", size(rule, 1), s) || !same("times", size(ends[1], 0), N))
+        return failed(&call);
+    for (int i = 0; i < 2; i++) {
+        if (!same("times of the weights", size(weights[i], 0), N) ||
+            !same("points of the weights", size(weights[i], 1), points))
+            return failed(&call);
+        for (npy_intp k = 0; k < N; k++) {
+            const npy_intp element = ((npy_intp *)PyArray_DATA(ends[i]))[k];
+            if (element < 0 || element >= K) {
+                PyErr_SetString(PyExc_ValueError, "no such element");
+                return failed(&call);
+            }
+        }
+    }
+    if (used > columns) {
+        PyErr_SetString(PyExc_ValueError, "more columns asked for than there are");
+        return failed(&call);
+    }
+    const npy_intp numbers = rows * used, element = points * rows * columns;
+    PyArrayObject *out = zeros(&call, 3, (npy_intp[]){N, rows, used});
+    double *totals = out == NULL ? NULL : scratch(&call, K * numbers + s);
+    if (totals == NULL)
+        return failed(&call);
+    double *share = totals + K * numbers;
+    const double *integration = data(rule), *h = data(steps);
+    memset(totals, 0, K * numbers * sizeof(double));
+    for (npy_intp k = 0; k < K; k++)
+        for (npy_intp j = 0; j < s; j++)
+            accumulate(totals + k * numbers, h[k] * integration[(s - 1) * s + j],
+                       data(values) + k * element + (1 + j) * rows * columns, rows, columns, used);
+    for (npy_intp i = 0; i < N; i++) {
+        const npy_intp from = ((npy_intp *)PyArray_DATA(ends[0]))[i];
+        const npy_intp to = ((npy_intp *)PyArray_DATA(ends[1]))[i];
+        double *sum = data(out) + i * numbers;
+        for (npy_intp k = from; k < to; k++)
+            for (npy_intp j = 0; j < numbers; j++)
+                sum[j] += totals[k * numbers + j];
+        for (int end = 0; end < 2; end++) {
+            const npy_intp k = end ? to : from;
+            const double *weight = data(weights[end]) + i * points;
+            for (npy_intp j = 0; j < s; j++)
+                share[j] = 0.0;
+            for (npy_intp a = 0; a < s; a++)
+                if (weight[1 + a] != 0.0)
+                    for (npy_intp j = 0; j < s; j++)
+                        share[j] += weight[1 + a] * integration[a * s + j];
+            for (npy_intp j = 0; j < s; j++)
+                accumulate(sum, (end ? h[k] : -h[k]) * share[j],
+                           data(values) + k * element + (1 + j) * rows * columns, rows, columns,
+                           used);
+        }
+    }
+    return results(&call, 1, out);
+}
+
+/* out (M, n) = offset (M, n) + gain (M, p, n)ᵀ eta (M, p), with n known to the compiler. */
+#define MAPPED(n)                                                                                 \
+    case n:                                                                                       \
+        for (npy_intp t = 0; t < M; t++, eta += p, out += n) {                                    \
+            double sum[n];                                                                        \
+            memcpy(sum, offset + t * n, sizeof(sum));                                             \
+            for (npy_intp k = 0; k < p; k++)                                                      \
+                for (int i = 0; i < n; i++)                                                       \
+                    sum[i] += eta[k] * gain[(t * p + k) * n + i];                                 \
+            memcpy(out, sum, sizeof(sum));                                                        \
+        }                                                                                         \
+        break
+
+static void mapped(double *restrict out, const double *restrict offset,
+                   const double *restrict gain, const double *restrict eta, npy_intp M, npy_intp n,
+                   npy_intp p)
+{
+    switch (n) {
+        MAPPED(1);
+        MAPPED(2);
+        MAPPED(3);
+        MAPPED(4);
+        MAPPED(5);
+        MAPPED(6);
+        MAPPED(7);
+        MAPPED(8);
+    default:
+        for (npy_intp t = 0; t < M; t++, eta += p, out += n) {
+            memcpy(out, offset + t * n, n * sizeof(double));
+            for (npy_intp k = 0; k < p; k++)
+                for (npy_intp i = 0; i < n; i++)
+                    out[i] += eta[k] * gain[(t * p + k) * n + i];
+        }
+    }
+}
+
+/* offset (M, n), gain (M, n, p), eta (g, M, p) -> offset + gain eta, (g, M, n). */
+static PyObject *affine_map(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 3))
+        return NULL;
+    PyArrayObject *offset = doubles(&call, 0, 2);
+    PyArrayObject *gain = offset == NULL ? NULL : doubles(&call, 1, 3);
+    PyArrayObject *eta = gain == NULL ? NULL : doubles(&call, 2, 3);
+    if (eta == NULL || !same("times of offset and gain", size(offset, 0), size(gain, 0)) ||
+        !same("states of offset and gain", size(offset, 1), size(gain, 1)) ||
+        !same("times of gain and eta", size(gain, 0), size(eta, 1)) ||
+        !same("parameters of gain and eta", size(gain, 2), size(eta, 2)))
+        return failed(&call);
+    const npy_intp M = size(gain, 0), n = size(gain, 1), p = size(gain, 2), g = size(eta, 0);
+    PyArrayObject *out = fresh(&call, 3, (npy_intp[]){g, M, n});
+    double *turned = out == NULL ? NULL : scratch(&call, M * n * p);
+    if (turned == NULL)
+        return failed(&call);
+    for (npy_intp t = 0; t < M; t++)
+        for (npy_intp i = 0; i < n; i++)
+            for (npy_intp k = 0; k < p; k++)
+                turned[(t * p + k) * n + i] = data(gain)[(t * n + i) * p + k];
+    for (npy_intp i = 0; i < g; i++)
+        mapped(data(out) + i * M * n, data(offset), turned, data(eta) + i * M * p, M, n, p);
+    return results(&call, 1, out);
+}
+
+#define KERNEL(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, NULL}
+
 PyMethodDef observer_kernels[] = {
+    KERNEL(entry_sizes),
+    KERNEL(largest_entry),
+    KERNEL(in_frame),
+    KERNEL(driven),
+    KERNEL(regression_signals),
+    KERNEL(products),
+    KERNEL(outer_products),
+    KERNEL(residual_sizes),
+    KERNEL(eigenvalues),
+    KERNEL(sampled_eigenvalues),
+    KERNEL(spectral_norm),
+    KERNEL(weakest),
+    KERNEL(first_time),
+    KERNEL(window_sums),
+    KERNEL(affine_map),
     {NULL, NULL, 0, NULL},
 };

@@ -75,7 +75,7 @@ def observe(
         A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
         b[:, q:] = (o.from_signals @ signals)[:, :, 0]
         g_y = (o.g_signals @ signals)[:, :, 0]
-        extras = (o.algebraic @ basis, g_y, o.G, o.range, o.elimination, o.injectivity)
+        extras = (o.on_basis, g_y, o.G, o.range, o.elimination, o.injectivity)
         zero = np.zeros((1, 1, 1))
         kernel = np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n))
         return Coefficients(None, zero, np.zeros((len(t), 1, 1)), (*extras, A, b, kernel))

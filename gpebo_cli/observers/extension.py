@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 
 import numpy as np
 
@@ -48,12 +49,12 @@ def initial_extension(
                 f"states ({', '.join(labels)})"
             )
     try:
-        out = np.array([float(v) for v in values])
+        out = [float(v) for v in values]
     except (TypeError, ValueError):
-        out = np.array([np.nan])
-    if not np.isfinite(out).all():
+        out = [np.nan]
+    if not all(map(isfinite, out)):
         raise ConfigError(f"{where}: every value must be a finite number, got {values}")
-    return out
+    return np.array(out, dtype=np.float64)
 
 
 def output_scale(settings: ObserverSettings, system: DescriptorSystem) -> Array:

@@ -26,11 +26,15 @@ last r, which loses everything in its own circuit (``regression: paper`` shows i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.linear import Coefficients, LinearProblem, LinearSolution, solve
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
@@ -40,9 +44,10 @@ from gpebo_cli.observers.observation import (
     AffineStateMap,
     InitialError,
     Observation,
+    largest_entry,
     log_norm,
 )
-from gpebo_cli.regression import LinearRegression, outer_products
+from gpebo_cli.regression import SMALL_SPECTRUM, LinearRegression, outer_products
 from gpebo_cli.result import Assumption
 from gpebo_cli.settings import ObserverSettings, SolverSettings
 from gpebo_cli.simulation import ivp
@@ -53,6 +58,7 @@ _PROJECTOR_TURNED = 1e-13
 _TINY = float(np.finfo(float).tiny)
 _RESPONSE = 1e-6  # error of the response to noise, which is known to no more digits than that
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
+_SMALL = 24  # states, up to which NumPy's calls cost more than the kernels' plain loops
 _VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
 
 
@@ -79,6 +85,11 @@ class Frame:
     kernel: Array  # (n, n_b)
     equations: Array  # (e, n)
 
+    @cached_property
+    def projector(self) -> Array:
+        """P, (n, n)."""
+        return np.asarray(self.domain @ self.domain.T)
+
 
 @dataclass(frozen=True, eq=False)
 class ObserverMatrices:
@@ -95,6 +106,7 @@ class ObserverMatrices:
     from_unknowns: Array  # (N, k, q) BᵀD_0
     from_signals: Array  # (N, k, m + r) Bᵀb_0 = from_signals [u; y]
     algebraic: Array  # (N, e + r, n) 𝒜
+    on_basis: Array  # (N, e + r, k) 𝒜 B
     g_signals: Array  # (N, e + r, m + r) g_y = g_signals [u; y]
     G: Array  # (N, e + r, q)
     range: Array  # (N, e + r, n_b) Q1
@@ -148,7 +160,7 @@ class ObserverMatrices:
         """
         return replace(
             self,
-            dynamics=self.dynamics - gain @ (self.algebraic @ self.split.basis),
+            dynamics=self.dynamics - gain @ self.on_basis,
             from_unknowns=self.from_unknowns - gain @ self.G,
             from_signals=self.from_signals - gain @ self.g_signals,
         )
@@ -158,14 +170,25 @@ class ObserverMatrices:
 Injection = Callable[[ObserverMatrices, Array, Array], Array]
 
 
-def row_sizes(E: Array) -> Array:
-    """Size of each row of E (N, n, n) over the times, shape (n,), one for rows that are zero.
+def row_sizes(entries: Array) -> Array:
+    """Size of each row of E over the times, shape (n,), one for rows that are zero.
 
     Dividing equations by constants changes nothing, but an equation in picofarads would else look
     like a rank deficiency of E. Powers of two: no rounding.
+
+    Args:
+        entries: the size of each entry of E over the times, (n, n).
     """
-    size = np.abs(E).max(axis=(0, 2))
+    size = entries.max(axis=1, initial=0.0)
     return np.asarray(np.exp2(np.rint(np.log2(np.where(size > 0, size, 1.0)))))
+
+
+def _entry_sizes(E: Array) -> Array:
+    """Largest size of each entry of E (N, n, n) over the times, (n, n)."""
+    if kernels.compiled is not None:
+        sizes: Array = kernels.compiled.entry_sizes(E)
+        return sizes
+    return np.asarray(np.abs(E).max(axis=0))
 
 
 def observer_matrices(
@@ -188,7 +211,6 @@ def observer_matrices(
         ModelError: the rank of E is not constant, or Assumption 1 fails; names the time and the
             singular value.
     """
-    m, q, r = system.m, system.q, system.r
     turning = like is not None and like.split.frame is None
     c = system.coefficients.taylor(t, 1 if turning else 0, inside)
     constant = system.coefficients.constant
@@ -197,14 +219,68 @@ def observer_matrices(
         matrix: Array = getattr(c, name)[0]
         return matrix[:1] if name in constant else matrix
 
-    E, A, B, F, C = map(value, "EABFC")
-    rows = row_sizes(E) if normalise else np.ones(system.n)
-    rows = rows if like is None else like.rows
+    model = _Model(value("E"), value("A"), value("B"), value("F"), value("C"))
+    if like is not None:
+        rows, scale = like.rows, like.output_scale
+    else:
+        entries = _entry_sizes(model.E)
+        rows = row_sizes(entries) if normalise else np.ones(system.n)
+        scale = np.ones(system.r)
+    if output_scale is not None:
+        scale = output_scale
+    if kernels.compiled is not None and system.n <= _SMALL:
+        frame = _axes_frame(entries) if like is None else like.split.frame
+        found = None if frame is None else _in_frame(model, rows, scale, frame, rank_tol)
+        if found is not None:
+            return found
+
+    def slope() -> Array:
+        known = c if turning else system.coefficients.taylor(t, 1, inside)
+        return np.asarray(known.E[1][: len(model.E)])
+
+    return _by_steps(system, model, rows, scale, t, rank_tol, like, slope)
+
+
+class _Model(NamedTuple):
+    """The plant's matrices at N times; a leading axis of 1 means constant in time."""
+
+    E: Array
+    A: Array
+    B: Array
+    F: Array
+    C: Array
+
+
+def _in_frame(
+    model: _Model, rows: Array, scale: Array, frame: Frame, rank_tol: float
+) -> ObserverMatrices | None:
+    """What :func:`_by_steps` finds if the frame is that of E at all times, in one call.
+
+    None where it is not, and where singular values have to tell.
+    """
+    (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
+     from_signals) = kernels.compiled.in_frame(  # type: ignore[union-attr]
+        *model, rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
+    )
+    rank = frame.domain.shape[1]
+    outside, size, inner, inverse, weakest = sizes.tolist()
+    if not (_fits(outside, size, rank, inner, inverse, rank_tol) and weakest > rank_tol):
+        return None
+    return ObserverMatrices(
+        _split(frame, pinv), rows, scale, dynamics, from_unknowns, from_signals, algebraic,
+        on_basis, g_signals, G, Q1, H, injectivity,
+    )
+
+
+def _by_steps(
+    system: DescriptorSystem, model: _Model, rows: Array, scale: Array, t: Array, rank_tol: float,
+    like: ObserverMatrices | None, slope: Callable[[], Array],
+) -> ObserverMatrices:
+    """The observer's matrices from those of the plant at the times t (N,) and Ė (N or 1, n, n)."""
+    m, q, r = system.m, system.q, system.r
+    E, A, B, F, C = model
     if (rows != 1.0).any():
         E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
-    scale = output_scale
-    if scale is None:
-        scale = np.ones(r) if like is None else like.output_scale
     C = scale[:, None] * C
     if like is None:
         split = _constant_split(E, system.states, rank_tol)
@@ -212,13 +288,12 @@ def observer_matrices(
         frame = like.split.frame
         split = None if frame is None else split_in_frame(E, frame, rank_tol)
     if split is None:
-        slope = c if turning else system.coefficients.taylor(t, 1, inside)
-        dE = slope.E[1][: len(E)] / rows[:, None]
         known = None if like is None else like.split.basis
-        split = _split_by_svd(system, E, dE, t, rank_tol, known)
+        split = _split_by_svd(system, E, slope() / rows[:, None], t, rank_tol, known)
 
     L, pinv, basis = split.equations, split.pinv, split.basis
     algebraic = joined(L @ A, C, axis=1)  # 𝒜 = [Π A; C]
+    on_basis = algebraic @ basis
     e = L.shape[1]
     of_y = np.zeros((1, e + r, r))
     of_y[0, e:] = -np.diag(scale)
@@ -232,7 +307,7 @@ def observer_matrices(
     direct = joined(
         Lambda @ basis, pinv @ F, pinv @ B, np.zeros((1, len(basis.T), r)), axis=2
     )
-    through = joined(algebraic @ basis, G, g_signals, axis=2)
+    through = joined(on_basis, G, g_signals, axis=2)
     whole = direct - (Lambda @ H) @ (transpose(Q1) @ through)
     k = basis.shape[1]
     dynamics = whole[:, :, :k]
@@ -240,10 +315,11 @@ def observer_matrices(
         split=split,
         rows=rows,
         output_scale=scale,
-        dynamics=dynamics[:1] if {"E", "A", "C"} <= constant else dynamics,
+        dynamics=dynamics[:1] if len(E) == len(A) == len(C) == 1 else dynamics,
         from_unknowns=whole[:, :, k : k + q],
         from_signals=whole[:, :, k + q :],
         algebraic=algebraic,
+        on_basis=on_basis,
         g_signals=g_signals,
         G=G,
         range=Q1,
@@ -252,19 +328,30 @@ def observer_matrices(
     )
 
 
+def _axes_frame(entries: Array) -> Frame | None:
+    """Coordinate axes where E has columns and rows that are exactly zero.
+
+    As in E = diag(E_a(t), 0); None where there are more of the ones than of the others.
+
+    Args:
+        entries: the size of each entry of E over the times, (n, n).
+    """
+    used = entries != 0.0  # NaN is not zero
+    rows, columns = used.any(axis=1), used.any(axis=0)
+    if np.count_nonzero(rows) != np.count_nonzero(columns):
+        return None
+    axes = np.eye(len(entries))
+    return Frame(axes[:, columns], axes[:, rows], axes[:, ~columns], axes[~rows])
+
+
 def _constant_split(E: Array, states: tuple[str, ...], rank_tol: float) -> Split | None:
     """E⁺ at the times (N, n, n), if kernel and range of E are the same at all of them.
 
-    Coordinate axes where columns and rows are exactly zero, as in E = diag(E_a(t), 0); else from
-    the singular vectors at the first time.
+    Coordinate axes where columns and rows are exactly zero; else from the singular vectors at the
+    first time.
     """
-    n = E.shape[1]
-    used = (E != 0.0).any(axis=0)
-    rows, columns = np.flatnonzero(used.any(axis=1)), np.flatnonzero(used.any(axis=0))
-    axes = np.eye(n)
-    if len(rows) == len(columns):
-        free, unused = ~used.any(axis=1), ~used.any(axis=0)
-        frame = Frame(axes[:, columns], axes[:, rows], axes[:, unused], axes[free])
+    frame = _axes_frame(_entry_sizes(E))
+    if frame is not None:
         split = split_in_frame(E, frame, rank_tol)
         if split is not None:
             return split
@@ -281,26 +368,47 @@ def split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
     None where kernel, range or rank are not those of the frame at one of the times.
     """
     B, U = frame.domain, frame.range
-    rank = B.shape[1]
-    size = float(np.abs(E).max(initial=0.0))
-    outside = max(
-        float(np.abs(E @ frame.kernel).max(initial=0.0)),
-        float(np.abs(frame.equations @ E).max(initial=0.0)),
+    size, outside = (
+        float(np.abs(part).max(initial=0.0)) for part in (E, E @ frame.kernel)
     )
-    if outside > _TURNED * size:
-        return None
+    outside = max(outside, float(np.abs(frame.equations @ E).max(initial=0.0)))
     inner = U.T @ E @ B
     try:
         inverse = np.asarray(np.linalg.inv(inner), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
-    largest = float(np.linalg.norm(inner, axis=(1, 2)).max(initial=0.0))
-    smallest = 1.0 / max(float(np.linalg.norm(inverse, axis=(1, 2)).max(initial=0.0)), _TINY)
-    if not smallest > np.sqrt(max(rank, 1)) * rank_tol * largest:
-        return None  # too close to call without singular values
+    norms = [
+        float(np.linalg.norm(part, axis=(1, 2)).max(initial=0.0)) for part in (inner, inverse)
+    ]
+    if not _fits(outside, size, B.shape[1], norms[0], norms[1], rank_tol):
+        return None
+    return _split(frame, inverse @ U.T)
+
+
+def _fits(
+    outside: float, size: float, rank: int, inner: float, inverse: float, rank_tol: float
+) -> bool:
+    """Whether E has this frame and full rank in it, beyond what singular values could change.
+
+    Args:
+        outside: largest entry of E outside the frame.
+        size: largest entry of E.
+        rank: of the frame.
+        inner: largest norm of UᵀE B over the times.
+        inverse: largest norm of its inverse.
+        rank_tol: singular values below this, relative, are zero.
+    """
+    if outside > _TURNED * size:
+        return False
+    return 1.0 / max(inverse, _TINY) > math.sqrt(max(rank, 1)) * rank_tol * inner
+
+
+def _split(frame: Frame, pinv: Array) -> Split:
+    """The split in a frame, with BᵀE⁺ (N, n_a, n)."""
     return Split(
-        rank=rank, basis=B, pinv=inverse @ U.T, turn=None, equations=frame.equations[None],
-        kernel=frame.kernel[None], projector=(B @ B.T)[None], frame=frame,
+        rank=frame.domain.shape[1], basis=frame.domain, pinv=pinv, turn=None,
+        equations=frame.equations[None], kernel=frame.kernel[None],
+        projector=frame.projector[None], frame=frame,
     )
 
 
@@ -378,6 +486,10 @@ def _weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
     ‖H‖_F took the place of ‖H‖_2 = 1/σ_min. Only times whose bound is below the true value at
     the time of the smallest bound can be weaker.
     """
+    if kernels.compiled is not None and 0 < elimination.shape[2] <= SMALL_SPECTRUM:
+        found: Array | None = kernels.compiled.weakest(injectivity, elimination)
+        if found is not None:  # else not all is finite
+            return float(found[0]), int(found[1])
     if not np.isfinite(injectivity).all():
         return float(np.inf), 0
     H = elimination if len(elimination) > 1 else np.repeat(elimination, len(injectivity), axis=0)
@@ -387,7 +499,9 @@ def _weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
         return np.asarray(injectivity[which] * norms)
 
     first = np.array([int(np.argmin(injectivity))])
-    candidates = np.flatnonzero(injectivity <= exact(first)[0])
+    # Where n_b = 1 the norms are the same but for rounding, and the first remains a candidate.
+    limit = max(exact(first)[0], injectivity[first[0]])
+    candidates = np.flatnonzero(injectivity <= limit)
     values = exact(candidates)
     k = int(np.argmin(values))
     return float(values[k]), int(candidates[k])
@@ -483,7 +597,7 @@ class Extension:
 
     def growth(self, q: int) -> float:
         """Largest entry of Φ."""
-        return float(np.abs(self.solution.trajectory.values[..., 1 + q :]).max(initial=0.0))
+        return largest_entry(self.solution.trajectory.values, 1 + q)
 
     def logarithm(self, q: int) -> float:
         """ln ‖Φ(end)‖₂, which is 0 at the start."""
@@ -500,31 +614,26 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     system, solver, basis = reduced.system, reduced.solver, reduced.basis
     q, n_a = system.q, reduced.rank
 
-    def equations(o: ObserverMatrices, signals: Array) -> Coefficients:
-        f = np.zeros((len(signals), basis.shape[1], 1 + q + n_a))
-        f[:, :, :1] = o.from_signals @ signals
-        f[:, :, 1 : 1 + q] = o.from_unknowns
-        g_y = (o.g_signals @ signals)[:, :, 0]
-        seen = (o.algebraic @ basis, g_y, o.G, o.range, o.elimination, o.injectivity)
+    def equations(o: ObserverMatrices, u: Array, y: Array) -> Coefficients:
+        f, g_y = _driven(o, u, y, 1 + q + n_a)
+        seen = (o.on_basis, g_y, o.G, o.range, o.elimination, o.injectivity)
         return Coefficients(None, o.dynamics, f, seen)
 
     def coefficients(t: Array, inside: Array) -> Coefficients:
-        return equations(reduced.matrices(t, inside), reduced.signals(t, inside))
+        u, y = reduced.inputs(t, inside), reduced.outputs(t, inside)
+        return equations(reduced.matrices(t, inside), u, y)
 
     latest: list[Assembled] = []
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
         """Everything to resolve; SolverError if the extension is beyond all bounds."""
-        if np.abs(values).max(initial=0.0) > _LARGEST:
+        if largest_entry(values) > _LARGEST:
             raise SolverError(
                 f"the dynamic extension of plant {system.name} grows beyond {_LARGEST:.0e}: A_0 is "
                 "unstable; use observer.remedy=output_injection, reset or current_coordinates, or "
                 "a shorter time.horizon"
             )
-        z, *flat = (
-            signal.reshape(signal.shape[0] * signal.shape[1], *signal.shape[2:])
-            for signal in (values, *extras)
-        )
+        z, *flat = map(_over_time, (values, *extras))
         assembled = regression_signals(z, q, basis, *flat)
         latest[:] = [assembled]
         return [
@@ -537,12 +646,32 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     else:
         known = None
         if mesh is reduced.inputs.mesh and reduced.injection is None:
-            both = np.concatenate([reduced.inputs.values, reduced.outputs.values], axis=2)
-            known = equations(reduced.first, both.reshape(mesh.points.size, -1, 1))
+            u, y = reduced.inputs.values, reduced.outputs.values
+            points = mesh.points.size
+            known = equations(reduced.first, u.reshape(points, -1), y.reshape(points, -1))
         solution = solve(
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         )
     return Extension(solution, latest[0])
+
+
+def _driven(o: ObserverMatrices, u: Array, y: Array, columns: int) -> tuple[Array, Array]:
+    """[b_0 | D_0 | 0], shape (N, k, columns), and g_y (N, e + r), of u (N, m) and y (N, r)."""
+    if kernels.compiled is not None:
+        driven: tuple[Array, Array] = kernels.compiled.driven(
+            o.from_unknowns, o.from_signals, o.g_signals, u, y, columns
+        )
+        return driven
+    signals = np.concatenate([u, y], axis=1)[:, :, None]
+    f = np.zeros((len(u), o.dynamics.shape[1], columns))
+    f[:, :, :1] = o.from_signals @ signals
+    f[:, :, 1 : 1 + o.from_unknowns.shape[2]] = o.from_unknowns
+    return f, (o.g_signals @ signals)[:, :, 0]
+
+
+def _over_time(signal: Array) -> Array:
+    """Values (K, s + 1, …) one point after the other, (K (s + 1), …)."""
+    return signal.reshape(signal.shape[0] * signal.shape[1], *signal.shape[2:])
 
 
 def observe(
@@ -576,10 +705,11 @@ def observe_reduced(reduced: ReducedSystem, settings: ObserverSettings) -> Obser
     extension = extend(reduced, reduced.mesh, reduced.start(V1 @ xi_a0, V1))
     mesh, final = extension.mesh, extension.assembled
     kept = final.kept_rows(system, settings.regression)
+    all_kept = len(kept) == final.Y.shape[1]
     return Observation(
         regression=LinearRegression(
-            Y=on_mesh(mesh, final.Y[:, kept]),
-            psi=on_mesh(mesh, final.psi[:, kept]),
+            Y=on_mesh(mesh, final.Y if all_kept else final.Y[:, kept]),
+            psi=on_mesh(mesh, final.psi if all_kept else final.psi[:, kept]),
             parameters=(*system.unknowns, *reduced.names),
             scale=final.psi_scale,
         ),
@@ -674,27 +804,43 @@ class Assembled:
 
     def kinds(self) -> list[tuple[Array, float]]:
         """Everything the mesh has to resolve, with the size below which it is rounding."""
-        products = outer_products(self.psi, self.Y)
+        squares, right = _products(self.psi, self.Y)
         Y, psi = 1e-3 * self.Y_scale, 1e-3 * self.psi_scale
         return [
             (self.Y, Y),
             (self.psi, psi),
             (self.offset, 0.0),
             (self.gain, 0.0),
-            (products[..., :-1], psi * self.psi_scale),
-            (products[..., -1], psi * self.Y_scale),
+            (squares, psi * self.psi_scale),
+            (right, psi * self.Y_scale),
         ]
 
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
+        if regression != "paper":
+            in_psi, in_Y = self._row_sizes()
+            large = (in_psi > _VANISHING * self.psi_scale) | (in_Y > _VANISHING * self.Y_scale)
+            kept: IntArray = large.nonzero()[0]
+            if len(kept):
+                return kept
         rows = self.Y.shape[1]
-        last = np.arange(rows - system.r, rows)
-        if regression == "paper":  # eq. (regpsi)
-            return last
-        in_psi = np.abs(self.psi).max(axis=(0, 2)) > _VANISHING * self.psi_scale
-        in_Y = np.abs(self.Y).max(axis=0) > _VANISHING * self.Y_scale
-        kept = np.flatnonzero(in_psi | in_Y)
-        return kept if len(kept) else last
+        return np.arange(rows - system.r, rows)  # eq. (regpsi)
+
+    def _row_sizes(self) -> tuple[Array, Array]:
+        """Largest entry of each row of ψ and of Y over the times, (e + r,) both."""
+        if kernels.compiled is not None:
+            sizes: tuple[Array, Array] = kernels.compiled.residual_sizes(self.psi, self.Y)
+            return sizes
+        return np.abs(self.psi).max(axis=(0, 2), initial=0.0), np.abs(self.Y).max(axis=0)
+
+
+def _products(psi: Array, Y: Array) -> tuple[Array, Array]:
+    """ψᵀψ (N, p, p) and ψᵀY (N, p) of ψ (N, rows, p) and Y (N, rows)."""
+    if kernels.compiled is not None and psi.shape[2] <= _SMALL:
+        products: tuple[Array, Array] = kernels.compiled.products(psi, Y)
+        return products
+    both = outer_products(psi, Y)
+    return both[..., :-1], both[..., -1]
 
 
 def regression_signals(
@@ -714,6 +860,12 @@ def regression_signals(
         H: likewise.
         injectivity: passed on.
     """
+    if kernels.compiled is not None and len(basis) <= _SMALL:
+        Y, psi, offset, gain, sizes = kernels.compiled.regression_signals(
+            z, q, basis, algebraic, g_y, G, Q1, H
+        )
+        Y_scale, psi_scale = sizes.tolist()
+        return Assembled(Y, psi, offset, gain, Y_scale, psi_scale, H, injectivity)
     signs = np.ones(z.shape[2])
     signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
     signed = z * signs
@@ -742,11 +894,11 @@ def initial_basis(P: Array, rank: int, states: tuple[str, ...]) -> tuple[Array, 
     Coordinate axes where they span the range (E diagonal, or zero columns): e0_<state>. Else an
     orthonormal basis made from the columns of P in the order of the states: e0_1, e0_2, …
     """
-    axes = np.flatnonzero(np.diag(P) > 0.5)
-    exact = np.zeros_like(P)
-    exact[axes, axes] = 1.0
+    on_axes = P.diagonal() > 0.5
+    exact = np.diag(on_axes.astype(np.float64))
+    axes = on_axes.nonzero()[0]
     if len(axes) == rank and np.abs(P - exact).max(initial=0.0) < 1e-13:
-        return np.eye(len(P))[:, axes], tuple(f"e0_{states[i]}" for i in axes)
+        return exact[:, axes], tuple([f"e0_{states[i]}" for i in axes.tolist()])
     columns: list[Array] = []
     for column in P.T:  # Gram–Schmidt, twice: deterministic, unlike singular vectors
         v = column.copy()

@@ -8,8 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.regression import Estimator, LinearRegression
+from gpebo_cli.regression import Estimator, LinearRegression, spectral_norm
 from gpebo_cli.result import Assumption
 from gpebo_cli.systems.descriptor import Array
 
@@ -57,6 +58,9 @@ class AffineStateMap:
         offset, gain = sampler(self.offset.values), sampler(self.gain.values)
 
         def reconstruct(eta: Array) -> Array:
+            if kernels.compiled is not None and eta.ndim == gain.ndim:
+                states: Array = kernels.compiled.affine_map(offset, gain, eta)
+                return states
             return np.asarray(offset + np.matmul(gain, eta[..., None])[..., 0])
 
         return reconstruct
@@ -91,14 +95,21 @@ class InitialError:
 
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """η at the times t (M,), shape (M, p)."""
-        if not (np.diff(theta, axis=0) != 0.0).any() or np.isnan(theta).any():
+        if _is_constant(theta) or np.isnan(theta).any():
             start = states.values[0, 0]
             # A state that nobody knows (NaN) does not spoil components it has no part in.
             parts = np.where(self.initial_basis == 0.0, 0.0, self.initial_basis * start[:, None])
             e0 = self.xi_a0 - parts.sum(axis=0)
-            return np.concatenate([theta, np.broadcast_to(e0, (len(t), len(e0)))], axis=1)
+            eta = np.empty((len(t), theta.shape[1] + len(e0)))
+            eta[:, : theta.shape[1]], eta[:, theta.shape[1] :] = theta, e0
+            return eta
         e0 = error_of_extension(self.extension(t), theta, states(t) @ self.basis)
         return np.concatenate([theta, e0], axis=1)
+
+
+def _is_constant(theta: Array) -> bool:
+    """Whether θ (M, q) is the same at all times; at a broadcast array nobody has to look."""
+    return theta.strides[0] == 0 or not theta.size or not (theta[1:] != theta[:-1]).any()
 
 
 def error_of_extension(W: Array, theta: Array, x: Array) -> Array:
@@ -112,8 +123,16 @@ def error_of_extension(W: Array, theta: Array, x: Array) -> Array:
 
 def log_norm(Phi: Array) -> float:
     """ln ‖Φ‖₂ of a matrix (n, n_a); Φ = 0 counts as the smallest number there is."""
-    size = float(np.linalg.norm(Phi, 2)) if Phi.size else 1.0
+    size = spectral_norm(Phi, Phi.shape[1]) if Phi.size else 1.0
     return float(np.log(max(size, np.finfo(float).tiny)))
+
+
+def largest_entry(values: Array, first: int = 0) -> float:
+    """Size of the largest entry of values (…, columns), in the columns from ``first`` on."""
+    if kernels.compiled is not None:
+        size: float = kernels.compiled.largest_entry(values, first)
+        return size
+    return float(np.abs(values[..., first:]).max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,7 +148,7 @@ class SampledObserver:
         o = self._matrices(t, t)
         g_y = (o.g_signals @ np.hstack([u, y])[:, :, None])[:, :, 0]
         assembled = regression_signals(
-            z, system.q, self.basis, o.algebraic @ self.basis, g_y, o.G, o.range, o.elimination,
+            z, system.q, self.basis, o.on_basis, g_y, o.G, o.range, o.elimination,
             o.injectivity,
         )
         rows = np.concatenate([assembled.psi, assembled.Y[:, :, None]], axis=2)
@@ -209,7 +209,8 @@ def sampled_observer(
     t = np.array([start])
     first = observer_matrices(system, t, t, solver.rank_tol, normalise=True)
     if not _kernel_is_fixed(system, first, t + _PROBED, solver.rank_tol):
-        first = replace(first, split=replace(first.split, basis=np.eye(system.n), frame=None))
+        split = replace(first.split, basis=np.eye(system.n), frame=None)
+        first = replace(first, split=split, on_basis=first.algebraic)
     split = first.split
     V1, names = initial_basis(split.projector[0], split.rank, system.states)
     xi_a0 = initial_extension(settings, system, names)
