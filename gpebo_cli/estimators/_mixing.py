@@ -29,7 +29,7 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
         return delta, Y.reshape(len(t), -1)
 
     def determinant(t: Array) -> Array:
-        return np.asarray(np.linalg.det(extended(t)[..., :p]))
+        return determinants(extended(t)[..., :p])
 
     delta, quotient = mixed_points(extended.values)
     return scalar_path(extended.mesh, signals, delta, quotient, t, determinant, floor)
@@ -43,6 +43,14 @@ def mixed_points(extended: Array) -> tuple[Array, Array]:
         return delta, quotient
     delta, quotient, usable = determinant_and_quotient(extended[..., :p], extended[..., p:])
     return delta, filled(quotient.reshape(*delta.shape, -1), usable)
+
+
+def determinants(omega: Array) -> Array:
+    """det Ω (N,) of Ω (N, p, p)."""
+    if kernels.compiled is not None and omega.shape[-1] <= _SMALL:
+        delta: Array = kernels.compiled.determinants(omega)
+        return delta
+    return np.asarray(np.linalg.det(omega))
 
 
 def determinant_and_quotient(omega: Array, rhs: Array) -> tuple[Array, Array, BoolArray]:
