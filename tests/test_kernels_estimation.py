@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernel_paths import COMPILED, by_both, needs_kernels
 
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.collocation.radau import radau_rule
@@ -20,9 +21,9 @@ from gpebo_cli.estimators._scalar import (
     linear_law,
 )
 from gpebo_cli.experiment import _evaluation
+from gpebo_cli.linalg import determinant_and_adjugate_action
 from gpebo_cli.metrics import SETTLED
 from gpebo_cli.observers.observation import AffineStateMap
-from kernel_paths import COMPILED, by_both, needs_kernels
 
 pytestmark = needs_kernels
 SEEDS = st.integers(0, 2**32 - 1)
@@ -57,9 +58,8 @@ def test_mixed_points(elements, p, c, ruined, seed):
             flat[point, :, :p] *= 1e-120
     with np.errstate(all="ignore"):
         condition = np.linalg.cond(omega)
-        delta, quotient = compare(
-            lambda: mixed_points(extended), rtol=1e-13 * condition[condition < 1e13].max(initial=1e3)
-        )
+        worst = condition[condition < 1e13].max(initial=1e3)
+        delta, quotient = compare(lambda: mixed_points(extended), rtol=1e-13 * worst)
     assert not np.isnan(quotient).any()
     assert delta.shape == (elements, 4)
 
@@ -91,6 +91,46 @@ def test_determinants(count, p, seed):
     omega[1::2] *= 1e-90
     compare(lambda: determinants(omega[..., :p]))
     compare(lambda: determinants(0.0 * omega[..., 1:]))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(1, 8), st.integers(0, 8), st.integers(0, 3), st.booleans(), SEEDS)
+def test_adjugate_action(p, rank, count, graded, seed):
+    """Of any rank: adj(Ω) b is the larger of its own digits and those that Ω leaves it."""
+    rng = np.random.default_rng(seed)
+    rank = min(rank, p)
+    omega = rng.normal(size=(count, p, rank)) @ rng.normal(size=(count, rank, p))
+    if graded:
+        omega *= 10.0 ** -rng.integers(0, 8, (p, 1))
+    rhs = rng.normal(size=(count, p, 2))
+    (one, action, condition), (other, expected, exact) = by_both(
+        lambda: determinant_and_adjugate_action(omega, rhs)
+    )
+    sigma = np.linalg.svd(omega, compute_uv=False)
+    # A change of Ω by ε‖Ω‖ changes a minor by that times minors that are one smaller, and so on.
+    minors = np.prod(np.maximum(sigma[:, : p - 1], 1e-15 * sigma[:, :1]), axis=1)
+    smaller = np.prod(np.maximum(sigma[:, : max(p - 2, 0)], 1e-15 * sigma[:, :1]), axis=1)
+    size = 1e-12 * (minors + sigma[:, 0] * smaller if p > 1 else minors)
+    assert (np.abs(action - expected) <= 10.0 * size[:, None, None]).all()
+    assert (np.abs(one - other) <= size * sigma[:, 0]).all()
+    np.testing.assert_allclose(condition, exact, rtol=1e-11, atol=2e-15 * p)
+
+
+@given(st.integers(1, 6), SEEDS)
+def test_adjugate_action_of_one_vector(p, seed):
+    rng = np.random.default_rng(seed)
+    omega, b = rng.normal(size=(2, 3, p, p)), rng.normal(size=(2, 3, p))
+    delta, action, _ = compare(lambda: determinant_and_adjugate_action(omega, b), 1e-8, 1e-9)
+    solved = (np.linalg.inv(omega) @ b[..., None])[..., 0] * delta[..., None]
+    np.testing.assert_allclose(action, solved, rtol=1e-7, atol=1e-8)
+
+
+def test_reciprocal_condition_of_tiny_and_of_triangular_matrices():
+    upper = np.triu(np.ones((6, 6)))
+    omega = np.array([upper, 1e-180 * upper, 1e180 * upper, np.diag([1.0, 0, 0, 0, 0, 0])])
+    with np.errstate(over="ignore", invalid="ignore"):
+        one, other = by_both(lambda: determinant_and_adjugate_action(omega, omega)[2])
+    np.testing.assert_allclose(one, other, rtol=1e-13)
 
 
 def a_path(rng, *, size=3, p=2, scale=1.0, times=9, flat=False, spread=1e-9):
@@ -265,6 +305,14 @@ def test_kernels_refuse_what_does_not_fit():
         COMPILED.energy(path.energy, path.mesh.steps, np.eye(2))
     with pytest.raises(ValueError, match="rows and columns of the extension: 3 and 2"):
         COMPILED.mixed_points(np.zeros((1, 1, 3, 2)), SINGULAR)
+    with pytest.raises(ValueError, match="rows and columns: 2 and 3"):
+        COMPILED.determinants(np.zeros((1, 2, 3)))
+    with pytest.raises(ValueError, match="matrices and right sides: 1 and 2"):
+        COMPILED.adjugate_action(np.zeros((1, 2, 2)), np.zeros((2, 2, 1)))
+    with pytest.raises(ValueError, match="rows and columns: 2 and 3"):
+        COMPILED.adjugate_action(np.zeros((1, 2, 3)), np.zeros((1, 2, 1)))
+    with pytest.raises(ValueError, match="rows of matrices and right sides: 2 and 3"):
+        COMPILED.adjugate_action(np.zeros((1, 2, 2)), np.zeros((1, 3, 1)))
     with pytest.raises(TypeError):
         COMPILED.mixed_points(np.zeros((1, 1, 2, 3)), "singular")
 

@@ -37,7 +37,7 @@ def axis(value: object, where: str, *, positive: bool = True) -> tuple[float, ..
     items = list(value) if isinstance(value, Sequence) else [value]
     if not items:
         raise ConfigError(f"{where} is an empty list; give a number, a list or logspace(a, b, n)")
-    if len(items) > _MANY and set(map(type, items)) == {float}:
+    if len(items) > _MANY and set(map(type, items)) <= {float, np.float64}:
         values = np.array(items)
         if np.isfinite(values).all() and (values.min() > 0.0 or not positive):
             return tuple(values.tolist())
