@@ -11,6 +11,10 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.systems.descriptor import Array
 
+# Rows of matrices, up to which LAPACK's calls cost more than what they compute: by elimination, and
+# where singular values are wanted.
+SMALL, _SMALL_SPECTRUM = 16, 8
+
 
 def transpose(a: Array) -> Array:
     """Transpose the last two axes, (…, a, b) to (…, b, a)."""
@@ -35,7 +39,8 @@ def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Ar
     """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p) or (..., p, c), singular Ω too.
 
     With Ω = U Σ Vᵀ, adj(Ω) = det(U) det(V) V diag(∏_{j≠i} σ_j) Uᵀ. The usual det(Ω)·inv(Ω) is
-    rejected: it is undefined at the start, where every extension begins at Ω = 0.
+    rejected: it is undefined at the start, where every extension begins at Ω = 0. The kernel does
+    it by elimination with the smallest pivot last, by which nothing is divided.
 
     Returns:
         det(Ω) of shape (...,), adj(Ω) b of the shape of b, and the reciprocal condition number
@@ -48,6 +53,13 @@ def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Ar
         (0.0, [0.0, 0.0])
     """
     p = omega.shape[-1]
+    if kernels.compiled is not None and 0 < p <= _SMALL_SPECTRUM:
+        columns = 1 if rhs.ndim < omega.ndim else rhs.shape[-1]
+        delta, action, condition = kernels.compiled.adjugate_action(
+            omega.reshape(-1, p, p), rhs.reshape(-1, p, columns)
+        )
+        shape = omega.shape[:-2]
+        return delta.reshape(shape), action.reshape(rhs.shape), condition.reshape(shape)
     u, sigma, vt = np.linalg.svd(omega)
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     # Products of all singular values but one, by prefix and suffix products: no division.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from itertools import product
+from math import prod
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from gpebo_cli.systems.descriptor import Array
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
 _MAX_CASES = 10_000_000
+_MANY = 8  # numbers, from which on looking at them one by one is what takes the time
 
 
 def axis(value: object, where: str, *, positive: bool = True) -> tuple[float, ...]:
@@ -35,6 +37,10 @@ def axis(value: object, where: str, *, positive: bool = True) -> tuple[float, ..
     items = list(value) if isinstance(value, Sequence) else [value]
     if not items:
         raise ConfigError(f"{where} is an empty list; give a number, a list or logspace(a, b, n)")
+    if len(items) > _MANY and set(map(type, items)) <= {float, np.float64}:
+        values = np.array(items)
+        if np.isfinite(values).all() and (values.min() > 0.0 or not positive):
+            return tuple(values.tolist())
     return tuple(number(item, where, positive=positive) for item in items)
 
 
@@ -80,9 +86,12 @@ def combinations(axes: Mapping[str, Sequence[float]]) -> tuple[Mapping[str, floa
         >>> [dict(case) for case in combinations({"alpha": [1.0], "gamma": [10.0, 100.0]})]
         [{'alpha': 1.0, 'gamma': 10.0}, {'alpha': 1.0, 'gamma': 100.0}]
     """
-    total = int(np.prod([len(values) for values in axes.values()], dtype=np.int64))
+    total = prod(len(values) for values in axes.values())
     if total > _MAX_CASES:
         raise ConfigError(f"the gains make {total} cases; at most {_MAX_CASES} fit in one run")
+    if len(axes) == 1:
+        ((name, only),) = axes.items()
+        return tuple([{name: value} for value in only])
     return tuple(dict(zip(axes, values, strict=True)) for values in product(*axes.values()))
 
 

@@ -31,20 +31,23 @@ def resolved_low_pass(signal: Trajectory, rate: Array, start: Array | None = Non
         rate: λ of the filters in 1/s, (p,) or any shape that broadcasts against the signal.
         start: of the filtered signal, of the shape of one value; None: 0.
     """
-    tail = np.zeros(0)
+    edges = signal.mesh.edges
+    smallest = 1e-13 * max(1.0, abs(float(edges[0])), abs(float(edges[-1])))
+    # Where an element is shorter it is the signal that is not resolved, not the filter.
+    shortest = max(smallest, 0.5 / float(np.max(rate)))
     for _ in range(_ROUNDS):
-        filtered = signal.low_pass(rate, start)
+        filtered, mesh = signal.low_pass(rate, start), signal.mesh
         flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
-        tail = unresolved(flat, signal.mesh.rule)
-        poor = tail > _TOLERANCE
-        smallest = 1e-13 * max(1.0, float(np.abs(signal.mesh.edges).max()))
-        poor &= signal.mesh.steps * np.max(rate) > 0.5  # else it is the signal, not the filter
-        poor &= signal.mesh.steps > smallest
+        poor = unresolved(flat, mesh.rule) > _TOLERANCE
+        poor &= mesh.steps > shortest
         if not poor.any():
             break
-        finer, _ = signal.mesh.split(np.where(poor, 4, 1))
-        points, inside = finer.points.ravel(), finer.inside.ravel()
-        values = signal(points, inside).reshape(*finer.points.shape, *signal.values.shape[2:])
+        finer, parent = mesh.split(np.where(poor, 4, 1))
+        values = np.empty((*finer.points.shape, *signal.values.shape[2:]))
+        kept, new = parent >= 0, parent < 0
+        values[kept] = signal.values[parent[kept]]
+        sampled = signal(finer.points[new].ravel(), finer.inside[new].ravel())
+        values[new] = sampled.reshape(-1, *values.shape[1:])
         signal = Trajectory(finer, values)
     return filtered
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -57,7 +58,7 @@ def estimate_mixed(
     )
     return MixedEstimates(
         groups=(mix(extended, t, regression.floor),),
-        reached=(reached(regression, extended, known, linear=linear),),
+        at_end=lambda: (reached(regression, extended, known, linear=linear),),
         start=per_parameter(settings.initial, names, "estimator.initial"),
         gains=gain_matrix(settings.gamma, names, "estimator.gamma"),
         condition="Δ not in L2",
@@ -132,11 +133,16 @@ class MixedEstimates:
     start: Array  # (p,)
     gains: Array  # (g, p or 1)
     condition: str
-    reached: tuple[ExtensionState, ...]  # of each group
+    at_end: Callable[[], tuple[ExtensionState, ...]]  # of each group; asked for at resets only
     needed: float = ONE_PERCENT  # of γ∫Δ²
     needed_for: str = "1 % of the initial error"
     transform: Transform | None = None
     realisations: tuple[int, ...] = ()
+
+    @cached_property
+    def reached(self) -> tuple[ExtensionState, ...]:
+        """The extension of each group at the end."""
+        return self.at_end()
 
     def delta(self, t: Array) -> Array:
         """Δ at the times t (M,), one row if it is the same for every case, else one per case."""

@@ -7,13 +7,12 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
-from gpebo_cli.linalg import determinant_and_adjugate_action
+from gpebo_cli.linalg import SMALL, determinant_and_adjugate_action
 from gpebo_cli.systems.descriptor import Array, BoolArray
 
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not
 # needed there either: its weight in every law is ∫Δ².
 SINGULAR = 1e-14
-_SMALL = 16  # parameters, up to which elimination without LAPACK is the faster one
 
 
 def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
@@ -29,7 +28,7 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
         return delta, Y.reshape(len(t), -1)
 
     def determinant(t: Array) -> Array:
-        return np.asarray(np.linalg.det(extended(t)[..., :p]))
+        return determinants(extended(t)[..., :p])
 
     delta, quotient = mixed_points(extended.values)
     return scalar_path(extended.mesh, signals, delta, quotient, t, determinant, floor)
@@ -38,11 +37,19 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
 def mixed_points(extended: Array) -> tuple[Array, Array]:
     """Δ (K, s + 1) and η̄ = 𝐘/Δ, usable everywhere, (K, s + 1, p c) of [Ω | 𝒴] (.., p, p + c)."""
     p = extended.shape[-2]
-    if kernels.compiled is not None and p <= _SMALL:
+    if kernels.compiled is not None and p <= SMALL:
         delta, quotient = kernels.compiled.mixed_points(extended, SINGULAR)
         return delta, quotient
     delta, quotient, usable = determinant_and_quotient(extended[..., :p], extended[..., p:])
     return delta, filled(quotient.reshape(*delta.shape, -1), usable)
+
+
+def determinants(omega: Array) -> Array:
+    """det Ω (N,) of Ω (N, p, p)."""
+    if kernels.compiled is not None and omega.shape[-1] <= SMALL:
+        delta: Array = kernels.compiled.determinants(omega)
+        return delta
+    return np.asarray(np.linalg.det(omega))
 
 
 def determinant_and_quotient(omega: Array, rhs: Array) -> tuple[Array, Array, BoolArray]:

@@ -219,7 +219,7 @@ def scalar_path(
 
 
 def integral_of_square(mesh: Mesh, delta: Array) -> Array:
-    """I = ∫Δ² of Δ (K, s + 1) at the points of its mesh, (K, s + 1); rounding lets it never fall."""
+    """I = ∫Δ² of Δ (K, s + 1) at the points of its mesh, (K, s + 1); it never falls."""
     if kernels.compiled is not None:
         energy: Array = kernels.compiled.energy(delta, mesh.steps, mesh.rule.integration)
         return energy

@@ -86,7 +86,7 @@ class LsDrem:
                 mix_least_squares(info, case["alpha"], case["f0"], t, regression.floor)
                 for info, case in zip(infos, part.cases, strict=True)
             ),
-            reached=tuple(info.reached for info in infos),
+            at_end=lambda: tuple(info.reached for info in infos),
             start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
             gains=gain_matrix(self.gamma, regression.parameters, "estimator.gamma"),
             condition="IE",

@@ -8,6 +8,13 @@
 
 /* Cases side by side: recurrences that do not wait for one another, in as many registers. */
 #define LANES 8
+/* For what is compiled twice: for LANES cases, and for one, without padding. */
+#if defined(__GNUC__)
+#define TWICE static inline __attribute__((always_inline))
+#else
+#define TWICE static inline
+#endif
+#define FEW 3 /* cases: up to here one after the other is faster than LANES with padding */
 #define TOGETHER 32 /* times at once when errors are measured */
 
 /* An argument that is a number; 0 with an exception if it is none. */
@@ -32,12 +39,25 @@ static inline double larger(double one, double other)
     return other > one || isnan(other) ? other : one;
 }
 
+/* one · other, with a power of two taken out where it would become too small or too large. */
+static inline double times_power(double one, double other, int *exponent)
+{
+    const double size = fabs(other), product = one * other;
+    if ((size > 1e-100 && size < 1e100 && fabs(product) > 1e-100 && fabs(product) < 1e100) ||
+        !isfinite(one) || !isfinite(other))
+        return product;
+    int first, second;
+    const double mantissa = frexp(one, &first) * frexp(other, &second);
+    *exponent += first + second;
+    return mantissa;
+}
+
 /* Solves A X = B as solve_in_place does, and gives det A, without under- or overflow on the way;
    0 for a pivot of zero, and then there is no X. A (n, n) is destroyed, B (n, columns) becomes X. */
 static double solve_and_determinant(double *A, double *B, npy_intp n, npy_intp columns)
 {
     double mantissa = 1.0;
-    long exponent = 0;
+    int exponent = 0;
     for (npy_intp k = 0; k < n; k++) {
         npy_intp best = k;
         for (npy_intp i = k + 1; i < n; i++)
@@ -59,13 +79,7 @@ static double solve_and_determinant(double *A, double *B, npy_intp n, npy_intp c
             }
         }
         const double *restrict pivot = A + k * n, *restrict known = B + k * columns;
-        if (isfinite(pivot[k]) && isfinite(mantissa)) {
-            int own;
-            mantissa *= frexp(pivot[k], &own);
-            exponent += own;
-        } else {
-            mantissa *= pivot[k];
-        }
+        mantissa = times_power(mantissa, pivot[k], &exponent);
         for (npy_intp i = k + 1; i < n; i++) {
             double *restrict row = A + i * n, *restrict right = B + i * columns;
             if (row[k] == 0.0)
@@ -90,9 +104,7 @@ static double solve_and_determinant(double *A, double *B, npy_intp n, npy_intp c
         for (npy_intp j = 0; j < columns; j++)
             solved[j] = isfinite(one) ? solved[j] * one : solved[j] / A[k * n + k];
     }
-    if (exponent > INT_MAX / 2 || exponent < -(INT_MAX / 2))
-        exponent = exponent > 0 ? INT_MAX / 2 : -(INT_MAX / 2);
-    return ldexp(mantissa, (int)exponent);
+    return exponent ? ldexp(mantissa, exponent) : mantissa;
 }
 
 /* Frobenius norm of the first n columns of A (rows, columns). */
@@ -323,26 +335,26 @@ static inline double power(int k)
     return value;
 }
 
-/* e^{−x} of LANES values x = γδ ≥ 0, and its mean (1 − e^{−x})/x over a step, 1 at x = 0; both to
+/* e^{−x} of some values x = γδ ≥ 0, and its mean (1 − e^{−x})/x over a step, 1 at x = 0; both to
    about one unit in the last place.
 
    x = k ln 2 − r, |r| ≤ ln(2)/2, and q = e^r − 1 by its series, which is good to 1e-17 q. Then
    e^{−x} = 2^−k (1 + q), and 1 − e^{−x} = (1 − 2^−k) − 2^−k q loses nothing: for k = 0 it is −q.
    The library's exp and expm1 take one value at a time; these loops become vector instructions. */
-static inline void decays_of_one(const double *restrict gamma, double length,
-                                 double *restrict end, double *restrict mean)
+TWICE void decays_of_one(const double *restrict gamma, double length, double *restrict end,
+                         double *restrict mean, const int lanes)
 {
     double x[LANES], r[LANES], q[LANES], shrunk[LANES];
-    for (int b = 0; b < LANES; b++)
+    for (int b = 0; b < lanes; b++)
         x[b] = gamma[b] * length < LEAST ? LEAST : gamma[b] * length;
-    for (int b = 0; b < LANES; b++)
+    for (int b = 0; b < lanes; b++)
         r[b] = x[b] > MOST ? MOST : x[b];
-    for (int b = 0; b < LANES; b++) {
+    for (int b = 0; b < lanes; b++) {
         const int k = r[b] <= MOST ? (int)(r[b] * LOG2_E + 0.5) : 0; /* NaN remains in r */
         r[b] = (k * LN2_HIGH - r[b]) + k * LN2_LOW;
         shrunk[b] = power(k);
     }
-    for (int b = 0; b < LANES; b++) {
+    for (int b = 0; b < lanes; b++) {
         const double v = r[b];
         double sum = 1.0 / 6227020800.0;
         sum = sum * v + 1.0 / 479001600.0;
@@ -358,17 +370,18 @@ static inline void decays_of_one(const double *restrict gamma, double length,
         sum = sum * v + 0.5;
         q[b] = shrunk[b] * ((sum * v) * v + v);
     }
-    for (int b = 0; b < LANES; b++) {
+    for (int b = 0; b < lanes; b++) {
         end[b] = shrunk[b] + q[b];
         mean[b] = ((1.0 - shrunk[b]) - q[b]) / x[b];
     }
 }
 
-/* The same for LANES cases with a gain for each of `own` parameters: all (own, LANES). */
-static void decays(const double *gamma, double length, npy_intp own, double *end, double *mean)
+/* The same for cases with a gain for each of `own` parameters: all (own, lanes). */
+TWICE void decays(const double *gamma, double length, npy_intp own, double *end, double *mean,
+                  const int lanes)
 {
-    for (npy_intp i = 0; i < own * LANES; i += LANES)
-        decays_of_one(gamma + i, length, end + i, mean + i);
+    for (npy_intp i = 0; i < own * lanes; i += lanes)
+        decays_of_one(gamma + i, length, end + i, mean + i, lanes);
 }
 
 /* Where the times are between the points of a path: the point before each (M,), I from there on
@@ -378,25 +391,38 @@ typedef struct {
     double *partial, *share;
 } Places;
 
-/* The law for LANES cases with η̄ linear in I between the points: the distances η̂ − η̄ at the
-   left end of every step, (N, p, LANES), from those at the start (p, LANES). */
-static void distances(const double *E, const double *Q, npy_intp elements, npy_intp each,
-                      npy_intp p, const double *gamma, npy_intp own, double *end, double *mean,
-                      double *distance)
+/* A path that the law takes: I (K, s + 1) and η̄ (K, s + 1, p). */
+typedef struct {
+    const double *energy, *quotient;
+    npy_intp elements, each, p;
+} Path;
+
+/* Some cases at once. */
+typedef struct {
+    npy_intp own;               /* gains of each: 1, or one for each of the p parameters */
+    double *gamma, *end, *mean; /* (own, lanes) gains, and room for their decays */
+    double *distance;           /* (N, p, lanes) η̂ − η̄ at the left end of every step */
+} Cases;
+
+/* The law with η̄ linear in I between the points: the distances at the left end of every step
+   from those at the start. */
+TWICE void go_along(const Path *path, const Cases *cases, const int lanes)
 {
-    for (npy_intp k = 0; k < elements; k++)
-        for (npy_intp i = 0; i + 1 < each; i++, distance += p * LANES) {
-            const double *left = Q + (k * each + i) * p;
-            const int jumps = i + 2 == each && k + 1 < elements; /* η̂ does not, where η̄ does */
-            if (i + 2 == each && k + 1 == elements)
+    const npy_intp each = path->each, p = path->p, own = cases->own;
+    double *distance = cases->distance, *const end = cases->end, *const mean = cases->mean;
+    for (npy_intp k = 0; k < path->elements; k++)
+        for (npy_intp i = 0; i + 1 < each; i++, distance += p * lanes) {
+            const double *left = path->quotient + (k * each + i) * p;
+            const int jumps = i + 2 == each; /* η̂ does not, where η̄ does */
+            if (jumps && k + 1 == path->elements)
                 return;
-            decays(gamma, step_length(E + k * each + i), own, end, mean);
+            decays(cases->gamma, step_length(path->energy + k * each + i), own, end, mean, lanes);
             for (npy_intp j = 0; j < p; j++) {
                 const double change = left[p + j] - left[j];
                 const double jump = jumps ? left[2 * p + j] - left[p + j] : 0.0;
-                const npy_intp lane = own == 1 ? 0 : j * LANES;
-                double *restrict d = distance + j * LANES, *restrict next = d + p * LANES;
-                for (int b = 0; b < LANES; b++)
+                const npy_intp lane = own == 1 ? 0 : j * lanes;
+                double *restrict d = distance + j * lanes, *restrict next = d + p * lanes;
+                for (int b = 0; b < lanes; b++)
                     next[b] = end[lane + b] * d[b] + (-mean[lane + b] * change - jump);
             }
         }
@@ -404,10 +430,11 @@ static void distances(const double *E, const double *Q, npy_intp elements, npy_i
 
 /* Where in the steps of I (K, s + 1) the times are, from the element of each (M,), its place in
    it and I there (M,); 0 with an exception for an element that there is not. */
-static int find_places(const double *E, npy_intp elements, const double *edges,
-                       const double *points, npy_intp each, const double *t,
-                       const npy_intp *element, const double *at, npy_intp times, Places places)
+static int find_places(const Path *path, const double *edges, const double *points,
+                       const double *t, const npy_intp *element, const double *at, npy_intp times,
+                       Places *places)
 {
+    const npy_intp elements = path->elements, each = path->each;
     for (npy_intp m = 0; m < times; m++) {
         const npy_intp k = element[m];
         if (k < 0 || k >= elements) {
@@ -419,18 +446,55 @@ static int find_places(const double *E, npy_intp elements, const double *edges,
         npy_intp i = 0;
         while (i + 2 < each && !(points[i + 1] > local))
             i++;
-        const double step = step_length(E + k * each + i);
-        double partial = at[m] - E[k * each + i];
+        const double step = step_length(path->energy + k * each + i);
+        double partial = at[m] - path->energy[k * each + i];
         partial = partial < 0.0 ? 0.0 : partial > step ? step : partial;
         if (partial == step && i + 2 < each) { /* the next point itself: nothing to go there */
             i++;
             partial = 0.0;
         }
-        places.point[m] = k * each + i;
-        places.partial[m] = partial;
-        places.share[m] = partial > 0.0 ? partial / step : 0.0;
+        places->point[m] = k * each + i;
+        places->partial[m] = partial;
+        places->share[m] = partial > 0.0 ? partial / step : 0.0;
     }
     return 1;
+}
+
+/* The law of `some` ≤ lanes cases, starts (p,) of each and γ (own,) of each at `stride` numbers
+   from one another: η̂ (some, times, p). */
+TWICE void linear_cases(const Path *path, const Places *places, npy_intp times,
+                        const double *start, npy_intp start_stride, const double *gains,
+                        npy_intp some, const Cases *cases, double *eta, const int lanes)
+{
+    const npy_intp p = path->p, own = cases->own;
+    for (npy_intp b = 0; b < lanes; b++) {
+        const npy_intp one = b < some ? b : some - 1;
+        for (npy_intp i = 0; i < own; i++)
+            cases->gamma[i * lanes + b] = gains[one * own + i];
+        for (npy_intp j = 0; j < p; j++)
+            cases->distance[j * lanes + b] = start[one * start_stride + j] - path->quotient[j];
+    }
+    go_along(path, cases, lanes);
+    for (npy_intp m = 0; m < times; m++) {
+        const npy_intp point = places->point[m];
+        const double *left = path->quotient + point * p;
+        const double share = places->share[m];
+        const double *d = cases->distance + (point - point / path->each) * p * lanes;
+        if (places->partial[m] == 0.0) {
+            for (npy_intp b = 0; b < some; b++)
+                for (npy_intp j = 0; j < p; j++)
+                    eta[(b * times + m) * p + j] = left[j] + d[j * lanes + b];
+            continue;
+        }
+        decays(cases->gamma, places->partial[m], own, cases->end, cases->mean, lanes);
+        for (npy_intp j = 0; j < p; j++) {
+            const double change = share * (left[p + j] - left[j]);
+            const npy_intp lane = own == 1 ? 0 : j * lanes;
+            for (npy_intp b = 0; b < some; b++)
+                eta[(b * times + m) * p + j] = left[j] + cases->end[lane + b] * d[j * lanes + b] +
+                                               (1.0 - cases->mean[lane + b]) * change;
+        }
+    }
 }
 
 /* I (K, s + 1), η̄ (K, s + 1, p), edges (K + 1,), points of the rule (s + 1,), times (M,), their
@@ -476,49 +540,29 @@ static PyObject *linear_law(PyObject *module, PyObject *const *given, Py_ssize_t
     if (where == NULL)
         return failed(&call);
     Places places = {(npy_intp *)PyArray_DATA(where), work, work + times};
-    double *gamma = work + 2 * times, *end = gamma + own * LANES, *mean = end + own * LANES;
-    double *distance = mean + own * LANES;
-    const double *E = data(energies), *Q = data(quotient);
-    if (!find_places(E, elements, data(edges), data(points), each, data(t),
-                     (const npy_intp *)PyArray_DATA(element), data(at), times, places))
+    double *room = work + 2 * times;
+    const Path path = {data(energies), data(quotient), elements, each, p};
+    const Cases cases = {own, room, room + own * LANES, room + 2 * own * LANES,
+                         room + 3 * own * LANES};
+    if (!find_places(&path, data(edges), data(points), data(t),
+                     (const npy_intp *)PyArray_DATA(element), data(at), times, &places))
         return failed(&call);
-    for (npy_intp first = 0; first < g; first += LANES) {
+    const npy_intp start_stride = stride(size(start, 0), p);
+    for (npy_intp first = 0; first < g;) {
+        const double *from = data(start) + first * start_stride, *gamma = data(gains) + first * own;
+        double *eta = data(out) + first * times * p;
         const npy_intp some = g - first < LANES ? g - first : LANES;
-        for (npy_intp b = 0; b < LANES; b++) {
-            const npy_intp one = first + (b < some ? b : some - 1);
-            const double *from = data(start) + one * stride(size(start, 0), p);
-            for (npy_intp i = 0; i < own; i++)
-                gamma[i * LANES + b] = data(gains)[one * own + i];
-            for (npy_intp j = 0; j < p; j++)
-                distance[j * LANES + b] = from[j] - Q[j];
-        }
-        distances(E, Q, elements, each, p, gamma, own, end, mean, distance);
-        for (npy_intp m = 0; m < times; m++) {
-            const double *left = Q + places.point[m] * p;
-            const npy_intp step = places.point[m] - places.point[m] / each;
-            const double *d = distance + step * p * LANES;
-            if (places.partial[m] == 0.0) {
-                for (npy_intp b = 0; b < some; b++)
-                    for (npy_intp j = 0; j < p; j++)
-                        data(out)[((first + b) * times + m) * p + j] =
-                            left[j] + d[j * LANES + b];
-                continue;
-            }
-            decays(gamma, places.partial[m], own, end, mean);
-            for (npy_intp j = 0; j < p; j++) {
-                const double change = places.share[m] * (left[p + j] - left[j]);
-                const npy_intp lane = own == 1 ? 0 : j * LANES;
-                double *eta = data(out) + (first * times + m) * p + j;
-                for (npy_intp b = 0; b < some; b++)
-                    eta[b * times * p] = left[j] + end[lane + b] * d[j * LANES + b] +
-                                         (1.0 - mean[lane + b]) * change;
-            }
-        }
+        if (some < FEW)
+            linear_cases(&path, &places, times, from, start_stride, gamma, 1, &cases, eta, 1);
+        else
+            linear_cases(&path, &places, times, from, start_stride, gamma, some, &cases, eta,
+                         LANES);
+        first += some < FEW ? 1 : some;
     }
     return results(&call, 1, out);
 }
 
-/* What is known of the error norms of LANES cases as time goes on; squares, because roots cost
+/* What is known of the error norms of some cases as time goes on; squares, because roots cost
    more. */
 typedef struct {
     double level[LANES];  /* the square that counts as settled */
@@ -529,12 +573,12 @@ typedef struct {
     double sum[LANES];    /* twice the integral of the squares, by trapezoids */
 } Course;
 
-/* Takes the squares (count, LANES) at the times from index `first` on. */
-static void follow(Course *course, const double *squares, const double *t, npy_intp first,
-                   npy_intp count, double fraction)
+/* Takes the squares (count, lanes) at the times from index `first` on. */
+TWICE void follow(Course *course, const double *squares, const double *t, npy_intp first,
+                  npy_intp count, double fraction, const int lanes)
 {
     if (first == 0)
-        for (int b = 0; b < LANES; b++) {
+        for (int b = 0; b < lanes; b++) {
             course->level[b] = fraction * fraction * squares[b];
             course->last[b] = -1;
             course->before[b] = squares[b];
@@ -542,24 +586,24 @@ static void follow(Course *course, const double *squares, const double *t, npy_i
         }
     for (npy_intp m = 0; m < count; m++) {
         const double step = first + m > 0 ? t[first + m] - t[first + m - 1] : 0.0;
-        const double *square = squares + m * LANES;
-        for (int b = 0; b < LANES; b++)
+        const double *square = squares + m * lanes;
+        for (int b = 0; b < lanes; b++)
             course->sum[b] += step * (square[b] + course->before[b]);
-        for (int b = 0; b < LANES; b++)
+        for (int b = 0; b < lanes; b++)
             course->before[b] = square[b];
     }
-    for (int b = 0; b < LANES; b++) {
+    for (int b = 0; b < lanes; b++) {
         if (first > 0 && course->last[b] == first - 1)
             course->below[b] = squares[b];
         npy_intp m = count - 1;
-        while (m >= 0 && !(squares[m * LANES + b] > course->level[b]))
+        while (m >= 0 && !(squares[m * lanes + b] > course->level[b]))
             m--;
         if (m < 0)
             continue;
         course->last[b] = first + m;
-        course->above[b] = squares[m * LANES + b];
+        course->above[b] = squares[m * lanes + b];
         if (m + 1 < count)
-            course->below[b] = squares[(m + 1) * LANES + b];
+            course->below[b] = squares[(m + 1) * lanes + b];
     }
 }
 
@@ -585,27 +629,138 @@ static double settled(const Course *course, npy_intp b, const double *t, npy_int
     return t[last] + share * (t[last + 1] - t[last]) - t[0];
 }
 
-/* x̂_i = offset_i + Σ_j gain_ij η̂_j of LANES cases, η̂ (p, LANES). */
-static inline void state(double offset, const double *gain, const double *eta, npy_intp p,
-                         double *x)
+/* x̂_i = offset_i + Σ_j gain_ij η̂_j of some cases, η̂ (p, lanes). */
+TWICE void state(double offset, const double *gain, const double *eta, npy_intp p, double *x,
+                 const int lanes)
 {
     double sum[LANES] = {0.0};
     for (npy_intp j = 0; j < p; j++)
-        for (int b = 0; b < LANES; b++)
-            sum[b] += gain[j] * eta[j * LANES + b];
-    for (int b = 0; b < LANES; b++)
+        for (int b = 0; b < lanes; b++)
+            sum[b] += gain[j] * eta[j * lanes + b];
+    for (int b = 0; b < lanes; b++)
         x[b] = offset + sum[b];
 }
 
-/* Adds the squares of the errors of LANES values, and notes their sizes if asked to. */
-static inline void add_error(const double *value, double truth, double *restrict square,
-                             double *restrict worst)
+/* Adds the squares of the errors of some values, and notes their sizes if asked to. */
+TWICE void add_error(const double *value, double truth, double *restrict square,
+                     double *restrict worst, const int lanes)
 {
-    for (int b = 0; b < LANES; b++)
+    for (int b = 0; b < lanes; b++)
         square[b] += (value[b] - truth) * (value[b] - truth);
     if (worst != NULL)
-        for (int b = 0; b < LANES; b++)
+        for (int b = 0; b < lanes; b++)
             worst[b] = larger(worst[b], fabs(value[b] - truth));
+}
+
+/* An array of numbers for every time, or one for all of them. */
+typedef struct {
+    const double *values;
+    npy_intp stride;
+} Signal;
+
+static inline const double *at_time(Signal signal, npy_intp m)
+{
+    return signal.values + m * signal.stride;
+}
+
+/* What estimates are measured against. */
+typedef struct {
+    const double *t;                     /* (M,) */
+    Signal truth, offset, gain, x;       /* η (p,), offset (n,) and gain (n, p) of x̂, x (n,) */
+    npy_intp times, p, n, columns, kept; /* M, p, n, and how many of the next */
+    const npy_intp *column, *keep;       /* parameters that are judged, times that are kept */
+    const int *known, *known_x;          /* which of the columns (columns,) and states (n,) are */
+    int of_eta, of_x;                    /* whether there is anything to measure */
+    double fraction;                     /* at which an error has settled */
+} Measure;
+
+/* Where the results for some cases go: numbers (5, stride), η̂ (some, k, p) and x̂ (some, k, n). */
+typedef struct {
+    double *numbers, *eta, *x;
+    npy_intp stride;
+} Found;
+
+/* Measures `some` ≤ lanes cases of η̂ (some, M, p); room for (TOGETHER, p, lanes) numbers. */
+TWICE void measure_cases(const Measure *with, const double *estimates, npy_intp some, double *room,
+                         Found found, const int lanes)
+{
+    const npy_intp times = with->times, p = with->p, n = with->n, last = times - 1;
+    Course of[2];
+    double worst[2][LANES] = {{0.0}}, x[LANES];
+    for (npy_intp from = 0; from < times; from += TOGETHER) {
+        const npy_intp now = times - from < TOGETHER ? times - from : TOGETHER;
+        double squares[2][TOGETHER * LANES];
+        for (int i = 0; i < 2; i++)
+            memset(squares[i], 0, now * lanes * sizeof(double));
+        for (npy_intp b = 0; b < lanes; b++) {
+            const double *own = estimates + ((b < some ? b : some - 1) * times + from) * p;
+            for (npy_intp i = 0; i < now * p; i++)
+                room[i * lanes + b] = own[i];
+        }
+        for (npy_intp i = 0; i < now; i++) {
+            const npy_intp m = from + i;
+            const double *eta = room + i * p * lanes, *gain = at_time(with->gain, m);
+            const double *truth = at_time(with->truth, m), *true_x = at_time(with->x, m);
+            const double *offset = at_time(with->offset, m);
+            for (npy_intp j = 0; j < with->columns; j++)
+                if (with->known[j])
+                    add_error(eta + with->column[j] * lanes, truth[with->column[j]],
+                              squares[0] + i * lanes, m == last ? worst[0] : NULL, lanes);
+            for (npy_intp j = 0; j < n; j++)
+                if (with->known_x[j]) {
+                    state(offset[j], gain + j * p, eta, p, x, lanes);
+                    add_error(x, true_x[j], squares[1] + i * lanes, m == last ? worst[1] : NULL,
+                              lanes);
+                }
+        }
+        for (int i = 0; i < 2; i++)
+            follow(of + i, squares[i], with->t, from, now, with->fraction, lanes);
+    }
+    for (npy_intp b = 0; b < some; b++) {
+        double *one = found.numbers + b;
+        one[0] = with->of_eta ? settled(of, b, with->t, times) : NAN;
+        one[found.stride] = with->of_x ? settled(of + 1, b, with->t, times) : NAN;
+        one[2 * found.stride] = with->of_eta ? worst[0][b] : NAN;
+        one[3 * found.stride] = with->of_x ? worst[1][b] : NAN;
+        one[4 * found.stride] =
+            with->of_x ? sqrt(0.5 * of[1].sum[b] / (with->t[last] - with->t[0])) : NAN;
+    }
+    for (npy_intp k = 0; k < with->kept; k++) {
+        const npy_intp m = with->keep[k];
+        for (npy_intp b = 0; b < lanes; b++)
+            for (npy_intp j = 0; j < p; j++)
+                room[j * lanes + b] = estimates[((b < some ? b : some - 1) * times + m) * p + j];
+        for (npy_intp b = 0; b < some; b++)
+            for (npy_intp j = 0; j < p; j++)
+                found.eta[(b * with->kept + k) * p + j] = room[j * lanes + b];
+        for (npy_intp i = 0; i < n; i++) {
+            state(at_time(with->offset, m)[i], at_time(with->gain, m) + i * p, room, p, x, lanes);
+            for (npy_intp b = 0; b < some; b++)
+                found.x[(b * with->kept + k) * n + i] = x[b];
+        }
+    }
+}
+
+/* Notes what is known, from the end of the first case (M, p): NaN is what nobody knows. */
+static void find_known(Measure *with, const double *estimates, int *known)
+{
+    const npy_intp p = with->p, last = with->times - 1;
+    const double *eta = estimates + last * p, *gain = at_time(with->gain, last);
+    with->of_eta = with->columns == 0;
+    with->of_x = 0;
+    with->known = known;
+    with->known_x = known + with->columns;
+    for (npy_intp i = 0; i < with->columns; i++, known++) {
+        const npy_intp j = with->column[i];
+        *known = !isnan(eta[j] - at_time(with->truth, last)[j]);
+        with->of_eta |= *known;
+    }
+    for (npy_intp i = 0; i < with->n; i++, known++) {
+        double x;
+        state(at_time(with->offset, last)[i], gain + i * p, eta, p, &x, 1);
+        *known = !isnan(x - at_time(with->x, last)[i]);
+        with->of_x |= *known;
+    }
 }
 
 /* Times (M,), η̂ (g, M, p), η (1 or M, p), columns of η that are judged (c,), offset (1 or M, n)
@@ -656,83 +811,30 @@ static PyObject *measured(PyObject *module, PyObject *const *given, Py_ssize_t c
     PyArrayObject *out = fresh(&call, 2, (npy_intp[]){5, g});
     PyArrayObject *kept_eta = out ? fresh(&call, 3, (npy_intp[]){g, kept, p}) : NULL;
     PyArrayObject *kept_x = kept_eta ? fresh(&call, 3, (npy_intp[]){g, kept, n}) : NULL;
-    double *eta = kept_x ? scratch(&call, TOGETHER * p * LANES) : NULL;
-    int *known = eta ? integers(&call, columns + n) : NULL;
+    double *room = kept_x ? scratch(&call, TOGETHER * p * LANES) : NULL;
+    int *known = room ? integers(&call, columns + n) : NULL;
     if (known == NULL)
         return failed(&call);
-    const npy_intp truth_stride = stride(size(truth, 0), p), x_stride = stride(size(true_x, 0), n);
-    const npy_intp offset_stride = stride(size(offset, 0), n);
-    const npy_intp gain_stride = stride(size(gain, 0), n * p), last = times - 1;
-    int *known_x = known + columns, of_eta = columns == 0, of_x = 0;
-    for (npy_intp i = 0; g && i < columns; i++) { /* what is known */
-        const double end = data(estimates)[last * p + column[i]];
-        known[i] = !isnan(end - data(truth)[last * truth_stride + column[i]]);
-        of_eta |= known[i];
-    }
-    for (npy_intp i = 0; g && i < n; i++) {
-        double end = data(offset)[last * offset_stride + i];
-        for (npy_intp j = 0; j < p; j++)
-            end += data(gain)[last * gain_stride + i * p + j] * data(estimates)[last * p + j];
-        known_x[i] = !isnan(end - data(true_x)[last * x_stride + i]);
-        of_x |= known_x[i];
-    }
-    for (npy_intp first = 0; first < g; first += LANES) {
+    Measure with = {
+        .t = data(t), .times = times, .p = p, .n = n, .columns = columns, .column = column,
+        .kept = kept, .keep = keep, .fraction = fraction,
+        .truth = {data(truth), stride(size(truth, 0), p)},
+        .offset = {data(offset), stride(size(offset, 0), n)},
+        .gain = {data(gain), stride(size(gain, 0), n * p)},
+        .x = {data(true_x), stride(size(true_x, 0), n)},
+    };
+    if (g)
+        find_known(&with, data(estimates), known);
+    for (npy_intp first = 0; first < g;) {
+        const double *eta = data(estimates) + first * times * p;
+        const Found found = {data(out) + first, data(kept_eta) + first * kept * p,
+                             data(kept_x) + first * kept * n, g};
         const npy_intp some = g - first < LANES ? g - first : LANES;
-        Course of[2];
-        double worst[2][LANES] = {{0.0}}, x[LANES];
-        for (npy_intp from = 0; from < times; from += TOGETHER) {
-            const npy_intp now = times - from < TOGETHER ? times - from : TOGETHER;
-            double squares[2][TOGETHER * LANES] = {{0.0}};
-            for (npy_intp b = 0; b < LANES; b++) {
-                const npy_intp one = first + (b < some ? b : some - 1);
-                const double *own = data(estimates) + (one * times + from) * p;
-                for (npy_intp i = 0; i < now * p; i++)
-                    eta[i * LANES + b] = own[i];
-            }
-            for (npy_intp i = 0; i < now; i++) {
-                const npy_intp m = from + i;
-                const double *G = data(gain) + m * gain_stride, *all = eta + i * p * LANES;
-                const double *H = data(truth) + m * truth_stride;
-                const double *o = data(offset) + m * offset_stride;
-                const double *X = data(true_x) + m * x_stride;
-                double *square = squares[0] + i * LANES, *square_x = squares[1] + i * LANES;
-                for (npy_intp j = 0; j < columns; j++)
-                    if (known[j])
-                        add_error(all + column[j] * LANES, H[column[j]], square,
-                                  m == last ? worst[0] : NULL);
-                for (npy_intp j = 0; j < n; j++)
-                    if (known_x[j]) {
-                        state(o[j], G + j * p, all, p, x);
-                        add_error(x, X[j], square_x, m == last ? worst[1] : NULL);
-                    }
-            }
-            follow(of, squares[0], data(t), from, now, fraction);
-            follow(of + 1, squares[1], data(t), from, now, fraction);
-        }
-        for (npy_intp b = 0; b < some; b++) {
-            double *one = data(out) + first + b;
-            const double span = data(t)[last] - data(t)[0];
-            one[0] = of_eta ? settled(of, b, data(t), times) : NAN;
-            one[g] = of_x ? settled(of + 1, b, data(t), times) : NAN;
-            one[2 * g] = of_eta ? worst[0][b] : NAN;
-            one[3 * g] = of_x ? worst[1][b] : NAN;
-            one[4 * g] = of_x ? sqrt(0.5 * of[1].sum[b] / span) : NAN;
-        }
-        for (npy_intp k = 0; k < kept; k++) {
-            const double *o = data(offset) + keep[k] * offset_stride;
-            const double *G = data(gain) + keep[k] * gain_stride;
-            for (npy_intp b = 0; b < some; b++) {
-                const double *own = data(estimates) + ((first + b) * times + keep[k]) * p;
-                double *to = data(kept_eta) + ((first + b) * kept + k) * p;
-                for (npy_intp j = 0; j < p; j++)
-                    to[j] = eta[j * LANES + b] = own[j];
-            }
-            for (npy_intp i = 0; i < n; i++) {
-                state(o[i], G + i * p, eta, p, x);
-                for (npy_intp b = 0; b < some; b++)
-                    data(kept_x)[((first + b) * kept + k) * n + i] = x[b];
-            }
-        }
+        if (some < FEW)
+            measure_cases(&with, eta, 1, room, found, 1);
+        else
+            measure_cases(&with, eta, some, room, found, LANES);
+        first += some < FEW ? 1 : some;
     }
     return results(&call, 3, out, kept_eta, kept_x);
 }
