@@ -215,7 +215,7 @@ def wanted_parts(tail: Array, poor: BoolArray, tol: float, stages: int) -> IntAr
     """Into how many parts (K,) to cut each element so that its tail (K,) falls to ``tol``."""
     parts = np.ones(len(tail), dtype=np.intp)
     wanted = 1.25 * (tail[poor] / tol) ** (1.0 / stages)
-    parts[poor] = np.clip(np.ceil(wanted), 2, _MAX_PARTS).astype(np.intp)
+    parts[poor] = np.minimum(np.maximum(np.ceil(wanted), 2), _MAX_PARTS).astype(np.intp)
     return parts
 
 
