@@ -13,30 +13,22 @@ EVERY_WIDTH static void tails_of_kind(double *worst, const double *to_legendre, 
 {
     double *scale = work + K * c, *last = scale + c;
     for (npy_intp k = 0; k < K; k++) { /* largest value of each component so far */
-        double *restrict own = work + k * c;
-        const double *restrict v = values + k * points * c;
         for (npy_intp b = 0; b < c; b++)
-            own[b] = k ? work[(k - 1) * c + b] : 0.0;
-        for (npy_intp i = 0; i < points; i++, v += c)
-            for (npy_intp b = 0; b < c; b++)
-                own[b] = larger(own[b], fabs(v[b]));
+            work[k * c + b] = k ? work[(k - 1) * c + b] : 0.0;
+        enlarge(work + k * c, values + k * points * c, points, c);
     }
     const double *final = work + (K - 1) * c;
     for (npy_intp k = 0; k < K; k++) {
-        double largest = 0.0;
-        for (npy_intp b = 0; b < c; b++) {
+        for (npy_intp b = 0; b < c; b++)
             scale[b] = larger(work[k * c + b], foot * final[b]);
-            largest = larger(largest, scale[b]);
-        }
-        const double level = larger(share * largest, floor);
+        const double level = larger(share * largest_of(0.0, scale, c), floor);
         for (npy_intp b = 0; b < c; b++)
             scale[b] = larger(scale[b], level);
         last_coefficients(last, to_legendre, values + k * points * c, used, points, c);
         for (npy_intp j = 0; j < used; j++) {
-            double most = worst[k * used + j];
             for (npy_intp b = 0; b < c; b++)
-                most = larger(most, last[j * c + b] / scale[b]);
-            worst[k * used + j] = most;
+                last[j * c + b] /= scale[b];
+            worst[k * used + j] = largest_of(worst[k * used + j], last + j * c, c);
         }
     }
 }
