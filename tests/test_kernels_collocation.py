@@ -238,6 +238,26 @@ def test_points_of_a_mesh_and_sampling(seed, size, stages):
             np.testing.assert_allclose(one[1], other[1], rtol=1e-9, atol=1e-12)
 
 
+@given(st.lists(st.integers(0, 9), max_size=9), seeds)
+def test_splitting(parts, seed):
+    rng = np.random.default_rng(seed)
+    mesh = Mesh(np.cumsum(rng.uniform(0.01, 1.0, len(parts) + 1)), radau_rule(3))
+
+    def split():
+        finer, kept = mesh.split(np.array(parts, dtype=np.intp))
+        return finer.edges, kept
+
+    (edges, kept), (others, equal) = by_both(split)
+    np.testing.assert_array_equal(edges, others)
+    np.testing.assert_array_equal(kept, equal)
+
+
+def test_parts_less_than_none_are_refused():
+    for parts in (-1, np.iinfo(np.intp).max):
+        with pytest.raises(ValueError, match=f"{parts} parts"):
+            COMPILED.split(z(2), np.array([parts]))
+
+
 @given(seeds, st.lists(st.integers(0, 9), max_size=2), st.sampled_from([0, 1, 21, 2500]))
 def test_samples_integrals_and_filters(seed, shape, count):
     rng = np.random.default_rng(seed)
@@ -281,6 +301,7 @@ def given_arguments():
         ],
         "tails": [z((s + 1, s + 1)), 2, 0.0, 0.0, values, 0.0, values, 0.0],
         "mesh_points": [z(k + 1), z(s + 1), 0.0],
+        "split": [z(k + 1), np.ones(k, dtype=np.intp)],
         "sampler": [np.arange(k + 1.0), z(s + 1), z(s + 1), z(5), z(5), 0.0, 0.0],
         "sample": [z(5, dtype=np.intp), z((5, s + 1)), values],
         "integral": [z((s, s)), z(k), values, True],

@@ -81,6 +81,9 @@ class Mesh:
         Returns:
             The new mesh, and for each new element the old one it equals, or −1 if it is new.
         """
+        if kernels.compiled is not None:
+            finer, kept = kernels.compiled.split(self.edges, parts.astype(np.intp, copy=False))
+            return Mesh(finer, self.rule), kept
         parent = np.repeat(np.arange(self.size), parts)
         first = np.cumsum(parts) - parts
         position = np.arange(len(parent)) - first[parent]

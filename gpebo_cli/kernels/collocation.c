@@ -411,17 +411,10 @@ EVERY_WIDTH static void judge(const Ending *q, double *found)
     for (npy_intp c = 0; c < C; c++)
         whole[c] = noise[c] = worst[c] = brought[c] = 0.0;
     for (npy_intp k = 0; k < K; k++) {
-        double *restrict own = sizes + k * C;
-        const double *restrict v = q->V + k * points * C;
         for (npy_intp c = 0; c < C; c++)
-            own[c] = 0.0;
-        for (npy_intp i = 0; i < points; i++, v += C)
-            for (npy_intp c = 0; c < C; c++) {
-                const double one = fabs(v[c]);
-                own[c] = one > own[c] ? one : own[c];
-            }
-        for (npy_intp c = 0; c < C; c++)
-            whole[c] = own[c] > whole[c] ? own[c] : whole[c];
+            sizes[k * C + c] = 0.0;
+        enlarge(sizes + k * C, q->V + k * points * C, points, C);
+        enlarge(whole, sizes + k * C, 1, C);
     }
     floored(scale, whole, C, q->share, 0.0);
     const double *to_legendre = q->to_legendre + (points - rows) * points;

@@ -46,6 +46,42 @@ static inline void combine(double *out, const double *initial, const double *a, 
     COMBINE(1)
 }
 
+/* `enlarge` for a fixed number of columns. */
+#define ENLARGE(block)                                                                             \
+    for (; j + block <= width; j += block) {                                                       \
+        double most[block];                                                                        \
+        for (int c = 0; c < block; c++)                                                            \
+            most[c] = size[j + c];                                                                 \
+        for (npy_intp i = 0; i < rows; i++)                                                        \
+            for (int c = 0; c < block; c++)                                                        \
+                most[c] = larger(most[c], fabs(values[i * width + j + c]));                        \
+        for (int c = 0; c < block; c++)                                                            \
+            size[j + c] = most[c];                                                                 \
+    }
+
+/* size (width,): at least the largest number of each column of values (rows, width). */
+static inline void enlarge(double *size, const double *values, npy_intp rows, npy_intp width)
+{
+    npy_intp j = 0;
+    ENLARGE(16)
+    ENLARGE(8)
+    ENLARGE(4)
+    ENLARGE(1)
+}
+
+/* The largest of `least` and all values (count,); what is not a number stays. */
+static inline double largest_of(double least, const double *values, npy_intp count)
+{
+    double most[4] = {least, least, least, least};
+    npy_intp i = 0;
+    for (; i + 4 <= count; i += 4)
+        for (int c = 0; c < 4; c++)
+            most[c] = larger(most[c], values[i + c]);
+    for (; i < count; i++)
+        most[0] = larger(most[0], values[i]);
+    return larger(larger(most[0], most[1]), larger(most[2], most[3]));
+}
+
 /* |last Legendre coefficients| (rows, C) of the point values (points, C) of one element. */
 static inline void last_coefficients(double *out, const double *to_legendre, const double *values,
                                      npy_intp rows, npy_intp points, npy_intp C)

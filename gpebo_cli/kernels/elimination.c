@@ -3,10 +3,10 @@
 
 #include <float.h>
 
-/* Rows a and b of W change places, from a column on. */
-static inline void swap_rows(double *restrict a, double *restrict b, npy_intp from, npy_intp length)
+/* Rows a and b change places. */
+static inline void swap_rows(double *restrict a, double *restrict b, npy_intp length)
 {
-    for (npy_intp j = from; j < length; j++) {
+    for (npy_intp j = 0; j < length; j++) {
         const double kept = a[j];
         a[j] = b[j];
         b[j] = kept;
@@ -40,7 +40,7 @@ static inline int eliminate_column(double *W, npy_intp m, npy_intp length, npy_i
     double *pivot = W + (k + c) * length + k;
     const npy_intp best = largest_in(W + k + c, m, length, k + c);
     if (best != k + c)
-        swap_rows(pivot, W + best * length + k, 0, length - k);
+        swap_rows(pivot, W + best * length + k, length - k);
     if (pivot[c] == 0.0)
         return 0;
     const double reciprocal = 1.0 / pivot[c];

@@ -13,30 +13,22 @@ EVERY_WIDTH static void tails_of_kind(double *worst, const double *to_legendre, 
 {
     double *scale = work + K * c, *last = scale + c;
     for (npy_intp k = 0; k < K; k++) { /* largest value of each component so far */
-        double *restrict own = work + k * c;
-        const double *restrict v = values + k * points * c;
         for (npy_intp b = 0; b < c; b++)
-            own[b] = k ? work[(k - 1) * c + b] : 0.0;
-        for (npy_intp i = 0; i < points; i++, v += c)
-            for (npy_intp b = 0; b < c; b++)
-                own[b] = larger(own[b], fabs(v[b]));
+            work[k * c + b] = k ? work[(k - 1) * c + b] : 0.0;
+        enlarge(work + k * c, values + k * points * c, points, c);
     }
     const double *final = work + (K - 1) * c;
     for (npy_intp k = 0; k < K; k++) {
-        double largest = 0.0;
-        for (npy_intp b = 0; b < c; b++) {
+        for (npy_intp b = 0; b < c; b++)
             scale[b] = larger(work[k * c + b], foot * final[b]);
-            largest = larger(largest, scale[b]);
-        }
-        const double level = larger(share * largest, floor);
+        const double level = larger(share * largest_of(0.0, scale, c), floor);
         for (npy_intp b = 0; b < c; b++)
             scale[b] = larger(scale[b], level);
         last_coefficients(last, to_legendre, values + k * points * c, used, points, c);
         for (npy_intp j = 0; j < used; j++) {
-            double most = worst[k * used + j];
             for (npy_intp b = 0; b < c; b++)
-                most = larger(most, last[j * c + b] / scale[b]);
-            worst[k * used + j] = most;
+                last[j * c + b] /= scale[b];
+            worst[k * used + j] = largest_of(worst[k * used + j], last + j * c, c);
         }
     }
 }
@@ -137,6 +129,47 @@ static PyObject *mesh_points(PyObject *module, PyObject *const *given, Py_ssize_
         w[width - 1] -= off * step;
     }
     return results(&call, 2, points, within);
+}
+
+/* split(edges (K + 1,), parts (K,))
+
+   Edges of the mesh whose element k is cut into parts[k] equal ones, and for each new element the
+   old one it equals, or −1. */
+static PyObject *split(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 2))
+        return NULL;
+    PyArrayObject *edges = doubles(&call, 0, 1), *parts = edges ? indices(&call, 1, 1) : NULL;
+    if (parts == NULL || !same("edges and parts", size(edges, 0), size(parts, 0) + 1))
+        return failed(&call);
+    const npy_intp K = size(parts, 0), *into = (const npy_intp *)PyArray_DATA(parts);
+    npy_intp total = 0;
+    for (npy_intp k = 0; k < K; k++) {
+        if (into[k] < 0 || into[k] > NPY_MAX_INTP / 16 - total) {
+            PyErr_Format(PyExc_ValueError, "%zd parts", (Py_ssize_t)into[k]);
+            return failed(&call);
+        }
+        total += into[k];
+    }
+    PyArrayObject *finer = fresh(&call, 1, (npy_intp[]){total + 1});
+    PyObject *equals = finer ? PyArray_SimpleNew(1, (npy_intp[]){total}, NPY_INTP) : NULL;
+    if (equals == NULL)
+        return failed(&call);
+    npy_intp *kept = (npy_intp *)PyArray_DATA((PyArrayObject *)equals);
+    double *out = data(finer);
+    for (npy_intp k = 0; k < K; k++) {
+        const double left = data(edges)[k], step = data(edges)[k + 1] - left;
+        for (npy_intp i = 0; i < into[k]; i++) {
+            *out++ = left + step * ((double)i / (double)into[k]);
+            *kept++ = into[k] == 1 ? k : -1;
+        }
+    }
+    *out = data(edges)[K];
+    PyObject *answer = Py_BuildValue("(ON)", (PyObject *)finer, equals);
+    failed(&call); /* gives back what was held */
+    return answer;
 }
 
 /* sampler(edges (K + 1,), places (s + 1,), barycentric (s + 1,), t (N,), inside (N,) or None,
@@ -376,6 +409,7 @@ static PyObject *low_pass(PyObject *module, PyObject *const *given, Py_ssize_t c
 PyMethodDef mesh_kernels[] = {
     {"tails", (PyCFunction)(void (*)(void))tails, METH_FASTCALL, NULL},
     {"mesh_points", (PyCFunction)(void (*)(void))mesh_points, METH_FASTCALL, NULL},
+    {"split", (PyCFunction)(void (*)(void))split, METH_FASTCALL, NULL},
     {"sampler", (PyCFunction)(void (*)(void))sampler, METH_FASTCALL, NULL},
     {"sample", (PyCFunction)(void (*)(void))sample, METH_FASTCALL, NULL},
     {"integral", (PyCFunction)(void (*)(void))integral, METH_FASTCALL, NULL},
