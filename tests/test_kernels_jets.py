@@ -187,7 +187,7 @@ def test_jets_refuses_programs_that_lead_out_of_the_arrays():
 
 
 SIGNALS = ["sin(t)", "exp(-t)", "3", "t", "2 + exp(-((t - 1.31)/{})**2)", "-1 + 2*step(t - 0.7)",
-           "sin(30*t)"]  # fmt: skip
+           "sin(30*t)", "0.005 + t", "1e-6*sin(30*t)"]  # fmt: skip
 
 
 @st.composite
@@ -258,6 +258,30 @@ def test_noise_is_not_joined_and_nothing_is_where_no_number_is():
             )
         assert one is mesh
         assert other is mesh
+
+
+def test_what_cannot_be_joined_to_less_is_not_joined_to_more():
+    """Matrices that lose all of two elements, and keep the mean of four."""
+    values = np.repeat([1.0, 0.0], 4 * 2).reshape(8, 2, 1)
+    lost = np.zeros((4, 2)), np.zeros((2, 4))
+    mean = np.full((8, 2), 1 / 8), np.full((2, 8), 1 / 2)
+    for ways, edges in [((*lost, *mean), [0, 1, 2, 3, 4, 8]), (mean, np.arange(9))]:
+        given = values, np.array([1]), np.arange(9.0), np.array([0, 8])
+        found = COMPILED.joined(*given, 1e-3, 9.0, 0.0, 0.0, 1.0, *ways)
+        np.testing.assert_array_equal(found, edges)
+
+
+def test_what_is_small_beside_its_kind_does_not_keep_elements_apart():
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(6))
+    values = np.stack([np.ones(mesh.points.shape), 1e-8 * np.sin(9 * mesh.points)], axis=2)
+    sizes = []
+    for counts in ([2], [1, 1]):
+        one, other = by_both(
+            lambda counts=counts: mesh.joined(values, np.array(counts), 1e-4, np.zeros(0))
+        )
+        np.testing.assert_array_equal(one.edges, other.edges)
+        sizes.append(one.size)
+    assert sizes == [1, 8]
 
 
 @pytest.mark.parametrize("count", _JOINED)

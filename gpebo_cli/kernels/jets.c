@@ -466,13 +466,32 @@ EVERY_WIDTH static void column(const double *from, npy_intp stride, npy_intp cou
     }
 }
 
-/* Whether a column, every `stride` numbers, is one number throughout. */
-static int still(const double *from, npy_intp stride, npy_intp count)
+/* Whether all numbers are the same. */
+static int still(const double *from, npy_intp count)
 {
     npy_intp i = 1;
-    while (i < count && from[i * stride] == from[0])
+    while (i < count && from[i] == from[0])
         i++;
     return i >= count;
+}
+
+/* moved (entries,) becomes 1 where an entry of values (times, entries) is not one number throughout;
+   row by row, because a column of a large matrix is spread over as many cache lines as times. */
+EVERY_WIDTH static void mark_moved(npy_int64 *restrict moved, const double *restrict values,
+                                   npy_intp times, npy_intp entries)
+{
+    for (npy_intp i = 1; i < times; i++)
+        for (npy_intp e = 0; e < entries; e++)
+            moved[e] |= values[i * entries + e] != values[e];
+}
+
+/* Memory for as many marks, all 0; NULL with an exception. */
+static npy_int64 *marks(Call *call, npy_intp count)
+{
+    npy_int64 *made = (npy_int64 *)scratch(call, count);
+    if (made != NULL)
+        memset(made, 0, count * sizeof *made);
+    return made;
 }
 
 /* out[j] = Σ_i weights[i] matrix[i, j]; matrix (inner, columns). */
@@ -543,10 +562,14 @@ static PyObject *missed_between(PyObject *module, PyObject *const *given, Py_ssi
             !same("entries", entries, entries_of(seen)) ||
             (entries && (!size(nodal, 0) || !size(seen, 0)) && !outside("orders", 0)))
             return failed(&call);
+        npy_int64 *moved = marks(&call, entries);
+        if (moved == NULL)
+            return failed(&call);
+        mark_moved(moved, data(nodal), elements * points, entries);
+        mark_moved(moved, data(seen), elements * looks, entries);
         npy_intp different = 0;
         for (npy_intp e = 0; e < entries; e++) {
-            if (still(data(nodal) + e, entries, elements * points) &&
-                still(data(seen) + e, entries, elements * looks))
+            if (!moved[e])
                 continue;
             double *here = memory + different % REMEMBERED * length;
             double low, high, least, most;
@@ -598,7 +621,8 @@ static PyObject *known_kinds(PyObject *module, PyObject *const *given, Py_ssize_
         most_kinds += size(values[m], 0);
     }
     double *one = scratch(&call, times);
-    int *moves = one ? integers(&call, all) : NULL, *away = moves ? integers(&call, all) : NULL;
+    npy_int64 *moves = one ? marks(&call, all) : NULL;
+    int *away = moves ? integers(&call, all) : NULL;
     int *counts = away ? integers(&call, most_kinds) : NULL;
     if (counts == NULL)
         return failed(&call);
@@ -606,8 +630,9 @@ static PyObject *known_kinds(PyObject *module, PyObject *const *given, Py_ssize_
     for (npy_intp m = 0, at = 0; m < matrices; at += entries[m++]) {
         const npy_intp orders = size(values[m], 0);
         npy_intp moving = 0, inverted = 0;
+        if (orders)
+            mark_moved(moves + at, data(values[m]), times, entries[m]);
         for (npy_intp e = 0; orders && e < entries[m]; e++) {
-            moves[at + e] = !still(data(values[m]) + e, entries[m], times);
             moving += moves[at + e];
             away[at + e] = 0;
             if (!moves[at + e] || m != (npy_intp)of_reciprocals)
@@ -698,7 +723,7 @@ static void skip_known(const Signals *s, const npy_intp *counts, npy_intp kinds)
     for (npy_intp kind = 0; kind < kinds; first += counts[kind++])
         for (npy_intp j = first; j < first + counts[kind]; j++) {
             const double *here = s->values + j * length;
-            s->skipped[j] = still(here, 1, length);
+            s->skipped[j] = still(here, length);
             const npy_intp from = j - REMEMBERED < first ? first : j - REMEMBERED;
             for (npy_intp other = from; other < j && !s->skipped[j]; other++)
                 s->skipped[j] = !memcmp(s->values + other * length, here, length * sizeof(double));
