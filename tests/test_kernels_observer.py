@@ -16,11 +16,18 @@ from gpebo_cli import regression as regressions
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ModelError
-from gpebo_cli.observers import gpebo
+from gpebo_cli.observers import gpebo, observe
 from gpebo_cli.observers.observation import AffineStateMap, largest_entry, log_norm
 from gpebo_cli.regression import LinearRegression
-from gpebo_cli.settings import ExcitationSettings
+from gpebo_cli.settings import (
+    ExcitationSettings,
+    ObserverSettings,
+    SolverSettings,
+    TimeSettings,
+)
+from gpebo_cli.simulation.simulate import simulate
 from gpebo_cli.systems.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.systems.plant import plant_from_mapping
 
 pytestmark = needs_kernels
 seeds = st.integers(0, 2**32 - 1)
@@ -394,6 +401,19 @@ def test_windows_of_a_regression_with_realisations():
     # Ω is p × p, however many realisations of 𝒴 stand beside it.
     size = regressions.largest(plain.gram.values)
     assert regressions.largest(several.gram.values) == pytest.approx(size, rel=1e-13)
+
+
+def test_a_plant_without_inputs_is_observed():
+    system = plant_from_mapping({
+        "name": "free", "states": ["a", "b"], "E": [[1, 0], [0, 0]],
+        "A": [["-1 - t/9", 1], [1, 1]], "C": [[0, 1]], "outputs": ["y"], "initial_state": [1, -1],
+    })
+    signals = simulate(system, TimeSettings(horizon=3.0), SolverSettings()).signals
+    one, other = by_both(lambda: observe(
+        system, signals.inputs, signals.outputs, ObserverSettings(), SolverSettings()
+    ))
+    close(one.regression.psi.values, other.regression.psi.values)
+    close(one.regression.Y.values, other.regression.Y.values)
 
 
 A3, Z = np.zeros((4, 2, 3)), np.zeros
