@@ -24,6 +24,7 @@ from gpebo_cli.systems.descriptor import Array
 RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
+_APART = 1e-8  # eigenvalues nearer than this leave the direction to whoever computes it
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -33,17 +34,16 @@ def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings)
     Without a level asked for, ρ is 1e-8 of ``scale² · horizon``, where the scale is the size of
     the terms ψ is made of: a regressor that is zero but for rounding is never exciting.
     """
-    mesh, p = regression.mesh, regression.p
+    mesh = regression.mesh
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     rho = settings.rho
     if rho is None:
         rho = RELATIVE_LEVEL * regression.scale**2 * horizon
     window = settings.window if settings.window is not None else horizon / WINDOWS
     gram = regression.gram
-    values, vectors = np.linalg.eigh(gram.final[:, :p])
-    direction = vectors[:, 0].tolist()
+    values, direction = _weakest(gram.final)
     sign = 1.0 if max(direction, key=abs) >= 0.0 else -1.0
-    smallest, largest = max(float(values[0]), 0.0), float(values[-1])
+    smallest, largest = max(values[0], 0.0), values[-1]
     t_c = _first_time(gram, rho)
     return Excitation(
         t=t,
@@ -59,6 +59,22 @@ def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings)
             dict(zip(regression.parameters, (sign * part for part in direction), strict=True))
         ),
     )
+
+
+def _weakest(matrix: Array) -> tuple[list[float], list[float]]:
+    """Eigenvalues of a symmetric matrix (p, p), ascending, and the first one's eigenvector.
+
+    Further columns are not looked at.
+    """
+    p = len(matrix)
+    if kernels.compiled is not None and p <= SMALL_SPECTRUM:
+        found: tuple[Array, Array] | None = kernels.compiled.eigenvector(matrix)
+        if found is not None:  # else not all is finite
+            values, vector = found[0].tolist(), found[1].tolist()
+            if p == 1 or values[1] - values[0] > _APART * abs(values[-1]):
+                return values, vector
+    of_all, vectors = np.linalg.eigh(matrix[:, :p])
+    return of_all.tolist(), vectors[:, 0].tolist()
 
 
 def eigenvalues(matrices: Array) -> Array:
@@ -165,7 +181,7 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     mesh = outer.mesh
     level = np.full(len(t), np.nan)
     start = t - window
-    whole = np.flatnonzero(start >= mesh.edges[0] - 1e-12 * max(1.0, window))
+    whole = (start >= mesh.edges[0] - 1e-12 * max(1.0, window)).nonzero()[0]
     if len(whole) == 0:
         return level
     from_there = mesh.sampler(np.maximum(start[whole], mesh.edges[0]))

@@ -16,11 +16,18 @@ from gpebo_cli import regression as regressions
 from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ModelError
-from gpebo_cli.observers import gpebo
+from gpebo_cli.observers import gpebo, observe
 from gpebo_cli.observers.observation import AffineStateMap, largest_entry, log_norm
 from gpebo_cli.regression import LinearRegression
-from gpebo_cli.settings import ExcitationSettings
+from gpebo_cli.settings import (
+    ExcitationSettings,
+    ObserverSettings,
+    SolverSettings,
+    TimeSettings,
+)
+from gpebo_cli.simulation.simulate import simulate
 from gpebo_cli.systems.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.systems.plant import plant_from_mapping
 
 pytestmark = needs_kernels
 seeds = st.integers(0, 2**32 - 1)
@@ -256,6 +263,19 @@ def test_eigenvalues(count, p, more, missing, seed):
     assert (np.diff(one, axis=1) >= 0).all()
 
 
+@given(st.integers(1, 16), st.booleans(), seeds)
+def test_the_weakest_direction(p, flat, seed):
+    rng = np.random.default_rng(seed)
+    vectors = np.linalg.qr(rng.normal(size=(p, p)))[0]
+    values = 10.0 ** rng.uniform(-6, 3, p)
+    if flat:
+        values[: p // 2 + 1] = 0.0
+    A = np.concatenate([vectors * values @ vectors.T, np.ones((p, 1))], axis=1)
+    (one, direction), (other, expected) = by_both(lambda: excitation._weakest(A))
+    close(one, other, max(other), rounding=200)
+    assert abs(np.dot(direction, expected)) == pytest.approx(1.0, abs=1e-6)
+
+
 @pytest.mark.parametrize("A", [
     np.zeros((4, 4)), np.eye(5), np.diag([3.0, 1.0, 2.0]), np.ones((6, 6)), -np.ones((3, 3)),
     np.eye(4) + np.eye(4, k=1) + np.eye(4, k=-1), np.eye(4, k=3) + np.eye(4, k=-3),
@@ -347,7 +367,8 @@ def test_excitation(row, rho):
     close(one.gram_eigenvalues, other.gram_eigenvalues, size)
     close(one.pe_level, other.pe_level, size)
     assert (one.rho, one.window, one.is_ie) == (other.rho, other.window, other.is_ie)
-    assert one.weakest_direction == other.weakest_direction
+    expected = pytest.approx(dict(other.weakest_direction.components), abs=1e-7)
+    assert dict(one.weakest_direction.components) == expected
     assert (one.t_c is None) == (other.t_c is None)
     if rho is None and one.t_c is not None:
         assert abs(one.t_c - other.t_c) < 1e-6  # λ_min is flat where it starts
@@ -382,6 +403,19 @@ def test_windows_of_a_regression_with_realisations():
     assert regressions.largest(several.gram.values) == pytest.approx(size, rel=1e-13)
 
 
+def test_a_plant_without_inputs_is_observed():
+    system = plant_from_mapping({
+        "name": "free", "states": ["a", "b"], "E": [[1, 0], [0, 0]],
+        "A": [["-1 - t/9", 1], [1, 1]], "C": [[0, 1]], "outputs": ["y"], "initial_state": [1, -1],
+    })
+    signals = simulate(system, TimeSettings(horizon=3.0), SolverSettings()).signals
+    one, other = by_both(lambda: observe(
+        system, signals.inputs, signals.outputs, ObserverSettings(), SolverSettings()
+    ))
+    close(one.regression.psi.values, other.regression.psi.values)
+    close(one.regression.Y.values, other.regression.Y.values)
+
+
 A3, Z = np.zeros((4, 2, 3)), np.zeros
 # kernel, arguments that fit, and for each argument one that does not
 FITTING = {
@@ -396,6 +430,7 @@ FITTING = {
     "outer_products": (Z((2, 4, 2, 3)), Z((2, 4, 2, 1))),
     "residual_sizes": (Z((4, 2, 3)), Z((4, 2))),
     "eigenvalues": (Z((4, 2, 3)),),
+    "eigenvector": (Z((2, 3)),),
     "sampled_eigenvalues": (Z((4, 5, 2, 3)), Z(6, dtype=np.intp), Z((6, 5))),
     "spectral_norm": (A3, 2),
     "weakest": (np.ones(4), Z((4, 3, 2))),
@@ -415,7 +450,7 @@ def longer(array, axis):
 FREE = {
     "entry_sizes": {(0, 0), (0, 1), (0, 2)}, "largest_entry": {(0, 0), (0, 1), (0, 2)},
     "in_frame": {(2, 2), (3, 2), (9, 1), (10, 0)}, "driven": {(0, 2), (2, 1)},
-    "eigenvalues": {(0, 0), (0, 1), (0, 2)},
+    "eigenvalues": {(0, 0), (0, 1), (0, 2)}, "eigenvector": {(0, 0), (0, 1)},
     "products": {(0, 2)}, "outer_products": {(0, 3), (1, 3)}, "residual_sizes": {(0, 2)},
     "regression_signals": {(0, 2)}, "sampled_eigenvalues": {(0, 0), (0, 2), (0, 3)},
     "spectral_norm": {(0, 0), (0, 1), (0, 2)}, "weakest": {(1, 1), (1, 2)},

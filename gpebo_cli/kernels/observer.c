@@ -925,6 +925,14 @@ static void tridiagonal_ql(double *restrict d, double *restrict e, npy_intp p)
         }
 }
 
+/* Puts a value among the first `count` of `out`, which are ascending. */
+static void insert(double *out, npy_intp count, double value)
+{
+    for (; count > 0 && out[count - 1] > value; count--)
+        out[count] = out[count - 1];
+    out[count] = value;
+}
+
 /* Eigenvalues of the symmetric A (p, p), of which the lower triangle counts, ascending to `out`
    (p,), to rounding in the largest; A is destroyed, `beside` is (p,). 0 if A is not finite. */
 static int eigenvalues_of(double *restrict A, npy_intp p, double *restrict out,
@@ -941,14 +949,89 @@ static int eigenvalues_of(double *restrict A, npy_intp p, double *restrict out,
     tridiagonal(A, p, out, beside);
     tridiagonal_ql(out, beside, p);
     const double back = 1.0 / scale; /* a power of two */
-    for (npy_intp i = 0; i < p; i++) {
-        const double value = out[i] * back;
-        npy_intp j = i;
-        for (; j > 0 && out[j - 1] > value; j--)
-            out[j] = out[j - 1];
-        out[j] = value;
-    }
+    for (npy_intp i = 0; i < p; i++)
+        insert(out, i, out[i] * back);
     return 1;
+}
+
+#define NEGLIGIBLE 1e-18 /* entries beside a diagonal, of matrices whose largest one is near 1 */
+
+/* Eigenvalues of the symmetric A (p, p) in its diagonal and, in the columns of V (p, p), its
+   eigenvectors, by Jacobi's rotations. */
+static void rotate_to_diagonal(double *restrict A, double *restrict V, npy_intp p)
+{
+    for (npy_intp i = 0; i < p * p; i++)
+        V[i] = i % (p + 1) == 0;
+    int turned = 1;
+    for (int sweep = 0; turned && sweep < STEPS; sweep++) {
+        turned = 0;
+        for (npy_intp i = 1; i < p; i++)
+            for (npy_intp j = 0; j < i; j++) {
+                const double beside = A[i * p + j];
+                if (fabs(beside) <= NEGLIGIBLE)
+                    continue;
+                turned = 1;
+                const double theta = 0.5 * (A[i * p + i] - A[j * p + j]) / beside;
+                const double size = 1.0 / (fabs(theta) + sqrt(theta * theta + 1.0));
+                const double tangent = theta < 0.0 ? -size : size;
+                const double cosine = 1.0 / sqrt(tangent * tangent + 1.0);
+                const double sine = tangent * cosine;
+                A[j * p + j] -= tangent * beside;
+                A[i * p + i] += tangent * beside;
+                A[i * p + j] = A[j * p + i] = 0.0;
+                for (npy_intp k = 0; k < p; k++) {
+                    const double left = V[k * p + j], right = V[k * p + i];
+                    V[k * p + j] = cosine * left - sine * right;
+                    V[k * p + i] = sine * left + cosine * right;
+                    if (k == i || k == j)
+                        continue;
+                    const double one = A[k * p + j], other = A[k * p + i];
+                    A[k * p + j] = A[j * p + k] = cosine * one - sine * other;
+                    A[k * p + i] = A[i * p + k] = sine * one + cosine * other;
+                }
+            }
+    }
+}
+
+/* A (p, c >= p) -> eigenvalues of the left square, whose lower triangle counts, ascending (p,),
+   and the eigenvector (p,) of the first; None if not all is finite. */
+static PyObject *eigenvector(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 1))
+        return NULL;
+    PyArrayObject *A = doubles(&call, 0, 2);
+    if (A == NULL)
+        return failed(&call);
+    const npy_intp p = size(A, 0), c = size(A, 1);
+    if (c < p) {
+        PyErr_SetString(PyExc_ValueError, "the matrix is narrower than square");
+        return failed(&call);
+    }
+    PyArrayObject *values = fresh(&call, 1, &p);
+    PyArrayObject *vector = values == NULL ? NULL : fresh(&call, 1, &p);
+    double *square = vector == NULL ? NULL : scratch(&call, 2 * p * p);
+    if (square == NULL)
+        return failed(&call);
+    for (npy_intp i = 0; i < p; i++)
+        for (npy_intp j = 0; j <= i; j++)
+            square[i * p + j] = square[j * p + i] = data(A)[i * c + j];
+    const double scale = unit(square, p * p);
+    if (scale == 0.0)
+        return nothing(&call);
+    for (npy_intp i = 0; i < p * p; i++)
+        square[i] *= scale;
+    double *V = square + p * p;
+    rotate_to_diagonal(square, V, p);
+    npy_intp least = 0;
+    for (npy_intp i = 0; i < p; i++) {
+        least = square[i * p + i] < square[least * p + least] ? i : least;
+        insert(data(values), i, square[i * p + i] / scale);
+    }
+    for (npy_intp i = 0; i < p; i++)
+        data(vector)[i] = V[i * p + least];
+    return results(&call, 2, values, vector);
 }
 
 /* A (N, p, c >= p) -> eigenvalues of the left squares, whose lower triangles count, ascending
@@ -1468,6 +1551,7 @@ PyMethodDef observer_kernels[] = {
     KERNEL(outer_products),
     KERNEL(residual_sizes),
     KERNEL(eigenvalues),
+    KERNEL(eigenvector),
     KERNEL(sampled_eigenvalues),
     KERNEL(spectral_norm),
     KERNEL(weakest),

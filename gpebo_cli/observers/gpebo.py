@@ -646,9 +646,8 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     else:
         known = None
         if mesh is reduced.inputs.mesh and reduced.injection is None:
-            u, y = reduced.inputs.values, reduced.outputs.values
-            points = mesh.points.size
-            known = equations(reduced.first, u.reshape(points, -1), y.reshape(points, -1))
+            u, y = _over_time(reduced.inputs.values), _over_time(reduced.outputs.values)
+            known = equations(reduced.first, u, y)
         solution = solve(
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         )
