@@ -3,7 +3,6 @@
 #include "common.h"
 
 #include <float.h>
-#include <limits.h>
 #include <stdint.h>
 
 /* Cases side by side: recurrences that do not wait for one another, in as many registers. */
