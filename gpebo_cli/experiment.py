@@ -16,6 +16,7 @@ from gpebo_cli.assumptions import of_observation, warnings
 from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.excitation import WINDOWS, assess, sampled_window_level
+from gpebo_cli.linalg import SMALL
 from gpebo_cli.measurement import noise_levels
 from gpebo_cli.metrics import SETTLED, settling_time, time_rms
 from gpebo_cli.observers import Observation, StateMap, check_remedy, observe, signal_noise
@@ -293,7 +294,8 @@ def _evaluation(
     state_map: StateMap, grid: Array, truth: Array, x: Array, judged: slice, chosen: IntArray
 ) -> _Evaluation:
     """How a batch of cases is measured on the grid (M,) against η (M, p) and x (M, n)."""
-    if kernels.compiled is None or not isinstance(state_map, AffineStateMap):
+    large = max(truth.shape[1], x.shape[1]) > SMALL
+    if kernels.compiled is None or large or not isinstance(state_map, AffineStateMap):
         reconstruct = state_map.at(grid)
 
         def evaluate(eta: Array) -> tuple[Array, Array, Array]:
@@ -310,7 +312,8 @@ def _evaluation(
     def evaluate_affine(eta: Array) -> tuple[Array, Array, Array]:
         """The same in one pass over the estimates: x̂ is formed where it is needed."""
         found: tuple[Array, Array, Array] = measured(
-            grid, eta, truth, columns, offset, gain, x, chosen, SETTLED
+            grid, np.asarray(eta, dtype=np.float64), truth, columns, offset, gain, x, chosen,
+            SETTLED,
         )
         return found
 

@@ -6,6 +6,8 @@ singular value: a one-column product of size 1e-17 has rank 0, not 1.
 
 from __future__ import annotations
 
+from math import prod
+
 import numpy as np
 
 from gpebo_cli import kernels
@@ -54,11 +56,11 @@ def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Ar
     """
     p = omega.shape[-1]
     if kernels.compiled is not None and 0 < p <= _SMALL_SPECTRUM:
-        columns = 1 if rhs.ndim < omega.ndim else rhs.shape[-1]
+        shape, c = omega.shape[:-2], 1 if rhs.ndim < omega.ndim else rhs.shape[-1]
+        count = prod(shape)
         delta, action, condition = kernels.compiled.adjugate_action(
-            omega.reshape(-1, p, p), rhs.reshape(-1, p, columns)
+            omega.reshape(count, p, p), rhs.reshape(count, p, c)
         )
-        shape = omega.shape[:-2]
         return delta.reshape(shape), action.reshape(rhs.shape), condition.reshape(shape)
     u, sigma, vt = np.linalg.svd(omega)
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))

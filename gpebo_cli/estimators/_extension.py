@@ -33,13 +33,13 @@ def resolved_low_pass(signal: Trajectory, rate: Array, start: Array | None = Non
     """
     edges = signal.mesh.edges
     smallest = 1e-13 * max(1.0, abs(float(edges[0])), abs(float(edges[-1])))
-    # Where an element is shorter it is the signal that is not resolved, not the filter.
-    shortest = max(smallest, 0.5 / float(np.max(rate)))
+    fastest = float(np.max(rate))
     for _ in range(_ROUNDS):
         filtered, mesh = signal.low_pass(rate, start), signal.mesh
         flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
         poor = unresolved(flat, mesh.rule) > _TOLERANCE
-        poor &= mesh.steps > shortest
+        poor &= mesh.steps * fastest > 0.5  # else it is the signal, not the filter
+        poor &= mesh.steps > smallest
         if not poor.any():
             break
         finer, parent = mesh.split(np.where(poor, 4, 1))

@@ -3,7 +3,6 @@
 #include "common.h"
 
 #include <float.h>
-#include <limits.h>
 #include <stdint.h>
 
 /* Cases side by side: recurrences that do not wait for one another, in as many registers. */
@@ -280,44 +279,6 @@ static PyObject *law_variation(PyObject *module, PyObject *const *given, Py_ssiz
     return results(&call, 1, out);
 }
 
-/* I at the times (M,), η̄ (p,), η̂ at the start (1 or g, p), γ (g, 1 or p)
-   -> η̂ = η̄ + e^{−γI} (η̂(0) − η̄) (g, M, p). */
-static PyObject *constant_law(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 4))
-        return NULL;
-    PyArrayObject *at = doubles(&call, 0, 1), *final = at ? doubles(&call, 1, 1) : NULL;
-    PyArrayObject *start = final ? doubles(&call, 2, 2) : NULL;
-    PyArrayObject *gains = start ? doubles(&call, 3, 2) : NULL;
-    if (gains == NULL)
-        return failed(&call);
-    const npy_intp times = size(at, 0), p = size(final, 0), g = size(gains, 0);
-    const npy_intp own = size(gains, 1);
-    if (!same("parameters at the start", size(start, 1), p) ||
-        !timed("cases at the start", size(start, 0), g) ||
-        !(own == 1 || same("parameters with a gain", own, p)))
-        return failed(&call);
-    PyArrayObject *out = fresh(&call, 3, (npy_intp[]){g, times, p});
-    if (out == NULL)
-        return failed(&call);
-    double *eta = data(out);
-    for (npy_intp b = 0; b < g; b++) {
-        const double *from = data(start) + b * stride(size(start, 0), p);
-        const double *gamma = data(gains) + b * own;
-        for (npy_intp m = 0; m < times; m++, eta += p) {
-            double decay = 1.0;
-            for (npy_intp j = 0; j < p; j++) {
-                if (j < own)
-                    decay = exp(-gamma[j] * data(at)[m]);
-                eta[j] = data(final)[j] + decay * (from[j] - data(final)[j]);
-            }
-        }
-    }
-    return results(&call, 1, out);
-}
-
 #define LOG2_E 1.4426950408889634
 /* ln 2 in two parts, the first with so few digits that k times it is exact. */
 #define LN2_HIGH 6.93147180369123816490e-01
@@ -401,8 +362,81 @@ typedef struct {
 typedef struct {
     npy_intp own;               /* gains of each: 1, or one for each of the p parameters */
     double *gamma, *end, *mean; /* (own, lanes) gains, and room for their decays */
-    double *distance;           /* (N, p, lanes) η̂ − η̄ at the left end of every step */
+    double *distance;           /* (N or 1, p, lanes) η̂ − η̄ at the left end of every step */
 } Cases;
+
+/* Takes over the gains (own,) and the distances from η̄ (p,) of the starts (p,) of `some` cases;
+   what is left of the lanes repeats the last one. */
+TWICE void begin_cases(const Cases *cases, const double *quotient, npy_intp p,
+                       const double *start, npy_intp start_stride, const double *gains,
+                       npy_intp some, const int lanes)
+{
+    for (npy_intp b = 0; b < lanes; b++) {
+        const npy_intp one = b < some ? b : some - 1;
+        for (npy_intp i = 0; i < cases->own; i++)
+            cases->gamma[i * lanes + b] = gains[one * cases->own + i];
+        for (npy_intp j = 0; j < p; j++)
+            cases->distance[j * lanes + b] = start[one * start_stride + j] - quotient[j];
+    }
+}
+
+/* The law of `some` ≤ lanes cases with η̄ constant: η̂ (some, times, p), see constant_law. */
+TWICE void constant_cases(const double *at, npy_intp times, const double *final, npy_intp p,
+                          const double *start, npy_intp start_stride, const double *gains,
+                          npy_intp some, const Cases *cases, double *eta, const int lanes)
+{
+    begin_cases(cases, final, p, start, start_stride, gains, some, lanes);
+    for (npy_intp m = 0; m < times; m++) {
+        decays(cases->gamma, at[m], cases->own, cases->end, cases->mean, lanes);
+        for (npy_intp b = 0; b < some; b++)
+            for (npy_intp j = 0; j < p; j++) {
+                const npy_intp lane = cases->own == 1 ? b : j * lanes + b;
+                eta[(b * times + m) * p + j] =
+                    final[j] + cases->end[lane] * cases->distance[j * lanes + b];
+            }
+    }
+}
+
+/* I at the times (M,), η̄ (p,), η̂ at the start (1 or g, p), γ (g, 1 or p)
+   -> η̂ = η̄ + e^{−γI} (η̂(0) − η̄) (g, M, p). */
+static PyObject *constant_law(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 4))
+        return NULL;
+    PyArrayObject *at = doubles(&call, 0, 1), *final = at ? doubles(&call, 1, 1) : NULL;
+    PyArrayObject *start = final ? doubles(&call, 2, 2) : NULL;
+    PyArrayObject *gains = start ? doubles(&call, 3, 2) : NULL;
+    if (gains == NULL)
+        return failed(&call);
+    const npy_intp times = size(at, 0), p = size(final, 0), g = size(gains, 0);
+    const npy_intp own = size(gains, 1);
+    if (!same("parameters at the start", size(start, 1), p) ||
+        !timed("cases at the start", size(start, 0), g) ||
+        !(own == 1 || same("parameters with a gain", own, p)))
+        return failed(&call);
+    PyArrayObject *out = fresh(&call, 3, (npy_intp[]){g, times, p});
+    double *room = out ? scratch(&call, (p + 3 * own) * LANES) : NULL;
+    if (room == NULL)
+        return failed(&call);
+    const Cases cases = {own, room, room + own * LANES, room + 2 * own * LANES,
+                         room + 3 * own * LANES};
+    const npy_intp start_stride = stride(size(start, 0), p);
+    for (npy_intp first = 0; first < g;) {
+        const double *from = data(start) + first * start_stride, *gamma = data(gains) + first * own;
+        double *eta = data(out) + first * times * p;
+        const npy_intp some = g - first < LANES ? g - first : LANES;
+        if (some < FEW)
+            constant_cases(data(at), times, data(final), p, from, start_stride, gamma, 1, &cases,
+                           eta, 1);
+        else
+            constant_cases(data(at), times, data(final), p, from, start_stride, gamma, some,
+                           &cases, eta, LANES);
+        first += some < FEW ? 1 : some;
+    }
+    return results(&call, 1, out);
+}
 
 /* The law with η̄ linear in I between the points: the distances at the left end of every step
    from those at the start. */
@@ -467,13 +501,7 @@ TWICE void linear_cases(const Path *path, const Places *places, npy_intp times,
                         npy_intp some, const Cases *cases, double *eta, const int lanes)
 {
     const npy_intp p = path->p, own = cases->own;
-    for (npy_intp b = 0; b < lanes; b++) {
-        const npy_intp one = b < some ? b : some - 1;
-        for (npy_intp i = 0; i < own; i++)
-            cases->gamma[i * lanes + b] = gains[one * own + i];
-        for (npy_intp j = 0; j < p; j++)
-            cases->distance[j * lanes + b] = start[one * start_stride + j] - path->quotient[j];
-    }
+    begin_cases(cases, path->quotient, p, start, start_stride, gains, some, lanes);
     go_along(path, cases, lanes);
     for (npy_intp m = 0; m < times; m++) {
         const npy_intp point = places->point[m];

@@ -129,7 +129,7 @@ static double adjugate_in_place(double *A, double *B, npy_intp n, npy_intp colum
                 B[i * columns + j] -= factor * B[k * columns + j];
         }
     }
-    const double last = n ? A[n * n - 1] : 1.0, *d = B + (n - 1) * columns;
+    const double last = n ? A[n * n - 1] : 1.0, *d = B + (n ? n - 1 : 0) * columns;
     for (npy_intp k = n - 2; k >= 0; k--)
         for (npy_intp j = 0; j < columns; j++) {
             double c = last * B[k * columns + j] - A[k * n + n - 1] * d[j];
