@@ -19,6 +19,7 @@ from gpebo_cli.simulation.consistency import consistent_state
 from gpebo_cli.simulation.derivative_array import (
     Bases,
     Pivots,
+    StrangenessFree,
     Structure,
     analyse,
     balance,
@@ -140,6 +141,68 @@ def assert_same_structure(one, other):
 @given(SYSTEMS)
 def test_the_same_structure(drawn):
     assert_same_structure(*by_both(lambda: outcome(random_system(*drawn))))
+
+
+@settings(max_examples=100, deadline=None)
+@given(SYSTEMS)
+def test_the_same_bounds(drawn):
+    """Not only those that decide."""
+    system = random_system(*drawn)
+    structure = outcome(system)
+    assume(isinstance(structure, Structure))
+    assume(not structure.time_invariant)
+    t = np.linspace(0.1, 0.9, 23)
+    c = system.coefficients.taylor(t, structure.mu)
+    (one, first), (other, second) = by_both(
+        lambda: derivative_array._judged(t, c, structure.mu, structure.scaling, 1e-10, False)
+    )
+    assert (first is None) == (second is None)
+    assert (one.a, one.failure) == (other.a, other.failure)
+    np.testing.assert_allclose(one.smallest, other.smallest, rtol=1e-6, atol=1e-13)
+    sizes = [np.linalg.norm(levels.dynamics, axis=(1, 2)) for levels in (one, other)]
+    np.testing.assert_allclose(*sizes, rtol=1e-6, atol=1e-9 * sizes[0].max(initial=1.0))
+
+
+def alone(E, A):
+    """Coefficients of order 0 without inputs, E and A (N, n, n)."""
+    times, n = E.shape[:2]
+    return Coefficients(
+        E[None], A[None], *[np.zeros((1, times, n, 0))] * 2, np.zeros((1, times, 0, n)),
+        *[np.zeros((1, times, 0))] * 2,
+    )
+
+
+@pytest.mark.parametrize("where", [0, 3, 9])
+def test_what_is_wrong_at_one_time_is_said_of_that_time(where):
+    E, A = np.zeros((10, 2, 2)) + np.diag([1.0, 0.0]), np.zeros((10, 2, 2)) + np.eye(2)
+    A[where, 1, 1] = 0.0
+    one, other = by_both(lambda: derivative_array._judged(
+        np.arange(10.0), alone(E, A), 0, balance(alone(E, A)), 1e-10, False
+    ))
+    assert one[1] is other[1] is None
+    assert one[0].failure == other[0].failure
+    assert f"constraints are linearly dependent at t = {where}" in one[0].failure
+
+
+@pytest.mark.parametrize("tiny", [1e-3, 1e-13, 0.0])
+@pytest.mark.parametrize("where", [0, 5, 8])
+def test_times_beside_one_that_needs_other_pivots(tiny, where):
+    """Rows are exchanged alike at neighbouring times, which does not suit this one."""
+    E = np.random.default_rng(3).normal(size=(11, 4, 4)) + 9.0 * np.eye(4)
+    E[where] = np.roll(E[where], 1, axis=0)
+    E[where, 0, 0] = tiny
+    c, ones = alone(E, E), np.ones(4)
+    pivots = (np.arange(4), np.arange(4), 4, np.eye(4))
+    known, *_, basis, _, _ = COMPILED.reduced(
+        c.E, c.A, ones, ones, 1.0, 0, c.B, c.F, c.u, c.theta, *pivots, 1, 300.0, 1e-13
+    )
+    assert known[0]
+    np.testing.assert_allclose(basis, np.linalg.inv(E), atol=1e-14)
+    E[where] = np.roll(E[where], -1, axis=0) * np.array([1.0, 0.0, 1.0, 1.0])  # singular
+    known, *_ = COMPILED.reduced(
+        c.E, c.A, ones, ones, 1.0, 0, c.B, c.F, c.u, c.theta, *pivots, 1, 300.0, 1e-13
+    )
+    assert not known[0]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -308,23 +371,35 @@ def test_dips(seed, count, infinite):
 
 
 @settings(deadline=None)
-@given(SEEDS, st.integers(0, 4), st.lists(st.integers(1, 3), min_size=1, max_size=2),
-       st.booleans())
-def test_consistent_states(seed, d, blocks, near):
+@given(SEEDS, st.integers(0, 4), st.lists(st.integers(1, 3), min_size=1, max_size=2))
+def test_consistent_states(seed, d, blocks):
     system = random_system(seed, d, blocks)
     structure = outcome(system)
     assume(isinstance(structure, Structure))
     reduced = reduce(system, structure, np.array([0.2, 0.4]), np.array([0.2, 0.4]))
     x0 = np.random.default_rng(seed).normal(size=system.n)
-    if near:
-        x0 = consistent_state(reduced, x0)
     one, other = by_both(lambda: consistent_state(reduced, x0))
     size = np.abs(other).max()
     np.testing.assert_allclose(one, other, atol=1e-9 * size)
     residual = np.abs(reduced.A2[0] @ one + reduced.f2[0]).max()
     assert residual <= 1e-12 * (np.abs(reduced.A2[0]).max() * size + 1.0)
-    if near:
-        assert (one == x0).sum() == (other == x0).sum()
+
+
+@given(SEEDS)
+def test_what_no_constraint_moves_keeps_its_digits(seed):
+    rng = np.random.default_rng(seed)
+    E, A2, x0 = np.diag([1.0, 4.0, 0.0]), rng.normal(size=(1, 3)), rng.normal(size=3)
+    A2[0, 2] = 3.0
+    f2 = rng.normal(size=1)
+    nothing = np.zeros((1, 0, 3))
+    reduced = StrangenessFree(
+        nothing, nothing, np.zeros((1, 0)), A2[None], f2[None], None, None, np.zeros((3, 4)),
+        E[None], np.zeros((1, 0)), nothing,
+    )
+    for x in by_both(lambda: consistent_state(reduced, x0)):
+        assert x[:2].tolist() == x0[:2].tolist()
+        assert A2[0] @ x == pytest.approx(-f2[0], abs=1e-14)
+        assert x[2] != x0[2]
 
 
 def test_a_consistent_state_of_dependent_constraints_is_left_to_singular_values():
@@ -462,7 +537,7 @@ def test_numbers_out_of_range_are_refused():
                 getattr(COMPILED, name)(*given_arguments)
 
 
-def test_matrices_may_lie_anywhere():
+def test_matrices_may_lie_anywhere(monkeypatch):
     """Transposed, reversed in time, every other one: strides are no kernel's excuse."""
     system = random_system(8, 2, [2])
     structure = outcome(system)
@@ -471,6 +546,7 @@ def test_matrices_may_lie_anywhere():
     t = np.linspace(0, 1, 21)
     c = system.coefficients.taylor(t, structure.mu)
     expected = reduce(system, structure, t, t, c)
+    monkeypatch.setattr(derivative_array, "forcing", None)  # nor a reason to leave it to NumPy
     turned = {name: np.asfortranarray(value) for name, value in vars(c).items()}
     assert_same_equations(reduce(system, structure, t, t, Coefficients(**turned)), expected)
     twice = {name: np.repeat(value, 2, axis=1)[:, ::2] for name, value in vars(c).items()}

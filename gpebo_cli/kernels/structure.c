@@ -248,7 +248,8 @@ static int orthogonalise(double *W, npy_intp rows, npy_intp length, double *sigm
                 if (cosine > worst)
                     worst = cosine;
                 const double zeta = (other - one) / (2.0 * product);
-                const double t = (zeta >= 0.0 ? 1.0 : -1.0) / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
+                const double sign = zeta >= 0.0 ? 1.0 : -1.0;
+                const double t = sign / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
                 const double c = 1.0 / sqrt(1.0 + t * t), s = c * t;
                 for (npy_intp j = 0; j < length; j++) {
                     const double kept = x[j];
@@ -292,7 +293,7 @@ typedef struct {
     double *sigma;       /* (size,) of M, from large to small */
     npy_intp *order;     /* (size,) */
     double *Z2;          /* (a, size) by rows, orthonormal: Z2ᵀ */
-    double *A2;          /* (n, n) */
+    double *A2;          /* (a, n) */
     double *T2;          /* (d, n) by rows: T2ᵀ */
     double *Z1;          /* (d, n) by rows: Z1ᵀ */
     double smallest[3];  /* of M, Â2 and E T2, relative; infinite where there is none */
@@ -1199,11 +1200,11 @@ static PyObject *reduced(PyObject *module, PyObject *const *given, Py_ssize_t co
         return failed(&call);
     }
     double *buffer = make(&call, n, d, times, times, &out)
-                         ? scratch(&call, LANES * (n * n + n + a * (n + 1)) + 4 * n)
+                         ? scratch(&call, LANES * (n * n + 2 * n + a * (n + 1)) + 3 * n)
                          : NULL;
     if (buffer == NULL)
         return failed(&call);
-    double *vector = buffer + n * n * LANES, *sizes = vector + n * LANES;
+    double *vector = buffer + n * (n + 1) * LANES, *sizes = vector + n * LANES;
     double *of_E1 = sizes + LANES * a * (n + 1), *of_A = of_E1 + n, *of_basis = of_A + n;
     for (npy_intp j = 0; j < n; j++) {
         of_E1[j] = m.time / m.columns[j];
@@ -1299,14 +1300,13 @@ static PyObject *reduced_constant(PyObject *module, PyObject *const *given, Py_s
     }
     const double *Z1 = data(first_basis), *Z2 = data(second_basis);
     double *e = make(&call, n, d, times, 1, &out)
-                    ? scratch(&call, 2 * n * size_of_M + 2 * n * n + a * n + 2 * a + 2 * size_of_M +
-                                         LANES * (2 * n + size_of_M))
+                    ? scratch(&call, 2 * n * size_of_M + 2 * n * n + a * n + a + 2 * LANES * n)
                     : NULL;
     if (e == NULL)
         return failed(&call);
     double *A = e + n * size_of_M, *whole = A + n * size_of_M, *inverse = whole + n * n;
-    double *sizes = inverse + n * n, *of_f2 = sizes + a * n, *vector = of_f2 + 2 * a + 2 * size_of_M;
-    double *lanes = vector + LANES * n;
+    double *sizes = inverse + n * n, *of_f2 = sizes + a * n;
+    double *vector = of_f2 + a, *lanes = vector + LANES * n;
     scaled(&m, 0, e, A);
     memset(whole, 0, n * n * sizeof(double));
     memset(inverse, 0, n * n * sizeof(double));
@@ -1550,7 +1550,8 @@ static PyObject *consistent(PyObject *module, PyObject *const *given, Py_ssize_t
         PyErr_SetString(PyExc_ValueError, "more constraints than states");
         return failed(&call);
     }
-    PyArrayObject *known = zeros(&call, 1, (npy_intp[]){1}), *x = known ? zeros(&call, 1, &n) : NULL;
+    PyArrayObject *known = zeros(&call, 1, (npy_intp[]){1});
+    PyArrayObject *x = known ? zeros(&call, 1, &n) : NULL;
     PyArrayObject *order_of = x ? fresh_indices(&call, n) : NULL;
     double *W = order_of ? scratch(&call, 4 * n * n + 4 * n) : NULL;
     if (W == NULL)
