@@ -334,7 +334,7 @@ def test_times_at_which_the_pivots_will_not_do():
     model = system.coefficients.taylor(near, 0)
     s, pivots = structure.scaling, structure.reference
     for t, trusted in ((0, True), (1, True), (2, False), (3, False)):
-        c = {name: value[:, t : t + 1] for name, value in vars(model).items()}
+        c = {name: value[:, t : t + 1] for name, value in model._asdict().items()}
         known = COMPILED.reduced(
             c["E"], c["A"], s.rows, s.columns, s.time, 0, c["B"], c["F"], c["u"], c["theta"],
             pivots.rows, pivots.columns, pivots.rank, pivots.Z1, 1, 300.0, 1e-13,
@@ -547,11 +547,11 @@ def test_matrices_may_lie_anywhere(monkeypatch):
     c = system.coefficients.taylor(t, structure.mu)
     expected = reduce(system, structure, t, t, c)
     monkeypatch.setattr(derivative_array, "forcing", None)  # nor a reason to leave it to NumPy
-    turned = {name: np.asfortranarray(value) for name, value in vars(c).items()}
+    turned = {name: np.asfortranarray(value) for name, value in c._asdict().items()}
     assert_same_equations(reduce(system, structure, t, t, Coefficients(**turned)), expected)
-    twice = {name: np.repeat(value, 2, axis=1)[:, ::2] for name, value in vars(c).items()}
+    twice = {name: np.repeat(value, 2, axis=1)[:, ::2] for name, value in c._asdict().items()}
     assert_same_equations(reduce(system, structure, t, t, Coefficients(**twice)), expected)
-    back = {name: value[:, ::-1].copy()[:, ::-1] for name, value in vars(c).items()}
+    back = {name: value[:, ::-1].copy()[:, ::-1] for name, value in c._asdict().items()}
     assert_same_equations(
         reduce(system, replace(structure), t, t, Coefficients(**back)), expected
     )

@@ -96,7 +96,7 @@ def law_variation(energy: Array, quotient: Array, gain: float) -> tuple[float, f
 
 
 def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:
-    """η̄ constant: η̂ = η̄ + e^{−γI} (η̂(0) − η̄), as :func:`scalar_law`."""
+    """η̄ constant: η̂ = η̄ + e^{−γI} (η̂(0) − η̄), (g, M, p); arguments as in :func:`scalar_law`."""
     final = path.quotient[-1, -1]
     if kernels.compiled is not None:
         eta: Array = kernels.compiled.constant_law(
@@ -112,7 +112,8 @@ def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     """η̄ linear in I between neighbouring points: what little it varies is second order.
 
     A step x = γ δI of the distance ε = η̂ − η̄, which stays accurate after convergence, is
-    ε₊ = e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄). Arguments and result are :func:`scalar_law`'s.
+    ε₊ = e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄). Arguments and result, (g, M, p), are
+    :func:`scalar_law`'s.
     """
     if kernels.compiled is not None:
         estimates: Array = kernels.compiled.linear_law(

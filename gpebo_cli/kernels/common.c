@@ -48,6 +48,18 @@ PyArrayObject *indices(Call *call, Py_ssize_t place, int axes)
     return argument(call, place, axes, NPY_INTP);
 }
 
+int number(Call *call, Py_ssize_t place, double *value)
+{
+    *value = PyFloat_AsDouble(call->given[place]);
+    return !(*value == -1.0 && PyErr_Occurred() != NULL);
+}
+
+int whole_number(Call *call, Py_ssize_t place, npy_intp *value)
+{
+    *value = PyLong_AsSsize_t(call->given[place]);
+    return !(*value == -1 && PyErr_Occurred() != NULL);
+}
+
 PyArrayObject *fresh(Call *call, int axes, const npy_intp *shape)
 {
     return keep(call, PyArray_SimpleNew(axes, (npy_intp *)shape, NPY_DOUBLE));
@@ -56,6 +68,11 @@ PyArrayObject *fresh(Call *call, int axes, const npy_intp *shape)
 PyArrayObject *zeros(Call *call, int axes, const npy_intp *shape)
 {
     return keep(call, PyArray_ZEROS(axes, (npy_intp *)shape, NPY_DOUBLE, 0));
+}
+
+PyArrayObject *fresh_indices(Call *call, npy_intp length)
+{
+    return keep(call, PyArray_SimpleNew(1, &length, NPY_INTP));
 }
 
 double *scratch(Call *call, size_t numbers)

@@ -16,6 +16,17 @@
 #include <stdlib.h>
 #include <string.h>
 
+/* One version of a function for each width of the processor's registers, chosen when the module
+   is loaded. All round alike: no loop adds up in another order, nothing is contracted. */
+#if defined(__has_attribute) && defined(__x86_64__) && defined(__GLIBC__) && !defined(GPEBO_PLAIN)
+#if __has_attribute(target_clones)
+#define EVERY_WIDTH __attribute__((target_clones("avx512f", "avx2", "default")))
+#endif
+#endif
+#ifndef EVERY_WIDTH
+#define EVERY_WIDTH
+#endif
+
 /* Arguments of one call, and results under way: whatever happens, `release` gives all back. */
 #define MOST_HELD 32
 typedef struct {
@@ -33,9 +44,16 @@ int begin(Call *call, PyObject *const *given, Py_ssize_t count, Py_ssize_t expec
 PyArrayObject *doubles(Call *call, Py_ssize_t place, int axes);
 PyArrayObject *indices(Call *call, Py_ssize_t place, int axes);
 
+/* An argument that is a number, or a whole one; 0 with an exception if it is none. */
+int number(Call *call, Py_ssize_t place, double *value);
+int whole_number(Call *call, Py_ssize_t place, npy_intp *value);
+
 /* A new array for a result, with nothing in it, or zeros; NULL with an exception. */
 PyArrayObject *fresh(Call *call, int axes, const npy_intp *shape);
 PyArrayObject *zeros(Call *call, int axes, const npy_intp *shape);
+
+/* A new array of intp with one axis, with nothing in it. */
+PyArrayObject *fresh_indices(Call *call, npy_intp length);
 
 /* Memory that lives as long as the call; NULL with an exception. */
 double *scratch(Call *call, size_t numbers);
@@ -51,6 +69,12 @@ int same(const char *what, npy_intp one, npy_intp other);
 
 static inline double *data(PyArrayObject *array) { return (double *)PyArray_DATA(array); }
 static inline npy_intp size(PyArrayObject *array, int axis) { return PyArray_DIM(array, axis); }
+
+/* The larger one; what is not a number stays. */
+static inline double larger(double a, double b)
+{
+    return a >= b || a != a ? a : b;
+}
 
 /* Solves A X = B by elimination with row pivoting, A (n, n) and B (n, columns) by rows; A is
    destroyed and B becomes X. 0 if a pivot is exactly zero. For small n: what LAPACK spends on

@@ -4,23 +4,6 @@
 
 #include "common.h"
 
-/* One version of a function for each width of the processor's registers, chosen when the module
-   is loaded. All round alike: no loop adds up in another order, nothing is contracted. */
-#if defined(__has_attribute) && defined(__x86_64__) && defined(__GLIBC__) && !defined(GPEBO_PLAIN)
-#if __has_attribute(target_clones)
-#define EVERY_WIDTH __attribute__((target_clones("avx512f", "avx2", "default")))
-#endif
-#endif
-#ifndef EVERY_WIDTH
-#define EVERY_WIDTH
-#endif
-
-/* The larger one; what is not a number stays. */
-static inline double larger(double a, double b)
-{
-    return a >= b || a != a ? a : b;
-}
-
 /* `combine` for a fixed number of columns. */
 #define COMBINE(block)                                                                             \
     for (; j + block <= width; j += block) {                                                       \

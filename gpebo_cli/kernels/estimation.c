@@ -3,7 +3,6 @@
 #include "common.h"
 
 #include <float.h>
-#include <stdint.h>
 
 /* Cases side by side: recurrences that do not wait for one another, in as many registers. */
 #define LANES 8
@@ -16,13 +15,6 @@
 #define FEW 3 /* cases: up to here one after the other is faster than LANES with padding */
 #define TOGETHER 32 /* times at once when errors are measured */
 
-/* An argument that is a number; 0 with an exception if it is none. */
-static int number(Call *call, Py_ssize_t place, double *value)
-{
-    *value = PyFloat_AsDouble(call->given[place]);
-    return !(*value == -1.0 && PyErr_Occurred());
-}
-
 /* How far apart the values of two times are: 0 for an array (1, …) that is constant in time. */
 static npy_intp stride(npy_intp times, npy_intp numbers) { return times == 1 ? 0 : numbers; }
 
@@ -30,12 +22,6 @@ static npy_intp stride(npy_intp times, npy_intp numbers) { return times == 1 ? 0
 static int timed(const char *what, npy_intp given, npy_intp wanted)
 {
     return given == 1 || same(what, given, wanted);
-}
-
-/* The larger one, NaN if one of them is. */
-static inline double larger(double one, double other)
-{
-    return other > one || isnan(other) ? other : one;
 }
 
 /* one · other, with a power of two taken out where it would become too small or too large. */
@@ -279,61 +265,25 @@ static PyObject *law_variation(PyObject *module, PyObject *const *given, Py_ssiz
     return results(&call, 1, out);
 }
 
-#define LOG2_E 1.4426950408889634
-/* ln 2 in two parts, the first with so few digits that k times it is exact. */
-#define LN2_HIGH 6.93147180369123816490e-01
-#define LN2_LOW 1.90821492927058770002e-10
-/* From LEAST down x is as good as 0, from MOST up e^{−x} is next to the smallest number. */
+/* From LEAST down x is as good as 0. */
 #define LEAST 1e-300
-#define MOST 708.0
 
-/* 2^−k for 0 ≤ k ≤ 1022. */
-static inline double power(int k)
-{
-    const uint64_t bits = (uint64_t)(1023 - k) << 52;
-    double value;
-    memcpy(&value, &bits, sizeof value);
-    return value;
-}
-
-/* e^{−x} of some values x = γδ ≥ 0, and its mean (1 − e^{−x})/x over a step, 1 at x = 0; both to
-   about one unit in the last place.
-
-   x = k ln 2 − r, |r| ≤ ln(2)/2, and q = e^r − 1 by its series, which is good to 1e-17 q. Then
-   e^{−x} = 2^−k (1 + q), and 1 − e^{−x} = (1 − 2^−k) − 2^−k q loses nothing: for k = 0 it is −q.
-   The library's exp and expm1 take one value at a time; these loops become vector instructions. */
+/* e^{−x} of some values x = γδ ≥ 0, and its mean (1 − e^{−x})/x over a step, 1 at x = 0. */
 TWICE void decays_of_one(const double *restrict gamma, double length, double *restrict end,
                          double *restrict mean, const int lanes)
 {
-    double x[LANES], r[LANES], q[LANES], shrunk[LANES];
-    for (int b = 0; b < lanes; b++)
-        x[b] = gamma[b] * length < LEAST ? LEAST : gamma[b] * length;
-    for (int b = 0; b < lanes; b++)
-        r[b] = x[b] > MOST ? MOST : x[b];
     for (int b = 0; b < lanes; b++) {
-        const int k = r[b] <= MOST ? (int)(r[b] * LOG2_E + 0.5) : 0; /* NaN remains in r */
-        r[b] = (k * LN2_HIGH - r[b]) + k * LN2_LOW;
-        shrunk[b] = power(k);
-    }
-    for (int b = 0; b < lanes; b++) {
-        const double v = r[b];
-        double sum = 1.0 / 6227020800.0;
-        sum = sum * v + 1.0 / 479001600.0;
-        sum = sum * v + 1.0 / 39916800.0;
-        sum = sum * v + 1.0 / 3628800.0;
-        sum = sum * v + 1.0 / 362880.0;
-        sum = sum * v + 1.0 / 40320.0;
-        sum = sum * v + 1.0 / 5040.0;
-        sum = sum * v + 1.0 / 720.0;
-        sum = sum * v + 1.0 / 120.0;
-        sum = sum * v + 1.0 / 24.0;
-        sum = sum * v + 1.0 / 6.0;
-        sum = sum * v + 0.5;
-        q[b] = shrunk[b] * ((sum * v) * v + v);
-    }
-    for (int b = 0; b < lanes; b++) {
-        end[b] = shrunk[b] + q[b];
-        mean[b] = ((1.0 - shrunk[b]) - q[b]) / x[b];
+        const double x = gamma[b] * length;
+        if (x > 0.5) { /* 1 − e^{−x} has all its digits */
+            end[b] = exp(-x);
+            mean[b] = (1.0 - end[b]) / x;
+        } else if (x <= LEAST) {
+            end[b] = mean[b] = 1.0;
+        } else {
+            const double q = expm1(-x);
+            end[b] = 1.0 + q;
+            mean[b] = -q / x;
+        }
     }
 }
 

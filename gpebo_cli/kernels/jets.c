@@ -4,17 +4,6 @@
 
 #include <fenv.h>
 
-/* One version of a function for each width of the processor's registers, chosen when the module
-   is loaded. All round alike: no loop adds up in another order, nothing is contracted. */
-#if defined(__has_attribute) && defined(__x86_64__) && defined(__GLIBC__) && !defined(GPEBO_PLAIN)
-#if __has_attribute(target_clones)
-#define EVERY_WIDTH __attribute__((target_clones("avx512f", "avx2", "default")))
-#endif
-#endif
-#ifndef EVERY_WIDTH
-#define EVERY_WIDTH
-#endif
-
 #define MOST_MATRICES 8
 #define MOST_AXES 8
 #define GIVEN 2                 /* rows that the caller gives: t, inside */
@@ -37,7 +26,6 @@ typedef struct {
     const double *given[GIVEN];
     double *memory; /* rows GIVEN, GIVEN + 1, … of `length` numbers each */
     npy_intp length;
-    double *unread; /* one more */
     const double *constants;
 } Rows;
 
@@ -75,7 +63,8 @@ static inline const double *row_of(const Rows *rows, npy_intp index)
             z[i] = value;                                                                          \
     } while (0)
 
-/* Does one operation for `count` times; sine and cosine have their own, below. */
+/* Does one operation for `count` times. The C library computes functions one value at a time;
+   sines of several at once would be ten times faster, and ours to answer for. */
 EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, npy_intp count)
 {
     const npy_intp left = operation->left, right = operation->right;
@@ -91,6 +80,8 @@ EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, np
     case SQRT: UNARY(sqrt(x[i])); break;
     case EXP: UNARY(exp(x[i])); break;
     case LOG: UNARY(log(x[i])); break;
+    case SIN: UNARY(sin(x[i])); break;
+    case COS: UNARY(cos(x[i])); break;
     case TAN: UNARY(tan(x[i])); break;
     case SINH: UNARY(sinh(x[i])); break;
     case COSH: UNARY(cosh(x[i])); break;
@@ -99,81 +90,11 @@ EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, np
     }
 }
 
-#define FAR 1e5 /* angles up to here are reduced exactly: fewer than 2^20 quarters of a turn */
-
-/* Sine and cosine of angles up to FAR, to less than a unit in the last place, several at a time,
-   where the C library takes one after the other: each known function asks for a thousand.
-
-   The angle less k quarters of a turn, as y + rest: π/2 in three parts, the first two of 33 bits,
-   so that k times them is exact. There sin y = y + y z S(z) and cos y = 1 − z/2 + z² C(z) with
-   z = y², S and C of degree 5 through Chebyshev's points of 0 ≤ z ≤ (π/4)². */
-EVERY_WIDTH static void turn(const double *restrict angle, double *restrict s, double *restrict c,
-                             npy_intp count)
-{
-    const double to_integer = 6755399441055744.0; /* 1.5 · 2^52: its last bit counts ones */
-    for (npy_intp i = 0; i < count; i++) {
-        const double shifted = angle[i] * 0.6366197723675814 + to_integer;
-        const double k = shifted - to_integer;
-        npy_int64 quarter;
-        memcpy(&quarter, &shifted, sizeof quarter);
-        const double first = angle[i] - k * 1.5707963267341256, second = k * 6.077100506303966e-11;
-        const double y = first - second;
-        const double rest = ((first - y) - second) - k * 2.0222662487959506e-21;
-        const double z = y * y, cube = z * y;
-        const double S = 0.008333333333330948 +
-                         z * (-0.00019841269836756774 +
-                              z * (2.7557316101617874e-06 +
-                                   z * (-2.505113165023518e-08 + z * 1.5918115263265974e-10)));
-        const double C =
-            z * (0.041666666666666664 +
-                 z * (-0.0013888888888887398 +
-                      z * (2.480158729876456e-05 +
-                           z * (-2.7557317271145144e-07 +
-                                z * (2.087614614655861e-09 + z * -1.1382623647474604e-11)))));
-        const double sine =
-            y - ((z * (0.5 * rest - cube * S) - rest) - cube * -0.16666666666666666);
-        const double half = 0.5 * z, most = 1.0 - half;
-        const double cosine = most + (((1.0 - most) - half) + (z * C - y * rest));
-        const double one = quarter & 1 ? cosine : sine, other = quarter & 1 ? sine : cosine;
-        s[i] = quarter & 2 ? -one : one;
-        c[i] = (quarter + 1) & 2 ? -other : other;
-    }
-}
-
-/* Sine and cosine of the row `left`, into either of two rows. */
-static void sine_and_cosine(const Rows *rows, npy_intp left, double *s, double *c, npy_intp count)
-{
-    const double *angle = row_of(rows, left);
-    int near = 1;
-    for (npy_intp i = 0; i < count; i++)
-        near &= fabs(angle[i]) <= FAR;
-    if (near) {
-        turn(angle, s, c, count);
-        return;
-    }
-    for (npy_intp i = 0; i < count; i++) {
-        s[i] = sin(angle[i]);
-        c[i] = cos(angle[i]);
-    }
-}
-
-/* Does all operations for `count` times; of a sine and a cosine of the same row, which stand side
-   by side, each is a by-product of the other. */
+/* Does all operations for `count` times. */
 static void run(const Rows *rows, const Operation *code, npy_intp operations, npy_intp count)
 {
-    for (npy_intp k = 0; k < operations; k++) {
-        const int sine = code[k].what == SIN;
-        if (!sine && code[k].what != COS) {
-            operate(rows, code + k, count);
-            continue;
-        }
-        double *one = rows->memory + (code[k].result - GIVEN) * rows->length, *other = rows->unread;
-        const npy_intp left = code[k].left;
-        if (k + 1 < operations && code[k + 1].what == (sine ? COS : SIN) &&
-            code[k + 1].left == left)
-            other = rows->memory + (code[++k].result - GIVEN) * rows->length;
-        sine_and_cosine(rows, left, sine ? one : other, sine ? other : one, count);
-    }
+    for (npy_intp k = 0; k < operations; k++)
+        operate(rows, code + k, count);
 }
 
 static int outside(const char *what, npy_intp value)
@@ -339,11 +260,9 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
     npy_intp block = IN_CACHE / used;
     block = block < 32 ? 32 : block > 512 ? 512 : block;
     block = block > times ? times : block;
-    Rows rows = {{NULL, NULL}, scratch(&call, (used - GIVEN + 1) * block), block, NULL,
-                 data(constants)};
+    Rows rows = {{NULL, NULL}, scratch(&call, (used - GIVEN) * block), block, data(constants)};
     if (rows.memory == NULL)
         return failed(&call);
-    rows.unread = rows.memory + (used - GIVEN) * block;
     double *out[MOST_MATRICES] = {NULL};
     PyObject *answer = PyTuple_New(matrices);
     for (npy_intp m = 0; answer != NULL && m < matrices; m++) {
@@ -397,13 +316,6 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
 
 #define REMEMBERED 16 /* columns with which the next ones are compared */
 
-/* A number among the arguments. 0 with an exception if it is none. */
-static int number(const Call *call, Py_ssize_t place, double *value)
-{
-    *value = PyFloat_AsDouble(call->given[place]);
-    return *value != -1.0 || PyErr_Occurred() == NULL;
-}
-
 /* An argument as an array of float64 with at least two axes. */
 static PyArrayObject *values_of(Call *call, Py_ssize_t place)
 {
@@ -422,9 +334,6 @@ static npy_intp entries_of(PyArrayObject *values)
 }
 
 enum { LANES = 4 }; /* running largest numbers that do not wait for each other */
-
-/* The larger one; fmax is a call. */
-static inline double larger(double one, double other) { return one > other ? one : other; }
 
 /* The largest |x| of some numbers, 0 of none. */
 EVERY_WIDTH static double largest_size(const double *x, npy_intp count)

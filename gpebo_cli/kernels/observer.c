@@ -18,22 +18,14 @@ typedef struct {
     npy_intp numbers; /* per time */
 } Stack;
 
-/* The double that an argument is; 0 with an exception. */
-static int number(Call *call, Py_ssize_t place, double *value)
-{
-    *value = PyFloat_AsDouble(call->given[place]);
-    return !(*value == -1.0 && PyErr_Occurred() != NULL);
-}
-
 /* The integer that an argument is; 0 with an exception, also for a negative one. */
 static int count_of(Call *call, Py_ssize_t place, npy_intp *value)
 {
-    *value = PyLong_AsSsize_t(call->given[place]);
-    if (*value >= 0)
-        return 1;
-    if (PyErr_Occurred() == NULL)
+    if (!whole_number(call, place, value))
+        return 0;
+    if (*value < 0)
         PyErr_Format(PyExc_ValueError, "argument %zd is negative", place);
-    return 0;
+    return *value >= 0;
 }
 
 /* An array with `axes` axes after those of time, which are one, (N, …), or two, (K, s + 1, …). */

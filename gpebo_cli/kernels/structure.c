@@ -44,33 +44,6 @@ static int series(Call *call, Py_ssize_t place, int axes, Series *out)
     return 1;
 }
 
-static int number(Call *call, Py_ssize_t place, double *out)
-{
-    *out = PyFloat_AsDouble(call->given[place]);
-    return !(*out == -1.0 && PyErr_Occurred());
-}
-
-static int whole_number(Call *call, Py_ssize_t place, npy_intp *out)
-{
-    *out = PyLong_AsSsize_t(call->given[place]);
-    return !(*out == -1 && PyErr_Occurred());
-}
-
-/* A new array of intp, as `fresh` makes them of float64. */
-static PyArrayObject *fresh_indices(Call *call, npy_intp length)
-{
-    PyObject *made = PyArray_SimpleNew(1, &length, NPY_INTP);
-    if (made == NULL)
-        return NULL;
-    if (call->used == MOST_HELD) {
-        Py_DECREF(made);
-        PyErr_SetString(PyExc_SystemError, "a kernel holds too many arrays");
-        return NULL;
-    }
-    call->held[call->used++] = made;
-    return (PyArrayObject *)made;
-}
-
 /* E and A of a model with the scalings of its rows, states and time, differentiated mu times. */
 typedef struct {
     Series E, A;
