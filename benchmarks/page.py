@@ -250,14 +250,18 @@ def _problems(part: Data, rows: list[Row]) -> list[str]:
                 for name in names
             ],
         ),
-        ("Deriving apart: *reading* makes the text a program for Taylor coefficients; *taylor* "
-        "runs it once, for all derivatives at all points, and is part of *solving*."),
+        ("Deriving apart: *reading* parses the text; *recording*, once for each plant and order, "
+        "turns it into a program of elementary operations for Taylor coefficients, as CasADi and "
+        "SymPy compile theirs before the clock starts. *taylor* runs it once, for all derivatives "
+        "at all points, and is part of *solving*. *From text* is all of it, by a plant nobody has "
+        "seen before."),
         table(
-            ["problem", "index", "states", "reading", "taylor", "solving", "error", "points"],
+            ["problem", "index", "states", "reading", "recording", "taylor", "solving",
+             "from text", "error", "points"],
             [
                 (e["name"], str(e["index"]), str(e["n"]), duration(e["reading"]),
-                 duration(e["taylor"]), duration(e["solving"]), _error(e["error"]),
-                 str(e["points"]))
+                 duration(e["recording"]), duration(e["taylor"]), duration(e["solving"]),
+                 duration(e["first"]), _error(e["error"]), str(e["points"]))
                 for e in part.get("deriving", [])
             ],
         ),

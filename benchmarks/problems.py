@@ -28,6 +28,7 @@ from benchmarks.measure import (
     say,
     seconds,
 )
+from gpebo_cli.expressions import Tape
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 from gpebo_cli.systems.plant import plant_from_mapping
@@ -372,7 +373,8 @@ def rows() -> list[Row]:
 def deriving() -> list[dict[str, Any]]:
     """Seconds to read the text of each problem, and to take all derivatives that are needed.
 
-    The latter, at all points of the final mesh at once, are part of the time to solve.
+    The latter, at all points of the final mesh at once, are part of the time to solve. The program
+    that takes them is recorded once for each order up to μ; ``first`` begins with the text.
     """
     table = []
     for problem in problems():
@@ -383,12 +385,23 @@ def deriving() -> list[dict[str, Any]]:
         tol = solve.tolerance
         result = simulate(system, TimeSettings(start, stop - start), SolverSettings(tol=tol))
         points, order = result.signals.mesh.points.ravel(), result.structure.mu
+        tape = system.coefficients.tape  # type: ignore[attr-defined]
+
+        def record(tape: Tape = tape, order: int = order) -> None:
+            for k in range(order + 1):
+                tape.program(k, apart=tape.jumps)
+
+        def first(problem: Problem = problem, tol: float = tol) -> None:
+            ours(problem)(tol)()
+
         table.append({
             "name": problem.name, "index": result.structure.index, "n": system.n,
             "tolerance": tol, "error": solve.error,
             "reading": seconds(lambda p=problem: plant_from_mapping(p.mapping, p.name), 0.2),  # type: ignore[misc]
+            "recording": seconds(record, 0.2),
             "taylor": seconds(lambda s=system, t=points, k=order: s.coefficients.taylor(t, k), 0.2),  # type: ignore[misc]
             "solving": seconds(solve.solve, 0.3),
+            "first": seconds(first, 0.3),
             "points": len(points),
         })
     return table
