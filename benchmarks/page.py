@@ -260,8 +260,8 @@ def _problems(part: Data, rows: list[Row]) -> list[str]:
              "from text", "error", "points"],
             [
                 (e["name"], str(e["index"]), str(e["n"]), duration(e["reading"]),
-                 duration(e["recording"]), duration(e["taylor"]), duration(e["solving"]),
-                 duration(e["first"]), _error(e["error"]), str(e["points"]))
+                 duration(e.get("recording")), duration(e["taylor"]), duration(e["solving"]),
+                 duration(e.get("first")), _error(e["error"]), str(e["points"]))
                 for e in part.get("deriving", [])
             ],
         ),
