@@ -12,7 +12,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 help:
 	@echo 'make run      set up, then the main job: gpebo run plant=circuit estimator=drem'
 	@echo 'make test     set up, then the tests'
-	@echo 'make lint types layers    ruff, mypy, import-linter'
+	@echo 'make lint types layers    ruff and clang-format, mypy, import-linter'
 	@echo 'make kernels  compile gpebo_cli/kernels again, after a change of the C'
 	@echo 'make wheel    dist/gpebo-*.whl'
 	@echo 'make docs     site/index.html, the documentation; the notebook is run'
@@ -27,6 +27,7 @@ test: $(VENV)/installed-dev
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check
+	$(BIN)/clang-format --dry-run -Werror gpebo_cli/kernels/*.[ch]
 
 types: $(VENV)/installed-dev
 	$(BIN)/mypy

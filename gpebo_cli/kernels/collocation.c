@@ -94,8 +94,8 @@ EVERY_WIDTH static void drive(const Equation *q, npy_intp k, double *W, npy_intp
     const npy_intp s = q->s, d = q->d, n = q->n, columns = q->columns, size = n * columns;
     if (q->p.from != NULL)
         for (npy_intp i = 0; i < s; i++)
-            combine(q->slope + i * size, NULL, q->Dh + i * s, s, at(q->p, node(q, k, 0)),
-                    q->p.step, size);
+            combine(q->slope + i * size, NULL, q->Dh + i * s, s, at(q->p, node(q, k, 0)), q->p.step,
+                    size);
     for (npy_intp i = 0; i < s; i++) {
         const npy_intp point = node(q, k, i);
         const double *f = at(q->f, point), *slope = q->slope + i * size;
@@ -144,8 +144,8 @@ EVERY_WIDTH static void expand(const Equation *q, npy_intp k, const double *W, n
 }
 
 /* Elements 0 … count − 1, one system each; 0 if one is singular. */
-static int distinct_elements(const Equation *q, npy_intp count, double *W,
-                                         double *homogeneous, double *particular)
+static int distinct_elements(const Equation *q, npy_intp count, double *W, double *homogeneous,
+                             double *particular)
 {
     const npy_intp m = q->s * q->d, n = q->n, sides = n + q->columns;
     const npy_intp length = row_length(m, sides);
@@ -166,8 +166,8 @@ static int distinct_elements(const Equation *q, npy_intp count, double *W,
 
 /* Elements of one length under constant E, A and T: one system for all, whose responses to the
    left end are the same; 0 if it is singular. */
-static int equal_elements(const Equation *q, const int *members, npy_intp count,
-                                      double *W, double *homogeneous, double *particular)
+static int equal_elements(const Equation *q, const int *members, npy_intp count, double *W,
+                          double *homogeneous, double *particular)
 {
     const npy_intp m = q->s * q->d, n = q->n, columns = q->columns, sides = n + count * columns;
     const npy_intp length = row_length(m, sides);
@@ -249,8 +249,7 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
     q.together = scratch(&call, (n + 1) * m + s * n * columns + d * d + s * s + columns);
     double *W = q.together ? scratch(&call, m * row_length(m, sides)) : NULL;
     int *members = W ? integers(&call, 2 * K) : NULL;
-    PyArrayObject *particular =
-        members ? fresh(&call, 4, (npy_intp[]){K, s, n, columns}) : NULL;
+    PyArrayObject *particular = members ? fresh(&call, 4, (npy_intp[]){K, s, n, columns}) : NULL;
     if (particular == NULL)
         return failed(&call);
     q.coupling = q.together + n * m;
@@ -285,8 +284,7 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
             memcpy(data(homogeneous) + members[i] * block, first, block * sizeof(double));
     }
     if (!solved) {
-        failed(&call);
-        Py_RETURN_NONE;
+        return no_answer(&call);
     }
     return results(&call, 2, homogeneous, particular);
 }
@@ -294,8 +292,8 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
 /* --- chaining ----------------------------------------------------------------------------- */
 
 /* out (rows, columns) = a (rows, n) x (n, columns) + b (rows, columns). */
-static inline void affine(double *out, const double *a, const double *x,
-                          const double *b, npy_intp rows, npy_intp n, npy_intp columns)
+static inline void affine(double *out, const double *a, const double *x, const double *b,
+                          npy_intp rows, npy_intp n, npy_intp columns)
 {
     for (npy_intp i = 0; i < rows; i++)
         combine(out + i * columns, b + i * columns, a + i * n, n, x, columns, columns);
@@ -373,8 +371,8 @@ static void floored(double *scale, const double *size, npy_intp C, double share,
 
 /* Local errors (C,) of the right end of an element from its last Legendre coefficients (used, C),
    see :func:`_propagated_error`. */
-static void local_errors(double *local, const double *last, const double *size,
-                         const double *scale, npy_intp s, npy_intp used, npy_intp C)
+static void local_errors(double *local, const double *last, const double *size, const double *scale,
+                         npy_intp s, npy_intp used, npy_intp C)
 {
     const double half = 0.5 * (double)(s - 1) / (double)s;
     for (npy_intp c = 0; c < C; c++) {
@@ -510,10 +508,20 @@ static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t 
     if (work == NULL)
         return failed(&call);
     const Ending ending = {
-        .K = K, .s = s, .n = n, .columns = columns, .used = used,
-        .apart = constant ? 0 : s * n * n, .H = data(H), .V = data(V), .to_legendre = data(L),
-        .amplified = amplified ? data(amplified) : NULL, .floor = floor, .share = share,
-        .level = level, .work = work,
+        .K = K,
+        .s = s,
+        .n = n,
+        .columns = columns,
+        .used = used,
+        .apart = constant ? 0 : s * n * n,
+        .H = data(H),
+        .V = data(V),
+        .to_legendre = data(L),
+        .amplified = amplified ? data(amplified) : NULL,
+        .floor = floor,
+        .share = share,
+        .level = level,
+        .work = work,
     };
     judge(&ending, found);
     failed(&call); /* gives back what was held */
@@ -521,8 +529,8 @@ static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t 
 }
 
 PyMethodDef collocation_kernels[] = {
-    {"element_maps", (PyCFunction)(void (*)(void))element_maps, METH_FASTCALL, NULL},
-    {"chain", (PyCFunction)(void (*)(void))chain, METH_FASTCALL, NULL},
-    {"estimates", (PyCFunction)(void (*)(void))estimates, METH_FASTCALL, NULL},
+    KERNEL(element_maps),
+    KERNEL(chain),
+    KERNEL(estimates),
     {NULL, NULL, 0, NULL},
 };

@@ -101,6 +101,18 @@ PyObject *failed(Call *call)
     return NULL;
 }
 
+PyObject *no_answer(Call *call)
+{
+    release(call);
+    Py_RETURN_NONE;
+}
+
+PyObject *one_number(Call *call, double value)
+{
+    release(call);
+    return PyFloat_FromDouble(value);
+}
+
 PyObject *results(Call *call, int count, ...)
 {
     PyObject *answer = NULL;

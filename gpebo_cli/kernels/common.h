@@ -59,8 +59,10 @@ PyArrayObject *fresh_indices(Call *call, npy_intp length);
 double *scratch(Call *call, size_t numbers);
 int *integers(Call *call, size_t numbers);
 
-/* Ends a call without a result. */
+/* Ends a call without a result, with None for one, or with a number. */
 PyObject *failed(Call *call);
+PyObject *no_answer(Call *call);
+PyObject *one_number(Call *call, double value);
 /* Ends a call with results: some of its arrays, as a tuple unless it is one. */
 PyObject *results(Call *call, int count, ...);
 
@@ -71,10 +73,7 @@ static inline double *data(PyArrayObject *array) { return (double *)PyArray_DATA
 static inline npy_intp size(PyArrayObject *array, int axis) { return PyArray_DIM(array, axis); }
 
 /* The larger one; what is not a number stays. */
-static inline double larger(double a, double b)
-{
-    return a >= b || a != a ? a : b;
-}
+static inline double larger(double a, double b) { return a >= b || a != a ? a : b; }
 
 /* Solves A X = B by elimination with row pivoting, A (n, n) and B (n, columns) by rows; A is
    destroyed and B becomes X. 0 if a pivot is exactly zero. For small n: what LAPACK spends on
@@ -82,9 +81,8 @@ static inline double larger(double a, double b)
 int solve_in_place(double *A, double *B, npy_intp n, npy_intp columns);
 
 /* C = A B for matrices by rows, A (rows, inner), B (inner, columns); C may be neither. */
-static inline void multiply(double *restrict C, const double *restrict A,
-                            const double *restrict B, npy_intp rows, npy_intp inner,
-                            npy_intp columns)
+static inline void multiply(double *restrict C, const double *restrict A, const double *restrict B,
+                            npy_intp rows, npy_intp inner, npy_intp columns)
 {
     for (npy_intp i = 0; i < rows; i++) {
         double *restrict row = C + i * columns;
@@ -99,8 +97,10 @@ static inline void multiply(double *restrict C, const double *restrict A,
     }
 }
 
-/* Kernels of one subject each; a file is added to the module in module.c. */
+/* An entry in the table of a file; each file is added to the module in module.c. */
+#define KERNEL(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, NULL}
 extern PyMethodDef linear_kernels[], jets_kernels[], mesh_kernels[], structure_kernels[],
-    collocation_kernels[], observer_kernels[], estimation_kernels[];
+    reduction_kernels[], collocation_kernels[], observer_kernels[], excitation_kernels[],
+    estimation_kernels[];
 
 #endif

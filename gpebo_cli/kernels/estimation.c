@@ -12,7 +12,7 @@
 #else
 #define TWICE static inline
 #endif
-#define FEW 3 /* cases: up to here one after the other is faster than LANES with padding */
+#define FEW 3       /* cases: up to here one after the other is faster than LANES with padding */
 #define TOGETHER 32 /* times at once when errors are measured */
 
 /* How far apart the values of two times are: 0 for an array (1, …) that is constant in time. */
@@ -38,7 +38,8 @@ static inline double times_power(double one, double other, int *exponent)
 }
 
 /* Solves A X = B as solve_in_place does, and gives det A, without under- or overflow on the way;
-   0 for a pivot of zero, and then there is no X. A (n, n) is destroyed, B (n, columns) becomes X. */
+   0 for a pivot of zero, and then there is no X. A (n, n) is destroyed, B (n, columns) becomes
+   X. */
 static double solve_and_determinant(double *A, double *B, npy_intp n, npy_intp columns)
 {
     double mantissa = 1.0;
@@ -317,9 +318,8 @@ typedef struct {
 
 /* Takes over the gains (own,) and the distances from η̄ (p,) of the starts (p,) of `some` cases;
    what is left of the lanes repeats the last one. */
-TWICE void begin_cases(const Cases *cases, const double *quotient, npy_intp p,
-                       const double *start, npy_intp start_stride, const double *gains,
-                       npy_intp some, const int lanes)
+TWICE void begin_cases(const Cases *cases, const double *quotient, npy_intp p, const double *start,
+                       npy_intp start_stride, const double *gains, npy_intp some, const int lanes)
 {
     for (npy_intp b = 0; b < lanes; b++) {
         const npy_intp one = b < some ? b : some - 1;
@@ -381,8 +381,8 @@ static PyObject *constant_law(PyObject *module, PyObject *const *given, Py_ssize
             constant_cases(data(at), times, data(final), p, from, start_stride, gamma, 1, &cases,
                            eta, 1);
         else
-            constant_cases(data(at), times, data(final), p, from, start_stride, gamma, some,
-                           &cases, eta, LANES);
+            constant_cases(data(at), times, data(final), p, from, start_stride, gamma, some, &cases,
+                           eta, LANES);
         first += some < FEW ? 1 : some;
     }
     return results(&call, 1, out);
@@ -414,9 +414,8 @@ TWICE void go_along(const Path *path, const Cases *cases, const int lanes)
 
 /* Where in the steps of I (K, s + 1) the times are, from the element of each (M,), its place in
    it and I there (M,); 0 with an exception for an element that there is not. */
-static int find_places(const Path *path, const double *edges, const double *points,
-                       const double *t, const npy_intp *element, const double *at, npy_intp times,
-                       Places *places)
+static int find_places(const Path *path, const double *edges, const double *points, const double *t,
+                       const npy_intp *element, const double *at, npy_intp times, Places *places)
 {
     const npy_intp elements = path->elements, each = path->each;
     for (npy_intp m = 0; m < times; m++) {
@@ -446,9 +445,9 @@ static int find_places(const Path *path, const double *edges, const double *poin
 
 /* The law of `some` ≤ lanes cases, starts (p,) of each and γ (own,) of each at `stride` numbers
    from one another: η̂ (some, times, p). */
-TWICE void linear_cases(const Path *path, const Places *places, npy_intp times,
-                        const double *start, npy_intp start_stride, const double *gains,
-                        npy_intp some, const Cases *cases, double *eta, const int lanes)
+TWICE void linear_cases(const Path *path, const Places *places, npy_intp times, const double *start,
+                        npy_intp start_stride, const double *gains, npy_intp some,
+                        const Cases *cases, double *eta, const int lanes)
 {
     const npy_intp p = path->p, own = cases->own;
     begin_cases(cases, path->quotient, p, start, start_stride, gains, some, lanes);
@@ -794,8 +793,15 @@ static PyObject *measured(PyObject *module, PyObject *const *given, Py_ssize_t c
     if (known == NULL)
         return failed(&call);
     Measure with = {
-        .t = data(t), .times = times, .p = p, .n = n, .columns = columns, .column = column,
-        .kept = kept, .keep = keep, .fraction = fraction,
+        .t = data(t),
+        .times = times,
+        .p = p,
+        .n = n,
+        .columns = columns,
+        .column = column,
+        .kept = kept,
+        .keep = keep,
+        .fraction = fraction,
         .truth = {data(truth), stride(size(truth, 0), p)},
         .offset = {data(offset), stride(size(offset, 0), n)},
         .gain = {data(gain), stride(size(gain, 0), n * p)},
@@ -818,12 +824,6 @@ static PyObject *measured(PyObject *module, PyObject *const *given, Py_ssize_t c
 }
 
 PyMethodDef estimation_kernels[] = {
-    {"mixed_points", (PyCFunction)(void (*)(void))mixed_points, METH_FASTCALL, NULL},
-    {"determinants", (PyCFunction)(void (*)(void))determinants, METH_FASTCALL, NULL},
-    {"energy", (PyCFunction)(void (*)(void))energy, METH_FASTCALL, NULL},
-    {"law_variation", (PyCFunction)(void (*)(void))law_variation, METH_FASTCALL, NULL},
-    {"constant_law", (PyCFunction)(void (*)(void))constant_law, METH_FASTCALL, NULL},
-    {"linear_law", (PyCFunction)(void (*)(void))linear_law, METH_FASTCALL, NULL},
-    {"measured", (PyCFunction)(void (*)(void))measured, METH_FASTCALL, NULL},
-    {NULL, NULL, 0, NULL},
+    KERNEL(mixed_points), KERNEL(determinants), KERNEL(energy),   KERNEL(law_variation),
+    KERNEL(constant_law), KERNEL(linear_law),   KERNEL(measured), {NULL, NULL, 0, NULL},
 };

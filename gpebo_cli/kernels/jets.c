@@ -6,14 +6,30 @@
 
 #define MOST_MATRICES 8
 #define MOST_AXES 8
-#define GIVEN 2                 /* rows that the caller gives: t, inside */
+#define GIVEN 2 /* rows that the caller gives: t, inside */
 #define REFUSED (FE_INVALID | FE_DIVBYZERO | FE_OVERFLOW)
 #define IN_CACHE ((npy_intp)1 << 14) /* numbers in all rows of a block */
 
 /* In the order of _OPERATIONS in expressions/program.py. */
 enum {
-    ADD, SUBTRACT, MULTIPLY, DIVIDE, POWER, GREATER_EQUAL, NEGATIVE, SQRT,
-    EXP, LOG, SIN, COS, TAN, SINH, COSH, TANH, SIGN, OPERATIONS
+    ADD,
+    SUBTRACT,
+    MULTIPLY,
+    DIVIDE,
+    POWER,
+    GREATER_EQUAL,
+    NEGATIVE,
+    SQRT,
+    EXP,
+    LOG,
+    SIN,
+    COS,
+    TAN,
+    SINH,
+    COSH,
+    TANH,
+    SIGN,
+    OPERATIONS
 };
 
 /* One operation: what, the row of its result, its operands; see `operand`. */
@@ -238,9 +254,8 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
     }
     PyArrayObject *once[MOST_MATRICES];
     for (npy_intp m = 0; m < matrices; m++) {
-        const int axes = PyArray_Check(given[FIRST + m])
-                             ? PyArray_NDIM((PyArrayObject *)given[FIRST + m])
-                             : 0;
+        const int axes =
+            PyArray_Check(given[FIRST + m]) ? PyArray_NDIM((PyArrayObject *)given[FIRST + m]) : 0;
         once[m] = doubles(&call, FIRST + m, axes < 2 ? 2 : axes > MOST_AXES ? MOST_AXES : axes);
         if (once[m] == NULL || !same("orders of a matrix", size(once[m], 0), orders) ||
             !same("times in a matrix", size(once[m], 1), 1))
@@ -295,8 +310,8 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
             const npy_intp entries = PyArray_SIZE(once[target[0]]) / orders;
             for (npy_intp k = 0; k < orders; k++)
                 fine &= scatter(&rows, results_rows[k * outputs + j],
-                                out[target[0]] + (k * times + first) * entries + target[1],
-                                entries, here);
+                                out[target[0]] + (k * times + first) * entries + target[1], entries,
+                                here);
         }
     }
     if (fetestexcept(REFUSED)) {
@@ -349,8 +364,8 @@ EVERY_WIDTH static double largest_size(const double *x, npy_intp count)
 }
 
 /* Copies a column, every `stride` numbers, and says its smallest and largest number. */
-EVERY_WIDTH static void column(const double *from, npy_intp stride, npy_intp count, double *to, double *low,
-                   double *high)
+EVERY_WIDTH static void column(const double *from, npy_intp stride, npy_intp count, double *to,
+                               double *low, double *high)
 {
     double least[LANES] = {INFINITY, INFINITY, INFINITY, INFINITY}, most[LANES];
     for (npy_intp i = 0; i < count; i++)
@@ -384,8 +399,9 @@ static int still(const double *from, npy_intp count)
     return i >= count;
 }
 
-/* moved (entries,) becomes 1 where an entry of values (times, entries) is not one number throughout;
-   row by row, because a column of a large matrix is spread over as many cache lines as times. */
+/* moved (entries,) becomes 1 where an entry of values (times, entries) is not one number
+   throughout; row by row, because a column of a large matrix is spread over as many cache lines
+   as there are times. */
 EVERY_WIDTH static void mark_moved(npy_int64 *restrict moved, const double *restrict values,
                                    npy_intp times, npy_intp entries)
 {
@@ -424,8 +440,8 @@ static inline void combine(double *restrict out, const double *restrict matrix,
 /* Raises `missed` (elements,) to how far each element's polynomial is from the values `seen`
    (elements, looks) in between, relative to `largest`; nodal (elements, points). */
 EVERY_WIDTH static void raise_missed(double *missed, const double *between, const double *nodal,
-                         const double *seen, double largest, npy_intp elements, npy_intp points,
-                         npy_intp looks, double *expected)
+                                     const double *seen, double largest, npy_intp elements,
+                                     npy_intp points, npy_intp looks, double *expected)
 {
     for (npy_intp k = 0; k < elements; k++, nodal += points, seen += looks) {
         combine(expected, between, nodal, points, looks);
@@ -492,10 +508,10 @@ static PyObject *missed_between(PyObject *module, PyObject *const *given, Py_ssi
             if (known)
                 continue;
             different++;
-            const double largest = larger(larger(fabs(low), fabs(high)),
-                                          larger(fabs(least), fabs(most)));
-            raise_missed(data(out) + pair * elements, data(between), here,
-                         here + elements * points, largest, elements, points, looks, expected);
+            const double largest =
+                larger(larger(fabs(low), fabs(high)), larger(fabs(least), fabs(most)));
+            raise_missed(data(out) + pair * elements, data(between), here, here + elements * points,
+                         largest, elements, points, looks, expected);
         }
     }
     return expected == NULL ? failed(&call) : results(&call, 1, out);
@@ -665,8 +681,8 @@ EVERY_WIDTH static int one_does(const Signals *s, npy_intp first, npy_intp toget
     return 1;
 }
 
-/* joined(values (elements, points, c), counts (kinds,), edges (elements + 1,), bounds (pieces + 1,),
-          tol, longest, foot, share, tiny, there (count * points, points),
+/* joined(values (elements, points, c), counts (kinds,), edges (elements + 1,), bounds
+          (pieces + 1,), tol, longest, foot, share, tiny, there (count * points, points),
           back (points, count * points), …)
 
    The edges that stay, see Mesh.joined in collocation/mesh.py. The last two arguments, for each
@@ -743,8 +759,8 @@ static PyObject *joined(PyObject *module, PyObject *const *given, Py_ssize_t cou
                 int ready = together * (data(edges)[k + 1] - data(edges)[k]) <= longest;
                 for (npy_intp i = 1; i < half; i++)
                     ready &= !stays[k + i] && !stays[k + half + i];
-                if (!ready || !one_does(&s, k, together, data(there), data(back), tol, sampled,
-                                        replaced))
+                if (!ready ||
+                    !one_does(&s, k, together, data(there), data(back), tol, sampled, replaced))
                     continue;
                 for (npy_intp i = 1; i < together; i++) {
                     left -= stays[k + i];
@@ -798,10 +814,6 @@ static PyObject *outputs(PyObject *module, PyObject *const *given, Py_ssize_t co
 }
 
 PyMethodDef jets_kernels[] = {
-    {"jets", (PyCFunction)(void (*)(void))jets, METH_FASTCALL, NULL},
-    {"missed_between", (PyCFunction)(void (*)(void))missed_between, METH_FASTCALL, NULL},
-    {"known_kinds", (PyCFunction)(void (*)(void))known_kinds, METH_FASTCALL, NULL},
-    {"joined", (PyCFunction)(void (*)(void))joined, METH_FASTCALL, NULL},
-    {"outputs", (PyCFunction)(void (*)(void))outputs, METH_FASTCALL, NULL},
-    {NULL, NULL, 0, NULL},
+    KERNEL(jets),   KERNEL(missed_between), KERNEL(known_kinds),
+    KERNEL(joined), KERNEL(outputs),        {NULL, NULL, 0, NULL},
 };

@@ -232,7 +232,7 @@ static PyObject *adjugate_action(PyObject *module, PyObject *const *given, Py_ss
 }
 
 PyMethodDef linear_kernels[] = {
-    {"adjugate_action", (PyCFunction)(void (*)(void))adjugate_action, METH_FASTCALL, NULL},
-    {"affine_scan", (PyCFunction)(void (*)(void))affine_scan, METH_FASTCALL, NULL},
+    KERNEL(adjugate_action),
+    KERNEL(affine_scan),
     {NULL, NULL, 0, NULL},
 };

@@ -1,4 +1,4 @@
-/* gpebo_cli/collocation/mesh.py: signals on a mesh, how well it resolves them, sampling, filters. */
+/* gpebo_cli/collocation/mesh.py: signals on a mesh, whether it resolves them, sampling, filters. */
 #include "elements.h"
 
 #include <float.h>
@@ -7,9 +7,8 @@
 
 /* worst (K, used) of one kind, values (K, points, c); `work` holds (K + 1 + used) c numbers. */
 EVERY_WIDTH static void tails_of_kind(double *worst, const double *to_legendre, npy_intp used,
-                                      npy_intp K, npy_intp points, const double *values,
-                                      npy_intp c, double floor, double foot, double share,
-                                      double *work)
+                                      npy_intp K, npy_intp points, const double *values, npy_intp c,
+                                      double floor, double foot, double share, double *work)
 {
     double *scale = work + K * c, *last = scale + c;
     for (npy_intp k = 0; k < K; k++) { /* largest value of each component so far */
@@ -240,8 +239,7 @@ static PyObject *sampler(PyObject *module, PyObject *const *given, Py_ssize_t co
 
 /* out (N, c): each the weighted sum of the point values (points, c) of its element. */
 EVERY_WIDTH static void weighted_sums(double *out, const npy_intp *element, const double *weights,
-                                      const double *values, npy_intp N, npy_intp points,
-                                      npy_intp c)
+                                      const double *values, npy_intp N, npy_intp points, npy_intp c)
 {
     for (npy_intp i = 0; i < N; i++, weights += points, out += c) {
         const double *v = values + element[i] * points * c;
@@ -407,12 +405,6 @@ static PyObject *low_pass(PyObject *module, PyObject *const *given, Py_ssize_t c
 }
 
 PyMethodDef mesh_kernels[] = {
-    {"tails", (PyCFunction)(void (*)(void))tails, METH_FASTCALL, NULL},
-    {"mesh_points", (PyCFunction)(void (*)(void))mesh_points, METH_FASTCALL, NULL},
-    {"split", (PyCFunction)(void (*)(void))split, METH_FASTCALL, NULL},
-    {"sampler", (PyCFunction)(void (*)(void))sampler, METH_FASTCALL, NULL},
-    {"sample", (PyCFunction)(void (*)(void))sample, METH_FASTCALL, NULL},
-    {"integral", (PyCFunction)(void (*)(void))integral, METH_FASTCALL, NULL},
-    {"low_pass", (PyCFunction)(void (*)(void))low_pass, METH_FASTCALL, NULL},
-    {NULL, NULL, 0, NULL},
+    KERNEL(tails),  KERNEL(mesh_points), KERNEL(split),    KERNEL(sampler),
+    KERNEL(sample), KERNEL(integral),    KERNEL(low_pass), {NULL, NULL, 0, NULL},
 };

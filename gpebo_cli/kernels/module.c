@@ -13,8 +13,9 @@ PyMODINIT_FUNC PyInit__compiled(void)
     if (module == NULL)
         return NULL;
     PyMethodDef *subjects[] = {
-        linear_kernels,      jets_kernels,     mesh_kernels,       structure_kernels,
-        collocation_kernels, observer_kernels, estimation_kernels,
+        linear_kernels,    jets_kernels,       mesh_kernels,
+        structure_kernels, reduction_kernels,  collocation_kernels,
+        observer_kernels,  excitation_kernels, estimation_kernels,
     };
     for (size_t i = 0; i < sizeof(subjects) / sizeof(subjects[0]); i++)
         if (PyModule_AddFunctions(module, subjects[i]) < 0) {
