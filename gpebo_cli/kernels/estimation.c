@@ -268,6 +268,8 @@ static PyObject *law_variation(PyObject *module, PyObject *const *given, Py_ssiz
 
 /* From LEAST down x is as good as 0. */
 #define LEAST 1e-300
+/* From GONE up e^{−x} is zero, which the library finds out slowly. */
+#define GONE 746.0
 
 /* e^{−x} of some values x = γδ ≥ 0, and its mean (1 − e^{−x})/x over a step, 1 at x = 0. */
 TWICE void decays_of_one(const double *restrict gamma, double length, double *restrict end,
@@ -276,7 +278,7 @@ TWICE void decays_of_one(const double *restrict gamma, double length, double *re
     for (int b = 0; b < lanes; b++) {
         const double x = gamma[b] * length;
         if (x > 0.5) { /* 1 − e^{−x} has all its digits */
-            end[b] = exp(-x);
+            end[b] = x < GONE ? exp(-x) : 0.0;
             mean[b] = (1.0 - end[b]) / x;
         } else if (x <= LEAST) {
             end[b] = mean[b] = 1.0;
@@ -347,6 +349,18 @@ TWICE void constant_cases(const double *at, npy_intp times, const double *final,
     }
 }
 
+/* For many and for few cases, see TWICE. */
+EVERY_WIDTH static void constant_lanes(const double *at, npy_intp times, const double *final,
+                                       npy_intp p, const double *start, npy_intp start_stride,
+                                       const double *gains, npy_intp some, const Cases *cases,
+                                       double *eta)
+{
+    if (some < FEW)
+        constant_cases(at, times, final, p, start, start_stride, gains, 1, cases, eta, 1);
+    else
+        constant_cases(at, times, final, p, start, start_stride, gains, some, cases, eta, LANES);
+}
+
 /* I at the times (M,), η̄ (p,), η̂ at the start (1 or g, p), γ (g, 1 or p)
    -> η̂ = η̄ + e^{−γI} (η̂(0) − η̄) (g, M, p). */
 static PyObject *constant_law(PyObject *module, PyObject *const *given, Py_ssize_t count)
@@ -377,12 +391,8 @@ static PyObject *constant_law(PyObject *module, PyObject *const *given, Py_ssize
         const double *from = data(start) + first * start_stride, *gamma = data(gains) + first * own;
         double *eta = data(out) + first * times * p;
         const npy_intp some = g - first < LANES ? g - first : LANES;
-        if (some < FEW)
-            constant_cases(data(at), times, data(final), p, from, start_stride, gamma, 1, &cases,
-                           eta, 1);
-        else
-            constant_cases(data(at), times, data(final), p, from, start_stride, gamma, some, &cases,
-                           eta, LANES);
+        constant_lanes(data(at), times, data(final), p, from, start_stride, gamma, some, &cases,
+                       eta);
         first += some < FEW ? 1 : some;
     }
     return results(&call, 1, out);
@@ -474,6 +484,18 @@ TWICE void linear_cases(const Path *path, const Places *places, npy_intp times, 
     }
 }
 
+/* For many and for few cases. */
+EVERY_WIDTH static void linear_lanes(const Path *path, const Places *places, npy_intp times,
+                                     const double *start, npy_intp start_stride,
+                                     const double *gains, npy_intp some, const Cases *cases,
+                                     double *eta)
+{
+    if (some < FEW)
+        linear_cases(path, places, times, start, start_stride, gains, 1, cases, eta, 1);
+    else
+        linear_cases(path, places, times, start, start_stride, gains, some, cases, eta, LANES);
+}
+
 /* I (K, s + 1), η̄ (K, s + 1, p), edges (K + 1,), points of the rule (s + 1,), times (M,), their
    elements (M,), I there (M,), η̂ at the start (1 or g, p), γ (g, 1 or p)
    -> η̂ (g, M, p) of the law with η̄ linear in I between neighbouring points. */
@@ -529,11 +551,7 @@ static PyObject *linear_law(PyObject *module, PyObject *const *given, Py_ssize_t
         const double *from = data(start) + first * start_stride, *gamma = data(gains) + first * own;
         double *eta = data(out) + first * times * p;
         const npy_intp some = g - first < LANES ? g - first : LANES;
-        if (some < FEW)
-            linear_cases(&path, &places, times, from, start_stride, gamma, 1, &cases, eta, 1);
-        else
-            linear_cases(&path, &places, times, from, start_stride, gamma, some, &cases, eta,
-                         LANES);
+        linear_lanes(&path, &places, times, from, start_stride, gamma, some, &cases, eta);
         first += some < FEW ? 1 : some;
     }
     return results(&call, 1, out);
@@ -718,6 +736,16 @@ TWICE void measure_cases(const Measure *with, const double *estimates, npy_intp 
     }
 }
 
+/* For many and for few cases. */
+EVERY_WIDTH static void measure_lanes(const Measure *with, const double *estimates, npy_intp some,
+                                      double *room, Found found)
+{
+    if (some < FEW)
+        measure_cases(with, estimates, 1, room, found, 1);
+    else
+        measure_cases(with, estimates, some, room, found, LANES);
+}
+
 /* Notes what is known, from the end of the first case (M, p): NaN is what nobody knows. */
 static void find_known(Measure *with, const double *estimates, int *known)
 {
@@ -814,10 +842,7 @@ static PyObject *measured(PyObject *module, PyObject *const *given, Py_ssize_t c
         const Found found = {data(out) + first, data(kept_eta) + first * kept * p,
                              data(kept_x) + first * kept * n, g};
         const npy_intp some = g - first < LANES ? g - first : LANES;
-        if (some < FEW)
-            measure_cases(&with, eta, 1, room, found, 1);
-        else
-            measure_cases(&with, eta, some, room, found, LANES);
+        measure_lanes(&with, eta, some, room, found);
         first += some < FEW ? 1 : some;
     }
     return results(&call, 3, out, kept_eta, kept_x);

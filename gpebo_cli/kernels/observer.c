@@ -60,9 +60,9 @@ static inline int all_zero(const double *restrict a)
 
 /* C (rows, columns; row length c) += sign A B, with A (rows, inner; row length a) or, if
    `turned`, Aᵀ of A (inner, rows; row length a), and B (inner, columns; row length b). */
-static void lanes_add(Lane *restrict C, npy_intp c, const Lane *restrict A, npy_intp a, int turned,
-                      const Lane *restrict B, npy_intp b, npy_intp rows, npy_intp inner,
-                      npy_intp columns, double sign)
+EVERY_WIDTH static void lanes_add(Lane *restrict C, npy_intp c, const Lane *restrict A, npy_intp a,
+                                  int turned, const Lane *restrict B, npy_intp b, npy_intp rows,
+                                  npy_intp inner, npy_intp columns, double sign)
 {
     for (npy_intp i = 0; i < rows; i++)
         for (npy_intp k = 0; k < inner; k++) {
@@ -82,9 +82,9 @@ static void lanes_add(Lane *restrict C, npy_intp c, const Lane *restrict A, npy_
 }
 
 /* C (rows, columns; row length c) += A M for a constant M (inner, columns). */
-static void times_constant(Lane *restrict C, npy_intp c, const Lane *restrict A,
-                           const double *restrict M, npy_intp rows, npy_intp inner,
-                           npy_intp columns)
+EVERY_WIDTH static void times_constant(Lane *restrict C, npy_intp c, const Lane *restrict A,
+                                       const double *restrict M, npy_intp rows, npy_intp inner,
+                                       npy_intp columns)
 {
     for (npy_intp k = 0; k < inner; k++)
         for (npy_intp j = 0; j < columns; j++) {
@@ -102,8 +102,9 @@ static void times_constant(Lane *restrict C, npy_intp c, const Lane *restrict A,
 
 /* C (rows, columns; row length c) += M A for a constant M (rows, inner), or Mᵀ of M (inner, rows)
    if `turned`, and A (inner, columns). */
-static void constant_times(Lane *restrict C, npy_intp c, const double *restrict M, int turned,
-                           const Lane *restrict A, npy_intp rows, npy_intp inner, npy_intp columns)
+EVERY_WIDTH static void constant_times(Lane *restrict C, npy_intp c, const double *restrict M,
+                                       int turned, const Lane *restrict A, npy_intp rows,
+                                       npy_intp inner, npy_intp columns)
 {
     for (npy_intp i = 0; i < rows; i++)
         for (npy_intp k = 0; k < inner; k++) {
@@ -120,7 +121,7 @@ static void constant_times(Lane *restrict C, npy_intp c, const double *restrict 
 }
 
 /* The sum of squares of some entries at each of the times. */
-static void squares(double *restrict out, const Lane *restrict A, npy_intp numbers)
+EVERY_WIDTH static void squares(double *restrict out, const Lane *restrict A, npy_intp numbers)
 {
     for (int l = 0; l < LANES; l++)
         out[l] = 0.0;
@@ -133,8 +134,8 @@ static void squares(double *restrict out, const Lane *restrict A, npy_intp numbe
 
    Gram-Schmidt, twice: Q is orthonormal to rounding unless A is rank-deficient to rounding, which
    a large X shows (or entries that are no numbers, where a column vanishes). */
-static void factorise(Lane *restrict A, Lane *restrict R, Lane *restrict X, npy_intp rows,
-                      npy_intp columns)
+EVERY_WIDTH static void factorise(Lane *restrict A, Lane *restrict R, Lane *restrict X,
+                                  npy_intp rows, npy_intp columns)
 {
     clear(R, columns * columns);
     clear(X, columns * columns);

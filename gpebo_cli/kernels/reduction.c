@@ -21,8 +21,8 @@ static inline int nothing(const double *x)
    exchanged for all lanes alike, the largest in sum first; a lane for which that leads to
    multipliers above MULTIPLIER is solved by itself with pivots of its own, and is NaN if
    singular. memory: (n + columns) n (LANES + 1) numbers. */
-static void solve_lanes(double *restrict A, double *restrict B, npy_intp n, npy_intp columns,
-                        double *restrict memory)
+EVERY_WIDTH static void solve_lanes(double *restrict A, double *restrict B, npy_intp n,
+                                    npy_intp columns, double *restrict memory)
 {
     double *kept_A = memory, *kept_B = memory + n * n * LANES;
     memcpy(kept_A, A, n * n * LANES * sizeof(double));
@@ -104,8 +104,9 @@ static void solve_lanes(double *restrict A, double *restrict B, npy_intp n, npy_
 }
 
 /* C = A B, or C −= A B, in every lane, A (rows, inner, LANES), B (inner, columns, LANES). */
-static void multiply_lanes(double *restrict C, const double *restrict A, const double *restrict B,
-                           npy_intp rows, npy_intp inner, npy_intp columns, int subtract)
+EVERY_WIDTH static void multiply_lanes(double *restrict C, const double *restrict A,
+                                       const double *restrict B, npy_intp rows, npy_intp inner,
+                                       npy_intp columns, int subtract)
 {
     if (!subtract)
         memset(C, 0, rows * columns * LANES * sizeof(double));
@@ -122,8 +123,9 @@ static void multiply_lanes(double *restrict C, const double *restrict A, const d
 }
 
 /* C = Aᵀ B with A (inner, rows) the same for all lanes, B (inner, columns, LANES). */
-static void multiply_same(double *restrict C, const double *restrict A, const double *restrict B,
-                          npy_intp rows, npy_intp inner, npy_intp columns)
+EVERY_WIDTH static void multiply_same(double *restrict C, const double *restrict A,
+                                      const double *restrict B, npy_intp rows, npy_intp inner,
+                                      npy_intp columns)
 {
     memset(C, 0, rows * columns * LANES * sizeof(double));
     for (npy_intp i = 0; i < rows; i++, C += columns * LANES)
@@ -137,7 +139,7 @@ static void multiply_same(double *restrict C, const double *restrict A, const do
 }
 
 /* Frobenius norms of every lane of x (count, LANES), at least the smallest positive number. */
-static void norms(const double *x, npy_intp count, double *out)
+EVERY_WIDTH static void norms(const double *x, npy_intp count, double *out)
 {
     double sum[LANES] = {0};
     for (npy_intp i = 0; i < count; i++)
@@ -259,7 +261,8 @@ static void block_of(const Model *m, const Elimination *el, npy_intp from, npy_i
 
 /* Scaled coefficients and the blocks of M and N at one block of times; M11 and M21 may be wanted
    transposed. */
-static void fill(const Model *m, Elimination *el, npy_intp first, npy_intp used, int transposed)
+EVERY_WIDTH static void fill(const Model *m, Elimination *el, npy_intp first, npy_intp used,
+                             int transposed)
 {
     const npy_intp n = m->n, size = m->size, r = el->rank;
     gather(el->raw_e, &m->E, m->mu + 1, first, used);
@@ -455,8 +458,8 @@ static int forcing(Call *call, const Model *m, Forcing *f)
 }
 
 /* f_k += Σ_i matrix_i vector_{k−i}, (mu + 1, n, LANES); a constant matrix is read where it is. */
-static void add_product(const Model *m, double *f, const Series *matrix, const double *lanes,
-                        const double *vector, npy_intp width)
+EVERY_WIDTH static void add_product(const Model *m, double *f, const Series *matrix,
+                                    const double *lanes, const double *vector, npy_intp width)
 {
     const npy_intp n = m->n;
     for (npy_intp i = 0; i <= m->mu; i++)
@@ -477,7 +480,7 @@ static void add_product(const Model *m, double *f, const Series *matrix, const d
 }
 
 /* g = (f_0, …, f_mu) in scaled rows and time, at one block of times. */
-static void force(const Model *m, Forcing *f, npy_intp first, npy_intp used)
+EVERY_WIDTH static void force(const Model *m, Forcing *f, npy_intp first, npy_intp used)
 {
     const npy_intp n = m->n, orders = m->mu + 1;
     if (f->B.time)
@@ -585,7 +588,7 @@ static void unscale(const Model *m, double *amplification)
 
 /* [Z1ᵀE; Â2]⁻¹, its rows times the states' scales, into inverse; where it grows more than that,
    lanes of `good` become 0. Rows are judged by their own size. whole is used up. */
-static void invert(const Model *m, Elimination *el, double most_growth, double *good)
+EVERY_WIDTH static void invert(const Model *m, Elimination *el, double most_growth, double *good)
 {
     const npy_intp n = m->n;
     double scale[LANES], grown[LANES];
