@@ -151,7 +151,7 @@ def _best(rows: Sequence[Row], who: str) -> str:
         return f"no {who} solver meets the target"
     texts = []
     groups = {row["peer"].partition(", ")[2].removesuffix(", × 1,000") for row in valid}
-    for how in sorted(groups):
+    for how in sorted(groups, reverse=True):  # a script first: it is what a user would run
         group = [r for r in valid if r["peer"].partition(", ")[2].removesuffix(", × 1,000") == how]
         best = min(group, key=lambda row: row["peer_seconds"])
         texts.append(f"{_ratio(best)} {best['peer']}")
