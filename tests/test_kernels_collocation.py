@@ -252,6 +252,37 @@ def test_splitting(parts, seed):
     np.testing.assert_array_equal(kept, equal)
 
 
+@given(st.lists(st.booleans(), min_size=1, max_size=12), st.booleans(), st.booleans(), seeds)
+def test_merging(fresh, one_before, one_after, seed):
+    """Old elements in their order, some left out, new ones in between; one may stand for all."""
+    rng = np.random.default_rng(seed)
+    fresh = np.array(fresh)
+    old = np.sort(rng.choice(30, size=int((~fresh).sum()), replace=False))
+    kept = np.full(len(fresh), -1)
+    kept[~fresh] = old
+
+    def maps(size, alone):
+        homogeneous = rng.normal(size=(1 if alone else size, 2, 3, 3))
+        extras = (rng.normal(size=(size, 3, 0)), rng.normal(size=(1, 1, 2)))
+        return linear._ElementMaps(homogeneous, rng.normal(size=(size, 2, 3, 1)), extras)
+
+    before, after = maps(30, one_before), maps(int(fresh.sum()), one_after)
+    merged, expected = by_both(lambda: linear._merge(before, after, kept, fresh))
+    np.testing.assert_array_equal(merged.homogeneous, expected.homogeneous)
+    np.testing.assert_array_equal(merged.particular, expected.particular)
+    for one, other in zip(merged.extras, expected.extras, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("before", "after", "kept"), [
+    ((2, 3), (2, 3), [0, 1, -1]), ((2, 3), (1, 3), [0, 2]), ((0, 3), (1, 3), [0]),
+    ((2, 3), (1, 2), [0, -1]),
+])  # fmt: skip
+def test_what_cannot_be_merged_is_refused(before, after, kept):
+    with pytest.raises(ValueError, match=r"elements?: |element \d of|numbers of an element"):
+        COMPILED.merged(np.zeros(before), np.zeros(after), np.array(kept))
+
+
 def test_parts_less_than_none_are_refused():
     for parts in (-1, np.iinfo(np.intp).max):
         with pytest.raises(ValueError, match=f"{parts} parts"):

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from math import prod
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -300,6 +301,12 @@ def _check_budget(
 
 def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArray) -> _ElementMaps:
     def merged(before: Array, after: Array) -> Array:
+        if kernels.compiled is not None:
+            width = prod(before.shape[1:])
+            rows: Array = kernels.compiled.merged(
+                before.reshape(len(before), width), after.reshape(len(after), width), kept
+            )
+            return rows.reshape(len(kept), *before.shape[1:])
         out = np.empty((len(kept), *before.shape[1:]))
         out[~fresh] = before if len(before) == 1 else before[kept[~fresh]]
         out[fresh] = after

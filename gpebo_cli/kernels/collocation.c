@@ -354,6 +354,52 @@ static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t coun
     return answer;
 }
 
+/* --- refinement --------------------------------------------------------------------------- */
+
+/* merged(before (K or 1, width), after (F or 1, width), kept (N,)) -> (N, width)
+
+   Row i is row kept[i] of `before`, or the only one it has; where kept[i] < 0, it is the next one
+   of `after`, or the only one. */
+static PyObject *merged(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 3))
+        return NULL;
+    PyArrayObject *before = doubles(&call, 0, 2), *after = before ? doubles(&call, 1, 2) : NULL;
+    PyArrayObject *kept = after ? indices(&call, 2, 1) : NULL;
+    if (kept == NULL || !same("numbers of an element", size(before, 1), size(after, 1)))
+        return failed(&call);
+    const npy_intp K = size(before, 0), N = size(kept, 0), width = size(before, 1);
+    const npy_intp *from = (const npy_intp *)PyArray_DATA(kept);
+    npy_intp fresh_ones = 0, largest = -1;
+    for (npy_intp i = 0; i < N; i++) {
+        fresh_ones += from[i] < 0;
+        largest = from[i] > largest ? from[i] : largest;
+    }
+    const int shared = size(after, 0) == 1;
+    if (!shared && !same("new elements", size(after, 0), fresh_ones))
+        return failed(&call);
+    if (largest >= 0 && (K == 0 || (K > 1 && largest >= K))) {
+        PyErr_Format(PyExc_ValueError, "element %zd of %zd", (Py_ssize_t)largest, (Py_ssize_t)K);
+        return failed(&call);
+    }
+    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){N, width});
+    if (out == NULL)
+        return failed(&call);
+    double *to = data(out);
+    const double *next = data(after);
+    for (npy_intp i = 0; i < N; i++, to += width) {
+        const double *one = data(before) + (K > 1 && from[i] >= 0 ? from[i] * width : 0);
+        if (from[i] < 0) {
+            one = next;
+            next += shared ? 0 : width;
+        }
+        memcpy(to, one, width * sizeof(double));
+    }
+    return results(&call, 1, out);
+}
+
 /* --- error estimates ---------------------------------------------------------------------- */
 
 #define LAST 4 /* Legendre coefficients that are looked at */
@@ -529,8 +575,5 @@ static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t 
 }
 
 PyMethodDef collocation_kernels[] = {
-    KERNEL(element_maps),
-    KERNEL(chain),
-    KERNEL(estimates),
-    {NULL, NULL, 0, NULL},
+    KERNEL(element_maps), KERNEL(merged), KERNEL(chain), KERNEL(estimates), {NULL, NULL, 0, NULL},
 };
