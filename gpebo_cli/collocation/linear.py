@@ -339,24 +339,24 @@ def _element_maps(
     if len(h) <= chunk:
         c = problem.coefficients(t.ravel(), inside.ravel()) if known is None else known
         return _solve_elements(problem, mesh.rule, h, t, c)
-    pieces = []
+    whole: list[Array] = []  # filled piece by piece: all pieces beside the whole are twice as much
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
         if known is None:
             c = problem.coefficients(t[part].ravel(), inside[part].ravel())
         else:
             c = _at_points(known, slice(i * (s + 1), (i + chunk) * (s + 1)))
-        pieces.append(_solve_elements(problem, mesh.rule, h[part], t[part], c))
-    return _ElementMaps(
-        np.concatenate([
-            np.broadcast_to(p.homogeneous, (len(p.particular), s, n, n)) for p in pieces
-        ]),
-        np.concatenate([p.particular for p in pieces]),
-        tuple(
-            parts[0] if parts[0].shape[:2] == (1, 1) else np.concatenate(parts)
-            for parts in zip(*(p.extras for p in pieces), strict=True)
-        ),
-    )
+        maps = _solve_elements(problem, mesh.rule, h[part], t[part], c)
+        piece = [maps.homogeneous, maps.particular, *maps.extras]
+        if not whole:
+            whole = [
+                values if values.shape[:2] == (1, 1) else np.empty((len(h), *values.shape[1:]))
+                for values in piece
+            ]
+        for everywhere, here in zip(whole, piece, strict=True):
+            if everywhere.shape[:2] != (1, 1):
+                everywhere[part] = here
+    return _ElementMaps(whole[0], whole[1], tuple(whole[2:]))
 
 
 def _is_constant(c: Coefficients) -> bool:
