@@ -61,7 +61,7 @@ def compile_kernels(root: Path, *options: str) -> Path:
 
     unix = sys.platform != "win32"
     # Contracted multiplications would round otherwise on one processor than on the next.
-    usual = ["-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno", *WARNINGS] if unix else []
+    usual = ["-std=c11", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", *WARNINGS] if unix else []
     extension = Extension(
         "gpebo_cli.kernels._compiled",
         sources=[str(path) for path in sorted((root / FOLDER).glob("*.c"))],
