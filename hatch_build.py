@@ -61,13 +61,13 @@ def compile_kernels(root: Path, *options: str) -> Path:
 
     unix = sys.platform != "win32"
     # Contracted multiplications would round otherwise on one processor than on the next.
-    usual = ["-std=c11", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", *WARNINGS] if unix else []
+    usual = ["-std=c11", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", *WARNINGS]
     extension = Extension(
         "gpebo_cli.kernels._compiled",
         sources=[str(path) for path in sorted((root / FOLDER).glob("*.c"))],
         include_dirs=[np.get_include(), str(root / FOLDER)],
         define_macros=[("Py_LIMITED_API", "0x{:02X}{:02X}0000".format(*STABLE_SINCE))],
-        extra_compile_args=[*usual, *options],
+        extra_compile_args=[*(usual if unix else []), *options],
         extra_link_args=list(options),
         py_limited_api=True,
     )

@@ -76,8 +76,9 @@ static inline npy_intp size(PyArrayObject *array, int axis) { return PyArray_DIM
 static inline double larger(double a, double b) { return a >= b || a != a ? a : b; }
 
 /* Solves A X = B by elimination with row pivoting, A (n, n) and B (n, columns) by rows; A is
-   destroyed and B becomes X. 0 if a pivot is exactly zero. For small n: what LAPACK spends on
-   looking at its arguments is more than what there is to do. */
+   left with the pivots on its diagonal and B becomes X. Returns the sign of the exchanges, ±1, or 0
+   if a pivot is exactly zero. For small n: what LAPACK spends on looking at its arguments is more
+   than what there is to do. */
 int solve_in_place(double *A, double *B, npy_intp n, npy_intp columns);
 
 /* C = A B for matrices by rows, A (rows, inner), B (inner, columns); C may be neither. */

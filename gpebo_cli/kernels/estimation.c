@@ -38,58 +38,14 @@ static inline double times_power(double one, double other, int *exponent)
 }
 
 /* Solves A X = B as solve_in_place does, and gives det A, without under- or overflow on the way;
-   0 for a pivot of zero, and then there is no X. A (n, n) is destroyed, B (n, columns) becomes
-   X. */
+   0 for a pivot of zero, and then there is no X. */
 static double solve_and_determinant(double *A, double *B, npy_intp n, npy_intp columns)
 {
-    double mantissa = 1.0;
+    const int sign = solve_in_place(A, B, n, columns);
+    double mantissa = sign;
     int exponent = 0;
-    for (npy_intp k = 0; k < n; k++) {
-        npy_intp best = k;
-        for (npy_intp i = k + 1; i < n; i++)
-            if (fabs(A[i * n + k]) > fabs(A[best * n + k]))
-                best = i;
-        if (A[best * n + k] == 0.0)
-            return 0.0;
-        if (best != k) {
-            mantissa = -mantissa;
-            for (npy_intp j = k; j < n; j++) {
-                const double kept = A[k * n + j];
-                A[k * n + j] = A[best * n + j];
-                A[best * n + j] = kept;
-            }
-            for (npy_intp j = 0; j < columns; j++) {
-                const double kept = B[k * columns + j];
-                B[k * columns + j] = B[best * columns + j];
-                B[best * columns + j] = kept;
-            }
-        }
-        const double *restrict pivot = A + k * n, *restrict known = B + k * columns;
-        mantissa = times_power(mantissa, pivot[k], &exponent);
-        for (npy_intp i = k + 1; i < n; i++) {
-            double *restrict row = A + i * n, *restrict right = B + i * columns;
-            if (row[k] == 0.0)
-                continue;
-            const double factor = row[k] / pivot[k];
-            for (npy_intp j = k + 1; j < n; j++)
-                row[j] -= factor * pivot[j];
-            for (npy_intp j = 0; j < columns; j++)
-                right[j] -= factor * known[j];
-        }
-    }
-    for (npy_intp k = n - 1; k >= 0; k--) {
-        double *restrict solved = B + k * columns;
-        for (npy_intp i = k + 1; i < n; i++) {
-            const double a = A[k * n + i];
-            const double *restrict later = B + i * columns;
-            for (npy_intp j = 0; j < columns; j++)
-                solved[j] -= a * later[j];
-        }
-        const double one = 1.0 / A[k * n + k];
-        /* Of a tiny pivot there is no reciprocal. */
-        for (npy_intp j = 0; j < columns; j++)
-            solved[j] = isfinite(one) ? solved[j] * one : solved[j] / A[k * n + k];
-    }
+    for (npy_intp k = 0; sign && k < n; k++)
+        mantissa = times_power(mantissa, A[k * n + k], &exponent);
     return exponent ? ldexp(mantissa, exponent) : mantissa;
 }
 

@@ -3,6 +3,7 @@
 
 int solve_in_place(double *A, double *B, npy_intp n, npy_intp columns)
 {
+    int sign = 1;
     for (npy_intp k = 0; k < n; k++) {
         npy_intp best = k;
         for (npy_intp i = k + 1; i < n; i++)
@@ -11,6 +12,7 @@ int solve_in_place(double *A, double *B, npy_intp n, npy_intp columns)
         if (A[best * n + k] == 0.0)
             return 0;
         if (best != k) {
+            sign = -sign;
             for (npy_intp j = k; j < n; j++) {
                 const double kept = A[k * n + j];
                 A[k * n + j] = A[best * n + j];
@@ -46,7 +48,7 @@ int solve_in_place(double *A, double *B, npy_intp n, npy_intp columns)
         for (npy_intp j = 0; j < columns; j++)
             solved[j] /= pivot;
     }
-    return 1;
+    return sign;
 }
 
 static PyObject *affine_scan(PyObject *module, PyObject *const *given, Py_ssize_t count)
