@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import os
 import subprocess
 import sys
@@ -9,6 +11,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+
+from gpebo_cli import kernels
 
 ROOT = Path(__file__).parents[1]
 
@@ -43,9 +47,9 @@ def gpebo(installed, tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
     environment |= {"PYTHONPATH": str(installed), "MPLBACKEND": "Agg"}
 
-    def call(*words):
+    def call(*words, **variables):
         return subprocess.run(
-            [sys.executable, "-m", "gpebo_cli", *words], cwd=tmp_path, env=environment,
+            [sys.executable, "-m", "gpebo_cli", *words], cwd=tmp_path, env=environment | variables,
             capture_output=True, text=True, check=False, timeout=120,
         )
 
@@ -67,6 +71,15 @@ def test_what_is_in_it(wheel):
     assert tops == {"gpebo_cli", "hydra_plugins", metadata}
 
 
+def test_kernels_are_compiled_or_left_out(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    compiled = [name for name in names if name.startswith("gpebo_cli/kernels/_compiled.")]
+    assert len(compiled) == (kernels.compiled is not None)
+    assert ("abi3" in wheel.name) == ("-any" not in wheel.name) == bool(compiled)
+    assert not [name for name in names if name.endswith((".c", ".h"))]
+
+
 def test_it_is_the_installed_package_that_runs(installed, gpebo):
     done = gpebo("run", "--info", "searchpath")
     assert done.returncode == 0, done.stderr
@@ -80,6 +93,21 @@ def test_the_main_job(gpebo, tmp_path):
     assert len(list((tmp_path / "here" / "figures").glob("*.png"))) >= 7
     tables = {"signals", "regression", "excitation", "estimates", "cases"}
     assert {path.stem for path in (tmp_path / "here").glob("*.csv")} == tables
+
+
+@pytest.mark.skipif(kernels.compiled is None, reason="the kernels are not compiled")
+def test_a_run_without_kernels_says_so_and_finds_the_same(gpebo, tmp_path):
+    found = {}
+    for kind in ("compiled", "numpy"):
+        words = ["plant=circuit", "figures=none", f"hydra.run.dir={kind}"]
+        done = gpebo("run", *words, GPEBO_KERNELS=kind)
+        assert (done.returncode, done.stderr) == (0, "")
+        summary = json.loads((tmp_path / kind / "summary.json").read_text())
+        assert summary["versions"]["kernels"] == kind
+        with (tmp_path / kind / "estimates.csv").open() as rows:
+            found[kind] = [[float(cell) for cell in row] for row in list(csv.reader(rows))[1:]]
+    for one, other in zip(found["compiled"], found["numpy"], strict=True):
+        assert one == pytest.approx(other, rel=1e-9, abs=1e-9)
 
 
 def test_a_recipe_a_plant_of_ones_own_and_a_repetition(gpebo, tmp_path):
