@@ -162,6 +162,11 @@ WRONG = [
     (["list", "--config-dir", "nowhere"], "--config-dir nowhere: there is no such folder"),
     (["run", "plant=circut"], "plant=circut: there is no such plant"),
     (["run", "plant=circut"], "did you mean circuit?"),
+    (["run", "plant=nan"], "plant=nan: there is no such plant"),
+    (["run", "estimator=1e3"], "estimator=1e3: there is no such estimator"),
+    (["run", "plant=null"], "plant=null: there is no such plant"),
+    (["run", "plant=1,circuit"], "plant=1,circuit: several values"),
+    (["run", "-m", "plant=1,circuit"], "plant=1: there is no such plant"),
     (["run", "experiment=paper"], "did you mean paper_circuit?"),
     (["run", "estimtor=drem"], "did you mean estimator?"),
     (["run", "estimator.gama=1"], "estimator.gama: no such key"),
@@ -540,3 +545,13 @@ def test_a_file_that_would_be_ignored_is_refused(tmp_path, mine):
     done = gpebo("run", "--config-dir", mine, "plant=circuit", *FAST, cwd=tmp_path)
     assert done.returncode == 2
     assert "would be ignored; rename it" in done.stderr
+
+
+def test_a_plant_may_have_a_number_for_a_name(tmp_path):
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "2024.yaml").write_text(
+        "name: year\nstates: [x]\noutputs: [y]\nE: [[1]]\nA: [[-1]]\nC: [[1]]\n"
+        "initial_state: {x: 1}\n"
+    )
+    done = gpebo("run", "--config-dir", ".", "plant=2024", "figures=none", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")

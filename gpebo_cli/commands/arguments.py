@@ -44,6 +44,10 @@ VALUES = {
 
 # Hydra takes name(…) for one of its own functions, unless it is quoted.
 _LOGSPACE = re.compile(r"^([^=]+)=(logspace\([^()'\"]*\))$")
+# What Hydra's grammar reads as a number, a truth value or nothing.
+_NOT_TEXT = re.compile(
+    r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false|null", re.IGNORECASE
+)
 
 _SWEEPER = "gpebo"
 _SWEEP_WORDS = ("resume", "fail_fast")  # of a sweep, not of the configuration
@@ -203,13 +207,20 @@ def _override(word: str, *, multirun: bool) -> str:
     """One override as Hydra takes it: ``logspace`` is a sweep with -m, else an axis of one run."""
     match = _LOGSPACE.match(word)
     if match is None:
-        key = word.partition("=")[0]
-        if key.lstrip("+") == "hydra/sweeper" and key != word:
+        key, equals, value = word.partition("=")
+        if key.lstrip("+") == "hydra/sweeper" and equals:
             raise ConfigError(f"{word}: gpebo has a sweeper of its own; leave this away")
+        if key.lstrip("+") in GROUPS and equals and (multirun or "," not in value):
+            return f"{key}={_names(value)}"
         return word
     if multirun:
         return f"{match[1]}={logspace(match[2], match[1])}"
     return f"{match[1]}='{match[2]}'"
+
+
+def _names(chosen: str) -> str:
+    """Names of files that Hydra would read as numbers or truth (``plant=2024``), quoted."""
+    return ",".join(quoted(n) if _NOT_TEXT.fullmatch(n) else n for n in chosen.split(","))
 
 
 def _resume(given: str | None) -> str | None:

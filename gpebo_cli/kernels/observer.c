@@ -746,10 +746,9 @@ static PyObject *residual_sizes(PyObject *module, PyObject *const *given, Py_ssi
         for (npy_intp i = 0; i < rows; i++, other++) {
             double most = data(in_psi)[i];
             for (npy_intp j = 0; j < p; j++, one++)
-                most = fabs(*one) <= most || most != most ? most : fabs(*one);
+                most = larger(most, fabs(*one));
             data(in_psi)[i] = most;
-            most = data(in_Y)[i];
-            data(in_Y)[i] = fabs(*other) <= most || most != most ? most : fabs(*other);
+            data(in_Y)[i] = larger(data(in_Y)[i], fabs(*other));
         }
     return results(&call, 2, in_psi, in_Y);
 }
