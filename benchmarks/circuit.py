@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import Array, Prepare, Row, Solve, compare, decades, loosest
-from gpebo_cli.experiment import run_experiment
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
-from gpebo_cli.systems.descriptor import DescriptorSystem
-from gpebo_cli.systems.plant import plant_from_mapping
 
 ROOT = Path(__file__).parent.parent
 RATES = np.array([0.1, 0.2, 0.3])

@@ -36,7 +36,7 @@ def experiment(
 ) -> Callable[[], object]:
     """The numerical part of the experiment with a shipped plant."""
     from benchmarks.circuit import plant
-    from gpebo_cli.experiment import run_experiment
+    from gpebo_cli.experiment.pipeline import run_experiment
     from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 
     gamma: Any = 1e10 if gains == 1 else np.logspace(6, 12, gains).tolist()
@@ -58,9 +58,9 @@ def chain(n: int, *, varying: bool) -> Callable[[], object]:
 
     n − 1 node voltages and the source's current; ``C_i v_i' = (v_{i−1} − 2 v_i + v_{i+1})/R``.
     """
+    from gpebo_cli.model.plant import plant_from_mapping
     from gpebo_cli.settings import SolverSettings, TimeSettings
     from gpebo_cli.simulation.simulate import simulate
-    from gpebo_cli.systems.plant import plant_from_mapping
 
     nodes = n - 1
     E = [["0"] * n for _ in range(n)]

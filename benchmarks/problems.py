@@ -28,10 +28,10 @@ from benchmarks.measure import (
     say,
     seconds,
 )
-from gpebo_cli.expressions import Tape
+from gpebo_cli.model.expressions import Tape
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.plant import plant_from_mapping
 
 FOLDER = Path(__file__).parent.parent / "tests" / "data" / "problems"
 TARGET = 1e-8

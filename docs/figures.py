@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Trajectory, initial_mesh
-from gpebo_cli.collocation.radau import radau_rule
-from gpebo_cli.commands.locations import conf_folder
-from gpebo_cli.experiment import run_experiment
+from gpebo_cli.cli.locations import conf_folder
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.canonical import (
     canonical_blocks,
     diagonalising_gain,
     unknown_input_matrices,
 )
-from gpebo_cli.outputs.files import make_folder
-from gpebo_cli.outputs.style import Axis, Curve, Panel, compose, line, save
+from gpebo_cli.results.files import make_folder
+from gpebo_cli.results.style import Axis, Curve, Panel, compose, line, save
 from gpebo_cli.settings import ObserverSettings, Settings, TimeSettings
-from gpebo_cli.systems.descriptor import Array
-from gpebo_cli.systems.plant import plant_from_mapping
 
 IMAGES = Path(__file__).parent / "img"
 HORIZON = 20.0

@@ -14,7 +14,7 @@ import nbformat
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from gpebo_cli.commands import usage
+from gpebo_cli.cli import usage
 
 DOCS = Path(__file__).parent
 NOTEBOOK = DOCS / "first_run.ipynb"

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from gpebo_cli.commands.locations import conf_folder
-from gpebo_cli.experiment import run_experiment
-from gpebo_cli.outputs.figures import describe
-from gpebo_cli.outputs.files import make_folder, write_text
-from gpebo_cli.outputs.style import Axis, Curve, Panel, compose, line, save
-from gpebo_cli.result import RunResult
+from gpebo_cli.cli.locations import conf_folder
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.experiment.result import RunResult
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.results.figures import describe
+from gpebo_cli.results.files import make_folder, write_text
+from gpebo_cli.results.style import Axis, Curve, Panel, compose, line, save
 from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings, TimeSettings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
-from gpebo_cli.systems.plant import plant_from_mapping
 
 HERE = Path(__file__).parent
 PAGE = HERE / "howto" / "noise.md"

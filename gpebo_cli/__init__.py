@@ -18,11 +18,11 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ belo
     from gpebo_cli.api.calls import available, check, load_plant, run
     from gpebo_cli.api.result import Result
     from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
+    from gpebo_cli.model.descriptor import DescriptorSystem
+    from gpebo_cli.model.functions import Names, system_from_functions
     from gpebo_cli.observers import observe
     from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
     from gpebo_cli.simulation.simulate import simulate
-    from gpebo_cli.systems.descriptor import DescriptorSystem
-    from gpebo_cli.systems.functions import Names, system_from_functions
 
 __all__ = [
     "ConfigError",
@@ -52,8 +52,8 @@ _HOMES = {
     "observers": ("observe",),
     "settings": ("ObserverSettings", "SolverSettings", "TimeSettings"),
     "simulation.simulate": ("simulate",),
-    "systems.descriptor": ("DescriptorSystem",),
-    "systems.functions": ("Names", "system_from_functions"),
+    "model.descriptor": ("DescriptorSystem",),
+    "model.functions": ("Names", "system_from_functions"),
 }
 
 

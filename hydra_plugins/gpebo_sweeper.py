@@ -49,8 +49,8 @@ class GpeboSweeper(BasicSweeper):
         Raises:
             GpeboError: a job failed or has no result; the table has been written then.
         """
-        from gpebo_cli.commands.arguments import logspace
-        from gpebo_cli.commands.sweep import Orders, run_sweep
+        from gpebo_cli.cli.arguments import logspace
+        from gpebo_cli.cli.sweep import Orders, run_sweep
 
         if self.config is None or self.launcher is None or self.hydra_context is None:
             raise RuntimeError("sweep() before setup()")  # Hydra never does

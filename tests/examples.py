@@ -22,8 +22,8 @@ ROOT = Path(__file__).parents[1]
 _SERVER = """
 import json, os, signal, socket, sys
 import matplotlib.backends.backend_agg, matplotlib.figure, scipy.linalg, scipy.integrate, hydra
-import gpebo_cli.api.calls, gpebo_cli.commands.job, gpebo_cli.outputs.gallery, gpebo_cli.estimators
-from gpebo_cli.app import main
+import gpebo_cli.api.calls, gpebo_cli.cli.job, gpebo_cli.results.gallery, gpebo_cli.estimators
+from gpebo_cli.cli.app import main
 
 server = socket.socket(socket.AF_UNIX)
 server.bind(sys.argv[1])

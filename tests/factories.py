@@ -7,20 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.result import (
-    Assumption,
-    Direction,
+from gpebo_cli.evidence.excitation import Excitation
+from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.experiment.result import (
     EstimationResult,
-    Excitation,
-    Metrics,
     RegressionResult,
-    Requirement,
     RunResult,
     SimulationResult,
     StateChange,
 )
+from gpebo_cli.findings import Assumption, Direction, Requirement
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.settings import ObserverSettings, OutputSettings, Settings
-from gpebo_cli.systems.descriptor import Array, Coefficients, DescriptorSystem
 
 STATES = ("e1", "e2", "il", "ir1", "ir2", "iv")
 UNITS = {"e1": "V", "e2": "V", "il": "A", "ir1": "A", "ir2": "A", "iv": "A", "V": "V", "y": "A"}

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gpebo_cli.systems.descriptor import DescriptorSystem
-from gpebo_cli.systems.plant import plant_from_mapping
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.model.plant import plant_from_mapping
 
 DATA = Path(__file__).parent / "data"
 CONF = Path(__file__).parent.parent / "conf"

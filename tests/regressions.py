@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh
-from gpebo_cli.collocation.radau import radau_rule
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.regression.linear import LinearRegression
 
 Row = Callable[[np.ndarray], np.ndarray]  # times (…) -> ψ (…, p)
 

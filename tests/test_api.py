@@ -312,7 +312,7 @@ from typing import Any
 
 import numpy as np
 
-from gpebo_cli.result import Requirement
+from gpebo_cli.findings import Requirement
 
 
 @dataclass(frozen=True)

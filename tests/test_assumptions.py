@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from plants import shipped
 
-from gpebo_cli.assumptions import check
+from gpebo_cli.experiment.assumptions import check
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import ObserverSettings, Settings
-from gpebo_cli.systems.plant import plant_from_mapping
 
 ROOT = Path(__file__).parent.parent
 

@@ -13,8 +13,8 @@ from benchmarks import __main__ as program
 from benchmarks import circuit, floor, gains, growth, measure, plain_figures, problems
 from benchmarks.measure import Failed, Found, Row, compare, loosest
 from benchmarks.page import PARTS, duration, page, table
-from gpebo_cli.outputs.figures import describe
-from gpebo_cli.outputs.folder import write_run
+from gpebo_cli.results.figures import describe
+from gpebo_cli.results.folder import write_run
 
 KEYS = {"name", "ours_seconds", "ours_error", "peer", "peer_seconds", "peer_error", "ratio"}
 

@@ -7,7 +7,7 @@ import pytest
 from plants import reference, shipped
 
 from gpebo_cli.errors import ConfigError, ModelError
-from gpebo_cli.experiment import run_experiment
+from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.canonical import unknown_input_matrices
 from gpebo_cli.settings import ObserverSettings, Settings, SolverSettings, TimeSettings

@@ -92,7 +92,7 @@ def test_run_help_names_the_real_defaults(tmp_path):
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["list"], ["--version"]])
 def test_help_imports_nothing_heavy(tmp_path, words):
     script = (
-        "import sys; sys.argv = ['gpebo', *sys.argv[1:]]; from gpebo_cli.app import main; "
+        "import sys; sys.argv = ['gpebo', *sys.argv[1:]]; from gpebo_cli.cli.app import main; "
         "main(); heavy = {'numpy', 'hydra', 'omegaconf', 'yaml', 'argparse', 'pathlib', 're', "
         "'dataclasses'} & set(sys.modules); sys.exit(f'imported {heavy}' if heavy else 0)"
     )
@@ -107,7 +107,7 @@ def test_help_imports_nothing_heavy(tmp_path, words):
 def test_composing_imports_no_numbers(tmp_path):
     script = (
         "import sys; sys.argv = ['gpebo', 'run', '--cfg', 'job']; "
-        "from gpebo_cli.app import main; main(); sys.exit('numpy' in sys.modules)"
+        "from gpebo_cli.cli.app import main; main(); sys.exit('numpy' in sys.modules)"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], env=environment(), cwd=tmp_path,
@@ -119,7 +119,7 @@ def test_composing_imports_no_numbers(tmp_path):
 def test_a_run_without_figures_imports_neither_tables_nor_drawing(tmp_path):
     script = (
         "import sys; sys.argv = ['gpebo', 'run', *sys.argv[1:]]; "
-        "from gpebo_cli.app import main; main(); "
+        "from gpebo_cli.cli.app import main; main(); "
         "heavy = {'pandas', 'sympy', 'matplotlib'} & set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
@@ -249,7 +249,7 @@ def test_a_traceback_when_it_is_asked_for(tmp_path):
 
 def test_an_unexpected_error_is_one_line_too(tmp_path):
     script = (
-        "import sys; from gpebo_cli import app\n"
+        "import sys; from gpebo_cli.cli import app\n"
         "def broken(words): raise RuntimeError('first\\nsecond')\n"
         "app._dispatch = broken; sys.exit(app.main())"
     )

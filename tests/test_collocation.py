@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from gpebo_cli.collocation.linear import (
+from gpebo_cli.errors import SolverError
+from gpebo_cli.numerics.collocation import (
     Coefficients,
     Constraints,
     LinearProblem,
     solve,
     solve_constant,
 )
-from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh
-from gpebo_cli.collocation.radau import differentiation_schur, radau_rule
-from gpebo_cli.errors import SolverError
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
 
 
 @pytest.mark.parametrize("stages", range(2, 13))

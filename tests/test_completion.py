@@ -15,12 +15,12 @@ from typing import get_args, get_type_hints
 import pytest
 from examples import ROOT, environment
 
-from gpebo_cli.app import COMMANDS
-from gpebo_cli.commands.completion import SCRIPTS, candidates
-from gpebo_cli.commands.locations import GROUPS
-from gpebo_cli.outputs.figures import FIGURES
-from gpebo_cli.outputs.names import FIGURE_NAMES, METRICS
-from gpebo_cli.result import Metrics
+from gpebo_cli.cli.app import COMMANDS
+from gpebo_cli.cli.completion import SCRIPTS, candidates
+from gpebo_cli.cli.locations import GROUPS
+from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.results.figures import FIGURES
+from gpebo_cli.results.names import FIGURE_NAMES, METRICS
 from gpebo_cli.settings import ObserverSettings
 
 
@@ -115,7 +115,7 @@ def test_names_that_are_written_twice_agree():
 def test_answering_loads_no_numbers(here):
     script = (
         "import sys; sys.argv = ['gpebo', '__complete', 'run', 'plant=']; "
-        "from gpebo_cli.app import main; main(); "
+        "from gpebo_cli.cli.app import main; main(); "
         "heavy = {'numpy', 'hydra', 'omegaconf', 'yaml', 'pandas'} & set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )

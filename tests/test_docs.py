@@ -15,8 +15,8 @@ from examples import ROOT, blocks, commands, gpebo, python, shell
 
 from gpebo_cli import __all__ as public
 from gpebo_cli import __version__
-from gpebo_cli.app import COMMANDS
-from gpebo_cli.commands import usage
+from gpebo_cli.cli import usage
+from gpebo_cli.cli.app import COMMANDS
 
 README = ROOT / "README.md"
 TUTORIAL = ROOT / "docs" / "tutorial.md"

@@ -11,7 +11,8 @@ from plants import CONF, shipped
 from regressions import ETA, fading, regression
 
 from gpebo_cli import estimators
-from gpebo_cli.collocation.mesh import Trajectory
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.canonical import (
     canonical_blocks,
@@ -22,7 +23,6 @@ from gpebo_cli.observers.canonical import (
 from gpebo_cli.observers.gpebo import observer_matrices
 from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.plant import plant_from_mapping
 
 SOLVER = SolverSettings()
 T = np.linspace(0.0, 20.0, 401)

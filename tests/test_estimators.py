@@ -203,7 +203,7 @@ def test_noise_free_error_is_the_exponential_of_the_energy(gamma):
 @pytest.mark.parametrize("make", [kreisselmeier, lion])
 def test_mixed_regression_holds(make):
     """𝐘 = Δ η to 1e-11 of their size, at every time, Ω = 0 at the start included."""
-    from gpebo_cli.linalg import determinant_and_adjugate_action
+    from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 
     values = make(CLEAN, np.array([0.1, 0.2, 0.3]))(T)
     delta, Y, _ = determinant_and_adjugate_action(values[..., :3], values[..., 3])

@@ -8,8 +8,8 @@ from plants import reference, shipped
 from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec
 
-from gpebo_cli.excitation import assess, persistent
-from gpebo_cli.metrics import settling_time, time_rms
+from gpebo_cli.evidence.excitation import assess, persistent
+from gpebo_cli.evidence.metrics import settling_time, time_rms
 from gpebo_cli.observers import observe
 from gpebo_cli.settings import (
     ExcitationSettings,

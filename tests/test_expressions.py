@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.expressions import Expression, breakpoints, parse, record, shorten, taylor
-from gpebo_cli.expressions import tape as tape_module
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.expressions import Expression, breakpoints, parse, record, shorten, taylor
+from gpebo_cli.model.expressions import tape as tape_module
 
 WHERE = "plant mine: A[0][1]"
 # Seconds of this process's own work, whatever else the machine does: what this is there to find

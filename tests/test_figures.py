@@ -20,11 +20,11 @@ from matplotlib.text import Text
 from PIL import Image
 
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.outputs import style
-from gpebo_cli.outputs.figures import FIGURES, draw
-from gpebo_cli.outputs.folder import write_run
-from gpebo_cli.outputs.provenance import Provenance
-from gpebo_cli.result import EstimationResult, RunResult
+from gpebo_cli.experiment.result import EstimationResult, RunResult
+from gpebo_cli.results import style
+from gpebo_cli.results.figures import FIGURES, draw
+from gpebo_cli.results.folder import write_run
+from gpebo_cli.results.provenance import Provenance
 
 CIRCUIT_FIGURES = {
     "regressor",

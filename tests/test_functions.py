@@ -7,10 +7,10 @@ import pytest
 from plants import shipped
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment import run_experiment
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model.functions import Names, system_from_functions
 from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.functions import Names, system_from_functions
 
 SOLVER = SolverSettings()
 

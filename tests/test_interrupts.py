@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from gpebo_cli.commands import interrupts
+from gpebo_cli.cli import interrupts
 
 
 class Finaliser:

@@ -13,16 +13,18 @@ from plants import shipped
 from test_cli import FAST, folders, gpebo
 from test_observer import ROTATING
 
-from gpebo_cli.assumptions import check
-from gpebo_cli.collocation.mesh import Mesh
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment import run_experiment
-from gpebo_cli.linalg import transpose
+from gpebo_cli.experiment.assumptions import check
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.experiment.result import RunResult
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers import SignalNoise, observe
 from gpebo_cli.observers import gpebo as basis_observer
 from gpebo_cli.observers.kalman_bucy import noise_model, reduced_system
 from gpebo_cli.observers.riccati import run_filter
-from gpebo_cli.result import RunResult
 from gpebo_cli.settings import (
     NoiseSettings,
     ObserverSettings,
@@ -31,8 +33,6 @@ from gpebo_cli.settings import (
     TimeSettings,
 )
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
-from gpebo_cli.systems.plant import plant_from_mapping
 
 SOLVER = SolverSettings()
 

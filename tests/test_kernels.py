@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kernel_paths import COMPILED, by_both, needs_kernels
 
 from gpebo_cli import kernels
-from gpebo_cli.linalg import affine_scan
+from gpebo_cli.numerics.linalg import affine_scan
 
 pytestmark = needs_kernels
 

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_paths import COMPILED, by_both, needs_kernels
 
-from gpebo_cli.collocation import linear
-from gpebo_cli.collocation.linear import Coefficients, Constraints, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh, unresolved_kinds
-from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import SolverError
+from gpebo_cli.numerics import collocation as linear
+from gpebo_cli.numerics.collocation import Coefficients, Constraints, LinearProblem, solve
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved_kinds
+from gpebo_cli.numerics.radau import radau_rule
 
 pytestmark = needs_kernels
 

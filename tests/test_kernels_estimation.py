@@ -10,8 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_paths import COMPILED, by_both, needs_kernels
 
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
-from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.estimators._mixing import SINGULAR, determinants, mixed_points
 from gpebo_cli.estimators._scalar import (
     ScalarPath,
@@ -20,9 +18,11 @@ from gpebo_cli.estimators._scalar import (
     law_variation,
     linear_law,
 )
-from gpebo_cli.experiment import _evaluation
-from gpebo_cli.linalg import determinant_and_adjugate_action
-from gpebo_cli.metrics import SETTLED
+from gpebo_cli.evidence.metrics import SETTLED
+from gpebo_cli.experiment.pipeline import _evaluation
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.observation import AffineStateMap
 
 pytestmark = needs_kernels

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_paths import COMPILED, by_both, needs_kernels
 
-from gpebo_cli.collocation.mesh import _JOINED, Mesh, _joining, initial_mesh, joining_change
-from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.expressions import parse, record
+from gpebo_cli.model.descriptor import MATRIX_NAMES
+from gpebo_cli.model.expressions import parse, record
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import _JOINED, Mesh, _joining, initial_mesh, joining_change
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.simulation import simulate
-from gpebo_cli.systems.descriptor import MATRIX_NAMES
-from gpebo_cli.systems.plant import plant_from_mapping
 
 pytestmark = needs_kernels
 

@@ -11,14 +11,17 @@ from hypothesis import strategies as st
 from kernel_paths import COMPILED, by_both, needs_kernels
 from regressions import ETA, fading, regression, three
 
-from gpebo_cli import excitation, kernels
-from gpebo_cli import regression as regressions
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
-from gpebo_cli.collocation.radau import radau_rule
+from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
+from gpebo_cli.evidence import excitation
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import gpebo, observe
 from gpebo_cli.observers.observation import AffineStateMap, largest_entry, log_norm
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression import linear as regressions
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import (
     ExcitationSettings,
     ObserverSettings,
@@ -26,8 +29,6 @@ from gpebo_cli.settings import (
     TimeSettings,
 )
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.descriptor import Array, Coefficients, DescriptorSystem
-from gpebo_cli.systems.plant import plant_from_mapping
 
 pytestmark = needs_kernels
 seeds = st.integers(0, 2**32 - 1)

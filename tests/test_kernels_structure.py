@@ -14,9 +14,10 @@ from plants import DATA, problem, shipped
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
-from gpebo_cli.simulation import consistency, derivative_array
-from gpebo_cli.simulation.consistency import consistent_state
-from gpebo_cli.simulation.derivative_array import (
+from gpebo_cli.model.descriptor import Coefficients, DescriptorSystem
+from gpebo_cli.reduction import consistency, derivative_array
+from gpebo_cli.reduction.consistency import consistent_state
+from gpebo_cli.reduction.derivative_array import (
     Bases,
     Pivots,
     StrangenessFree,
@@ -25,7 +26,6 @@ from gpebo_cli.simulation.derivative_array import (
     balance,
     reduce,
 )
-from gpebo_cli.systems.descriptor import Coefficients, DescriptorSystem
 
 pytestmark = needs_kernels
 

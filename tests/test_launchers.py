@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from test_sweep import FAST, begin, gpebo, rows, wait_for, without_seconds
 
-from gpebo_cli.commands.workers import Watch
+from gpebo_cli.cli.workers import Watch
 
 WORDS = ["run", "-m", "estimator.gamma=1e6,-1,1e8", *FAST]
 

@@ -17,9 +17,9 @@ from factories import make_result
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gpebo_cli.outputs import circuit
-from gpebo_cli.outputs.figures import draw
-from gpebo_cli.result import RunResult
+from gpebo_cli.experiment.result import RunResult
+from gpebo_cli.results import circuit
+from gpebo_cli.results.figures import draw
 
 pytest.importorskip("pytest_mpl")
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpebo_cli.linalg import affine_scan, determinant_and_adjugate_action
+from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
 
 
 def adjugate(omega: np.ndarray) -> np.ndarray:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import sympy as sp
 
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.plant import plant_from_mapping
 
 t = sp.Symbol("t")
 

@@ -11,12 +11,9 @@ from plants import shipped
 from scipy.integrate import solve_ivp
 from test_cli import folders, gpebo
 
-from gpebo_cli.collocation.mesh import Trajectory, initial_mesh
-from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import build
-from gpebo_cli.experiment import run_experiment
-from gpebo_cli.measurement import (
+from gpebo_cli.experiment.noise import (
     between,
     draw_errors,
     measure,
@@ -24,8 +21,11 @@ from gpebo_cli.measurement import (
     noise_levels,
     sampled_mesh,
 )
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import observe
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import (
     NoiseSettings,
     ObserverSettings,

@@ -6,9 +6,9 @@ import pytest
 import yaml
 from examples import ROOT, gpebo
 
-from gpebo_cli.commands.check import _ADVICE
-from gpebo_cli.commands.new import TEMPLATE
-from gpebo_cli.systems.plant import KEYS
+from gpebo_cli.cli.check import _ADVICE
+from gpebo_cli.cli.new import TEMPLATE
+from gpebo_cli.model.plant import KEYS
 
 
 def test_it_runs_as_it_stands_with_the_defaults_and_converges(tmp_path):

@@ -7,11 +7,11 @@ import pytest
 from plants import reference, shipped
 
 from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.gpebo import observer_matrices
 from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.plant import plant_from_mapping
 
 SOLVER = SolverSettings()
 T = np.linspace(0, 20, 801)

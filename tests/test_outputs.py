@@ -17,11 +17,11 @@ import pytest
 from factories import STATES, make_result, with_figures, without_observer
 
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.outputs import files
-from gpebo_cli.outputs.folder import TABLES, write_run
-from gpebo_cli.outputs.provenance import GitState, Provenance, git_state, provenance
-from gpebo_cli.outputs.summary import plain, summary_text
-from gpebo_cli.result import EstimationResult, RunResult
+from gpebo_cli.experiment.result import EstimationResult, RunResult
+from gpebo_cli.results import files
+from gpebo_cli.results.folder import TABLES, write_run
+from gpebo_cli.results.provenance import GitState, Provenance, git_state, provenance
+from gpebo_cli.results.summary import plain, summary_text
 
 MADE_BY = Provenance({"gpebo": "0.1.0"}, GitState("c0ffee", False))
 
@@ -346,7 +346,7 @@ def test_git_state_never_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_tables_need_neither_matplotlib_nor_pandas() -> None:
     code = (
-        "import sys, gpebo_cli.outputs.tables, gpebo_cli.outputs.folder;"
+        "import sys, gpebo_cli.results.tables, gpebo_cli.results.folder;"
         "print([name for name in ('matplotlib', 'pandas', 'scipy', 'PIL') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

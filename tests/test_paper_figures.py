@@ -17,14 +17,14 @@ import yaml
 from factories import make_result
 from PIL import Image
 
-from gpebo_cli.commands import configuration, figures
-from gpebo_cli.commands.locations import choices, conf_folder
+from gpebo_cli.cli import configuration, figures
+from gpebo_cli.cli.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.outputs import circuit, gallery
-from gpebo_cli.outputs.figures import describe, overlay
-from gpebo_cli.outputs.series import blocks, csv_text, differences, reference_text
-from gpebo_cli.outputs.studies import STUDIES
-from gpebo_cli.outputs.style import TIME, Axis, Curve, Panel, compose, line
+from gpebo_cli.results import circuit, gallery
+from gpebo_cli.results.figures import describe, overlay
+from gpebo_cli.results.series import blocks, csv_text, differences, reference_text
+from gpebo_cli.results.studies import STUDIES
+from gpebo_cli.results.style import TIME, Axis, Curve, Panel, compose, line
 from gpebo_cli.settings import Settings
 
 TABLES = Path(__file__).parent / "data" / "paper"

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.systems.descriptor import MATRIX_NAMES, CoefficientSource, DescriptorSystem
-from gpebo_cli.systems.plant import KEYS, plant_from_mapping
+from gpebo_cli.model.descriptor import MATRIX_NAMES, CoefficientSource, DescriptorSystem
+from gpebo_cli.model.plant import KEYS, plant_from_mapping
 
 PLANTS = Path(__file__).parents[1] / "conf" / "plant"
 TIMES = np.array([0.0, 0.4, 1.7, 6.3, 19.5])

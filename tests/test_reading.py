@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.reading import nearest, read
+from gpebo_cli.schema import nearest, read
 from gpebo_cli.settings import ObserverSettings, OutputSettings, SolverSettings, TimeSettings
 
 

@@ -11,11 +11,12 @@ from plants import shipped
 from regressions import ETA, regression, three
 from test_cli import folders, gpebo
 
-from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import build
-from gpebo_cli.experiment import run_experiment
-from gpebo_cli.measurement import measure, noise_levels
+from gpebo_cli.experiment.noise import measure, noise_levels
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.gpebo import observer_matrices
 from gpebo_cli.settings import (
@@ -26,7 +27,6 @@ from gpebo_cli.settings import (
     TimeSettings,
 )
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.plant import plant_from_mapping
 
 ESTIMATORS = (
     {"name": "gradient", "gamma": [1.0, 10.0]},

@@ -13,10 +13,10 @@ from plants import shipped
 from test_cli import gpebo
 
 from gpebo_cli import check, run
-from gpebo_cli.collocation.mesh import Mesh
-from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment import run_experiment
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.recordings.hold import edges, held, on_mesh, recording_mesh
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import LineReader, read_table

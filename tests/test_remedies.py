@@ -21,14 +21,15 @@ from scipy.linalg import expm
 from test_observer import ROTATING
 
 from gpebo_cli import estimators
-from gpebo_cli.assumptions import check
 from gpebo_cli.errors import ConfigError, SolverError
-from gpebo_cli.excitation import segment_level, window_level
-from gpebo_cli.experiment import run_experiment
-from gpebo_cli.moving import filtered
+from gpebo_cli.evidence.excitation import segment_level, window_level
+from gpebo_cli.experiment.assumptions import check
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.gpebo import observer_matrices
-from gpebo_cli.regression import ExtensionState, Reset, largest
+from gpebo_cli.regression.dynamics import filtered
+from gpebo_cli.regression.linear import ExtensionState, Reset, largest
 from gpebo_cli.settings import (
     NoiseSettings,
     ObserverSettings,
@@ -37,7 +38,6 @@ from gpebo_cli.settings import (
     TimeSettings,
 )
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.plant import plant_from_mapping
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "examples"

@@ -10,13 +10,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_continuous_are
 
-from gpebo_cli.collocation.mesh import initial_mesh
-from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import SolverError
-from gpebo_cli.linalg import transpose
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.observability import window_gramians
 from gpebo_cli.observers.riccati import Filtered, StateSpace, pair, quotient, run_filter
-from gpebo_cli.systems.descriptor import Array
 
 Of = Callable[[float], Array]
 

@@ -20,14 +20,14 @@ from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, quotient_of, spectrum
-from gpebo_cli.experiment import run_experiment
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.experiment.sampled import SampledRun
+from gpebo_cli.experiment.stream import Stream
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.recordings.table import Samples
-from gpebo_cli.regression import SampledRegression, outer_products
-from gpebo_cli.sampled import SampledRun
+from gpebo_cli.regression.linear import SampledRegression, outer_products
 from gpebo_cli.settings import DataSettings, ObserverSettings, Settings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.streaming import Stream
-from gpebo_cli.systems.plant import plant_from_mapping
 
 RNG = np.random.default_rng(7)
 
@@ -416,7 +416,7 @@ def test_the_memory_of_a_stream_does_not_grow(tmp_path):
     script = (
         "import sys\n"
         "sys.argv = ['gpebo', 'run', 'data.file=-', 'estimator=least_squares']\n"
-        "from gpebo_cli.app import main\n"
+        "from gpebo_cli.cli.app import main\n"
         "code = main()\n"
         # Not ru_maxrss, which a process inherits from the one that started it.
         "peak = [x for x in open('/proc/self/status') if x.startswith('VmHWM')][0].split()[1]\n"

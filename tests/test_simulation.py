@@ -8,9 +8,9 @@ from plants import reference, shipped
 from scipy.integrate import solve_ivp
 
 from gpebo_cli.errors import ModelError
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.plant import plant_from_mapping
 
 SOLVER = SolverSettings()
 

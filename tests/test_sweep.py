@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from gpebo_cli.commands.arguments import logspace, parse, quoted
-from gpebo_cli.commands.sweep_folder import (
+from gpebo_cli.cli.arguments import logspace, parse, quoted
+from gpebo_cli.cli.sweep_folder import (
     JobRecord,
     Plan,
     read_plan,
@@ -22,7 +22,7 @@ from gpebo_cli.commands.sweep_folder import (
     table,
     write_record,
 )
-from gpebo_cli.commands.sweep_progress import line
+from gpebo_cli.cli.sweep_progress import line
 from gpebo_cli.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -389,7 +389,7 @@ def test_runs_and_their_cases_are_compared_with_a_heat_map_of_two_gains(tmp_path
 def test_error_curves_are_those_of_the_run(tmp_path):
     import numpy as np
 
-    from gpebo_cli.outputs.finished import read_errors, read_run
+    from gpebo_cli.results.finished import read_errors, read_run
 
     words = ["run", "estimator.gamma=[1e6,1e8]", "plant=descriptor", "estimator=ls_drem", *FAST]
     assert gpebo(*words, "hydra.run.dir=a", cwd=tmp_path).returncode == 0

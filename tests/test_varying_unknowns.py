@@ -8,13 +8,13 @@ from plants import shipped
 from scipy.integrate import solve_ivp
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment import run_experiment
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model.functions import system_from_functions
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
-from gpebo_cli.outputs.figures import parameters
+from gpebo_cli.results.figures import parameters
 from gpebo_cli.settings import ObserverSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
-from gpebo_cli.systems.functions import system_from_functions
-from gpebo_cli.systems.plant import plant_from_mapping
 
 SOLVER = SolverSettings()
 STEP = {"theta1": "1.5 + step(t - 2.2)", "theta2": "-0.8 + 0.3*sin(3*t)"}

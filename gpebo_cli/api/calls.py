@@ -7,19 +7,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import Any, cast
 
-from gpebo_cli import assumptions
 from gpebo_cli.api.choice import choose, plain, primary
 from gpebo_cli.api.result import Result
-from gpebo_cli.commands import configuration
-from gpebo_cli.commands.locations import DATA_GROUPS, GROUPS, choices, conf_folder
+from gpebo_cli.cli import configuration
+from gpebo_cli.cli.locations import DATA_GROUPS, GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import Estimator, settings_of
-from gpebo_cli.experiment import run_experiment
-from gpebo_cli.reading import nearest, shown
-from gpebo_cli.result import Assumption
+from gpebo_cli.experiment import assumptions
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.findings import Assumption
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings, SolverSettings
-from gpebo_cli.systems.descriptor import DescriptorSystem
-from gpebo_cli.systems.plant import plant_from_mapping
 
 Plant = str | os.PathLike[str] | Mapping[str, object] | DescriptorSystem
 Choice = str | Mapping[str, object]

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from gpebo_cli.commands import configuration
-from gpebo_cli.commands.guard import check_file
-from gpebo_cli.commands.locations import choices, conf_folder
+from gpebo_cli.cli import configuration
+from gpebo_cli.cli.guard import check_file
+from gpebo_cli.cli.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.reading import nearest, shown
+from gpebo_cli.schema import nearest, shown
 
 PRIMARY = "gpebo.yaml"
 

@@ -13,16 +13,18 @@ import numpy as np
 
 from gpebo_cli import estimators
 from gpebo_cli.api.choice import primary
-from gpebo_cli.commands import configuration
-from gpebo_cli.commands.report import case_rows, run_lines
+from gpebo_cli.cli import configuration
+from gpebo_cli.cli.report import case_rows, run_lines
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.outputs import figures
-from gpebo_cli.outputs.figures import truth_at
-from gpebo_cli.outputs.folder import write_run
-from gpebo_cli.outputs.frames import frame
-from gpebo_cli.reading import nearest, shown
-from gpebo_cli.result import Assumption, Excitation, RunResult
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.evidence.excitation import Excitation
+from gpebo_cli.experiment.result import RunResult
+from gpebo_cli.findings import Assumption
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.results import figures
+from gpebo_cli.results.figures import truth_at
+from gpebo_cli.results.folder import write_run
+from gpebo_cli.results.frames import frame
+from gpebo_cli.schema import nearest, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,7 +75,8 @@ class Result:
     ``result["il"]`` is a true signal (N,), ``result["il_hat"]`` its estimates (G, M).
 
     Attributes:
-        details: everything, as arrays by position; see :class:`gpebo_cli.result.RunResult`.
+        details: everything, as arrays by position; see
+            :class:`gpebo_cli.experiment.result.RunResult`.
         config: the configuration, complete, as ``config.yaml`` has it.
 
     Examples:

@@ -18,8 +18,8 @@ from typing import cast
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._recursive import InformationRoot, Recursion
 from gpebo_cli.estimators._segments import estimate
-from gpebo_cli.reading import nearest, read
-from gpebo_cli.regression import Estimates, Estimator
+from gpebo_cli.regression.linear import Estimates, Estimator
+from gpebo_cli.schema import nearest, read
 
 GROUP = "gpebo.estimators"
 """The entry points under which other packages offer estimators."""

@@ -15,7 +15,7 @@ from math import prod
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.model.descriptor import Array
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
 _MAX_CASES = 10_000_000

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory, unresolved
-from gpebo_cli.regression import LinearRegression, with_realisations
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import Trajectory, unresolved
+from gpebo_cli.regression.linear import LinearRegression, with_realisations
 
 _TOLERANCE = 1e-11
 _ROUNDS = 30

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import SolverError
 from gpebo_cli.estimators._vector import VectorLaw
-from gpebo_cli.linalg import determinant_and_adjugate_action
-from gpebo_cli.moving import Dynamics
-from gpebo_cli.regression import ExtensionState
-from gpebo_cli.result import Requirement
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.linear import ExtensionState
 
 _ONE_PERCENT = float(np.log(100.0))
 _DIGITS = 1e-12  # reciprocal condition of Ω below which nothing is left of some direction

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import SolverError
 from gpebo_cli.estimators._extension import resolved_low_pass
-from gpebo_cli.linalg import transpose
-from gpebo_cli.regression import ExtensionState, LinearRegression, largest
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.linear import ExtensionState, LinearRegression, largest
 
 _PICARD_ROUNDS = 200
 

@@ -9,13 +9,13 @@ from typing import Protocol
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.estimators._base import axis, number, per_parameter
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
-from gpebo_cli.regression import ExtensionState, LinearRegression, largest
-from gpebo_cli.result import Requirement
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.linear import ExtensionState, LinearRegression, largest
 
 ONE_PERCENT = float(np.log(100.0))
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
-from gpebo_cli.linalg import SMALL, determinant_and_adjugate_action
-from gpebo_cli.systems.descriptor import Array, BoolArray
+from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.numerics.linalg import SMALL, determinant_and_adjugate_action
+from gpebo_cli.numerics.mesh import Trajectory
 
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not
 # needed there either: its weight in every law is ∫Δ².

@@ -19,10 +19,10 @@ import numpy as np
 
 from gpebo_cli.estimators._information import Spectrum
 from gpebo_cli.estimators._scalar import mean_decay
-from gpebo_cli.linalg import affine_scan, determinant_and_adjugate_action
-from gpebo_cli.regression import SampledRegression, outer_products
-from gpebo_cli.result import Requirement
-from gpebo_cli.systems.descriptor import Array, BoolArray
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
+from gpebo_cli.regression.linear import SampledRegression, outer_products
 
 _SINGULAR = 1e-10  # below this ratio of singular values of S the quotient 𝐘/Δ is rounding
 _SINGULAR_FILTER = 1e-14  # the same for Ω, where squares have been formed

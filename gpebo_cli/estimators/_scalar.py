@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.collocation.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.errors import SolverError
-from gpebo_cli.linalg import affine_scan
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import affine_scan
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 
 # (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p)
 MixedSignals = Callable[[Array, Array], tuple[Array, Array]]

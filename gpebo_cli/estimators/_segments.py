@@ -10,16 +10,16 @@ from typing import Protocol, cast, runtime_checkable
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.moving import Dynamics
-from gpebo_cli.regression import (
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.linear import (
     Estimates,
     Estimator,
     ExtensionState,
     LinearRegression,
     Reset,
 )
-from gpebo_cli.result import Requirement
-from gpebo_cli.systems.descriptor import Array
 
 
 class Resumable(Estimates, Protocol):

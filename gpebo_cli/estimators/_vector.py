@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.moving import Dynamics
-from gpebo_cli.regression import ExtensionState, with_realisations
-from gpebo_cli.result import Requirement
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.linear import ExtensionState, with_realisations
 
 _MAX_ELEMENTS = 200_000
 _TOLERANCE = 1e-11

@@ -13,8 +13,8 @@ from gpebo_cli.estimators._base import number
 from gpebo_cli.estimators._mixed import MixedEstimates
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.estimators.ls_drem import LsDrem
-from gpebo_cli.regression import ExtensionState, LinearRegression
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.linear import ExtensionState, LinearRegression
 
 
 @dataclass(frozen=True)

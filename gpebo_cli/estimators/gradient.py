@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.estimators._base import combinations, per_parameter
 from gpebo_cli.estimators._mixed import gain_axis, gain_matrix
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
-from gpebo_cli.excitation import persistent
-from gpebo_cli.moving import Dynamics
-from gpebo_cli.regression import ExtensionState, LinearRegression
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.evidence.excitation import persistent
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.linear import ExtensionState, LinearRegression
 
 
 @dataclass(frozen=True)

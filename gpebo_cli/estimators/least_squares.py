@@ -12,10 +12,10 @@ from gpebo_cli.estimators._base import axis, combinations, number, per_parameter
 from gpebo_cli.estimators._following import SolvedEstimates
 from gpebo_cli.estimators._information import Spectrum, information
 from gpebo_cli.estimators._recursive import InformationRoot, SampledEstimates, spectrum
-from gpebo_cli.moving import Dynamics, filtered
-from gpebo_cli.regression import ExtensionState, LinearRegression, SampledRegression
-from gpebo_cli.result import Requirement
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.linear import ExtensionState, LinearRegression, SampledRegression
 
 
 @dataclass(frozen=True)

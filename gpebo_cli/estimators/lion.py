@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from gpebo_cli.estimators._base import combinations
 from gpebo_cli.estimators._extension import lion
 from gpebo_cli.estimators._mixed import MixedEstimates, estimate_mixed, gain_axis
-from gpebo_cli.regression import ExtensionState, LinearRegression
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.linear import ExtensionState, LinearRegression
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import SampledEstimates, ScalarLaw, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares
-from gpebo_cli.regression import ExtensionState, LinearRegression, SampledRegression
-from gpebo_cli.result import Requirement
-from gpebo_cli.systems.descriptor import Array, BoolArray
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.regression.linear import ExtensionState, LinearRegression, SampledRegression
 
 
 @dataclass(frozen=True)

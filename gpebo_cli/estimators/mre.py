@@ -11,15 +11,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.estimators._base import combinations, number, per_parameter
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import gain_axis, gain_matrix, reached
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
-from gpebo_cli.excitation import persistent
-from gpebo_cli.moving import Dynamics, filtered
-from gpebo_cli.regression import ExtensionState, LinearRegression
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.evidence.excitation import persistent
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.linear import ExtensionState, LinearRegression
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-/* gpebo_cli/collocation/linear.py: element systems, chaining, error estimates. */
+/* gpebo_cli/numerics/collocation.py: element systems, chaining, error estimates. */
 #include "elements.h"
 
 #include <float.h>

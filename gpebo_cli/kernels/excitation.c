@@ -1,4 +1,4 @@
-/* gpebo_cli/excitation.py, regression.py: spectra of small symmetric matrices, windows, the first
+/* gpebo_cli/evidence/excitation.py, regression.py: spectra of small symmetric matrices, windows, the first
    time of excitation. */
 #include "stack.h"
 

@@ -1,4 +1,4 @@
-/* Known functions of time: gpebo_cli/expressions, their Taylor coefficients; simulation/simulate.py
+/* Known functions of time: gpebo_cli/model/expressions, their Taylor coefficients; simulation/simulate.py
    and Mesh.joined, the mesh that they ask for. */
 #include "common.h"
 

@@ -1,4 +1,4 @@
-/* gpebo_cli/linalg.py: small matrices, and recurrences over time. */
+/* gpebo_cli/numerics/linalg.py: small matrices, and recurrences over time. */
 #include "common.h"
 
 int solve_in_place(double *A, double *B, npy_intp n, npy_intp columns)

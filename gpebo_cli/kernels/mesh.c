@@ -1,4 +1,4 @@
-/* gpebo_cli/collocation/mesh.py: signals on a mesh, whether it resolves them, sampling, filters. */
+/* gpebo_cli/numerics/mesh.py: signals on a mesh, whether it resolves them, sampling, filters. */
 #include "elements.h"
 
 #include <float.h>

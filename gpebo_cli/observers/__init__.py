@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.measurement import NoiseLevels
+from gpebo_cli.experiment.noise import NoiseLevels
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import canonical, current, gpebo, injection, kalman_bucy, resets
 from gpebo_cli.observers.kalman_bucy import SignalNoise
 from gpebo_cli.observers.observation import Observation, StateMap
 from gpebo_cli.settings import NoiseSettings, ObserverSettings, SolverSettings
-from gpebo_cli.systems.descriptor import DescriptorSystem
 
 __all__ = ["Observation", "SignalNoise", "StateMap", "check_remedy", "observe", "signal_noise"]
 

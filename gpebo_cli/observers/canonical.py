@@ -25,10 +25,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError, ModelError
-from gpebo_cli.expressions import parse, taylor
+from gpebo_cli.findings import Assumption
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.expressions import parse, taylor
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.extension import initial_extension, output_scale
 from gpebo_cli.observers.observation import (
     InitialError,
@@ -36,12 +38,10 @@ from gpebo_cli.observers.observation import (
     Reconstruction,
     log_norm,
 )
-from gpebo_cli.reading import nearest
-from gpebo_cli.regression import LinearRegression, outer_products
-from gpebo_cli.result import Assumption
+from gpebo_cli.regression.linear import LinearRegression, outer_products
+from gpebo_cli.schema import nearest
 from gpebo_cli.settings import ObserverSettings, SolverSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 _ZERO = 1e-12  # entries below this share of their matrix are zero
 _FINER = 4  # the observer for z_b runs on elements this many times shorter: ẑ_a may be steep

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.moving import Dynamics
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers.gpebo import (
     Assembled,
     ReducedSystem,
@@ -29,9 +29,9 @@ from gpebo_cli.observers.gpebo import (
 )
 from gpebo_cli.observers.gpebo import reduce as reduced_system
 from gpebo_cli.observers.observation import AffineStateMap, Observation
-from gpebo_cli.regression import LinearRegression
+from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import ObserverSettings, SolverSettings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,10 @@ from math import isfinite
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.measurement import per_signal
-from gpebo_cli.reading import nearest
+from gpebo_cli.experiment.noise import per_signal
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.schema import nearest
 from gpebo_cli.settings import ObserverSettings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 
 def initial_extension(

@@ -35,10 +35,12 @@ from typing import NamedTuple
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, LinearSolution, solve
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
-from gpebo_cli.linalg import joined, orthonormal_complement, transpose
+from gpebo_cli.findings import Assumption
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, LinearSolution, solve
+from gpebo_cli.numerics.linalg import joined, orthonormal_complement, transpose
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.extension import initial_extension, output_scale
 from gpebo_cli.observers.observation import (
     AffineStateMap,
@@ -47,11 +49,9 @@ from gpebo_cli.observers.observation import (
     largest_entry,
     log_norm,
 )
-from gpebo_cli.regression import SMALL_SPECTRUM, LinearRegression, outer_products
-from gpebo_cli.result import Assumption
+from gpebo_cli.regression.linear import SMALL_SPECTRUM, LinearRegression, outer_products
 from gpebo_cli.settings import ObserverSettings, SolverSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem, IntArray
 
 _TURNED = 8 * float(np.finfo(float).eps)  # of E outside the frame, relative: rounding
 _PROJECTOR_TURNED = 1e-13

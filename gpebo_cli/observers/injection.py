@@ -31,16 +31,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.expressions import parse, taylor
-from gpebo_cli.linalg import transpose
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.expressions import parse, taylor
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.gpebo import Injection, ObserverMatrices, ReducedSystem, observe_reduced
 from gpebo_cli.observers.gpebo import reduce as reduced_system
 from gpebo_cli.observers.observation import Observation
 from gpebo_cli.settings import ObserverSettings, SolverSettings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 _TOLERANCE = 1e-6  # of S
 _PER_HORIZON = 4.0  # rate of the injection where A_0 is stable

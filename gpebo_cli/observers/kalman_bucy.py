@@ -28,18 +28,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Trajectory
-from gpebo_cli.linalg import transpose
-from gpebo_cli.measurement import per_signal
+from gpebo_cli.experiment.noise import per_signal
+from gpebo_cli.findings import Assumption, Requirement
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import gpebo
 from gpebo_cli.observers.extension import initial_extension
 from gpebo_cli.observers.observability import WindowGramians, window_gramians
 from gpebo_cli.observers.observation import AffineStateMap, Observation, Reconstruction
 from gpebo_cli.observers.riccati import Filtered, StateSpace, run_filter
-from gpebo_cli.regression import LinearRegression
-from gpebo_cli.result import Assumption, Requirement
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import ObserverSettings, SolverSettings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 _LEVEL = 1e-8  # of M's largest eigenvalue over all windows, in units of P(0)⁻¹: below, no evidence
 _INITIAL_VARIANCE = 10.0  # of what observer.P0 leaves out

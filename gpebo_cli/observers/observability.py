@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
-from gpebo_cli.linalg import transpose
-from gpebo_cli.systems.descriptor import Array
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 
 _WINDOWS = 10  # to a horizon
 

@@ -21,9 +21,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.extension import initial_extension
 from gpebo_cli.observers.gpebo import (
     Assembled,
@@ -41,9 +42,14 @@ from gpebo_cli.observers.observation import (
     error_of_extension,
     log_norm,
 )
-from gpebo_cli.regression import ExtensionState, LinearRegression, Reset, largest, outer_products
+from gpebo_cli.regression.linear import (
+    ExtensionState,
+    LinearRegression,
+    Reset,
+    largest,
+    outer_products,
+)
 from gpebo_cli.settings import ObserverSettings, SolverSettings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 _GROWTH = 100.0  # of Φ between resets: two digits
 _TOLERANCE = 1e-6  # of Φ, where only its size matters

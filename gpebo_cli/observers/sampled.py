@@ -16,10 +16,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import Coefficients, LinearProblem, solve
-from gpebo_cli.collocation.mesh import Mesh
-from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.extension import initial_extension
 from gpebo_cli.observers.gpebo import (
     ObserverMatrices,
@@ -29,9 +30,8 @@ from gpebo_cli.observers.gpebo import (
     split_in_frame,
 )
 from gpebo_cli.recordings.hold import edges, held
-from gpebo_cli.regression import SampledRegression
+from gpebo_cli.regression.linear import SampledRegression
 from gpebo_cli.settings import ObserverSettings, SolverSettings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 _STAGES = 4  # per sample, order 7: beyond what any hold is good for
 _PROBED = np.linspace(0.0, 1.0, 17)  # seconds: what turns, does so by more than rounding in them

@@ -12,14 +12,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import (
+from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource
+from gpebo_cli.numerics.mesh import (
     Mesh,
     Trajectory,
     legendre_tail,
     signal_scale,
 )
-from gpebo_cli.collocation.radau import RadauRule, radau_rule
-from gpebo_cli.systems.descriptor import Array, BoolArray, CoefficientSource
+from gpebo_cli.numerics.radau import RadauRule, radau_rule
 
 # (times (N,), where it is decided which samples they are between (N,)) -> values (N, c)
 Held = Callable[[Array, Array], Array]

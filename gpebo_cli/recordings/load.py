@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
-from gpebo_cli.collocation.radau import radau_rule
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.recordings.hold import held, on_mesh, recording_mesh
 from gpebo_cli.recordings.table import Samples, Table, read_table
 from gpebo_cli.settings import DataSettings, TimeSettings
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
 
 _ROUNDING = 1e-12  # of the largest time: by how much a span may miss the samples
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.reading import nearest, shown
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.schema import nearest, shown
 
 TIME = "t"
 _SEPARATORS = {";": "semicolons", "\t": "tabs"}

@@ -12,16 +12,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from gpebo_cli.collocation.linear import (
+from gpebo_cli.errors import SolverError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.collocation import (
     LinearProblem,
     LinearSolution,
     at_points,
     unresolved_signals,
 )
-from gpebo_cli.collocation.mesh import Mesh, Trajectory
-from gpebo_cli.errors import SolverError
-from gpebo_cli.simulation.derivative_array import Structure, derivative_array, forcing, scaled
-from gpebo_cli.systems.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.reduction.derivative_array import Structure, derivative_array, forcing, scaled
 
 _MAX_ROUNDS = 12
 
@@ -58,7 +58,7 @@ def solve(
     max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None,
 ) -> LinearSolution:
-    """Same meaning as :func:`gpebo_cli.collocation.linear.solve`, for E = I (n, n) only.
+    """Same meaning as :func:`gpebo_cli.numerics.collocation.solve`, for E = I (n, n) only.
 
     Raises:
         SolverError: solve_ivp gave up, or the mesh cannot resolve the result.

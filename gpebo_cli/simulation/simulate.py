@@ -10,7 +10,10 @@ from math import isfinite
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.collocation.linear import (
+from gpebo_cli.errors import ModelError
+from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.model.descriptor import Coefficients as ModelCoefficients
+from gpebo_cli.numerics.collocation import (
     Coefficients,
     Constraints,
     LinearProblem,
@@ -18,15 +21,12 @@ from gpebo_cli.collocation.linear import (
     solve,
     wanted_parts,
 )
-from gpebo_cli.collocation.mesh import Mesh, Trajectory, initial_mesh, unresolved
-from gpebo_cli.collocation.radau import RadauRule, radau_rule
-from gpebo_cli.errors import ModelError
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved
+from gpebo_cli.numerics.radau import RadauRule, radau_rule
+from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
+from gpebo_cli.reduction.derivative_array import StrangenessFree, Structure, analyse, reduce
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.simulation.consistency import Jump, consistent_state, jump
-from gpebo_cli.simulation.derivative_array import StrangenessFree, Structure, analyse, reduce
-from gpebo_cli.systems.descriptor import MATRIX_NAMES, Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.systems.descriptor import Coefficients as ModelCoefficients
 
 _FIRST_ELEMENTS = 24  # of the first mesh: enough nodes to notice a pulse, few enough to be free
 _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made

@@ -1,0 +1,141 @@
+"""Entry point: dispatch on the first word, errors as one line, exit codes.
+
+Dispatch is by hand because Hydra owns the rest of the command line and declines to share it with
+argparse or click; and because ``gpebo --help`` should cost no more than starting Python. So this
+module imports nothing that the interpreter has not loaded already.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from gpebo_cli.errors import ConfigError, GpeboError
+
+COMMANDS = {
+    "run": "run",
+    "check": "check",
+    "compare": "compare",
+    "figures": "figures",
+    "list": "listing",
+    "new": "new",
+    "completion": "completion",
+}
+"""Commands, and the modules of ``gpebo_cli.cli`` whose ``main`` they are."""
+
+_AT_ONCE = ("list", "new", "completion")  # over before anybody can press Ctrl-C
+
+
+def main() -> int:
+    """Run the command line in ``sys.argv``; the exit code: 0, 1, 2 or 130."""
+    traceback_wanted = os.environ.get("HYDRA_FULL_ERROR") == "1"  # before a command sets it
+    sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    try:
+        code = _dispatch(sys.argv[1:])
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader, `head` for instance, has seen enough
+        _drop_stdout()
+        return 0
+    except KeyboardInterrupt:
+        _report("interrupted", 130)
+        return _leave(130)
+    except Exception as error:  # noqa: BLE001  whatever it is, its user sees one line
+        return _failed(error, traceback_wanted=traceback_wanted)
+    return code
+
+
+def _failed(error: Exception, *, traceback_wanted: bool) -> int:
+    """Report an error as its user should see it; the exit code."""
+    if _was_interrupted(error):
+        _report("interrupted", 130)
+        return _leave(130)
+    if traceback_wanted:
+        _print_traceback()
+    if isinstance(error, GpeboError):
+        return _report(str(error), error.exit_code)
+    if isinstance(error, OSError):
+        _drop_stdout()  # a full disk behind it would be reported again when Python exits
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return _report(f"{where}{error.strerror or error}", 1)
+    what = f"internal error: {type(error).__name__}: {error}"
+    return _report(f"{what} (set HYDRA_FULL_ERROR=1 for the traceback)", 1)
+
+
+def _was_interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error; libraries wrap it into errors of their own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _dispatch(words: list[str]) -> int:
+    command, rest = (words[0], words[1:]) if words else ("--help", [])
+    if command in ("--help", "-h", "help"):
+        from gpebo_cli.cli.usage import HELP
+
+        sys.stdout.write(HELP)
+        return 0
+    if command in ("--version", "-V", "version"):
+        from gpebo_cli._version import __version__
+
+        sys.stdout.write(f"gpebo {__version__}\n")
+        return 0
+    if command == "run" and not {"--help", "-h"}.isdisjoint(rest):
+        from gpebo_cli.cli.usage import run_help
+
+        sys.stdout.write(run_help())
+        return 0
+    if command in COMMANDS:
+        from importlib import import_module
+
+        if command in _AT_ONCE:
+            return int(import_module(f"gpebo_cli.cli.{COMMANDS[command]}").main(rest))
+        from gpebo_cli.cli import interrupts
+
+        with interrupts.remembered():
+            return int(import_module(f"gpebo_cli.cli.{COMMANDS[command]}").main(rest))
+    if command == "__complete":  # asked by the scripts that `gpebo completion` prints
+        from gpebo_cli.cli import completion
+
+        return completion.answer(rest, list(COMMANDS))
+    raise ConfigError(_unknown(command))
+
+
+def _unknown(command: str) -> str:
+    from gpebo_cli.schema import nearest, shown
+
+    text = f"unknown command {shown(command)}; known: {', '.join(COMMANDS)}"
+    if "=" in command:
+        return f"{text}; did you mean `gpebo run {command}`?"
+    return text + (nearest(command, COMMANDS) or "; see gpebo --help")
+
+
+def _report(message: str, code: int) -> int:
+    line = " ".join(message.split())  # one line, whatever a library put into it
+    sys.stderr.write(f"gpebo: error: {line}\n")
+    return code
+
+
+def _leave(code: int) -> int:
+    """End the process with ``code`` now.
+
+    If SIGINT arrived inside an ``exec``, as dataclasses use it, CPython remembers that and ends the
+    process by the signal whatever is returned here.
+    """
+    import atexit
+
+    atexit._run_exitfuncs()  # noqa: SLF001  there is no public way to run them early
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def _drop_stdout() -> None:
+    """Send what is still buffered nowhere, so that the interpreter's exit does not try again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _print_traceback() -> None:
+    import traceback
+
+    traceback.print_exc()

@@ -1,0 +1,273 @@
+"""The words after ``gpebo run``, sorted before Hydra sees them.
+
+Hydra's own parser answers a wrong flag with several lines, and refuses overrides on both sides
+of a flag (``plant=circuit -m gain=1,2``). Here flags are checked, and handed on after all
+overrides.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from gpebo_cli.cli.locations import GROUPS, choices, conf_folder
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.schema import nearest, shown
+
+_SWITCHES = {
+    "--dry-run": "--dry-run",
+    "--hydra-help": "--hydra-help",
+    "-m": "--multirun",
+    "-r": "--run",
+    "--version": "--version",
+    "--resolve": "--resolve",
+    "-sc": "--shell-completion",
+}
+_WITH_VALUE = {
+    "-c": "--cfg",
+    "-p": "--package",
+    "-cd": "--config-dir",
+    "-cn": "--config-name",
+    "-i": "--info",
+}
+_LONG = {long: long for long in (*_SWITCHES.values(), *_WITH_VALUE.values())}
+OPTIONS = tuple(_LONG)
+"""Long names of all options of ``gpebo run``."""
+
+VALUES = {
+    "--cfg": ("job", "hydra", "all"),
+    "--info": ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
+}
+"""What an option that has few values accepts."""
+
+# Hydra takes name(…) for one of its own functions, unless it is quoted.
+_LOGSPACE = re.compile(r"^([^=]+)=(logspace\([^()'\"]*\))$")
+# What Hydra's grammar reads as a number, a truth value or nothing.
+_NOT_TEXT = re.compile(
+    r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false|null", re.IGNORECASE
+)
+
+_SWEEPER = "gpebo"
+_SWEEP_WORDS = ("resume", "fail_fast")  # of a sweep, not of the configuration
+_KEYS = (*GROUPS, "launcher", "time", "excitation", "figures", "output", *_SWEEP_WORDS)
+
+PRIMARY = "gpebo"
+"""The primary configuration, conf/gpebo.yaml; another name than a run's own config.yaml."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What ``gpebo run`` was asked to do."""
+
+    overrides: tuple[str, ...] = ()
+    switches: frozenset[str] = frozenset()  # long names
+    config_dir: str | None = None  # absolute
+    config_name: str = PRIMARY
+    options: tuple[str, ...] = ()  # of Hydra, as it reads them
+    resume: str | None = None  # absolute folder of a sweep to go on with
+    fail_fast: str = ""  # as given; empty: not given
+    dry_run: bool = False
+
+    @property
+    def of_a_sweep(self) -> str:
+        """A word that only a sweep understands, or nothing."""
+        if self.dry_run:
+            return "--dry-run"
+        if self.resume is not None:
+            return "resume"
+        return "fail_fast" if self.fail_fast else ""
+
+    @property
+    def for_hydra(self) -> list[str]:
+        """The words for Hydra's parser: overrides first, then every flag."""
+        folder = [] if self.config_dir is None else ["--config-dir", self.config_dir]
+        name = [] if self.config_name == PRIMARY else ["--config-name", self.config_name]
+        words = [*self.overrides, *self._sweeper, *sorted(self.switches), *self.options]
+        return [*words, *folder, *name]
+
+    @property
+    def _sweeper(self) -> list[str]:
+        # Chosen here rather than in conf/gpebo.yaml: other primary configurations sweep, too.
+        words = [f"hydra/sweeper={_SWEEPER}"]
+        if self.resume is not None:
+            words.append(f"hydra.sweeper.resume={quoted(self.resume)}")
+        if self.fail_fast:
+            words.append(f"hydra.sweeper.fail_fast={self.fail_fast}")
+        if self.dry_run:
+            words.append("hydra.sweeper.dry_run=true")
+        return words
+
+    def with_override(self, override: str) -> Arguments:
+        """The same with one more override, which wins."""
+        return replace(self, overrides=(*self.overrides, override))
+
+    @property
+    def folders(self) -> list[str]:
+        """Where configuration is looked for, in this order."""
+        return [conf_folder(), *([] if self.config_dir is None else [self.config_dir])]
+
+
+def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> Arguments:
+    """Sort the words of the command line.
+
+    Args:
+        words: after the command.
+        command: its name, for messages.
+        more: options that the command has besides those of ``gpebo run``, for messages.
+
+    Raises:
+        ConfigError: an unknown flag, a flag without its value, a folder or a primary
+            configuration that does not exist.
+    """
+    overrides: list[str] = []
+    switches: set[str] = set()
+    values: dict[str, str] = {}
+    sweep: dict[str, str] = {}
+    rest = iter(words)
+    for word in rest:
+        if not word.startswith("-"):
+            key, _, text = word.partition("=")
+            if key in _SWEEP_WORDS:
+                sweep[key] = text
+            else:
+                overrides.append(word)
+            continue
+        given, equals, value = word.partition("=")
+        flag = _SWITCHES.get(given) or _WITH_VALUE.get(given) or _LONG.get(given)
+        if flag is None:
+            key = given.lstrip("-")
+            if key.partition(".")[0] in _KEYS:
+                raise ConfigError(
+                    f"unknown option {shown(given)}; {key} is written without dashes, as in "
+                    f"{key}={value or 'VALUE'}"
+                )
+            raise ConfigError(
+                f"unknown option {shown(given)}; see gpebo {command} --help"
+                + nearest(given, [*_LONG, *more])
+            )
+        if flag in _SWITCHES.values():
+            if equals:
+                raise ConfigError(f"{flag} takes no value, got {shown(value)}")
+            switches.add(flag)
+            continue
+        if not equals:
+            value = next(rest, "")
+        values[flag] = _checked(flag, value)
+    config_dir = _config_dir(values.pop("--config-dir", None))
+    config_name = _config_name(values.pop("--config-name", None), config_dir)
+    overrides = _with_data(overrides, config_name)
+    options = tuple(item for pair in values.items() for item in pair)
+    dry_run = "--dry-run" in switches
+    switches.discard("--dry-run")
+    multirun = "--multirun" in switches
+    return Arguments(
+        tuple(_override(word, multirun=multirun) for word in overrides),
+        frozenset(switches),
+        config_dir,
+        config_name,
+        options,
+        _resume(sweep.get("resume")),
+        _fail_fast(sweep.get("fail_fast")),
+        dry_run,
+    )
+
+
+def _with_data(overrides: list[str], config_name: str) -> list[str]:
+    """``data.file=FILE`` says that there is a recording: no need to write ``data=csv``, too."""
+    given = any(word.startswith("data.file=") and word != "data.file=null" for word in overrides)
+    chosen = any(word.startswith("data=") for word in overrides)
+    missing = given and not chosen and config_name == PRIMARY
+    return ["data=csv", *overrides] if missing else overrides
+
+
+def quoted(text: str) -> str:
+    """``text`` as a quoted value that Hydra's grammar reads back as it is."""
+    # Backslashes count only before a quote and at the end.
+    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), text)
+    return f"'{escaped}'"
+
+
+def logspace(text: str, where: str) -> str | None:
+    """``logspace(a,b,n)`` as the values of a sweep, ``1e6,1e7,…``; None for any other text.
+
+    Raises:
+        ConfigError: a, b or n is not what the axis of a run would accept.
+    """
+    if not _LOGSPACE.match(f"{where}={text}"):
+        return None
+    from gpebo_cli.estimators._base import axis  # the same numbers as in one run, to the last bit
+
+    return ",".join(f"{value:g}" if float(f"{value:g}") == value else repr(value)
+                    for value in axis(text, where))
+
+
+def _override(word: str, *, multirun: bool) -> str:
+    """One override as Hydra takes it: ``logspace`` is a sweep with -m, else an axis of one run."""
+    match = _LOGSPACE.match(word)
+    if match is None:
+        key, equals, value = word.partition("=")
+        if key.lstrip("+") == "hydra/sweeper" and equals:
+            raise ConfigError(f"{word}: gpebo has a sweeper of its own; leave this away")
+        if key.lstrip("+") in GROUPS and equals and (multirun or "," not in value):
+            return f"{key}={_names(value)}"
+        return word
+    if multirun:
+        return f"{match[1]}={logspace(match[2], match[1])}"
+    return f"{match[1]}='{match[2]}'"
+
+
+def _names(chosen: str) -> str:
+    """Names of files that Hydra would read as numbers or truth (``plant=2024``), quoted."""
+    return ",".join(quoted(n) if _NOT_TEXT.fullmatch(n) else n for n in chosen.split(","))
+
+
+def _resume(given: str | None) -> str | None:
+    if given is None:
+        return None
+    folder = os.path.abspath(os.path.expanduser(given))
+    if not given or not os.path.isdir(folder):
+        what = given or "(nothing)"
+        raise ConfigError(f"resume={what}: there is no such folder; give that of a sweep")
+    return folder
+
+
+def _fail_fast(given: str | None) -> str:
+    if given is None:
+        return ""
+    if given.lower() not in ("true", "false"):
+        raise ConfigError(f"fail_fast: expected true or false, got {shown(given)}")
+    return given.lower()
+
+
+def _checked(flag: str, value: str) -> str:
+    accepted = VALUES.get(flag)
+    if accepted is not None and value not in accepted:
+        got = f", got {shown(value)}" if value else ""
+        raise ConfigError(f"{flag} needs one of {', '.join(accepted)}{got}")
+    if not value or value.startswith("-"):
+        raise ConfigError(f"{flag} needs a value; see gpebo run --help")
+    return value
+
+
+def _config_dir(given: str | None) -> str | None:
+    if given is None:
+        return None
+    folder = os.path.abspath(os.path.expanduser(given))
+    if not os.path.isdir(folder):
+        raise ConfigError(f"--config-dir {given}: there is no such folder")
+    return folder
+
+
+def _config_name(given: str | None, config_dir: str | None) -> str:
+    name = PRIMARY if given is None else given.removesuffix(".yaml")
+    folders = [conf_folder(), *([] if config_dir is None else [config_dir])]
+    if any(os.path.isfile(os.path.join(folder, f"{name}.yaml")) for folder in folders):
+        return name
+    known = [found for folder in folders for found in choices(folder, "")]
+    where = "" if config_dir is None else f" in {config_dir}"
+    raise ConfigError(
+        f"--config-name {name}: there is no {name}.yaml{where}; known: {', '.join(known)}"
+        + nearest(name, known)
+    )

@@ -1,0 +1,302 @@
+"""``gpebo completion SHELL``: the script a shell loads, and the candidates it asks for.
+
+The scripts are short: they hand over the words before the cursor (``gpebo __complete``) and get
+back one candidate a line. So all shells offer the same, files of a ``--config-dir`` included, and
+a new plant needs no new script. Files are read line by line: the answer takes as long as
+``gpebo list``.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Sequence
+
+from gpebo_cli.cli.arguments import OPTIONS, VALUES
+from gpebo_cli.cli.listing import KINDS, described
+from gpebo_cli.cli.locations import DATA_GROUPS, GROUPS, choices, conf_folder
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.results.names import FIGURE_NAMES, FORMATS, METRICS
+from gpebo_cli.schema import nearest, shown
+
+FOLDERS = ":folders"
+"""Answered instead of candidates where a folder is wanted: the shell knows them better."""
+
+_LAUNCHER = "launcher"
+_SWEEP_FOLDERS = ("resume", "hydra.run.dir", "hydra.sweep.dir")
+_FIXED = {
+    "fail_fast": ("true", "false"),
+    "observer.regression": ("projected", "paper"),
+    "observer.L_w": ("diagonal", "remark4"),
+    "figures": ("all", "none", "["),
+}
+_FOLDER_OPTIONS = ("--config-dir", "-cd", "--output", "--check", "--update")
+_WITH_KEYS = tuple(group for group in DATA_GROUPS if group != "plant")
+_NOT_KEYS = ("name", "title", "reference", "defaults", "hydra")
+
+# Bash cuts words at "=" (COMP_WORDBREAKS) and replaces the last piece only, so what stands before
+# that piece is taken off each candidate.
+_BASH = """\
+# bash completion for gpebo; in ~/.bashrc:  eval "$(gpebo completion bash)"
+_gpebo() {
+    local line="${COMP_LINE:0:COMP_POINT}" cur="${COMP_WORDS[COMP_CWORD]}" word before reply folder
+    word="${line##*[[:space:]]}"
+    [[ $cur == [=:] ]] && cur=""
+    before="${word%"$cur"}"
+    COMPREPLY=()
+    while IFS=$'\\t' read -r reply _; do
+        if [[ $reply == :folders* ]]; then
+            reply="${reply#:folders}"
+            compopt -o filenames 2>/dev/null
+            while IFS= read -r folder; do
+                folder="$reply$folder"
+                COMPREPLY+=("${folder#"$before"}")
+            done < <(compgen -d -- "${word#"$reply"}")
+            return
+        fi
+        case $reply in *=|*.|*\\[) compopt -o nospace 2>/dev/null ;; esac
+        COMPREPLY+=("${reply#"$before"}")
+    done < <("${COMP_WORDS[0]}" __complete --line "$line" 2>/dev/null)
+}
+complete -F _gpebo gpebo
+"""
+
+_ZSH = """\
+#compdef gpebo
+# zsh completion for gpebo; in ~/.zshrc, after compinit:  eval "$(gpebo completion zsh)"
+_gpebo() {
+    local -a plain open shown_plain shown_open
+    local reply text
+    while IFS=$'\\t' read -r reply text; do
+        if [[ $reply == :folders* ]]; then
+            compset -P "${(b)reply#:folders}"
+            _files -/
+            return
+        elif [[ $reply == *(=|.|\\[) ]]; then
+            open+=("$reply"); shown_open+=("$reply${text:+  -- $text}")
+        else
+            plain+=("$reply"); shown_plain+=("$reply${text:+  -- $text}")
+        fi
+    done < <("${words[1]}" __complete "${(@Q)words[2,CURRENT]}" 2>/dev/null)
+    (( $#plain )) && compadd -l -d shown_plain -a plain
+    (( $#open )) && compadd -S '' -l -d shown_open -a open
+}
+compdef _gpebo gpebo
+"""
+
+_FISH = """\
+# fish completion for gpebo; in ~/.config/fish/config.fish:  gpebo completion fish | source
+function __gpebo
+    set -l words (commandline -opc) (commandline -ct)
+    set -l replies ($words[1] __complete $words[2..-1] 2>/dev/null)
+    if string match -q ':folders*' -- "$replies[1]"
+        set -l before (string replace ':folders' '' -- $replies[1])
+        set -l typed (string replace -- "$before" '' (commandline -ct))
+        for folder in (__fish_complete_directories "$typed" '')
+            printf '%s%s\\n' "$before" $folder
+        end
+    else
+        printf '%s\\n' $replies
+    end
+end
+complete -c gpebo -f -a '(__gpebo)'
+"""
+
+SCRIPTS = {"bash": _BASH, "zsh": _ZSH, "fish": _FISH}
+
+
+def main(words: list[str]) -> int:
+    """Print the script of a shell; the exit code.
+
+    Raises:
+        ConfigError: not one shell, or an unknown one.
+    """
+    if not {"--help", "-h"}.isdisjoint(words):
+        from gpebo_cli.cli.usage import COMPLETION_HELP
+
+        sys.stdout.write(COMPLETION_HELP)
+        return 0
+    if len(words) != 1 or words[0] not in SCRIPTS:
+        given = shown(" ".join(words)) if words else "nothing"
+        raise ConfigError(
+            f"gpebo completion needs one of {', '.join(SCRIPTS)}; got {given}"
+            + nearest(" ".join(words), SCRIPTS)
+        )
+    sys.stdout.write(SCRIPTS[words[0]])
+    return 0
+
+
+def answer(words: list[str], commands: Sequence[str]) -> int:
+    """Print the candidates for the last of ``words`` (perhaps empty), one a line; 0."""
+    if words[:1] == ["--line"]:
+        words = _split(" ".join(words[1:]))
+    for candidate in candidates(words or [""], commands):
+        sys.stdout.write(f"{candidate}\n")
+    return 0
+
+
+def _split(line: str) -> list[str]:
+    """The words after ``gpebo`` in a line as typed so far; the last one is being typed."""
+    words = [word.strip("'\"") for word in line.split()]
+    if line[-1:].isspace():
+        words.append("")
+    named = [i for i, word in enumerate(words) if os.path.basename(word) == "gpebo"]
+    return words[(named[0] if named else 0) + 1 :]
+
+
+def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
+    """What the last word can become, each with a description behind a tab where there is one.
+
+    Args:
+        words: after ``gpebo``, the last one being typed.
+        commands: names of all commands.
+    """
+    *before, word = words
+    if not before:
+        return _starting(word, [*commands, "--help", "--version"])
+    command, *before = before
+    if command in ("run", "check"):
+        return _of_run(command, before, word)
+    if before and before[-1] in _FOLDER_OPTIONS:
+        return [FOLDERS]
+    if word.startswith("--") and word.partition("=")[0] in _FOLDER_OPTIONS and "=" in word:
+        return [f"{FOLDERS}{word.partition('=')[0]}="]
+    found: dict[str, list[str]] = {
+        "list": [*KINDS, "--config-dir", "--help"],
+        "figures": [
+            *choices(conf_folder(), "experiment"),
+            *("--output", "--check", "--update", "--help"), "figures.formats=",
+        ],
+        "compare": ["--sort", "--reverse", "--csv", "--output", "--no-figures", "--help"],
+        "new": ["--config-dir", "--help", *(["plant"] if not before else [])],
+        "completion": [*SCRIPTS, "--help"],
+    }
+    if word.startswith("figures.formats="):
+        return _listed("figures.formats=", word, FORMATS)
+    if command == "compare":
+        if before[-1:] == ["--sort"]:
+            return _starting(word, METRICS)
+        if not word.startswith("-"):
+            return [FOLDERS]
+    return _starting(word, found.get(command, []))
+
+
+def _of_run(command: str, before: Sequence[str], word: str) -> list[str]:
+    """Options, groups and keys, and the values of those that have a few."""
+    folders = [conf_folder(), *_config_dir(before)]
+    last = before[-1] if before else ""
+    if last in _FOLDER_OPTIONS:
+        return [FOLDERS]
+    if last in ("--config-name", "-cn"):
+        return _starting(word, [name for folder in folders for name in choices(folder, "")])
+    for short, long in (("-c", "--cfg"), ("-i", "--info")):
+        if last in (short, long):
+            return _starting(word, VALUES[long])
+    if word.startswith("-"):
+        if word.partition("=")[0] in _FOLDER_OPTIONS and "=" in word:
+            return [f"{FOLDERS}{word.partition('=')[0]}="]
+        more = ["--json"] if command == "check" else ["-m"]
+        return _starting(word, [*more, "--help", *OPTIONS])
+    key, equals, _ = word.partition("=")
+    if equals:
+        return _values(key, word, folders)
+    groups = [f"{group}=" for group in (*GROUPS, _LAUNCHER)]
+    return _starting(word, [*groups, *_keys(word, before, folders)])
+
+
+def _values(key: str, word: str, folders: Sequence[str]) -> list[str]:
+    if key in _SWEEP_FOLDERS:
+        return [f"{FOLDERS}{key}="]
+    if key == "figures" and "[" in word:
+        return _listed("figures=", word, FIGURE_NAMES)
+    if key in _FIXED:
+        return _starting(word, [f"{key}={value}" for value in _FIXED[key]])
+    if key not in (*GROUPS, _LAUNCHER):
+        return []
+    # Of a sweep, plant=a,b: what stands before the last comma stays.
+    head, comma, _ = word.rpartition(",")
+    stem = head + comma if comma else f"{key}="
+    taken = head.partition("=")[2].split(",")
+    titles: dict[str, str] = {}
+    for folder in folders:
+        for name in choices(folder, key):
+            if name not in taken:
+                path = os.path.join(folder, key, f"{name}.yaml")
+                titles.setdefault(f"{stem}{name}", described(path)[0])
+    return [
+        f"{text}\t{told}" if told else text
+        for text, told in titles.items()
+        if text.startswith(word)
+    ]
+
+
+def _keys(word: str, before: Sequence[str], folders: Sequence[str]) -> list[str]:
+    """Keys of the configuration: sections, and with a section typed, what is in it."""
+    primary = os.path.join(conf_folder(), "gpebo.yaml")
+    section, dot, _ = word.partition(".")
+    if not dot:
+        top = [key for key in _read_keys(primary) if key not in (*_NOT_KEYS, "figures")]
+        inside = [f"{name}." for name in (*_WITH_KEYS, *top)]
+        return ["figures=", "resume=", "fail_fast=", "hydra.run.dir=", "hydra.sweep.dir=", *inside]
+    if section == "hydra":
+        return ["hydra.run.dir=", "hydra.sweep.dir="]
+    if section in _WITH_KEYS:
+        chosen = [w.partition("=")[2] for w in before if w.startswith(f"{section}=")]
+        name = chosen[-1] if chosen else _default(primary, section)
+        paths = [os.path.join(folder, section, f"{name}.yaml") for folder in folders]
+        keys = [key for path in paths for key in _read_keys(path) if key not in _NOT_KEYS]
+    else:
+        keys = _read_keys(primary, section)
+    return [f"{section}.{key}=" for key in keys]
+
+
+def _default(primary: str, group: str) -> str:
+    """The file of ``group`` that the primary configuration chooses."""
+    return "".join(_read_keys(primary, "defaults", f"- {group}")[:1])
+
+
+def _read_keys(path: str, section: str = "", wanted: str = "") -> list[str]:
+    """Keys of a YAML file of ours, or of a section, in order; with ``wanted``, that key's value."""
+    try:
+        with open(path, encoding="utf-8", errors="replace") as stream:
+            lines = stream.read().splitlines()
+    except OSError:
+        return []
+    found = []
+    inside = not section
+    for line in lines:
+        text = line.strip()
+        key, colon, value = text.partition(":")
+        if not colon or text.startswith("#"):
+            continue
+        top = not line.startswith(" ")
+        if section and top:
+            inside = key == section
+        elif inside and top == (not section) and len(line) - len(line.lstrip()) <= 2:
+            if not wanted and key[0].isalpha():
+                found.append(key)
+            elif wanted and key == wanted:
+                found.append(value.partition("#")[0].strip())
+    return found
+
+
+def _config_dir(words: Sequence[str]) -> list[str]:
+    """The folder that ``--config-dir`` names among the words, if it does."""
+    for position, word in enumerate(words):
+        flag, equals, value = word.partition("=")
+        if flag in ("--config-dir", "-cd"):
+            folder = value if equals else "".join(words[position + 1 : position + 2])
+            return [os.path.expanduser(folder)] if folder else []
+    return []
+
+
+def _listed(stem: str, word: str, names: Iterable[str]) -> list[str]:
+    """``[a,b`` with one more name."""
+    head, separator, _ = word.rpartition("," if "," in word else "[")
+    given = head.partition("[")[2].split(",")
+    begun = f"{head}{separator}" if separator else f"{stem}["
+    return _starting(word, [f"{begun}{name}" for name in names if name not in given])
+
+
+def _starting(word: str, names: Iterable[str]) -> list[str]:
+    return [name for name in dict.fromkeys(names) if name.startswith(word)]

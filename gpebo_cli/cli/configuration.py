@@ -1,0 +1,281 @@
+"""From plain data to :class:`Settings`, and to the ``config.yaml`` of a run. Knows no Hydra."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import yaml
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.schema import convert, nearest, read, shown
+from gpebo_cli.settings import (
+    DataSettings,
+    ExcitationSettings,
+    NoiseSettings,
+    ObserverSettings,
+    OutputSettings,
+    Settings,
+    SolverSettings,
+    TimeSettings,
+)
+
+_KEYS = (
+    "plant",
+    "data",
+    "observer",
+    "estimator",
+    "solver",
+    "noise",
+    "time",
+    "excitation",
+    "figures",
+    "output",
+    "title",
+    "reference",
+)
+_DESCRIPTIVE = ("title", "reference")  # of files in the groups; for people
+_FOLDER = "estimator"  # an observer that estimates by itself: its name again, for its folders
+
+# Accepted ranges, ends included. What a type cannot say; beyond them nothing sensible happens.
+_RANGES = {
+    "time.samples": (2, 10_000_000),
+    "solver.tol": (1e-15, 0.1),
+    "solver.stages": (2, 16),
+    "solver.max_elements": (1, math.inf),
+    "solver.max_strangeness_index": (0, 20),
+    "solver.rank_tol": (1e-15, 0.1),
+    "output.max_rows": (2, math.inf),
+    "observer.regularisation": (1e-6, 1.0),
+    "noise.seed": (0, math.inf),
+    "observer.reset_keep": (0, 1),
+    "noise.seeds": (1, 1_000_000),
+}
+_OPEN = ("start", "horizon")  # of time: null where the data, or a default, decides
+_POSITIVE = (
+    "time.horizon", "observer.sample_time", "excitation.rho", "excitation.window",
+    "noise.sample_time", "observer.reset_interval",
+)
+
+
+def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
+    """The settings of one run.
+
+    Args:
+        config: plain data, as :func:`gpebo_cli.cli.composed.plain` returns it.
+        draw: whether ``figures: null`` means all figures or none.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type, or a value out of range.
+    """
+    for key in config:
+        if key not in _KEYS:
+            raise ConfigError(
+                f"{key}: no such key; the configuration has {', '.join(_KEYS)}"
+                + nearest(str(key), _KEYS)
+            )
+    data = read(DataSettings, _group(config, "data"), "data")
+    built = Settings(
+        plant=config["plant"],
+        data=data,
+        estimator=_group(config, "estimator"),
+        time=_time(config, recorded=data.name == "csv"),
+        solver=read(SolverSettings, _group(config, "solver"), "solver"),
+        observer=read(ObserverSettings, _observer(config), "observer"),
+        excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
+        output=_output(config, draw=draw),
+        noise=read(NoiseSettings, _group(config, "noise"), "noise"),
+    )
+    _check_ranges(built)
+    _check_no_noise(built.noise)
+    return built
+
+
+def _check_no_noise(noise: NoiseSettings) -> None:
+    """A recipe may set levels of a file that the command line then replaces by none."""
+    if noise.name == "none" and noise != NoiseSettings():
+        keys = [key for key, value in vars(noise).items() if value != getattr(NoiseSettings, key)]
+        raise ConfigError(
+            f"noise.{keys[0]}: noise=none has no noise; leave it out, or choose noise=gaussian"
+        )
+
+
+def _group(config: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """A section without what is for people only."""
+    section = config.get(name)
+    if section is None:
+        return {}
+    if not isinstance(section, Mapping):
+        raise ConfigError(f"{name}: expected a mapping of keys to values, got {shown(section)}")
+    return {str(k): v for k, v in section.items() if k not in _DESCRIPTIVE}
+
+
+def complete(config: Mapping[str, Any], built: Settings) -> dict[str, Any]:
+    """The configuration with the span of time that ``null`` stands for, where a default decides."""
+    decided = {key: getattr(built.time, key) for key in _OPEN}
+    span = {key: value for key, value in decided.items() if math.isfinite(value)}
+    return {**config, "time": {**config.get("time", {}), **span}}
+
+
+def _time(config: Mapping[str, Any], *, recorded: bool) -> TimeSettings:
+    """The span of the experiment; ``null`` is the default, or where a recording begins or ends."""
+    section = {key: value for key, value in _group(config, "time").items()
+               if value is not None or key not in _OPEN}
+    time = read(TimeSettings, section, "time")
+    if not recorded:
+        return time
+    return replace(
+        time,
+        start=time.start if "start" in section else -math.inf,
+        horizon=time.horizon if "horizon" in section else math.inf,
+    )
+
+
+def _observer(config: Mapping[str, Any]) -> dict[str, Any]:
+    section = _group(config, "observer")
+    if section.get(_FOLDER) == section.get("name"):
+        section.pop(_FOLDER, None)
+    return section
+
+
+def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:
+    section = _group(config, "output")
+    if "figures" in section:
+        raise ConfigError("output.figures: no such key; did you mean figures?")
+    words = {None: draw, "all": True, "none": False}
+    figures = config.get("figures")
+    if figures is None or isinstance(figures, str):
+        if figures not in words:
+            raise ConfigError(
+                f"figures: expected all, none or a list of names, got {shown(figures)}; did you "
+                f"mean figures=[{figures}]?"
+            )
+        figures = words[figures]
+    chosen = convert(figures, bool | list[str], "figures")
+    return read(OutputSettings, {**section, "figures": chosen}, "output")
+
+
+def _check_ranges(built: Settings) -> None:
+    for name, (low, high) in _RANGES.items():
+        value = _value(built, name)
+        if not low <= value <= high:
+            upto = f"to {high:g}" if math.isfinite(high) else "or more"
+            raise ConfigError(f"{name}: expected {low:g} {upto}, got {value:g}")
+    for name in _POSITIVE:
+        value = _value(built, name)
+        if value is not None and value <= 0:
+            raise ConfigError(f"{name}: expected a positive number, got {value:g}")
+
+
+def _value(built: Settings, name: str) -> Any:
+    group, _, key = name.partition(".")
+    return getattr(getattr(built, group), key)
+
+
+@dataclass(frozen=True)
+class RunPatterns:
+    """Where a run and a sweep are written, before ``${now:…}`` and names are filled in."""
+
+    run: str
+    sweep: str
+    subdir: str
+
+
+def patterns(primary: Mapping[str, Any]) -> RunPatterns:
+    """The patterns in the ``hydra`` section of a primary configuration."""
+    run, sweep = primary["hydra"]["run"], primary["hydra"]["sweep"]
+    return RunPatterns(str(run["dir"]), str(sweep["dir"]), str(sweep["subdir"]))
+
+
+REPEATS = "Repeats the run: gpebo run --config-dir <this folder> --config-name config"
+"""What the first line of a ``config.yaml`` says."""
+
+
+def config_text(config: Mapping[str, Any], patterns: RunPatterns, head: str = REPEATS) -> str:
+    """The ``config.yaml`` of a run: complete, and good to repeat it into a new folder."""
+    hydra = {
+        "output_subdir": None,
+        "job": {"chdir": False},
+        "run": {"dir": patterns.run},
+        "sweep": {"dir": patterns.sweep, "subdir": patterns.subdir},
+    }
+    defaults: list[Any] = [
+        "_self_",
+        {"override hydra/job_logging": "none"},
+        {"override hydra/hydra_logging": "none"},
+    ]
+    return f"# {head}\n" + yaml.dump(
+        {"defaults": defaults, **config, "hydra": hydra},
+        Dumper=_Dumper,
+        allow_unicode=True,
+        default_flow_style=None,  # rows of a matrix on one line each
+        sort_keys=False,
+        width=100,
+    )
+
+
+def load(path: str) -> dict[str, Any]:
+    """The mapping in a YAML file, read as Hydra's loader reads it.
+
+    Raises:
+        ConfigError: the file cannot be read, is not YAML, has a key twice, or is no mapping.
+    """
+    try:
+        with open(path, encoding="utf-8") as stream:
+            content = yaml.load(stream, Loader=_Loader)  # noqa: S506  a SafeLoader
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not text in UTF-8") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(yaml_problem(error)) from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected a mapping of keys to values, got {shown(content)}")
+    return content
+
+
+def yaml_problem(error: yaml.YAMLError) -> str:
+    """File, line and problem of an error of PyYAML's, in one sentence."""
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None) or str(error)
+    where = "" if mark is None else f"{mark.name}, line {mark.line + 1}: "
+    return f"{where}not valid YAML: {problem}"
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads 1e9 as a number and refuses a key that stands twice, as OmegaConf's loader does."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
+        """Refuse what YAML would silently overwrite."""
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value} stands twice", key.start_mark
+                )
+            seen.add(key.value if isinstance(key.value, str) else None)
+        return super().construct_mapping(node, deep=deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that OmegaConf would read as a number, and repeats what occurs twice."""
+
+    def ignore_aliases(self, data: object) -> bool:  # noqa: ARG002
+        """A matrix that stands in two places is written twice; there is nothing to follow."""
+        return True
+
+
+# As in omegaconf's loader; PyYAML alone takes 1e9, without a point, for text.
+_Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.[\d_]+)(e[-+]?\d+)?$|[-+]?\.?(inf|nan)$", re.IGNORECASE),
+    list("-+0123456789.inIN"),
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d[\d_]*\.?\d*|\.\d+)e[-+]?\d+$", re.IGNORECASE),
+    list("-+0123456789."),
+)

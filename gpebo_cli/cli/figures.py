@@ -1,0 +1,194 @@
+"""``gpebo figures``: run the recipes of the paper and write their figures, tables and a page."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpebo_cli.cli.locations import choices, conf_folder
+from gpebo_cli.cli.options import Options, parse, unknown
+from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.schema import nearest, shown
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from gpebo_cli.experiment.result import RunResult
+    from gpebo_cli.results.gallery import Recipe
+    from gpebo_cli.results.page import Section
+
+_OUTPUT = "outputs/paper"
+_FORMATS = "figures.formats"
+_FOLDERS = {"--output": "a folder", "--check": "a folder", "--update": "a folder"}
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    """What ``gpebo figures`` was asked to do."""
+
+    names: list[str]
+    formats: list[str]
+    folders: Mapping[str, str]  # --output, --check, --update
+
+
+def main(words: list[str]) -> int:
+    """Regenerate the figures; the exit code.
+
+    Raises:
+        ConfigError: an unknown recipe, option or format.
+        GpeboError: a run failed, a file cannot be written, or ``--check`` found a difference.
+    """
+    options = parse("figures", words, _FOLDERS)
+    if options.help:
+        from gpebo_cli.cli.usage import FIGURES_HELP
+
+        sys.stdout.write(FIGURES_HELP)
+        return 0
+    arguments = _arguments(options)
+
+    # Only now, when the words are known to be good: half a second of imports.
+    from gpebo_cli.results import gallery
+    from gpebo_cli.results.files import make_folder, write_text
+    from gpebo_cli.results.page import page
+    from gpebo_cli.results.provenance import provenance
+    from gpebo_cli.results.studies import STUDIES
+
+    folder = Path(arguments.folders.get("--output", _OUTPUT))
+    update, check = arguments.folders.get("--update"), arguments.folders.get("--check")
+    names = arguments.names or list(STUDIES)
+    if gallery.lacks_circuit(names):
+        sys.stderr.write("Fig. 1 is left out: it needs schemdraw, pip install 'gpebo[figures]'\n")
+    make_folder(folder)
+    sections: list[Section] = []
+    differences: list[str] = []
+    for recipe in run_recipes(names):
+        figures = gallery.figures_of(recipe)
+        section = gallery.write_recipe(folder / recipe.name, recipe, figures, arguments.formats)
+        sections.append(section)
+        sys.stdout.write(f"{recipe.name}: {len(section.pictures)} figures\n")
+        if update is not None:
+            gallery.write_references(Path(update), recipe.name, figures)
+        if check is not None:
+            differences += gallery.check_references(Path(check), recipe.name, figures)
+    write_text(folder / "index.html", page(sections, provenance()))
+    sys.stdout.write(f"{folder / 'index.html'}\n")
+    if differences:
+        sys.stdout.writelines(f"{line}\n" for line in differences)
+        sys.stdout.flush()  # before what follows on stderr
+        raise GpeboError(
+            f"{len(differences)} differences from the tables in {check}; first: {differences[0]}"
+        )
+    return 0
+
+
+def _arguments(options: Options) -> _Arguments:
+    names: list[str] = []
+    formats = ["png"]
+    for word in options.words:
+        key, equals, value = word.partition("=")
+        if key == _FORMATS:
+            formats = _formats(value)
+        elif equals and key != "experiment":
+            raise unknown("figures", key, (*_FOLDERS, _FORMATS, "--help"))
+        else:
+            names.append(_recipe(word))
+    check = options.values.get("--check")
+    if check is not None and not os.path.isdir(check):
+        raise ConfigError(f"--check {check}: there is no such folder")
+    return _Arguments(list(dict.fromkeys(names)), formats, options.values)
+
+
+def _recipe(word: str) -> str:
+    known = choices(conf_folder(), "experiment")
+    name = word.removeprefix("experiment=")
+    if name not in known:
+        raise ConfigError(
+            f"gpebo figures: there is no recipe {shown(name)}; known: {', '.join(known)}"
+            + nearest(name, known)
+        )
+    return name
+
+
+def _formats(text: str) -> list[str]:
+    """``[png,pdf]`` or ``pdf``; PNG is always among them, for the page shows it."""
+    from gpebo_cli.results.names import FORMATS
+
+    given = [part.strip() for part in text.strip("[] ").split(",")]
+    for name in given:
+        if name not in FORMATS:
+            raise ConfigError(
+                f"{_FORMATS}: expected some of {', '.join(FORMATS)}, as in "
+                f"{_FORMATS}=[png,pdf]; got {shown(name)}"
+            )
+    return [name for name in FORMATS if name == "png" or name in given]
+
+
+def run_recipes(names: list[str]) -> Iterator[Recipe]:
+    """Compose and run recipes, one at a time.
+
+    Raises:
+        ConfigError: a recipe is wrong.
+        GpeboError: one of its runs failed; it is named.
+    """
+    from hydra import initialize_config_dir
+    from omegaconf import OmegaConf
+
+    from gpebo_cli.cli.arguments import Arguments
+    from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS, explain
+    from gpebo_cli.results.gallery import Recipe
+
+    for name in names:
+        runs: dict[str, RunResult] = {}
+        try:
+            with initialize_config_dir(conf_folder(), version_base="1.3"):
+                jobs = list(_jobs(name))
+        except LIBRARY_ERRORS as error:
+            raise ConfigError(f"experiment {name}: {explain(error, Arguments())}") from error
+        for label, cfg in jobs:
+            try:
+                runs[label] = _run_job(cfg)
+            except GpeboError as error:
+                where = f"experiment {name}" + (f", {label}" if label else "")
+                raise type(error)(f"{where}: {error}") from error
+        words = {key: str(OmegaConf.select(cfg, key) or "") for key in ("title", "reference")}
+        yield Recipe(name, runs=runs, **words)
+
+
+def _jobs(name: str) -> Iterator[tuple[str, DictConfig]]:
+    """Configurations of a recipe: one, or those of its ``hydra.sweeper.params`` by their values."""
+    from hydra import compose
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.types import RunMode
+
+    overrides = [f"experiment={name}"]
+    first = compose("gpebo", overrides, return_hydra_config=True)
+    swept: Mapping[str, Any] = first.hydra.sweeper.get("params") or {}
+    if first.hydra.mode != RunMode.MULTIRUN or not swept:
+        yield "", compose("gpebo", overrides)
+        return
+    parser = OverridesParser.create()
+    values = []
+    for key, text in swept.items():
+        override = parser.parse_override(f"{key}={text}")
+        values.append(
+            list(override.sweep_string_iterator()) if override.is_sweep_override() else [str(text)]
+        )
+    for chosen in itertools.product(*values):
+        pairs = zip(swept, chosen, strict=True)
+        yield ", ".join(chosen), compose("gpebo", [*overrides, *(f"{k}={v}" for k, v in pairs)])
+
+
+def _run_job(cfg: DictConfig) -> RunResult:
+    from gpebo_cli.cli import composed, configuration
+    from gpebo_cli.cli.report import Progress
+    from gpebo_cli.experiment.pipeline import run_experiment
+    from gpebo_cli.model.plant import plant_from_mapping
+
+    settings = configuration.settings(composed.plain(cfg), draw=False)
+    with Progress() as progress:
+        return run_experiment(settings, plant_from_mapping(settings.plant), progress)

@@ -1,0 +1,152 @@
+"""What Hydra, OmegaConf and PyYAML raise, as one line with the nearest name."""
+
+from __future__ import annotations
+
+import os
+import re
+
+import yaml
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from gpebo_cli.cli.arguments import Arguments
+from gpebo_cli.cli.configuration import yaml_problem
+from gpebo_cli.cli.locations import GROUPS, choices
+from gpebo_cli.schema import nearest, shown
+
+LIBRARY_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError)
+"""What composing a configuration can raise because of what a user wrote."""
+
+_QUOTED = re.compile(r"^Could not (?:override|append to config)[^']*'([^']+)'")
+_SEVERAL = re.compile(r"^Ambiguous value for argument '([^']+)'")
+_TWICE = re.compile(r"^(?:Multiple values for )?([\w/]+)(?:\.| appears more than once)")
+_NO_NAME = re.compile(r"Interpolation key '(\w+)\.name' not found")  # asked for by hydra.run.dir
+_NO_MATCH = re.compile(r"^Could not override '([^']+)'\.\s+No match in the defaults list")
+_MISSING_IN = re.compile(r"^In '([^']+)'")
+_EXTRAS = {"joblib": "parallel", "ray": "ray", "submitit_slurm": "slurm", "submitit_local": "slurm"}
+_LONGEST = 400
+
+
+def explain(error: BaseException, arguments: Arguments) -> str:
+    """One sentence for an error of :data:`LIBRARY_ERRORS`: what was given, what is accepted."""
+    if isinstance(error, yaml.YAMLError):
+        return _one_line(yaml_problem(error))
+    if isinstance(error, MissingConfigException):
+        return _missing(error, arguments)
+    if isinstance(error, OverrideParseException):
+        return _unparsable(error, arguments)
+    text, cause = str(error), error.__cause__
+    if match := _SEVERAL.search(text):
+        return _several(match[1])
+    if (match := _TWICE.search(text)) and match[1] in GROUPS:
+        group = match[1]
+        return f"{group} is chosen twice; write {group}=NAME once, without +"
+    if match := _NO_NAME.search(text):
+        return f"{match[1]}.name is missing; choose a file with {match[1]}=NAME, or give the name"
+    if match := _NO_MATCH.search(text):
+        return _no_match(match[1])
+    if match := _QUOTED.search(text):
+        return _unknown_key(match[1], cause)
+    if isinstance(cause, OmegaConfBaseException):
+        text = f"{text}: {cause.msg or cause}" if text else str(cause.msg or cause)
+    return _one_line(text)
+
+
+def _missing(error: MissingConfigException, arguments: Arguments) -> str:
+    group, _, name = (error.missing_cfg_file or "").rpartition("/")
+    if not group:
+        return _one_line(str(error))
+    if group.partition("/")[0] in GROUPS and ("/" in group or name.endswith(".yaml")):
+        return _a_path((error.missing_cfg_file or "").partition("/"))
+    if group == "hydra/launcher" and name in _EXTRAS:
+        return f"{group}={name} is not installed; pip install 'gpebo[{_EXTRAS[name]}]'"
+    known = sorted({found for folder in arguments.folders for found in choices(folder, group)})
+    known = known or sorted(error.options or ())
+    match = _MISSING_IN.search(str(error))
+    chooser = match[1] if match else arguments.config_name
+    where = "" if chooser == arguments.config_name else f"{chooser}: "
+    text = f"{where}{group}={name}: there is no such {group}; known: {', '.join(known)}"
+    hint = nearest(name, known)
+    if arguments.config_dir is None and os.path.isfile(os.path.join(group, f"{name}.yaml")):
+        return f"{text}; yours, {group}/{name}.yaml, is found with --config-dir ."
+    if not hint and arguments.config_dir is None and group in GROUPS:
+        hint = f" (yours: --config-dir DIR with DIR/{group}/{name}.yaml)"
+    return text + hint
+
+
+def _a_path(parts: tuple[str, str, str]) -> str:
+    """Of a choice that is the path of a file instead of its name."""
+    group, _, path = parts
+    name = os.path.basename(path).removesuffix(".yaml")
+    folder = os.path.dirname(os.path.dirname(path)) or "."
+    return (
+        f"{group}={path}: give the name of a file in the folder {group} of a --config-dir, not its "
+        f"path; write --config-dir {folder} {group}={name}"
+    )
+
+
+def _unparsable(error: OverrideParseException, arguments: Arguments) -> str:
+    given = str(error.override)
+    if "=" not in given and not given.startswith("~"):
+        known = ", ".join(f"{group}=" for group in GROUPS)
+        named = [
+            f"{group}={given}"
+            for group in GROUPS
+            if any(given in choices(folder, group) for folder in (*arguments.folders, "."))
+        ]
+        hint = f"; did you mean {named[0]}?" if named else " (see gpebo run --help)"
+        return f"{shown(given)} is not key=value; groups are {known}{hint}"
+    reason = str(error.message).splitlines()[0] if error.message else "cannot be read"
+    return _one_line(
+        f"{shown(given)} cannot be read as key=value: {reason}; "
+        "quote values with special characters, as in 'plant.title=\"a, b\"'"
+    )
+
+
+def _several(override: str) -> str:
+    key, _, values = override.partition("=")
+    return (
+        f"{override}: several values; write '{key}=[{values}]' for a list (a case for each gain "
+        "in one run), or add -m for a run for each"
+    )
+
+
+def _no_match(key: str) -> str:
+    return (
+        f"{key}=…: this configuration has {key} written out and chooses no file for it; change "
+        f"its keys ({key}.KEY=VALUE), or leave --config-name away"
+    )
+
+
+def _unknown_key(key: str, cause: BaseException | None) -> str:
+    """Of a key that does not exist: its neighbours, which OmegaConf's error still knows."""
+    parent = getattr(cause, "parent_node", None)
+    if not isinstance(parent, DictConfig):
+        reason = getattr(cause, "msg", None) or "it cannot be set"
+        return _one_line(f"{key}: {reason}")
+    path = _path(parent)
+    known = [str(name) for name in parent if name != "hydra"]
+    if not path:
+        known += [group for group in GROUPS if group not in known]
+    missing = key.removeprefix(path).lstrip(".").partition(".")[0]
+    full = f"{path}.{missing}" if path else missing
+    inside = path or "the configuration"
+    deeper = [
+        f"{section}.{missing}"
+        for section in (known if not path else ())
+        if isinstance(child := parent.get(section), DictConfig)
+        and missing in child
+    ]
+    hint = f"; did you mean {deeper[0]}?" if deeper else nearest(missing, known)
+    return f"{full}: no such key; {inside} has {', '.join(known)}{hint}"
+
+
+def _path(node: DictConfig) -> str:
+    full = node._get_full_key(None)  # noqa: SLF001  no public way to ask where a node stands
+    return str(full or "")
+
+
+def _one_line(text: str) -> str:
+    line = "; ".join(part.strip() for part in text.splitlines() if part.strip(" \t^"))
+    return line if len(line) <= _LONGEST else line[: _LONGEST - 1] + "…"

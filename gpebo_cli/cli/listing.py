@@ -1,0 +1,106 @@
+"""``gpebo list``: what can be chosen, one line each, without a YAML parser or numbers."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from gpebo_cli.cli.locations import choices, conf_folder
+from gpebo_cli.cli.options import CONFIG_DIR, parse
+from gpebo_cli.errors import ConfigError
+
+KINDS = {
+    "plants": "plant",
+    "observers": "observer",
+    "estimators": "estimator",
+    "noise": "noise",
+    "experiments": "experiment",
+}
+
+_HEAD = 1 << 16  # characters of a file in which its title is looked for
+
+
+def main(words: list[str]) -> int:
+    """Print names, titles and references of the kinds asked for, by default of all."""
+    kinds, folders = _parse(words)
+    if not kinds:
+        from gpebo_cli.cli.usage import LIST_HELP
+
+        sys.stdout.write(LIST_HELP)
+        return 0
+    for position, kind in enumerate(kinds):
+        if len(kinds) > 1:
+            sys.stdout.write(f"{'' if position == 0 else chr(10)}{kind}\n")
+        sys.stdout.writelines(_lines(KINDS[kind], folders, indent="  " * (len(kinds) > 1)))
+    return 0
+
+
+def _parse(words: list[str]) -> tuple[list[str], list[str]]:
+    """Kinds (none if help is wanted) and the folders to look in."""
+    options = parse("list", words, CONFIG_DIR)
+    folders = [conf_folder()]
+    if options.config_dir is not None:
+        if not os.path.isdir(options.config_dir):
+            raise ConfigError(f"--config-dir {options.config_dir}: there is no such folder")
+        folders.append(options.config_dir)
+    if options.help:
+        return [], folders
+    kinds = [_kind(word) for word in options.words]
+    return list(dict.fromkeys(kinds)) or list(KINDS), folders
+
+
+def _kind(word: str) -> str:
+    for kind, group in KINDS.items():
+        if word in (kind, group):
+            return kind
+    from gpebo_cli.schema import nearest, shown
+
+    raise ConfigError(
+        f"gpebo list {shown(word)}: nothing of that kind; known: {', '.join(KINDS)}"
+        + nearest(word, KINDS)
+    )
+
+
+def _lines(group: str, folders: list[str], indent: str) -> list[str]:
+    entries: dict[str, str] = {}
+    for folder in folders:
+        for name in choices(folder, group):
+            # The first folder wins, as it does in Hydra's search path.
+            title, reference = described(os.path.join(folder, group, f"{name}.yaml"))
+            entries.setdefault(name, f"{title} [{reference}]" if reference else title)
+    width = max(map(len, entries), default=0)
+    return [f"{indent}{name:<{width}}  {text}".rstrip() + "\n" for name, text in entries.items()]
+
+
+def described(path: str) -> tuple[str, str]:
+    """Title and reference from the top level of a YAML file, empty where there is none.
+
+    Reads lines, not YAML: a parser takes longer to import than everything else here takes, and
+    a file that is hostile, or half-written, costs nothing.
+    """
+    found = {"title": "", "reference": ""}
+    try:
+        if not os.path.isfile(path):  # a pipe would block
+            return "", ""
+        with open(path, encoding="utf-8", errors="replace") as stream:
+            lines = stream.read(_HEAD).splitlines()
+    except OSError as error:
+        return f"(cannot be read: {error.strerror})", ""
+    for line in lines:
+        key, colon, value = line.partition(":")
+        if colon and key in found and not found[key]:
+            found[key] = _scalar(value)
+    return found["title"], found["reference"]
+
+
+def _scalar(text: str) -> str:
+    text = text.strip()
+    quote = text[:1]
+    if quote in ("'", '"') and text.find(quote, 1) > 0:
+        text = text[1 : text.find(quote, 1)]
+    else:
+        text = text.partition(" #")[0].rstrip()
+    if text in ("null", "~"):
+        return ""
+    # Titles come from other people's files: nothing that a terminal would obey.
+    return "".join(c if c.isprintable() else "?" for c in text)

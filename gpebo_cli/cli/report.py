@@ -1,0 +1,145 @@
+"""What a person sees of a run: progress on a terminal, a table, the last line."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from threading import Timer
+from time import monotonic
+from typing import TYPE_CHECKING, Self
+
+from gpebo_cli.cli import interrupts
+
+if TYPE_CHECKING:
+    from gpebo_cli.experiment.result import NoiseStatistics, RunResult
+
+_DELAY = 1.0  # seconds: what is quicker than this needs no progress
+_SHOWN_CASES = 12
+
+
+class Progress:
+    """Stages of a run on stderr, if that is a terminal and the run takes more than a second."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self._terminal = sys.stderr.isatty() and not quiet
+        self._stage = ""
+        self._start = monotonic()
+        self._timer = Timer(_DELAY, self._show)
+        self._timer.daemon = True
+
+    def __enter__(self) -> Self:
+        if self._terminal:
+            self._timer.start()  # says something even if the first stage takes for ever
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._timer.cancel()
+
+    def __call__(self, stage: str) -> None:
+        """A stage begins, unless Ctrl-C was pressed in the last one."""
+        interrupts.check()
+        self._stage = stage
+        if self._terminal and monotonic() - self._start > _DELAY:
+            self._show()
+
+    def _show(self) -> None:
+        sys.stderr.write(f"{monotonic() - self._start:6.1f} s  {self._stage}\n")
+        sys.stderr.flush()
+
+
+def case_rows(result: RunResult) -> list[dict[str, float]]:
+    """Gains and metrics of every case, named as in ``cases.csv``; none without an estimator."""
+    estimation, metrics = result.estimation, result.metrics
+    if estimation is None or metrics is None:
+        return []
+    columns = {name: [float(v) for v in values] for name, values in vars(metrics).items()}
+    return [
+        {**case, **{name: values[i] for name, values in columns.items()}}
+        for i, case in enumerate(estimation.cases)
+    ]
+
+
+_HEADINGS = {
+    "seconds_to_1pct_parameters": "parameters to 1 %",
+    "seconds_to_1pct_states": "states to 1 %",
+    "final_error_parameters": "final error, parameters",
+    "final_error_states": "final error, states",
+}
+# Times, and the errors that are not numbers where the truth is not known.
+_TIMES = {
+    "seconds_to_1pct_parameters": "final_error_parameters",
+    "seconds_to_1pct_states": "final_error_states",
+}
+
+
+def case_table(rows: Sequence[Mapping[str, float]], gains: Sequence[str]) -> list[str]:
+    """The lines of a table with one row per case; the middle of a long one is left out."""
+    head = [*gains, *_HEADINGS.values()]
+    count = len(rows)
+    chosen = list(range(count))
+    if count > _SHOWN_CASES:
+        half = _SHOWN_CASES // 2
+        chosen = [*range(half), *range(count - half, count)]
+    body = [
+        [*(f"{rows[i][g]:g}" for g in gains), *(_cell(n, rows[i]) for n in _HEADINGS)]
+        for i in chosen
+    ]
+    lines = columns([head, *body])
+    if count > _SHOWN_CASES:
+        lines.insert(1 + _SHOWN_CASES // 2, f"… {count - _SHOWN_CASES} more in cases.csv")
+    return lines
+
+
+def noise_table(noise: NoiseStatistics) -> list[str]:
+    """Errors over the seeds, one row per case and parameter; of many cases the first ones."""
+    cases = range(min(len(noise.bias), _SHOWN_CASES // max(1, len(noise.names)) or 1))
+    numbers = (noise.bias, noise.deviation, noise.rms)
+    body = [
+        [str(case), name, *(f"{values[case, i]:.2e}" for values in numbers)]
+        for case in cases
+        for i, name in enumerate(noise.names)
+    ]
+    head = ["case", f"over {noise.seeds} seeds", "bias", "deviation", "rms error"]
+    more = len(noise.bias) - len(cases)
+    return columns([head, *body]) + ([f"… {more} more cases in noise.csv"] if more else [])
+
+
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of text as lines with aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+        for row in rows
+    ]
+
+
+def _cell(name: str, row: Mapping[str, float]) -> str:
+    value = row[name]
+    if math.isnan(row[_TIMES.get(name, name)]):
+        return "unknown"
+    if name in _TIMES:
+        return f"{value:.3f} s" if math.isfinite(value) else "never"
+    return f"{value:.2e}"
+
+
+def run_lines(result: RunResult, folder: str = "") -> list[str]:
+    """The lines that tell of a run: table, what moved, ``folder`` if given, and the verdict."""
+    rows = case_rows(result)
+    lines: list[str] = []
+    if rows and result.estimation is not None:
+        lines += case_table(rows, list(result.estimation.cases[0]))
+    if result.noise is not None:
+        lines += noise_table(result.noise)
+    changes = result.simulation.moved if result.simulation else ()
+    moved = ", ".join(f"{m.state} {m.given:g} → {m.used:g}" for m in changes)
+    if moved:
+        lines.append(f"consistent initial state: {moved}")
+    return [*lines, *([folder] if folder else []), result.verdict]
+
+
+def print_run(result: RunResult, folder: str) -> None:
+    """Table, folder and verdict to stdout, the verdict last; warnings to stderr."""
+    sys.stdout.write("".join(f"{line}\n" for line in run_lines(result, folder)))
+    sys.stdout.flush()  # before what follows on stderr
+    sys.stderr.write("".join(f"gpebo: warning: {line}\n" for line in result.warnings))

@@ -1,0 +1,365 @@
+"""``gpebo run -m``: plan the jobs, hand them to a launcher, collect what they left on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from gpebo_cli.cli import interrupts
+from gpebo_cli.cli.arguments import Arguments, quoted
+from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS
+from gpebo_cli.cli.job import output_folder, run_job
+from gpebo_cli.cli.locations import GROUPS
+from gpebo_cli.cli.report import case_rows, columns
+from gpebo_cli.cli.sweep_folder import (
+    STOP,
+    TABLE,
+    JobRecord,
+    Plan,
+    clear,
+    read_plan,
+    read_records,
+    table,
+    write_record,
+    write_table,
+)
+from gpebo_cli.cli.sweep_progress import Bar
+from gpebo_cli.cli.workers import Watch, end_children
+from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.results.files import make_folder, write_text
+from gpebo_cli.schema import shown
+
+if TYPE_CHECKING:
+    from hydra.core.config_loader import ConfigLoader
+    from hydra.plugins.launcher import Launcher
+
+_NAMED_FAILURES = 5  # in the last line; results.csv has all
+_SHOWN_ROWS = 20
+_SUBDIR = "${hydra:job.num}"
+
+
+@dataclass(frozen=True)
+class Orders:
+    """How a sweep is run: the words of the command line that are not Hydra's."""
+
+    resume: str | None
+    fail_fast: bool
+    dry_run: bool
+    max_batch_size: int | None
+
+
+def run_sweep_job(cfg: DictConfig, arguments: Arguments) -> None:
+    """Run one job and record what became of it, in whatever process this is.
+
+    A job that fails is recorded and the next one runs; Hydra itself would stop at the first.
+    """
+    folder = Path(output_folder())
+    stop = folder.parent / STOP
+    if stop.exists():
+        return
+    hydra = HydraConfig.get()
+    start = perf_counter()
+    cases: list[dict[str, float | None]] = []
+    error = ""
+    interrupts.check()
+    try:
+        rows = case_rows(run_job(cfg, arguments, str(folder), draw=False, quiet=True))
+        cases = [{k: v if math.isfinite(v) else None for k, v in row.items()} for row in rows]
+    except GpeboError as raised:
+        error = str(raised)
+    except Exception as raised:  # noqa: BLE001  the next job runs whatever became of this one
+        interrupts.check()  # a library may have wrapped it
+        error = f"internal error: {type(raised).__name__}: {raised}"
+    make_folder(folder)
+    record = JobRecord(
+        job=int(folder.name),
+        overrides=_overrides(hydra.overrides.task),
+        status="failed" if error else "done",
+        seconds=perf_counter() - start,
+        error=" ".join(error.split()),
+        cases=cases,
+    )
+    write_record(folder, record)
+    if error and hydra.sweeper.fail_fast:
+        write_text(stop, f"{record.job}\n")
+
+
+def run_sweep(
+    jobs: Sequence[Sequence[str]],
+    orders: Orders,
+    config: DictConfig,
+    launcher: Launcher,
+    loader: ConfigLoader,
+) -> None:
+    """Run those of ``jobs`` that are not done, write ``results.csv``, print its beginning.
+
+    Args:
+        jobs: the overrides of each job; its number is its place here.
+        orders: where to go on, when to stop.
+        config: the composed configuration the jobs start from.
+        launcher: Hydra's, which runs :func:`run_sweep_job` somewhere and returns when all is done.
+        loader: composes the configuration of a job.
+
+    Raises:
+        ConfigError: a job cannot be composed, or the folder has another sweep.
+        GpeboError: a job failed or has no result.
+    """
+    folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()
+    plan = Plan(tuple(map(_overrides, jobs)), _digest(config))
+    _refuse_subdir(config)
+    _check_composition(jobs, config, loader)
+    _check_folder(folder, plan, resume=orders.resume is not None)
+    before = read_records(folder, plan)
+    waiting = [record.job for record in before if record.status != "done"]
+    if orders.dry_run:
+        _print_plan(before, resumed=orders.resume is not None)
+        return
+
+    make_folder(folder)
+    plan.write(folder)
+    clear(folder, waiting)
+    errors: dict[int, str] = {}
+    trouble = ""
+    finished = False
+    try:
+        with Bar(folder, plan, waiting), _watch(launcher, folder, plan):
+            trouble = _launch(jobs, waiting, folder, orders, launcher, errors)
+        finished = True
+    finally:  # also when it is interrupted: what is done is in the table
+        records = [
+            replace(r, error=errors.get(r.job, "no result")) if r.status == "missing" else r
+            for r in read_records(folder, plan)
+        ]
+        write_table(folder, records)
+        _print_table(records, folder, rows=finished)
+    _raise_failures(records, folder, trouble, stopped=(folder / STOP).exists())
+
+
+def _watch(launcher: Launcher, folder: Path, plan: Plan) -> AbstractContextManager[object]:
+    """For joblib, whose workers are children of this process; others notice for themselves."""
+    if type(launcher).__name__ != "JoblibLauncher":
+        return nullcontext()
+    return Watch(partial(_abandon, folder, plan))
+
+
+def _abandon(folder: Path, plan: Plan, reason: str) -> None:
+    """End the process of a sweep whose launcher is stuck, with what is done in the table."""
+    end_children()
+    records = [
+        replace(r, error="no result") if r.status == "missing" else r
+        for r in read_records(folder, plan)
+    ]
+    write_table(folder, records)
+    _print_table(records, folder, rows=True)
+    sys.stdout.flush()
+    missing = sum(r.status == "missing" for r in records)
+    sys.stderr.write(
+        f"gpebo: error: the launcher gave up: {reason}; {missing} jobs have no result; go on with "
+        f"resume={os.path.relpath(folder)}\n"
+    )
+    sys.stderr.flush()
+    os._exit(1)
+
+
+def _launch(
+    jobs: Sequence[Sequence[str]],
+    waiting: Sequence[int],
+    folder: Path,
+    orders: Orders,
+    launcher: Launcher,
+    errors: dict[int, str],
+) -> str:
+    """Hand over the jobs that wait; the reason if the launcher gave up.
+
+    Jobs say where they write, in full: other processes have other working directories, and the
+    jobs of a resumed sweep are not numbered from 0.
+    """
+    from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+
+    one_by_one = isinstance(launcher, BasicLauncher)  # fail_fast can stop between any two
+    size = 1 if one_by_one else orders.max_batch_size or max(len(waiting), 1)
+    where = f"hydra.sweep.dir={quoted(str(folder))}"
+    _quiet_ray()
+    for first in range(0, len(waiting), size):
+        numbers = waiting[first : first + size]
+        batch = [[*jobs[n], where, f"hydra.sweep.subdir='{n}'"] for n in numbers]
+        try:
+            returned = launcher.launch(batch, initial_job_idx=numbers[0])
+        except (*LIBRARY_ERRORS, GpeboError):
+            raise
+        except Exception as error:  # noqa: BLE001  a worker died, a cluster is out of reach
+            return f"{type(error).__name__}: {error}"
+        for number, job in zip(numbers, returned, strict=False):
+            try:
+                _ = job.return_value  # raises what the job raised, a full disk for instance
+            except Exception as error:  # noqa: BLE001
+                errors[number] = " ".join(f"{type(error).__name__}: {error}".split())
+        if orders.fail_fast and (folder / STOP).exists():
+            break
+    return ""
+
+
+def _quiet_ray() -> None:
+    """What Ray is told by variables: workers' output is in Ray's own logs, no usage report."""
+    os.environ.setdefault("RAY_LOG_TO_DRIVER", "0")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+
+
+def _overrides(job: Sequence[str]) -> dict[str, str]:
+    """What a job is; where it runs is no part of it, so a sweep may be gone on with elsewhere."""
+    pairs = (text.partition("=") for text in job)
+    return {key.lstrip("+"): value for key, _, value in pairs if key != "launcher"}
+
+
+def _digest(config: DictConfig) -> str:
+    """Of everything the jobs share: a resumed sweep must not mix two versions of a plant."""
+    content = OmegaConf.to_container(config, resolve=False)
+    assert isinstance(content, dict)  # noqa: S101  for the type checker: a DictConfig is one
+    content.pop("hydra", None)
+    text = OmegaConf.to_yaml(OmegaConf.create(content), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _refuse_subdir(config: DictConfig) -> None:
+    content = OmegaConf.to_container(config.hydra.sweep, resolve=False)
+    given = content.get("subdir") if isinstance(content, dict) else None
+    if given != _SUBDIR:
+        raise ConfigError(
+            f"hydra.sweep.subdir={given}: the folders of jobs are numbered, so that a sweep can be "
+            "resumed; leave it away"
+        )
+
+
+def _check_composition(
+    jobs: Sequence[Sequence[str]], config: DictConfig, loader: ConfigLoader
+) -> None:
+    """Compose one job for each choice of files: other values cannot make keys appear or vanish.
+
+    Hydra composes every job twice, which takes longer than most jobs.
+    """
+    seen = set()
+    for job in jobs:
+        pairs = [text.partition("=") for text in job]
+        kind = tuple((key, value if _is_group(key) else "") for key, _, value in pairs)
+        if kind not in seen:
+            seen.add(kind)
+            loader.load_sweep_config(config, list(job))
+
+
+def _is_group(key: str) -> bool:
+    return "/" in key or key.lstrip("+~") in GROUPS
+
+
+def _check_folder(folder: Path, plan: Plan, *, resume: bool) -> None:
+    """Refuse to mix two sweeps in one folder."""
+    there = read_plan(folder)
+    name = os.path.relpath(folder)
+    if there is None:
+        # Killed before it had a plan, a sweep leaves a folder with nothing in it.
+        if resume and any(not path.name.endswith(".tmp") for path in folder.iterdir()):
+            raise ConfigError(f"resume={name}: there is no sweep.json in it; give a sweep's folder")
+        return
+    if not resume:
+        raise ConfigError(
+            f"{name} has a sweep already; add resume={name} to go on with it, or choose another "
+            "hydra.sweep.dir"
+        )
+    if len(there.jobs) != len(plan.jobs):
+        raise ConfigError(
+            f"resume={name}: that sweep has {len(there.jobs)} jobs and this one {len(plan.jobs)}; "
+            "give the command that began it"
+        )
+    for number, (old, new) in enumerate(zip(there.jobs, plan.jobs, strict=True)):
+        if dict(old) != dict(new):
+            key = next(k for k in {**old, **new} if old.get(k) != new.get(k))
+            raise ConfigError(
+                f"resume={name}: job {number} had {key}={shown(old.get(key))} and has "
+                f"{shown(new.get(key))} now; give the command that began the sweep"
+            )
+    if there.configuration != plan.configuration:
+        raise ConfigError(
+            f"resume={name}: a configuration file has changed since that sweep began; begin a new "
+            "one"
+        )
+
+
+def _print_plan(records: Sequence[JobRecord], *, resumed: bool) -> None:
+    keys = list(dict.fromkeys(k for record in records for k in record.overrides))
+    state = {"done": "done", "failed": "again", "missing": "to run"}
+    head = ["job", *keys, *(["state"] if resumed else [])]
+    rows = [
+        [
+            str(r.job),
+            *(r.overrides.get(k, "") for k in keys),
+            *([state[r.status]] if resumed else []),
+        ]
+        for r in records
+    ]
+    done = sum(record.status == "done" for record in records)
+    told = f", {done} of them done" if resumed else ""
+    lines = [*columns([head, *rows]), f"{_jobs(len(records))}{told}; nothing was run"]
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+
+
+def _print_table(records: Sequence[JobRecord], folder: Path, *, rows: bool) -> None:
+    """The table's beginning (without it when interrupted), where it is, and counts."""
+    lines = []
+    if rows:
+        cells = [[_shown(cell) for cell in row] for row in table(records)]
+        lines += columns([row[:-1] for row in cells[: _SHOWN_ROWS + 1]])  # errors: below
+        if len(cells) > _SHOWN_ROWS + 1:
+            lines.append(f"… {len(cells) - _SHOWN_ROWS - 1} more")
+    count = Counter(record.status for record in records)
+    lines.append(str(Path(os.path.relpath(folder)) / TABLE))
+    missing = f", {count['missing']} missing" if count["missing"] else ""
+    lines.append(f"{_jobs(len(records))}, {count['done']} done, {count['failed']} failed{missing}")
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()  # before what follows on stderr
+
+
+def _raise_failures(
+    records: Sequence[JobRecord], folder: Path, trouble: str, *, stopped: bool
+) -> None:
+    failed = [record for record in records if record.status == "failed"]
+    missing = [record for record in records if record.status == "missing"]
+    if not (failed or missing or trouble):
+        return
+    parts = []
+    if failed:
+        named = "; ".join(f"job {r.job}: {r.error}" for r in failed[:_NAMED_FAILURES])
+        more = len(failed) - _NAMED_FAILURES
+        tail = f"; and {more} more in {TABLE}" if more > 0 else ""
+        parts.append(f"{len(failed)} of {_jobs(len(records))} failed: {named}{tail}")
+    if trouble:
+        parts.append(f"the launcher gave up: {trouble[:300]}")
+    if missing:
+        why = " (fail_fast)" if stopped else ""
+        parts.append(
+            f"{_jobs(len(missing))} without a result{why}; go on with "
+            f"resume={os.path.relpath(folder)}"
+        )
+    raise GpeboError("; ".join(parts))
+
+
+def _jobs(count: int) -> str:
+    return "1 job" if count == 1 else f"{count} jobs"
+
+
+def _shown(cell: str) -> str:
+    try:
+        return f"{float(cell):.4g}" if "." in cell else cell
+    except ValueError:
+        return cell

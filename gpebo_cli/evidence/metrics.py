@@ -1,0 +1,60 @@
+"""How well a case did: one number per case from its errors over time.
+
+Of the norm e of an error: the settling time is the least T with e(t) ≤ e(0)/100 for all t ≥ T, the
+root mean square over time is √(∫e² dt / horizon).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array
+
+SETTLED = 0.01  # share of an error at the start, below which it has settled
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """One number per case; NaN where a time was never reached."""
+
+    seconds_to_1pct_parameters: Array  # (G,)
+    seconds_to_1pct_states: Array  # (G,)
+    final_error_parameters: Array  # (G,) max abs
+    final_error_states: Array  # (G,) max abs
+    rms_error_states: Array  # (G,)
+
+
+def settling_time(t: Array, error: Array, fraction: float = SETTLED) -> Array:
+    """Time after which a nonnegative error stays below a fraction of its initial value.
+
+    Between two times the logarithm of the error is taken as linear, which is exact where it
+    decays exponentially.
+
+    Args:
+        t: times (M,), ascending; the result counts from t[0].
+        error: (g, M).
+        fraction: of the first value.
+
+    Returns:
+        (g,), NaN if it is never reached; 0 if the error is zero from the start.
+    """
+    level = fraction * error[:, :1]
+    above = error > level
+    last = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
+    out = np.where(above.any(axis=1), np.nan, 0.0)
+    rows = np.flatnonzero(above.any(axis=1) & (last < error.shape[1] - 1))
+    k = last[rows]
+    tiny = np.finfo(float).tiny
+    high = np.log(np.maximum(error[rows, k], tiny))
+    low = np.log(np.maximum(error[rows, k + 1], tiny))
+    wanted = np.log(np.maximum(level[rows, 0], tiny))
+    share = np.clip((high - wanted) / np.maximum(high - low, tiny), 0.0, 1.0)
+    out[rows] = t[k] + share * (t[k + 1] - t[k]) - t[0]
+    return out
+
+
+def time_rms(t: Array, error: Array) -> Array:
+    """Root mean square over time (trapezoidal) of error norms (g, M), shape (g,)."""
+    return np.asarray(np.sqrt(np.trapezoid(error**2, t, axis=1) / (t[-1] - t[0])))

@@ -1,0 +1,200 @@
+"""Every assumption a run rests on, as evidence: what holds, what does not, and by how much.
+
+``gpebo run`` writes this into ``summary.json``; ``gpebo check`` prints it. A check stops at the
+first stage that cannot be carried out and reports that stage as the failed assumption.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from gpebo_cli.errors import GpeboError, ModelError
+from gpebo_cli.evidence.excitation import Excitation, assess
+from gpebo_cli.experiment.noise import NoiseLevels, noise_levels
+from gpebo_cli.findings import Assumption
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.observers import observe, signal_noise
+from gpebo_cli.recordings.load import load
+from gpebo_cli.settings import Settings
+from gpebo_cli.simulation.simulate import Simulation, simulate
+
+_GROWTH = 1e6  # of Φ: above it, the state loses six digits of what the parameters know
+
+
+def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...]:
+    """All assumptions of the plant and the observer of ``settings``; never raises ModelError.
+
+    They are about ψ, which noise does not reach: signals are taken without it.
+    """
+    levels = noise_levels(settings.noise, system)
+    if settings.data.name == "csv":
+        recording = load(system, settings.data, settings.time, settings.solver.tol)
+        return tuple(_of_observer(settings, system, recording.inputs, recording.outputs, levels))
+    found: list[Assumption] = []
+    try:
+        simulation = simulate(system, settings.time, settings.solver)
+    except ModelError as error:
+        return (Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),)
+    found += of_simulation(system, simulation)
+    if settings.observer.name == "none":
+        return tuple(found)
+    if any(jump.impulses.any() for _, _, jump in simulation.jumps):
+        found.append(
+            Assumption("No impulses", "jumps of the input put no impulse into the state", False, {})
+        )
+        return tuple(found)
+    signals = simulation.signals
+    return (*found, *_of_observer(settings, system, signals.inputs, signals.outputs, levels))
+
+
+def _of_observer(
+    settings: Settings, system: DescriptorSystem, inputs: Trajectory, outputs: Trajectory,
+    levels: NoiseLevels,
+) -> list[Assumption]:
+    """What the observer needs of the plant, and of the signals it gets to see."""
+    try:
+        observation = observe(
+            system, inputs, outputs, settings.observer, settings.solver,
+            signal_noise(settings.noise, levels),
+        )
+    except ModelError as error:
+        return [Assumption(_named(error), "needed by the observer", False, {"found": str(error)})]
+    t = np.linspace(inputs.mesh.edges[0], inputs.mesh.edges[-1], 101)
+    excitation = assess(observation.regression, t, settings.excitation)
+    return of_observation(observation, excitation)
+
+
+def _named(error: GpeboError) -> str:
+    text = str(error)
+    for number in range(1, 8):
+        if f"Assumption {number}" in text:
+            return f"Assumption {number}"
+    return "Rank of E" if "rank of E" in text else "Observer"
+
+
+_SOLVABILITY = "uniquely solvable, with constant characteristic values (μ, d, a)"
+
+
+def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assumption]:
+    """Solvability, the consistent start, and for constant systems regularity and D2."""
+    s = simulation.structure
+    moved = float(np.abs(simulation.initial_state - system.initial_state).max(initial=0.0))
+    found = [
+        Assumption(
+            "Solvability",
+            _SOLVABILITY,
+            True,
+            {
+                "strangeness_index": s.mu,
+                "index": s.index,
+                "d": s.d,
+                "a": s.a,
+                "smallest_singular_value": s.smallest_singular_value,
+            },
+        ),
+        Assumption(
+            "Consistent start",
+            "a consistent initial state exists near the one given",
+            True,
+            {"largest_change": moved},
+        ),
+    ]
+    if {"E", "A", "C"} <= system.coefficients.constant and system.r:
+        found += _of_constant_system(system, simulation)
+    return found
+
+
+def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> list[Assumption]:
+    """For constant E, A, C: regularity of the pencil and the rank condition of point D2.
+
+    D2: rank [E A; 0 C; 0 E] = rank E + n is impulse observability, equivalent to Assumption 1.
+    """
+    t = simulation.signals.mesh.edges[:1]
+    c = system.coefficients.taylor(t, 0)
+    E, A, C = c.E[0, 0], c.A[0, 0], c.C[0, 0]
+    scale = float(np.linalg.norm(E) / max(np.linalg.norm(A), np.finfo(float).tiny)) or 1.0
+    # det(λE − A) is a polynomial of degree ≤ n: it vanishes identically if it does at n + 1 points.
+    points = np.exp(2j * np.pi * np.arange(system.n + 1) / (system.n + 1)) / scale
+    pencils = points[:, None, None] * E - A
+    sigma = np.linalg.svd(pencils, compute_uv=False)
+    regular = float(sigma[:, -1].max() / max(np.linalg.norm(A), np.finfo(float).tiny))
+    stacked = np.block([
+        [E, A], [np.zeros((system.r, system.n)), C], [np.zeros_like(E), E]
+    ])
+    ranks = (int(np.linalg.matrix_rank(stacked)), int(np.linalg.matrix_rank(E)))
+    return [
+        Assumption(
+            "Regularity", "the pencil λE − A is regular (constant coefficients)", regular > 1e-12,
+            {"largest_smallest_singular_value": regular},
+        ),
+        Assumption(
+            "Rank condition D2", "rank [E A; 0 C; 0 E] = rank E + n (constant coefficients)",
+            ranks[0] == ranks[1] + system.n,
+            {"rank": ranks[0], "needed": ranks[1] + system.n},
+        ),
+    ]
+
+
+class Observed(Protocol):
+    """What an observer says about itself, in continuous time or at samples."""
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """Of this observer, with their evidence."""
+        ...
+
+    @property
+    def growth(self) -> float | None:
+        """Largest entry of Φ; None: the states do not rest on it."""
+        ...
+
+    @property
+    def growth_rate(self) -> float | None:
+        """In 1/s, ln ‖Φ‖ over the horizon."""
+        ...
+
+
+def of_observation(observation: Observed, excitation: Excitation) -> list[Assumption]:
+    """The observer's own assumptions, excitation, and the growth of Φ."""
+    number = 5 if any(a.name == "Assumption 3" for a in observation.assumptions) else 2
+    found = [
+        *observation.assumptions,
+        Assumption(
+            f"Assumption {number}",
+            "interval excitation: ∫ψᵀψ ≥ ρ I at some t_c",
+            excitation.is_ie,
+            {
+                "t_c": excitation.t_c,
+                "rho": excitation.rho,
+                "lambda_min": excitation.lambda_min,
+                "condition": excitation.condition,
+                "weakest_direction": str(excitation.weakest_direction),
+            },
+        ),
+    ]
+    if observation.growth is not None:
+        found.append(
+            Assumption(
+                "Growth of Φ",
+                "Φ stays bounded, so that θ̂ → θ implies x̂ → x",
+                observation.growth < _GROWTH,
+                {"largest_entry": observation.growth, "rate": observation.growth_rate},
+            )
+        )
+    return found
+
+
+def warnings(observation: Observed) -> tuple[str, ...]:
+    """What does not stop a run and spoils its result, one line each: Φ that grows too far."""
+    growth, rate = observation.growth, observation.growth_rate
+    if growth is None or rate is None or growth < _GROWTH:
+        return ()
+    text = (
+        f"Φ has grown to {growth:.2g}, at {rate:.3g} 1/s: of its 16 digits the state estimate "
+        f"loses {np.log10(growth):.0f}; a remedy is needed, observer.remedy=output_injection, "
+        "reset or current_coordinates"
+    )
+    return (text,)

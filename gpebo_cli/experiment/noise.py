@@ -1,0 +1,282 @@
+"""What the observer gets to see: the true signals, sampled, noisy and rounded.
+
+At the sample instants t_k = start + k T_s the error of an output is
+
+    e_k = Q(y(t_k) + n_k) − y(t_k),      n_k ~ N(0, σ²),
+
+with Q rounding to the step of the converter, and the observer sees y(t) + e(t). Inputs likewise,
+without rounding; the plant is driven by the true u. Between the instants e is held, or it is the
+trigonometric interpolant of the samples, which has no frequency above 1/(2 T_s):
+
+    e(t) = Σ_k e_k D((t − t_k)/T_s),      D(x) = sin(πx)/(N sin(πx/N)),  N odd.
+
+It is the sinc series of samples that are continued periodically, and its variance is σ² at every
+time. Sinc itself was rejected: cut off at the ends of the horizon its variance falls there; so were
+cubic splines, which pass a part of what lies above 1/(2 T_s) and have less variance in between.
+
+Samples are boundaries of elements, so that what is held jumps between elements only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil, factorial, pi
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.schema import nearest
+from gpebo_cli.settings import NoiseSettings
+from gpebo_cli.simulation.simulate import Signals
+
+_SAME = 1e-6  # of T_s: an edge this near to an instant takes its place
+_RESOLVED = 1e-10  # of a sample: what a polynomial may miss of the interpolant
+_FEW = 8  # elements with the same place in their interval: below, an FFT is not worth it
+_CHUNK = 1 << 22  # numbers held at once while the interpolant is summed
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels:
+    """Standard deviations and steps per signal, zeros where there is no noise."""
+
+    outputs: Array  # (r,) σ
+    inputs: Array  # (m,) σ
+    steps: Array  # (r,) of quantisation
+
+    @property
+    def noisy_inputs(self) -> BoolArray:
+        """Which inputs are measured wrongly, shape (m,)."""
+        return self.inputs > 0
+
+    @property
+    def noisy_outputs(self) -> BoolArray:
+        """Which outputs are, shape (r,)."""
+        return (self.outputs > 0) | (self.steps > 0)
+
+    @property
+    def silent(self) -> bool:
+        """Whether what is measured is what is there."""
+        return not (self.noisy_inputs.any() or self.noisy_outputs.any())
+
+
+def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLevels:
+    """The levels by output and input of a plant, checked.
+
+    Raises:
+        ConfigError: a negative level, a list of the wrong length, an unknown name, or a sample
+            time or seed that cannot be.
+    """
+    if not (np.isfinite(settings.sample_time) and settings.sample_time > 0):
+        raise ConfigError(
+            f"noise.sample_time: expected a positive number of seconds, got {settings.sample_time}"
+        )
+    if settings.seed < 0:
+        raise ConfigError(f"noise.seed: expected 0 or more, got {settings.seed}")
+    outputs, inputs = system.outputs, system.inputs
+    return NoiseLevels(
+        per_signal(settings.outputs, outputs, "output", "noise.outputs"),
+        per_signal(settings.inputs, inputs, "input", "noise.inputs"),
+        per_signal(settings.quantisation, outputs, "output", "noise.quantisation"),
+    )
+
+
+def per_signal(
+    value: float | Sequence[float] | Mapping[str, float], names: Sequence[str], noun: str,
+    where: str, absent: float = 0.0,
+) -> Array:
+    """One number ≥ 0 per signal, from one for all, a list in their order, or a mapping by name.
+
+    Raises:
+        ConfigError: the wrong length, an unknown name, or a number that is negative or not finite.
+    """
+    listed = ", ".join(names) or "none"
+    if isinstance(value, Mapping):
+        for key in value:
+            if key not in names:
+                raise ConfigError(
+                    f"{where}: there is no {noun} {key!r}; the {noun}s are {listed}"
+                    + nearest(str(key), names)
+                )
+        numbers = np.array([value.get(name, absent) for name in names], dtype=np.float64)
+    elif isinstance(value, Sequence):
+        if len(value) != len(names):
+            raise ConfigError(
+                f"{where} has {len(value)} values, one for each {noun} is needed ({listed})"
+            )
+        numbers = np.array(value, dtype=np.float64)
+    else:
+        numbers = np.full(len(names), value, dtype=np.float64)
+    for name, number in zip(names, numbers, strict=True):
+        if not (np.isfinite(number) and number >= 0):
+            raise ConfigError(
+                f"{where}: expected finite numbers, 0 or more, got {number:g} for {name}"
+            )
+    return numbers
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMesh:
+    """A mesh whose elements end at the sample instants, and the sample that each follows."""
+
+    mesh: Mesh
+    sample: IntArray  # (K,) number of the last instant at or before the element
+    sample_time: float
+
+    @property
+    def first(self) -> IntArray:
+        """The element that starts at each instant, shape (samples,)."""
+        return np.searchsorted(self.sample, np.arange(self.count))
+
+    @property
+    def count(self) -> int:
+        """Number of samples within the horizon."""
+        return int(self.sample[-1]) + 1
+
+
+def check_samples(horizon: float, sample_time: float, max_elements: int) -> None:
+    """Refuse more samples than elements are allowed.
+
+    Raises:
+        ConfigError: names both numbers.
+    """
+    samples = horizon / sample_time
+    if samples > max_elements:
+        raise ConfigError(
+            f"noise.sample_time = {sample_time:g} s makes {samples:.6g} samples over "
+            f"{horizon:g} s, and each needs an element; solver.max_elements is {max_elements}. "
+            "Raise one of them"
+        )
+
+
+def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
+    """``mesh`` with every sample instant an edge; its own edges stay.
+
+    Args:
+        mesh: of the true signals.
+        sample_time: T_s, seconds.
+        parts: into how many elements an interval between instants is cut.
+    """
+    start, stop = mesh.edges[0], mesh.edges[-1]
+    count = max(1, ceil((stop - start) / sample_time - _SAME))
+    wanted = start + np.arange(count * parts) * (sample_time / parts)
+    wanted = wanted[wanted < stop - _SAME * sample_time]
+    # Where both kinds of edges (nearly) meet, the mesh's own stays: a jump stands there.
+    right = np.minimum(np.searchsorted(mesh.edges, wanted), mesh.size)
+    left = np.maximum(right - 1, 0)
+    near = np.minimum(np.abs(mesh.edges[right] - wanted), np.abs(mesh.edges[left] - wanted))
+    edges = np.union1d(mesh.edges, wanted[near > _SAME * sample_time])
+    sample = np.floor((edges[:-1] - start) / sample_time + _SAME).astype(np.intp)
+    return SampledMesh(Mesh(edges, mesh.rule), sample, sample_time)
+
+
+def measure(signals: Signals, settings: NoiseSettings, levels: NoiseLevels) -> Signals:
+    """The signals as the observer sees them, on a mesh that ends elements at the instants.
+
+    Without noise these are ``signals`` themselves, to the last bit.
+
+    Args:
+        signals: the true ones.
+        settings: sample time, shape and seed.
+        levels: see :func:`noise_levels`.
+
+    Returns:
+        u + e, y + e, and the true states.
+    """
+    if levels.silent:
+        return signals
+    grid = noise_grid(signals.mesh, settings)
+    mesh = grid.mesh
+    true = Signals(*(on_mesh(s, mesh) for s in (signals.inputs, signals.outputs, signals.states)))
+    of_outputs, of_inputs = draw_errors(true.outputs, grid, levels, settings.seed)
+    return Signals(
+        Trajectory(mesh, true.inputs.values + between(of_inputs, grid, settings.shape)),
+        Trajectory(mesh, true.outputs.values + between(of_outputs, grid, settings.shape)),
+        true.states,
+    )
+
+
+def noise_grid(mesh: Mesh, settings: NoiseSettings) -> SampledMesh:
+    """The mesh on which measured signals live."""
+    parts = 1
+    if settings.shape == "band_limited":
+        # A polynomial of degree s on h misses up to 2 (h π/(4 T_s))^(s+1)/(s + 1)! of e^{iπt/T_s}.
+        degree = mesh.rule.stages + 1
+        level = (_RESOLVED * factorial(degree) / 2.0) ** (1.0 / degree)
+        parts = max(1, ceil(pi / (4.0 * level)))
+    return sampled_mesh(mesh, settings.sample_time, parts)
+
+
+def on_mesh(signal: Trajectory, mesh: Mesh) -> Trajectory:
+    """The same signal (K, s + 1, …) on a mesh that has all edges of its own."""
+    values = signal(mesh.points.ravel(), mesh.inside.ravel())
+    return Trajectory(mesh, values.reshape(*mesh.points.shape, *signal.values.shape[2:]))
+
+
+def draw_errors(
+    outputs: Trajectory, grid: SampledMesh, levels: NoiseLevels, seed: int
+) -> tuple[Array, Array]:
+    """e_k of the outputs (N, r) and inputs (N, m) at the instants.
+
+    N is odd and there is at least one sample beyond the horizon, for the interpolant: outputs
+    count as constant from its end on.
+    """
+    count = grid.count + 1
+    count += 1 - count % 2
+    generator = np.random.default_rng(seed)
+    y = np.concatenate([
+        outputs.values[grid.first, 0],
+        np.broadcast_to(outputs.final, (count - grid.count, len(levels.outputs))),
+    ])
+    drawn = levels.outputs * generator.standard_normal((count, len(levels.outputs)))
+    of_inputs = levels.inputs * generator.standard_normal((count, len(levels.inputs)))
+    steps = levels.steps
+    rounded = steps > 0
+    seen = y[:, rounded] + drawn[:, rounded]
+    drawn[:, rounded] = steps[rounded] * np.rint(seen / steps[rounded]) - y[:, rounded]
+    return drawn, of_inputs
+
+
+def between(errors: Array, grid: SampledMesh, shape: str) -> Array:
+    """e(t) at the points of the mesh, shape (K, s + 1, c) or (K, 1, c), from e_k (N, c)."""
+    if shape == "hold":
+        return errors[grid.sample][:, None]
+    mesh, rule = grid.mesh, grid.mesh.rule
+    out = np.empty((mesh.size, rule.stages + 1, errors.shape[1]))
+    # Position of an element within its interval; equal ones of all intervals are one FFT.
+    left = (mesh.edges[:-1] - mesh.edges[0]) / grid.sample_time - grid.sample
+    length = mesh.steps / grid.sample_time
+    rounding = 64 * np.finfo(float).eps * float(np.abs(mesh.edges).max()) / grid.sample_time
+    digits = int(-np.log10(max(rounding, 1e-12)))
+    _, kind, members = np.unique(
+        np.round(np.stack([left, length]), digits), axis=1, return_inverse=True, return_counts=True
+    )
+    kind = kind.ravel()
+    few: BoolArray = members[kind] < _FEW
+    spectrum = np.fft.rfft(errors, axis=0)
+    frequencies = 2j * pi * np.arange(len(spectrum))[:, None] / len(errors)
+    for number in np.flatnonzero(members >= _FEW):
+        chosen = np.flatnonzero(kind == number)
+        exact_left, exact_length = left[chosen].mean(), length[chosen].mean()
+        for i, point in enumerate(rule.points):
+            turned = spectrum * np.exp(frequencies * (exact_left + exact_length * point))
+            shifted = np.fft.irfft(turned, n=len(errors), axis=0)
+            out[chosen, i] = shifted[grid.sample[chosen]]
+    out[few] = _summed(errors, (mesh.points[few] - mesh.edges[0]) / grid.sample_time)
+    return out
+
+
+def _summed(errors: Array, x: Array) -> Array:
+    """Σ_k e_k D(x − k) at x (…,), shape (…, c), term by term."""
+    count, flat = len(errors), x.ravel()
+    out = np.empty((len(flat), errors.shape[1]))
+    chunk = max(1, _CHUNK // count)
+    for i in range(0, len(flat), chunk):
+        distance = flat[i : i + chunk, None] - np.arange(count)
+        below = count * np.sin(pi * distance / count)
+        at_sample = np.abs(below) < 1e-12
+        kernel = np.where(at_sample, 1.0, np.sin(pi * distance) / np.where(at_sample, 1.0, below))
+        out[i : i + chunk] = kernel @ errors
+    return out.reshape(*x.shape, errors.shape[1])

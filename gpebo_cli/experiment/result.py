@@ -1,0 +1,185 @@
+"""What a run returns: sampled signals with their names, evidence, and how long each stage took.
+
+Plain frozen dataclasses over arrays, time first. The output layer turns them into tables,
+figures and ``summary.json``; nothing in here knows about files, pandas or matplotlib.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from gpebo_cli.evidence.excitation import Excitation
+from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.findings import Assumption, Requirement
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.settings import Settings
+
+
+@dataclass(frozen=True)
+class StateChange:
+    """A state that consistent initialisation (or a jump of the input) moved."""
+
+    state: str
+    given: float
+    used: float
+    time: float
+
+
+class SignalsResult(Protocol):
+    """Signals on the output grid, wherever they are from."""
+
+    @property
+    def t(self) -> Array:
+        """Times, (N,)."""
+        ...
+
+    @property
+    def inputs(self) -> Array:
+        """u, (N, m)."""
+        ...
+
+    @property
+    def outputs(self) -> Array:
+        """y, (N, r)."""
+        ...
+
+    @property
+    def states(self) -> Array:
+        """True states, (N, n), NaN for one that nobody knows."""
+        ...
+
+    @property
+    def measured_inputs(self) -> Array | None:
+        """What the observer saw, (N, m); None: the same."""
+        ...
+
+    @property
+    def measured_outputs(self) -> Array | None:
+        """What the observer saw, (N, r); None: the same."""
+        ...
+
+
+@dataclass(frozen=True)
+class RecordingResult:
+    """Signals of a recording on the output grid, and which file they are from."""
+
+    t: Array  # (N,)
+    inputs: Array  # (N, m)
+    outputs: Array  # (N, r)
+    states: Array  # (N, n), NaN for a state that was not recorded
+    file: str
+    sha256: str
+    rows: int
+    hold: str
+    first: float  # times of its first and last sample
+    last: float
+    known_states: tuple[str, ...]
+    elements: int
+    measured_inputs: None = None  # a recording is what was measured
+    measured_outputs: None = None
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """The plant's signals on the output grid and how they were obtained."""
+
+    t: Array  # (N,)
+    inputs: Array  # (N, m)
+    outputs: Array  # (N, r)
+    states: Array  # (N, n)
+    index: int  # differentiation index: strangeness index + 1, or 0 for an explicit ODE
+    strangeness_index: int
+    differential: int  # d, number of differential equations
+    algebraic: int  # a, number of constraints, hidden ones included
+    initial_state: Array  # (n,) the consistent one
+    moved: tuple[StateChange, ...]  # by consistent initialisation at the start
+    jumps: tuple[StateChange, ...]  # at jumps of the inputs inside the horizon
+    impulses: tuple[tuple[float, str], ...]  # (time, state) where a jump puts a Dirac impulse
+    error_estimate: float  # relative to each state's own size
+    elements: int
+    measured_inputs: Array | None = None  # (N, m) what the observer saw; None: the same
+    measured_outputs: Array | None = None  # (N, r)
+
+
+@dataclass(frozen=True)
+class RegressionResult:
+    """Y = psi eta on the output grid."""
+
+    t: Array  # (N,)
+    Y: Array  # (N, rows)
+    psi: Array  # (N, rows, p)
+    parameters: tuple[str, ...]  # p names: the plant's unknowns, then e0_<state>
+    error_estimate: float
+
+
+@dataclass(frozen=True)
+class EstimationResult:
+    """Estimates of every case (a case is one combination of gains) on a grid of times."""
+
+    cases: tuple[Mapping[str, float], ...]  # G combinations, gain name -> value
+    t: Array  # (M,) perhaps coarser than the output grid when there are many cases
+    names: tuple[str, ...]  # p names of what is estimated, mostly the regression's parameters
+    parameters: Array  # (G, M, p)
+    true_parameters: Array  # (M, p), NaN where nobody knows
+    states: Array  # (G, M, n), NaN for a state the observer does not see
+    delta: Array | None  # (D, M), D = 1 if it is the same for every case, else G; None: no mixing
+    checks: Mapping[str, Array]  # further estimates by column name, (G, M) each
+    requirement: Requirement
+
+
+@dataclass(frozen=True)
+class NoiseStatistics:
+    """Errors of the estimates at the horizon over many seeds of the noise."""
+
+    seeds: int
+    t: float
+    names: tuple[str, ...]  # (p,)
+    truth: Array  # (p,)
+    bias: Array  # (G, p) mean error
+    deviation: Array  # (G, p) standard deviation, from the mean over the seeds
+    rms: Array  # (G, p) root mean square error
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well the final estimates explain all data: what is known without the truth."""
+
+    residual: Array  # (G,) root mean square over time of ‖Y − ψη̂(end)‖
+    size: float  # the same of ‖Y‖
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Everything one run produced; the later stages are None when ``observer=none``.
+
+    Signals are from a simulation or from a recording; the other one of the two is None.
+    """
+
+    settings: Settings
+    system: DescriptorSystem
+    simulation: SimulationResult | None
+    regression: RegressionResult | None
+    excitation: Excitation | None
+    estimation: EstimationResult | None
+    metrics: Metrics | None
+    assumptions: tuple[Assumption, ...]
+    timings: Mapping[str, float]  # stage -> seconds
+    verdict: str  # the last line a person reads
+    noise: NoiseStatistics | None = None  # where more than one seed was asked for
+    recording: RecordingResult | None = None
+    fit: Fit | None = None  # of a recording
+    warnings: tuple[str, ...] = ()  # what does not stop a run and spoils its result, one line each
+
+    @property
+    def signals(self) -> SignalsResult:
+        """Inputs, outputs and what is known of the states, on the output grid.
+
+        Raises:
+            ValueError: the result has neither a simulation nor a recording.
+        """
+        signals = self.recording if self.simulation is None else self.simulation
+        if signals is None:
+            raise ValueError("a result needs a simulation or a recording")
+        return signals

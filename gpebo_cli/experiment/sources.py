@@ -1,0 +1,232 @@
+"""Where signals come from: a simulation of the plant, with noise or without, or a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.experiment.assumptions import of_simulation
+from gpebo_cli.experiment.noise import NoiseLevels, check_samples, measure
+from gpebo_cli.experiment.result import RecordingResult, SimulationResult, StateChange
+from gpebo_cli.experiment.verdict import simulation_verdict
+from gpebo_cli.findings import Assumption
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.recordings.load import Recording, load
+from gpebo_cli.settings import Settings, TimeSettings
+from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
+
+_MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
+_ROUNDING = 1e-12  # by which a sample may miss the end of the horizon
+_MAX_SAMPLES = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What the observer gets to see, and what is known about it."""
+
+    t: Array  # (N,) the output grid
+    inputs: Trajectory  # (m,)
+    outputs: Trajectory  # (r,)
+    states: Trajectory  # (n,) the truth, NaN where nobody knows
+    theta: Callable[[Array], Array]  # times (M,) -> (M, q), likewise
+    judged: slice  # parameters that count when estimates are compared with the truth
+    assumptions: tuple[Assumption, ...]
+    verdict: str
+    true: Signals | None = None  # of a simulation, without noise
+    simulation: SimulationResult | None = None
+    recording: RecordingResult | None = None
+
+
+def simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) -> Source:
+    """Signals of the plant.
+
+    Raises:
+        ConfigError: an impulse that an observer cannot be driven by.
+        ModelError: the plant cannot be simulated.
+        SolverError: a tolerance cannot be reached.
+    """
+    t = _grid(settings, settings.time.start, settings.time.start + settings.time.horizon)
+    simulation = simulate(system, settings.time, settings.solver)
+    measured = measure(simulation.signals, settings.noise, levels)
+    simulated = _sample_simulation(system, simulation, t)
+    if not levels.silent:
+        simulated = replace(
+            simulated,
+            # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
+            measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
+            measured_outputs=np.where(levels.noisy_outputs, measured.outputs(t), simulated.outputs),
+        )
+    if settings.observer.name != "none":
+        _refuse_impulses(system, simulated)
+    return Source(
+        t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
+        theta=system.theta_at, judged=_judged(system),
+        assumptions=tuple(of_simulation(system, simulation)),
+        verdict=simulation_verdict(simulated), true=simulation.signals, simulation=simulated,
+    )
+
+
+def recorded(settings: Settings, system: DescriptorSystem) -> Source:
+    """Signals of a recording; nobody knows what θ was when it was made.
+
+    Raises:
+        ConfigError: the file is wrong, or does not reach as far as it should.
+    """
+    recording = load(system, settings.data, settings.time, settings.solver.tol)
+    t = _grid(settings, *recording.span)
+    return Source(
+        t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
+        theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
+        assumptions=(), verdict="",
+        recording=_sample_recording(system, recording, t),
+    )
+
+
+def check_noise(settings: Settings, levels: NoiseLevels) -> None:
+    """Refuse noise on a recording, and more samples of noise than elements.
+
+    Raises:
+        ConfigError: says what is possible.
+    """
+    if levels.silent:
+        return
+    if settings.data.name == "csv":
+        raise ConfigError("noise is for simulations; a recording (data=csv) has its own")
+    check_samples(settings.time.horizon, settings.noise.sample_time, settings.solver.max_elements)
+
+
+def check_time(time: TimeSettings) -> None:
+    """Refuse a span or a grid of a simulation that is none.
+
+    Raises:
+        ConfigError: names the key and what it may be.
+    """
+    if not (np.isfinite(time.horizon) and time.horizon > 0):
+        raise ConfigError(f"time.horizon must be a positive number of seconds, got {time.horizon}")
+    if not np.isfinite(time.start):
+        raise ConfigError(f"time.start must be a finite time, got {time.start}")
+    if time.samples < 2:
+        raise ConfigError(f"time.samples must be at least 2, got {time.samples}")
+
+
+def _grid(settings: Settings, start: float, stop: float) -> Array:
+    """The output grid (N,): evenly spaced; of an observer at samples, some of those."""
+    if settings.observer.sample_time is None:
+        return np.linspace(start, stop, settings.time.samples)
+    t = sample_times(settings.observer.sample_time, start, stop)
+    kept: Array = t[kept_samples(1, len(t), settings.time.samples)]
+    return kept
+
+
+def sample_times(step: float, start: float, stop: float) -> Array:
+    """start, start + T, … up to stop, (K,).
+
+    Raises:
+        ConfigError: there is none after the start, or there are too many.
+    """
+    count = int(np.floor((stop - start) / step * (1.0 + _ROUNDING)))
+    if count < 1:
+        raise ConfigError(
+            f"observer.sample_time = {step:g} is longer than the horizon of {stop - start:g} s"
+        )
+    if count > _MAX_SAMPLES:
+        raise ConfigError(
+            f"observer.sample_time = {step:g} makes {count} samples; at most {_MAX_SAMPLES} fit in "
+            "one run"
+        )
+    return np.asarray(start + step * np.arange(count + 1), dtype=np.float64)
+
+
+def _judged(system: DescriptorSystem) -> slice:
+    """Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts."""
+    return slice(system.q if system.theta_varies else None)
+
+
+def _sample_recording(
+    system: DescriptorSystem, recording: Recording, t: Array
+) -> RecordingResult:
+    table, sampled = recording.table, recording.sampled(t)
+    return RecordingResult(
+        t=t,
+        inputs=sampled.inputs,
+        outputs=sampled.outputs,
+        states=sampled.states,
+        file=table.header.source,
+        sha256=table.sha256,
+        rows=len(table.samples.t),
+        hold=recording.hold,
+        first=float(table.samples.t[0]),
+        last=float(table.samples.t[-1]),
+        known_states=tuple(system.states[i] for i in table.header.known),
+        elements=recording.inputs.mesh.size,
+    )
+
+
+def _sample_simulation(
+    system: DescriptorSystem, simulation: Simulation, t: Array
+) -> SimulationResult:
+    signals, structure = simulation.signals, simulation.structure
+    sampler = signals.mesh.sampler(t)
+    start = float(signals.mesh.edges[0])
+    jumps = [
+        change
+        for when, before, jump in simulation.jumps
+        for change in _changes(system, before, jump.after, when)
+    ]
+    impulses = [
+        (when, state)
+        for when, _, jump in simulation.jumps
+        for i, state in enumerate(system.states)
+        if jump.impulses[:, i].any()
+    ]
+    return SimulationResult(
+        t=t,
+        inputs=sampler(signals.inputs.values),
+        outputs=sampler(signals.outputs.values),
+        states=sampler(signals.states.values),
+        index=structure.index,
+        strangeness_index=structure.mu,
+        differential=structure.d,
+        algebraic=structure.a,
+        initial_state=simulation.initial_state,
+        moved=tuple(_changes(system, system.initial_state, simulation.initial_state, start)),
+        jumps=tuple(jumps),
+        impulses=tuple(impulses),
+        error_estimate=simulation.error_estimate,
+        elements=signals.mesh.size,
+    )
+
+
+def _changes(
+    system: DescriptorSystem, before: Array, after: Array, time: float
+) -> list[StateChange]:
+    given, used = before.tolist(), after.tolist()
+    scale = max(map(abs, (0.0, *given, *used)))
+    return [
+        StateChange(state, old, new, time)
+        for state, old, new in zip(system.states, given, used, strict=True)
+        if abs(new - old) > _MOVED * scale
+    ]
+
+
+def _refuse_impulses(system: DescriptorSystem, simulated: SimulationResult) -> None:
+    if simulated.impulses:
+        t, state = simulated.impulses[0]
+        raise ConfigError(
+            f"plant {system.name}: the jump of the input at t = {t:.6g} puts an impulse into "
+            f"{state}; an observer cannot be driven by it. Use a continuous input, or "
+            "observer=none to simulate only"
+        )
+
+
+def kept_samples(cases: int, samples: int, max_rows: int) -> IntArray:
+    """Indices of the samples that are kept, evenly spread, first and last among them."""
+    count = min(samples, max(2, max_rows // max(cases, 1)))
+    if count == samples:
+        return np.arange(samples)
+    return np.unique(np.rint(np.linspace(0, samples - 1, count)).astype(np.intp))
+

@@ -1,0 +1,87 @@
+"""The last line of a run: exciting or not and from when on, and how well the state is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isfinite
+
+import numpy as np
+
+from gpebo_cli.evidence.excitation import Excitation
+from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.experiment.result import EstimationResult, Fit, SimulationResult
+from gpebo_cli.model.descriptor import Array
+
+
+def verdict(
+    excitation: Excitation, estimation: EstimationResult, metrics: Metrics, fit: Fit | None = None
+) -> str:
+    """The last line: exciting or not and from when on, and how well the state is known.
+
+    Without true states: how well the estimates explain the data.
+    """
+    if excitation.is_ie:
+        first = (
+            f"interval-exciting from t = {excitation.t_c:.4g} s on "
+            f"(λ_min(G) = {excitation.lambda_min:.3g} at the end, ρ = {excitation.rho:.2g})"
+        )
+    else:
+        first = (
+            f"NOT interval-exciting: λ_min(G) = {excitation.lambda_min:.3g} < ρ = "
+            f"{excitation.rho:.2g}; not excited: {excitation.weakest_direction}"
+        )
+    parts = [first]
+    judged = _best_case(metrics)
+    if judged is not None:
+        best = judged
+        seconds = metrics.seconds_to_1pct_states[best]
+        reached = f"below 1 % after {seconds:.4g} s" if isfinite(seconds) else "never below 1 %"
+        parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end, {reached}")
+    elif fit is not None:
+        best = int(np.argmin(np.where(np.isfinite(fit.residual), fit.residual, np.inf)))
+    else:
+        best = 0
+    if fit is not None:
+        parts.append(
+            f"|Y − ψη̂| with the final estimates is {fit.residual[best]:.2g}, |Y| is "
+            f"{fit.size:.2g} (root mean squares)"
+        )
+    label = _case_label(estimation.cases[best])
+    line = "; ".join(parts) + (f" ({label})" if label else "")
+    if not estimation.requirement.holds:
+        line += f"; {estimation.requirement.name} not met: {estimation.requirement.text}"
+    return line
+
+
+def simulation_verdict(simulated: SimulationResult) -> str:
+    """The last line of a run without an observer."""
+    return (
+        f"simulated: index {simulated.index}, {simulated.differential} differential and "
+        f"{simulated.algebraic} algebraic equations, error estimate "
+        f"{simulated.error_estimate:.1e} of each state's size"
+    )
+
+
+def _best_case(metrics: Metrics) -> int | None:
+    """The first case below 1 % for good; if there is none, the one with the least final error.
+
+    By the final error alone, cases that have all converged would be told apart by rounding. None
+    where the error of no case is a number.
+    """
+    least_error = _least(metrics.final_error_states)
+    if least_error is None:
+        return None
+    first = _least(metrics.seconds_to_1pct_states)
+    return least_error if first is None else first
+
+
+def _least(values: Array) -> int | None:
+    """Place of the least finite value of (g,), None if there is none."""
+    if len(values) == 1:
+        return 0 if isfinite(values[0]) else None
+    place = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
+    return place if isfinite(values[place]) else None
+
+
+def _case_label(case: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {value:.6g}" for name, value in case.items())

@@ -1,0 +1,29 @@
+"""The language of plant files: real functions of time as text, with exact derivatives.
+
+Numbers, names, ``+ - * / **``, ``t``, ``pi``, ``sin cos tan exp log sqrt sinh cosh tanh abs
+sign``, ``d(.)`` for the time derivative, and ``step(t - t1)``, which is 0 before t1 and 1 from t1
+on (its argument may be any affine function of t; a falling one gives 1 before and 0 from t1 on).
+
+Text is read by :func:`parse` into graphs of ``nodes``, recorded on a :class:`Tape` and evaluated
+in Taylor arithmetic (``jets``): derivatives of any order, no code generation, nothing executed.
+Both sides of a ``step`` are always computed, so ``sqrt(t - 1)*step(t - 1)`` fails for t < 1; an
+intermediate value that overflows is refused even where the end result would be finite again, so
+``1/(1 + exp(500*t))`` fails for t > 1.4 (``tanh`` does not).
+"""
+
+from gpebo_cli.model.expressions.breakpoints import breakpoints, breakpoints_of_tape
+from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten
+from gpebo_cli.model.expressions.tape import Assembly, Tape, record, taylor
+
+__all__ = [
+    "RESERVED",
+    "Assembly",
+    "Expression",
+    "Tape",
+    "breakpoints",
+    "breakpoints_of_tape",
+    "parse",
+    "record",
+    "shorten",
+    "taylor",
+]

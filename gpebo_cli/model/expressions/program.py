@@ -1,0 +1,137 @@
+"""A tape at one order as a program for the compiled kernel: elementary operations on rows of times.
+
+The rules of :mod:`~gpebo_cli.model.expressions.jets` are not written a second time. They are run
+once, with symbols for the times instead of arrays, and what they do with those is recorded: the
+kernel then does the same operations in the same order. Whatever is equal at all times is a plain
+float there, so it is computed while recording and costs nothing later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+from gpebo_cli.model.descriptor import Array, IntArray
+
+# In the order of the kernel's operations; greater_equal answers 0 or 1.
+_OPERATIONS = {
+    name: code
+    for code, name in enumerate((
+        "add", "subtract", "multiply", "divide", "power", "greater_equal", "negative", "sqrt",
+        "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "sign",
+    ))
+}  # fmt: skip
+_GIVEN = 2  # rows that the caller gives: the times, and those at which jumps are decided
+
+Key = tuple[int, int, int]  # operation and operands: rows, or constants as ~index
+
+
+class Row(NDArrayOperatorsMixin):
+    """A number at each of the times, of which only the origin is known."""
+
+    __slots__ = ("index", "recorder")
+
+    def __init__(self, recorder: Recorder, index: int) -> None:
+        self.recorder = recorder
+        self.index = index
+
+    def __array_ufunc__(self, ufunc: np.ufunc, _method: str, *inputs: Any, **_options: Any) -> Any:
+        """Record what NumPy was asked to compute."""
+        return self.recorder.operation(ufunc.__name__, *inputs)
+
+    def astype(self, _type: type) -> Row:
+        """This row: truth is 0 or 1 in a row."""
+        return self
+
+
+class Recorder:
+    """The operations recorded so far; equal ones once."""
+
+    def __init__(self) -> None:
+        self.rows: dict[Key, Row] = {}
+        self.constants: dict[float, int] = {}
+        self.t, self.inside = Row(self, 0), Row(self, 1)
+
+    def operand(self, value: Row | float) -> int:
+        """A row by its index, a constant by ~index."""
+        if isinstance(value, Row):
+            return value.index
+        return ~self.constants.setdefault(float(value), len(self.constants))
+
+    def operation(self, name: str, left: Row | float, right: Row | float = 0.0) -> Row:
+        """The row that an operation makes."""
+        if isinstance(left, Row) and name in ("multiply", "divide") and _is_one(right):
+            return left
+        if isinstance(right, Row) and name == "multiply" and _is_one(left):
+            return right
+        key = (_OPERATIONS[name], self.operand(left), self.operand(right))
+        return self.rows.setdefault(key, Row(self, _GIVEN + len(self.rows)))
+
+
+def _is_one(value: Row | float) -> bool:
+    return not isinstance(value, Row) and float(value) == 1.0
+
+
+class Program(NamedTuple):
+    """Operations on rows. Rows 0 and 1 are given; a constant stands as ~index for a row."""
+
+    code: IntArray  # (number, 4) operation, row of its result, left and right operand
+    constants: Array  # (number,)
+    results: IntArray  # (order + 1, outputs) the rows of the coefficients
+
+
+def finished(recorder: Recorder, places: Sequence[list[Any]], outputs: Iterable[int], order: int
+             ) -> Program:
+    """The program of a recording whose tape has these jets at its places.
+
+    What contributes to no jet of any place is left out; all the rest is kept, also what no output
+    needs: it may turn out not to be finite. Rows are used again once they are read no more.
+    """
+    final = [
+        [recorder.operand(jet[k]) if k < len(jet) else recorder.operand(0.0)
+         for jet in (places[place] for place in outputs)]
+        for k in range(order + 1)
+    ]  # fmt: skip
+    operations = list(recorder.rows)
+    last = [-1] * (_GIVEN + len(operations))  # the operation that reads a row last
+    kept = [False] * len(last)
+    for jet in places:
+        for coefficient in jet:
+            if isinstance(coefficient, Row):
+                kept[coefficient.index] = True
+    for number in reversed(range(len(operations))):
+        if kept[_GIVEN + number]:
+            for operand in operations[number][1:]:
+                if operand >= 0:
+                    kept[operand] = True
+                    last[operand] = max(last[operand], number)
+    for operand in (operand for one in final for operand in one if operand >= 0):
+        last[operand] = len(operations)
+
+    free: list[int] = []
+    row_of = {0: 0, 1: 1}
+    code: list[tuple[int, int, int, int]] = []
+    rows = _GIVEN
+    for number, (operation, left, right) in enumerate(operations):
+        index = _GIVEN + number
+        if not kept[index]:
+            continue
+        # Taken before the operands are free: no operation writes where it reads.
+        if free:
+            row_of[index] = free.pop()
+        else:
+            row_of[index], rows = rows, rows + 1
+        code.append((operation, row_of[index], row_of.get(left, left), row_of.get(right, right)))
+        free += [row_of[old] for old in {left, right} if old >= _GIVEN and last[old] == number]
+        if last[index] < 0:
+            free.append(row_of[index])
+    return Program(
+        np.array(code, dtype=np.intp).reshape(-1, 4),
+        np.array(list(recorder.constants), dtype=float),
+        np.array([[row_of.get(x, x) for x in one] for one in final], dtype=np.intp).reshape(
+            order + 1, -1
+        ),
+    )

@@ -1,0 +1,247 @@
+"""Text to expression: a walk over Python's syntax tree that knows only a short list of shapes.
+
+A plant file may come from a stranger. Its text is parsed, never compiled or run; whatever is not
+listed here is refused, and limits on length, depth and the size of numbers keep the refusal quick.
+``sympify`` was rejected: it runs ``eval`` on the text. SymPy as such was rejected too: 0.25 s to
+import, and repeated symbolic derivatives that grow without bound.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import numbers
+import re
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.expressions import nodes
+from gpebo_cli.model.expressions.nodes import FoldError, Node
+from gpebo_cli.schema import nearest
+
+MAX_LENGTH = 100_000  # characters of one expression
+MAX_DEPTH = 200  # nesting; a sum or product of many terms is one level
+
+RESERVED = frozenset({"t", "pi", "d", "step", *nodes.FUNCTIONS})
+"""Names that mean something in every expression."""
+
+_CALLS: dict[str, Callable[[Node], Node]] = {"d": nodes.derivative, "step": nodes.step}
+_BINARY: dict[type[ast.operator], Callable[[Node, Node], Node]] = {
+    ast.Add: nodes.add,
+    ast.Sub: nodes.subtract,
+    ast.Mult: nodes.multiply,
+    ast.Div: nodes.divide,
+    ast.Pow: nodes.power,
+}
+_ACCEPTED = "accepted: numbers, names, + - * / **, t, pi, " + ", ".join(
+    [*nodes.FUNCTIONS, "d(.), step(t - t1)"]
+)
+_FOREIGN = re.compile(r"[^A-Za-z0-9_.+\-*/(), \t\r\n]")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expression:
+    """A function of time, with the text it came from; made by :func:`parse`."""
+
+    node: Node
+    text: str
+    where: str
+    uses: tuple[Expression, ...] = ()  # the named expressions in the text, for messages
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it is the same number at all times."""
+        return self.node.is_number
+
+    @property
+    def value(self) -> float:
+        """The constant. Raises ConfigError where the expression depends on time."""
+        if not self.is_constant:
+            raise ConfigError(f"{self.where} = {shorten(self.text)} must not depend on t")
+        return self.node.value
+
+
+def parse(
+    value: object,
+    names: Mapping[str, Expression],
+    where: str,
+    elsewhere: Mapping[str, str] | None = None,
+) -> Expression:
+    """Read one entry of a plant.
+
+    Args:
+        value: a number, or text in the language of the module docstring of ``expressions``.
+        names: what names in the text stand for, besides the RESERVED ones.
+        where: what the entry is, such as ``"plant circuit: A[0][1]"``; starts every message.
+        elsewhere: names that exist but may not be used here, with what they are ("an input").
+
+    Raises:
+        ConfigError: anything else than an expression of the language, or one without a value.
+    """
+    if isinstance(value, bool):
+        raise ConfigError(
+            f"{where} is the boolean {str(value).lower()}; "
+            "write a number or an expression (YAML reads on, off, yes and no as booleans)"
+        )
+    if isinstance(value, numbers.Real):
+        return Expression(_number(value, where), _number_text(value), where)
+    if not isinstance(value, str):
+        kind = "empty" if value is None else f"a {type(value).__name__}"
+        raise ConfigError(f"{where} is {kind}; write a number or an expression")
+
+    reader = _Reader(names, elsewhere or {})
+    try:
+        node = reader.read(_syntax_tree(value), 0)
+    except FoldError as error:
+        raise ConfigError(f"{where} = {shorten(value)}: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{where} = {shorten(value)}: it is nested too deeply") from None
+    return Expression(node, value, where, tuple(reader.used.values()))
+
+
+def shorten(text: str, limit: int = 60) -> str:
+    """The text in quotes, on one line, with its middle left out where it is long."""
+    if len(text) > limit:
+        text = f"{text[: limit // 2]}...{text[-limit // 4 :]}"
+    return repr(text)
+
+
+def _number(value: numbers.Real, where: str) -> Node:
+    try:
+        finite = float(value)
+    except OverflowError:
+        finite = math.inf
+    if not math.isfinite(finite):
+        raise ConfigError(f"{where} is {_number_text(value)}; write a finite number")
+    return nodes.number(finite)
+
+
+def _number_text(value: numbers.Real) -> str:
+    try:
+        return str(value)[:60]
+    except ValueError:  # integers beyond what Python converts to decimal
+        return "an integer too large"
+
+
+def _syntax_tree(text: str) -> ast.expr:
+    """The syntax tree of text that holds no characters foreign to the language."""
+    text = text.strip()
+    if not text:
+        raise FoldError("it is empty; write a number or an expression")
+    if len(text) > MAX_LENGTH:
+        raise FoldError(f"it has {len(text)} characters, more than {MAX_LENGTH}")
+    if foreign := _FOREIGN.search(text):
+        hint = "write ** for powers" if foreign[0] == "^" else _ACCEPTED
+        raise FoldError(f"the character {foreign[0]!a} has no meaning here; {hint}")
+    try:
+        with warnings.catch_warnings():  # Python warns of text such as "1if t"
+            warnings.simplefilter("ignore")
+            # Line breaks (folded YAML text) would end the expression for Python.
+            return ast.parse(" ".join(text.split()), mode="eval").body
+    except (MemoryError, RecursionError):  # the parser's words for "nested too deeply"
+        raise FoldError("it is nested too deeply") from None
+    except (SyntaxError, ValueError) as error:
+        reason = getattr(error, "msg", None) or str(error)
+        if "nested parentheses" in reason:
+            reason = "it is nested too deeply"
+        elif "integer string conversion" in reason:
+            reason = "a number in it is too large"
+        else:
+            reason = "it is not an expression (" + reason.split(" (<")[0].rstrip(".") + ")"
+        raise FoldError(reason) from None
+
+
+class _Reader:
+    """One text's walk; collects the named expressions it meets."""
+
+    def __init__(self, names: Mapping[str, Expression], elsewhere: Mapping[str, str]) -> None:
+        self.names = names
+        self.elsewhere = elsewhere
+        self.used: dict[str, Expression] = {}
+
+    def read(self, tree: ast.expr, depth: int) -> Node:
+        """The node of a syntax tree; raises FoldError for whatever the language lacks."""
+        if depth > MAX_DEPTH:
+            raise FoldError(f"it is nested more than {MAX_DEPTH} deep")
+        match tree:
+            case ast.Constant(value=value):
+                return self._constant(value)
+            case ast.Name(id=name):
+                return self._name(name)
+            case ast.BinOp():
+                return self._binary(tree, depth)
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return nodes.negative(self.read(operand, depth + 1))
+            case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+                return self.read(operand, depth + 1)
+            case ast.Call(func=ast.Name(id=name)):
+                return self._call(name, tree, depth)
+        raise FoldError(f"{_describe(tree)} has no meaning here; {_ACCEPTED}")
+
+    def _binary(self, tree: ast.BinOp, depth: int) -> Node:
+        # a + b + c + ... leans to the left, one level per term: walk it down without recursion.
+        spine: list[tuple[Callable[[Node, Node], Node], ast.expr]] = []
+        left: ast.expr = tree
+        while isinstance(left, ast.BinOp):
+            operation = _BINARY.get(type(left.op))
+            if operation is None:
+                raise FoldError(f"the operator {type(left.op).__name__} has no meaning here")
+            spine.append((operation, left.right))
+            left = left.left
+        node = self.read(left, depth + 1)
+        for operation, right in reversed(spine):
+            node = operation(node, self.read(right, depth + 1))
+        return node
+
+    def _call(self, name: str, tree: ast.Call, depth: int) -> Node:
+        if name not in nodes.FUNCTIONS and name not in _CALLS:
+            known = [*nodes.FUNCTIONS, *_CALLS]
+            hint = nearest(name, known)
+            raise FoldError(
+                f"there is no function {shorten(name)}{hint} (accepted: {', '.join(known)})"
+            )
+        if len(tree.args) != 1 or tree.keywords:
+            given = "keywords" if tree.keywords else len(tree.args)
+            raise FoldError(f"{name} takes one argument, not {given}")
+        argument = self.read(tree.args[0], depth + 1)
+        return _CALLS[name](argument) if name in _CALLS else nodes.function(name, argument)
+
+    def _name(self, name: str) -> Node:
+        if name == "t":
+            return nodes.TIME
+        if name == "pi":
+            return nodes.number(math.pi)
+        if name in self.names:
+            self.used[name] = self.names[name]
+            return self.names[name].node
+        if name in RESERVED:
+            raise FoldError(f"{name} is a function and needs an argument, {name}(...)")
+        if name in self.elsewhere:
+            raise FoldError(f"{name} is {self.elsewhere[name]} and cannot be used here")
+        known = [*self.names, "t", "pi"]
+        listed = ", ".join(known[-12:])
+        raise FoldError(
+            f"the name {shorten(name)} is not defined{nearest(name, known)} (defined: {listed})"
+        )
+
+    @staticmethod
+    def _constant(value: object) -> Node:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise FoldError(f"{shorten(str(value))} is not a real number")
+        try:
+            return nodes.number(float(value))
+        except OverflowError:
+            raise FoldError("a number in it is too large") from None
+
+
+def _describe(tree: ast.expr) -> str:
+    match tree:
+        case ast.Attribute():
+            return "a dot after a name (attribute)"
+        case ast.Call():
+            return "a call of something that is not a name"
+        case ast.UnaryOp():
+            return "this unary operator"
+    return f"this kind of expression ({type(tree).__name__})"

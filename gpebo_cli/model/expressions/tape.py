@@ -1,0 +1,343 @@
+"""Many expressions, recorded as one list of instructions and evaluated together.
+
+Equal work is done once, also across expressions: two nodes with the same operation, arguments
+and value get the same place on the tape. A tape is flat, so it copies to other processes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpebo_cli import kernels
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.model.expressions import jets
+from gpebo_cli.model.expressions.jets import Coefficient, Jet
+from gpebo_cli.model.expressions.program import Program, Recorder, finished
+from gpebo_cli.model.expressions.syntax import Expression, shorten
+
+MAX_INSTRUCTIONS = 200_000
+MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in parts
+# Recording takes as long as evaluating four times without the kernel: where that is much, it may
+# never be gained again.
+_MOST_COMPILED = 1000
+
+# Function, its place in the pair of jets computed together, and which pair.
+_PAIRS = {
+    "sin": (np.sin, 0, False),
+    "cos": (np.cos, 1, False),
+    "sinh": (np.sinh, 0, True),
+    "cosh": (np.cosh, 1, True),
+}
+
+
+class Instruction(NamedTuple):
+    """One operation on earlier places of the tape."""
+
+    operation: str
+    arguments: tuple[int, ...]
+    value: float
+
+
+class Switch(NamedTuple):
+    """The place of an argument of abs or sign, and (c, s) where that argument is c + s t."""
+
+    argument: int
+    affine: tuple[float, float] | None
+
+
+class Label(NamedTuple):
+    """A named piece of text: its place, and the labels of the names in it."""
+
+    place: int
+    text: str
+    where: str
+    uses: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Tape:
+    """Instructions in an order in which arguments come first; made by :func:`record`."""
+
+    instructions: tuple[Instruction, ...]
+    extra: tuple[int, ...]  # orders needed beyond the one asked for, by the d(.) around a place
+    outputs: tuple[int, ...]  # places of the expressions
+    switches: tuple[Switch, ...]
+    labels: tuple[Label, ...]  # those of the expressions first
+
+    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Array:
+        """Taylor coefficients of all expressions, shape (order + 1, N, number of expressions).
+
+        Args:
+            t: times, shape (N,), seconds.
+            order: highest coefficient wanted.
+            inside: times, shape (N,), at which step, abs and sign are decided; by default ``t``.
+
+        Raises:
+            ConfigError: a value that is not finite; names the entry, its text and the time.
+        """
+        t = np.asarray(t, dtype=np.float64)
+        filled = self._in_a_row.taylor(t, order, inside)
+        if filled is not None:
+            return filled[0]
+        result = np.zeros((order + 1, len(self.outputs), len(t)))
+        held = max(1, len(self.instructions)) * (order + 1 + max(self.extra, default=0))
+        part = max(64, MAX_NUMBERS // held)
+        for first in range(0, len(t), part):
+            here = slice(first, first + part)
+            times = t[here]
+            decided = times if inside is None else inside[here]
+            places = self._checked(times, order, decided)
+            for column, place in enumerate(self.outputs):
+                for k, coefficient in enumerate(places[place][: order + 1]):
+                    result[k, column, here] = coefficient
+            # Arithmetic of plain floats (coefficients equal at all times) raises no flags.
+            if not np.isfinite(result[:, :, here]).all():
+                self._refuse(times, order, decided)
+        return np.moveaxis(result, 1, 2)
+
+    @cached_property
+    def jumps(self) -> bool:
+        """Whether there is any step, abs or sign."""
+        return bool(self.switches) or any(i.operation == "step" for i in self.instructions)
+
+    def program(self, order: int, apart: bool) -> Program | None:
+        """What :meth:`taylor` does, for the compiled kernel; None where that is not worth it.
+
+        Args:
+            order: highest coefficient wanted.
+            apart: whether the times at which jumps are decided are others than the times.
+        """
+        if len(self.instructions) > _MOST_COMPILED:
+            return None
+        recorder = Recorder()
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
+                places = self._run(recorder.t, order, recorder.inside if apart else recorder.t)
+        except FloatingPointError:
+            return None  # to be refused at any time
+        return finished(recorder, places, self.outputs, order)
+
+    @cached_property
+    def _in_a_row(self) -> Assembly:
+        targets = np.array([(0, j) for j in range(len(self.outputs))], dtype=np.intp)
+        return Assembly(self, targets.reshape(-1, 2), (np.zeros(len(self.outputs)),))
+
+    def arguments_of_switches(self, t: Array, inside: Array) -> Array:
+        """Arguments of abs and sign at the times ``t``, shape (number of switches, N).
+
+        Raises:
+            ConfigError: as for :meth:`taylor`.
+        """
+        places = self._checked(t, 0, inside)
+        result = np.empty((len(self.switches), len(t)))
+        for row, switch in enumerate(self.switches):
+            result[row] = places[switch.argument][0]
+        return result
+
+    def _checked(self, t: Array, order: int, inside: Array) -> list[Jet]:
+        """Run with every invalid operation refused, even one whose result is finite again."""
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
+                return self._run(t, order, inside)
+        except FloatingPointError:
+            # Only a second, slower run can tell whose fault it was and when; or that it was
+            # nobody's: vectorised loops may raise flags for lanes that they do not return.
+            self._refuse(t, order, inside)
+            with np.errstate(all="ignore"):
+                return self._run(t, order, inside)
+
+    def _run(self, t: Any, order: int, inside: Any, stop: int | None = None) -> list[Jet]:
+        """Jets of all places before ``stop``, those that jump decided at ``inside``.
+
+        The times are arrays (N,), or symbols for them that record what is done.
+        """
+        deciding: list[Jet] | None = None
+        if self.switches and inside is not t:
+            last = max(switch.argument for switch in self.switches)
+            deciding = self._run(inside, 0, inside, last + 1)
+        places: list[Jet] = []
+        pairs: dict[tuple[int, bool], tuple[int, tuple[Jet, Jet]]] = {}
+        for (operation, arguments, value), extra in zip(
+            self.instructions[:stop], self.extra[:stop], strict=True
+        ):
+            wanted = order + extra
+            jet: Jet
+            if operation in jets.BINARY:
+                left, right = arguments
+                jet = jets.BINARY[operation](places[left], places[right], wanted)
+            elif operation in _PAIRS:
+                function, which, hyperbolic = _PAIRS[operation]
+                argument = places[arguments[0]]
+                if wanted == 0:
+                    jet = [function(argument[0])]
+                else:
+                    known, pair = pairs.get((arguments[0], hyperbolic), (-1, ([], [])))
+                    if known < wanted:
+                        pair = jets.sine_and_cosine(argument, wanted, hyperbolic)
+                        pairs[arguments[0], hyperbolic] = wanted, pair
+                    jet = pair[which]
+            elif operation in jets.UNARY:
+                jet = jets.UNARY[operation](places[arguments[0]], wanted)
+            elif operation == "power":
+                jet = jets.power(places[arguments[0]], value, wanted)
+            elif operation == "number":
+                jet = [value]
+            elif operation == "t":
+                jet = [t, 1.0]
+            elif operation == "step":
+                jet = [(inside >= value).astype(np.float64)]
+            else:
+                sign = np.sign((places if deciding is None else deciding)[arguments[0]][0])
+                jet = [sign] if operation == "sign" else [sign * c for c in places[arguments[0]]]
+            places.append(jet)
+        return places
+
+    def _refuse(self, t: Array, order: int, inside: Array) -> None:
+        """Raise the error for the first entry, and in it the innermost name, that is not finite."""
+        for times in (t,) if inside is t else (t, inside):
+            with np.errstate(all="ignore"):
+                places = self._run(times, order if times is t else 0, inside)
+            # First index of a time at which a place, or something it is made of, is not finite.
+            bad: list[float] = []
+            for (_, arguments, _), jet in zip(self.instructions, places, strict=True):
+                own = [_first_not_finite(coefficient) for coefficient in jet]
+                bad.append(min([*own, *(bad[argument] for argument in arguments)]))
+            for label in self.labels[: len(self.outputs)]:
+                if bad[label.place] < math.inf:
+                    while inner := [k for k in label.uses if bad[self.labels[k].place] < math.inf]:
+                        label = self.labels[inner[0]]  # noqa: PLW2901  down to the culprit
+                    index = int(bad[label.place])
+                    value = np.broadcast_to(places[label.place][0], times.shape)[index]
+                    late = times is t and order > 0 and np.isfinite(value)
+                    what = "no finite derivative" if late else "no finite value"
+                    raise ConfigError(
+                        f"{label.where} = {shorten(label.text)} has {what} "
+                        f"at t = {times[index]:.10g}"
+                    )
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """Matrices in which some entries are outputs of a tape, and all others constants."""
+
+    tape: Tape
+    targets: IntArray  # (outputs, 2) the matrix and the entry in it, counted by rows
+    fixed: tuple[Array, ...]  # the matrices; what stands at the targets does not matter
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None
+    ) -> tuple[Array, ...] | None:
+        """Taylor coefficients of the matrices at the times t (N,), by the compiled kernel.
+
+        Returns:
+            shape (order + 1, N, ...) each, read-only where constant in time; None where there is
+            no kernel for it, or where it met an operation that may have to be refused:
+            :meth:`Tape.taylor` has to decide.
+        """
+        if kernels.compiled is None:
+            return None
+        apart = inside is not None and inside is not t and self.tape.jumps
+        key = order, apart
+        if key not in self._plans:
+            self._plans[key] = self._plan(order, apart)
+        plan = self._plans[key]
+        if plan is None:
+            return None
+        return kernels.compiled.jets(t, inside if apart else t, *plan)  # type: ignore[no-any-return]
+
+    @cached_property
+    def _plans(self) -> dict[tuple[int, bool], tuple[Array | IntArray, ...] | None]:
+        """What the kernel is given besides the times; by order, and whether jumps are apart."""
+        return {}
+
+    def _plan(self, order: int, apart: bool) -> tuple[Array | IntArray, ...] | None:
+        program = self.tape.program(order, apart)
+        if program is None:
+            return None
+        matrices = []
+        for fixed in self.fixed:
+            once = np.zeros((order + 1, 1, *fixed.shape))
+            once[0, 0] = fixed
+            once.flags.writeable = False
+            matrices.append(once)
+        return *program, self.targets, *matrices
+
+
+def _first_not_finite(coefficient: Coefficient) -> float:
+    flags = np.atleast_1d(~np.isfinite(coefficient))
+    return float(np.argmax(flags)) if flags.any() else math.inf
+
+
+def record(expressions: Sequence[Expression]) -> Tape:
+    """Record expressions on one tape.
+
+    Raises:
+        ConfigError: more than MAX_INSTRUCTIONS different operations.
+    """
+    instructions: dict[Instruction, int] = {}
+    place_of: dict[int, int] = {}  # by id of the node; the expressions keep the nodes alive
+    switches: dict[int, Switch] = {}
+    for expression in expressions:
+        stack = [expression.node]
+        while stack:
+            node = stack[-1]
+            missing = [a for a in node.arguments if id(a) not in place_of]
+            if missing:
+                stack.extend(missing)
+                continue
+            stack.pop()
+            arguments = tuple(place_of[id(a)] for a in node.arguments)
+            instruction = Instruction(node.operation, arguments, node.value)
+            place_of[id(node)] = instructions.setdefault(instruction, len(instructions))
+            if node.operation in ("abs", "sign"):
+                switches[arguments[0]] = Switch(arguments[0], node.arguments[0].affine)
+        if len(instructions) > MAX_INSTRUCTIONS:
+            raise ConfigError(
+                f"{expression.where}: the expressions up to here need more than "
+                f"{MAX_INSTRUCTIONS} operations"
+            )
+
+    extra = [0] * len(instructions)
+    for instruction, place in reversed(instructions.items()):
+        for argument in instruction.arguments:
+            needed = extra[place] + (instruction.operation == "derivative")
+            extra[argument] = max(extra[argument], needed)
+    return Tape(
+        instructions=tuple(instructions),
+        extra=tuple(extra),
+        outputs=tuple(place_of[id(expression.node)] for expression in expressions),
+        switches=tuple(switches.values()),
+        labels=_labels(expressions, place_of),
+    )
+
+
+def _labels(expressions: Sequence[Expression], place_of: dict[int, int]) -> tuple[Label, ...]:
+    """Labels of the expressions and of the names they use, as far as those are on the tape."""
+    listed = list(expressions)
+    index = {id(expression): k for k, expression in enumerate(listed)}
+    uses: list[tuple[int, ...]] = []
+    for expression in listed:  # grows as it is walked
+        kept = [used for used in expression.uses if id(used.node) in place_of]
+        for used in kept:
+            if id(used) not in index:
+                index[id(used)] = len(listed)
+                listed.append(used)
+        uses.append(tuple(index[id(used)] for used in kept))
+    return tuple(
+        Label(place_of[id(e.node)], e.text, e.where, used)
+        for e, used in zip(listed, uses, strict=True)
+    )
+
+
+def taylor(
+    expressions: Sequence[Expression], t: Array, order: int, inside: Array | None = None
+) -> Array:
+    """Taylor coefficients of expressions at times t (N,); :meth:`Tape.taylor` of their tape."""
+    return record(expressions).taylor(t, order, inside)

@@ -1,0 +1,448 @@
+"""From the plain data of a plant file to a :class:`DescriptorSystem`, checked at construction.
+
+Every message names the plant, the key and the entry, and where two sizes disagree, both.
+"""
+
+from __future__ import annotations
+
+import keyword
+import re
+import reprlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.expressions import (
+    RESERVED,
+    Assembly,
+    Expression,
+    Tape,
+    breakpoints_of_tape,
+    parse,
+    record,
+    shorten,
+)
+from gpebo_cli.schema import nearest
+
+KEYS = (
+    "name",
+    "title",
+    "reference",
+    "parameters",
+    "states",
+    "inputs",
+    "unknowns",
+    "outputs",
+    "E",
+    "A",
+    "B",
+    "F",
+    "C",
+    "initial_state",
+    "units",
+    "observer_defaults",
+)
+"""Keys of a plant file; name, states, E, A and initial_state are required."""
+
+_PLANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,79}")  # it becomes part of a folder's name
+_YAML_BOOLEAN = "YAML reads on, off, yes and no as booleans"
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """How one matrix is put together from constants and columns of the tape's values."""
+
+    shape: tuple[int, ...]
+    fixed: Array  # (size,), constants; zero where an entry depends on time
+    positions: NDArray[np.intp]  # of the entries that depend on time
+    columns: NDArray[np.intp]  # where their values stand among the tape's outputs
+
+    def assemble(self, values: Array) -> Array:
+        """Coefficients (K + 1, N, *shape) from the tape's values (K + 1, N, M)."""
+        orders, times = values.shape[:2]
+        if not len(self.positions):
+            once = np.zeros((orders, 1, *self.shape))
+            once[0] = self.fixed.reshape(self.shape)
+            # What np.broadcast_to does, at a fifth of its price: it is called for every matrix.
+            strides = (once.strides[0], 0, *once.strides[2:])
+            repeated: Array = np.ndarray((orders, times, *self.shape), float, once, 0, strides)
+            repeated.flags.writeable = False
+            return repeated
+        flat = np.zeros((orders, times, len(self.fixed)))
+        flat[0] = self.fixed
+        flat[:, :, self.positions] = values[:, :, self.columns]
+        return flat.reshape(orders, times, *self.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class TextCoefficients:
+    """The matrices of a plant given as text; a ``CoefficientSource``.
+
+    All entries that depend on time are evaluated together, equal ones once. Matrices that do not
+    depend on time come as read-only broadcast arrays.
+    """
+
+    tape: Tape
+    layouts: Mapping[str, _Layout]  # by the names in MATRIX_NAMES
+
+    @cached_property
+    def constant(self) -> frozenset[str]:
+        """Those of ``MATRIX_NAMES`` that do not depend on time."""
+        return frozenset(k for k, layout in self.layouts.items() if not len(layout.positions))
+
+    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:
+        """All matrices at the times ``t`` (N,) in seconds, to ``order``; see the protocol.
+
+        Raises:
+            ConfigError: an entry without a finite value or derivative; names it and the time.
+        """
+        filled = self._assembly.taylor(np.asarray(t, dtype=np.float64), order, inside)
+        if filled is not None:
+            return Coefficients._make(filled)
+        values = self.tape.taylor(t, order, inside)
+        return Coefficients(**{k: self.layouts[k].assemble(values) for k in MATRIX_NAMES})
+
+    @cached_property
+    def _assembly(self) -> Assembly:
+        layouts = [self.layouts[name] for name in MATRIX_NAMES]
+        targets = np.empty((len(self.tape.outputs), 2), dtype=np.intp)
+        for matrix, layout in enumerate(layouts):
+            targets[layout.columns, 0] = matrix
+            targets[layout.columns, 1] = layout.positions
+        fixed = tuple(layout.fixed.reshape(layout.shape) for layout in layouts)
+        return Assembly(self.tape, targets, fixed)
+
+    def breakpoints(self, start: float, stop: float) -> Array:
+        """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks."""
+        return breakpoints_of_tape(self.tape, start, stop)
+
+
+def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> DescriptorSystem:
+    """Build a plant from the plain data of its file.
+
+    Args:
+        mapping: the KEYS of a plant file; one that is absent, None or empty is the same.
+        source: the file, for messages.
+
+    Raises:
+        ConfigError: anything that is missing, unknown, of the wrong kind or size, or not an
+            expression of the language of ``gpebo_cli.model.expressions``.
+    """
+    file = f" ({source})" if source else ""
+    if not isinstance(mapping, Mapping):
+        raise ConfigError(f"plant{file} must be a mapping with the keys {', '.join(KEYS)}")
+    name = _plant_name(mapping.get("name"), file)
+    plant = f"plant {name}{file}"
+    for key in mapping:
+        if key not in KEYS:
+            hint = nearest(str(key), KEYS)
+            raise ConfigError(
+                f"{plant}: unknown key {_show(key)}{hint} (accepted: {', '.join(KEYS)})"
+            )
+
+    states = _names(plant, "states", _required(mapping, "states", plant))
+    inputs = _named_values(plant, "inputs", mapping.get("inputs"), "{V: sin(t)}")
+    unknowns = _named_values(plant, "unknowns", mapping.get("unknowns"), "{theta1: 1.5}")
+    outputs = _names(plant, "outputs", _or_empty(mapping.get("outputs"), ()))
+    kinds = {
+        "a state": states,
+        "an input": tuple(inputs),
+        "an unknown": tuple(unknowns),
+        "an output": outputs,
+    }
+    elsewhere = _kind_of_name(plant, kinds)
+    clash = [name for name in unknowns if name.startswith("e0_") and name[3:] in states]
+    if clash:
+        raise ConfigError(
+            f"{plant}: the unknown {clash[0]} has the name of the estimated initial error of "
+            f"the state {clash[0][3:]}; choose another name"
+        )
+    parameters = _parameters(plant, mapping.get("parameters"), elsewhere)
+
+    def read(value: object, where: str) -> Expression:
+        return parse(value, parameters, f"{plant}: {where}", elsewhere)
+
+    rows = _Side("state", states)
+    sides = {
+        "E": (rows, rows),
+        "A": (rows, rows),
+        "B": (rows, _Side("input", tuple(inputs))),
+        "F": (rows, _Side("unknown", tuple(unknowns))),
+        "C": (_Side("output", outputs), rows),
+    }
+    entries: dict[str, tuple[tuple[int, ...], list[Expression]]] = {}
+    for key, (down, across) in sides.items():
+        grid = _matrix(plant, key, mapping.get(key), down, across)
+        shape = (len(down.names), len(across.names))
+        entries[key] = (
+            shape,
+            [read(value, f"{key}[{i}][{j}]") for i, row in enumerate(grid) for j, value in row],
+        )
+    signals = [read(value, f"inputs.{label}") for label, value in inputs.items()]
+    entries["u"] = (len(inputs),), signals
+
+    theta = [read(value, f"unknowns.{label}") for label, value in unknowns.items()]
+    entries["theta"] = (len(unknowns),), theta
+    given = _initial_values(plant, _required(mapping, "initial_state", plant), states)
+    initial = [read(value, f"initial_state.{label}").value for label, value in given.items()]
+    return DescriptorSystem(
+        name=name,
+        states=states,
+        coefficients=_coefficients(entries),
+        initial_state=np.array(initial),
+        inputs=tuple(inputs),
+        unknowns=tuple(unknowns),
+        outputs=outputs,
+        theta=np.array([e.value if e.is_constant else np.nan for e in theta]),
+        title=_line(plant, "title", mapping.get("title")),
+        reference=_line(plant, "reference", mapping.get("reference")),
+        source=source,
+        units=_units(plant, mapping.get("units"), tuple(elsewhere)),
+        observer_defaults=dict(_mapping(plant, "observer_defaults", mapping)),
+    )
+
+
+def _coefficients(
+    entries: Mapping[str, tuple[tuple[int, ...], Sequence[Expression]]],
+) -> TextCoefficients:
+    varying: list[Expression] = []
+    layouts: dict[str, _Layout] = {}
+    for key, (shape, expressions) in entries.items():
+        positions = [k for k, e in enumerate(expressions) if not e.is_constant]
+        layouts[key] = _Layout(
+            shape,
+            np.array([e.value if e.is_constant else 0.0 for e in expressions]),
+            np.array(positions, dtype=np.intp),
+            np.arange(len(varying), len(varying) + len(positions), dtype=np.intp),
+        )
+        varying += [expressions[k] for k in positions]
+    return TextCoefficients(record(varying), layouts)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """What the rows or the columns of a matrix stand for."""
+
+    noun: str
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """``there are 2 inputs (V, I)``, for messages."""
+        verb = "is" if len(self.names) == 1 else "are"
+        named = f" ({_listed(self.names)})" if self.names else ""
+        return f"there {verb} {_count(len(self.names), self.noun)}{named}"
+
+
+def _listed(names: Sequence[str], limit: int = 8) -> str:
+    """The names with commas, the first ``limit`` of them."""
+    rest = [] if len(names) <= limit else ["..."]
+    return ", ".join([*names[:limit], *rest])
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _list(value: object) -> list[object] | None:
+    """The items of a list, None for anything else (text is not a list of letters)."""
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return list(value)
+    return None
+
+
+def _show(value: object) -> str:
+    """Any value, short: aliases can make a small YAML file a gigantic nested list."""
+    return shorten(value if isinstance(value, str) else reprlib.repr(value))
+
+
+def _or_empty(value: object, empty: object) -> object:
+    """The value, or ``empty`` where the key is absent or has nothing behind it."""
+    return empty if value is None else value
+
+
+def _required(mapping: Mapping[str, object], key: str, plant: str) -> object:
+    value = mapping.get(key)
+    if value is None:
+        raise ConfigError(f"{plant}: {key} is missing")
+    return value
+
+
+def _plant_name(value: object, file: str) -> str:
+    if value is None:
+        raise ConfigError(f"plant{file}: name is missing")
+    if not isinstance(value, str) or not _PLANT_NAME.fullmatch(value):
+        raise ConfigError(
+            f"plant{file}: name is {_show(value)}; write text of letters, digits, "
+            "'_', '-', '.' and blanks that starts with a letter or digit (it names folders)"
+        )
+    return value
+
+
+def _line(plant: str, key: str, value: object) -> str:
+    """A one-line text; the breaks of folded YAML text become blanks."""
+    if value is None:
+        return ""
+    if isinstance(value, bool | Mapping) or _list(value) is not None:
+        raise ConfigError(f"{plant}: {key} must be one line of text; quote it")
+    return " ".join(str(value).split())
+
+
+def _mapping(plant: str, key: str, mapping: Mapping[str, object]) -> Mapping[str, object]:
+    value = _or_empty(mapping.get(key), {})
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{plant}: {key} must be a mapping, not {_show(value)}")
+    return value
+
+
+def _name(plant: str, key: str, value: object) -> str:
+    """A name that can head a column and stand in an expression."""
+    if isinstance(value, bool):
+        raise ConfigError(
+            f"{plant}: {key} has the boolean {str(value).lower()} as a name; quote it "
+            f"({_YAML_BOOLEAN})"
+        )
+    if not (isinstance(value, str) and value.isascii() and value.isidentifier()):
+        raise ConfigError(
+            f"{plant}: {key} has the name {_show(value)}; a name is made of the letters "
+            "a-z, A-Z, digits and _, and starts with no digit"
+        )
+    if value in RESERVED:
+        raise ConfigError(
+            f"{plant}: {key} has the name {value}, which is reserved "
+            f"(reserved: {', '.join(sorted(RESERVED))})"
+        )
+    return value
+
+
+def _names(plant: str, key: str, value: object) -> tuple[str, ...]:
+    items = _list(value)
+    if items is None:
+        raise ConfigError(
+            f"{plant}: {key} must be a list of names such as [x1, x2], not {_show(value)}"
+        )
+    names = tuple(_name(plant, key, item) for item in items)
+    if key == "states" and not names:
+        raise ConfigError(f"{plant}: states is empty; a plant has at least one state")
+    return names
+
+
+def _named_values(plant: str, key: str, value: object, example: str) -> dict[str, object]:
+    if value is None or value == []:
+        return {}
+    if not isinstance(value, Mapping):
+        raise ConfigError(
+            f"{plant}: {key} must map names to values, such as {example}, not {_show(value)}"
+        )
+    return {_name(plant, key, label): item for label, item in value.items()}
+
+
+def _kind_of_name(plant: str, kinds: Mapping[str, Iterable[str]]) -> dict[str, str]:
+    """Which kind each name is; refuses names given twice, because columns are found by name."""
+    seen: dict[str, str] = {}
+    for kind, names in kinds.items():
+        for name in names:
+            if name in seen:
+                twice = f"{kind} twice" if seen[name] == kind else f"{seen[name]} and {kind}"
+                raise ConfigError(f"{plant}: {name} is {twice}; every name must be used once")
+            seen[name] = kind
+    return seen
+
+
+def _parameters(plant: str, value: object, elsewhere: Mapping[str, str]) -> dict[str, Expression]:
+    given = _named_values(plant, "parameters", value, "{R: 2 + sin(t)}")
+    parameters: dict[str, Expression] = {}
+    later = dict.fromkeys(given, "a parameter defined further down")
+    for label, item in given.items():
+        if keyword.iskeyword(label):
+            raise ConfigError(
+                f"{plant}: parameters has the name {label}, a word of Python that cannot stand "
+                f"in an expression; write {label}_ or another name"
+            )
+        where = f"{plant}: parameters.{label}"
+        later[label] = "this parameter itself"
+        parameters[label] = parse(item, parameters, where, {**elsewhere, **later})
+    return parameters
+
+
+def _matrix(
+    plant: str, key: str, value: object, down: _Side, across: _Side
+) -> list[list[tuple[int, object]]]:
+    """The entries of a matrix by row, each with its column; sizes checked."""
+    n_rows, n_columns = len(down.names), len(across.names)
+    if value is None or value == []:
+        if n_rows and n_columns:
+            needed = across if down.noun == "state" else down
+            raise ConfigError(
+                f"{plant}: {key} is missing; {needed}, so it needs {_count(n_rows, 'row')} "
+                f"of {n_columns}"
+            )
+        return []
+    rows = _list(value)
+    if rows is None:
+        raise ConfigError(
+            f"{plant}: {key} must be a list of {_count(n_rows, 'row')}, not {_show(value)}"
+        )
+    if len(rows) != n_rows:
+        raise ConfigError(f"{plant}: {key} has {_count(len(rows), 'row')} but {down}")
+    grid: list[list[tuple[int, object]]] = []
+    for i, row in enumerate(rows):
+        entries = _list(row)
+        if entries is None:
+            raise ConfigError(
+                f"{plant}: {key}[{i}] must be a list, one entry per {across.noun}, not {_show(row)}"
+            )
+        grid.append(list(enumerate(entries)))
+    widths = [len(row) for row in grid]
+    for i, width in enumerate(widths):
+        if width != widths[0]:
+            raise ConfigError(
+                f"{plant}: the rows of {key} differ: {key}[0] has length {widths[0]}, "
+                f"{key}[{i}] has length {width}"
+            )
+    if widths[0] != n_columns:
+        raise ConfigError(f"{plant}: {key} has {_count(widths[0], 'column')} but {across}")
+    return grid
+
+
+def _initial_values(plant: str, value: object, states: tuple[str, ...]) -> dict[str, object]:
+    """Initial value by state, in the order of the states."""
+    if isinstance(value, Mapping):
+        for label in value:
+            if label not in states:
+                raise ConfigError(
+                    f"{plant}: initial_state has {_show(label)}, which is not a state"
+                    f"{nearest(str(label), states)} (states: {_listed(states)})"
+                )
+        missing = [state for state in states if state not in value]
+        if missing:
+            raise ConfigError(f"{plant}: initial_state lacks {_listed(missing)}")
+        return {state: value[state] for state in states}
+    values = _list(value)
+    if values is None:
+        raise ConfigError(
+            f"{plant}: initial_state must map states to numbers or list "
+            f"{_count(len(states), 'number')}, not {_show(value)}"
+        )
+    if len(values) != len(states):
+        raise ConfigError(
+            f"{plant}: initial_state has {_count(len(values), 'value')} but "
+            f"{_Side('state', states)}"
+        )
+    return dict(zip(states, values, strict=True))
+
+
+def _units(plant: str, value: object, names: Sequence[str]) -> dict[str, str]:
+    units: dict[str, str] = {}
+    for label, unit in _mapping(plant, "units", {"units": value}).items():
+        if label not in names:
+            raise ConfigError(
+                f"{plant}: units has {_show(label)}, which is no state, input, output or "
+                f"unknown{nearest(str(label), names)}"
+            )
+        units[label] = _line(plant, f"units.{label}", unit)
+    return units

@@ -1,0 +1,122 @@
+"""Small dense linear algebra over a batch of matrices (leading axis: time).
+
+Ranks are judged against the size of what a matrix was made from, never against its own largest
+singular value: a one-column product of size 1e-17 has rank 0, not 1.
+"""
+
+from __future__ import annotations
+
+from math import prod
+
+import numpy as np
+
+from gpebo_cli import kernels
+from gpebo_cli.model.descriptor import Array
+
+# Rows of matrices, up to which LAPACK's calls cost more than what they compute: by elimination, and
+# where singular values are wanted.
+SMALL, _SMALL_SPECTRUM = 16, 8
+
+
+def transpose(a: Array) -> Array:
+    """Transpose the last two axes, (…, a, b) to (…, b, a)."""
+    return np.swapaxes(a, -1, -2)
+
+
+def joined(*parts: Array, axis: int) -> Array:
+    """Blocks (N or 1, a, b) side by side (axis 2) or stacked (axis 1); those of one time repeat."""
+    count = max(map(len, parts))
+    return np.concatenate(
+        [p if len(p) == count else np.broadcast_to(p, (count, *p.shape[1:])) for p in parts],
+        axis=axis,
+    )
+
+
+def orthonormal_complement(basis: Array) -> Array:
+    """Projector onto the orthogonal complement of orthonormal columns, shape (..., n, n)."""
+    return np.eye(basis.shape[-2]) - basis @ transpose(basis)
+
+
+def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Array, Array]:
+    """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p) or (..., p, c), singular Ω too.
+
+    With Ω = U Σ Vᵀ, adj(Ω) = det(U) det(V) V diag(∏_{j≠i} σ_j) Uᵀ. The usual det(Ω)·inv(Ω) is
+    rejected: it is undefined at the start, where every extension begins at Ω = 0. The kernel does
+    it by elimination with the smallest pivot last, by which nothing is divided.
+
+    Returns:
+        det(Ω) of shape (...,), adj(Ω) b of the shape of b, and the reciprocal condition number
+        σ_min/σ_max of shape (...,), zero where Ω = 0.
+
+    Examples:
+        >>> import numpy as np
+        >>> delta, action, _ = determinant_and_adjugate_action(np.zeros((2, 2)), np.ones(2))
+        >>> float(delta), action.tolist()  # the adjugate of Ω = 0 is defined, its inverse is not
+        (0.0, [0.0, 0.0])
+    """
+    p = omega.shape[-1]
+    if kernels.compiled is not None and 0 < p <= _SMALL_SPECTRUM:
+        shape, c = omega.shape[:-2], 1 if rhs.ndim < omega.ndim else rhs.shape[-1]
+        count = prod(shape)
+        delta, action, condition = kernels.compiled.adjugate_action(
+            omega.reshape(count, p, p), rhs.reshape(count, p, c)
+        )
+        return delta.reshape(shape), action.reshape(rhs.shape), condition.reshape(shape)
+    u, sigma, vt = np.linalg.svd(omega)
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    # Products of all singular values but one, by prefix and suffix products: no division.
+    ones = np.ones((*sigma.shape[:-1], 1))
+    before = np.concatenate([ones, np.cumprod(sigma[..., :-1], axis=-1)], axis=-1)
+    after = np.concatenate([np.cumprod(sigma[..., :0:-1], axis=-1)[..., ::-1], ones], axis=-1)
+    determinant = sign * before[..., p - 1] * sigma[..., p - 1]
+    columns = rhs if rhs.ndim == omega.ndim else rhs[..., None]
+    coordinates = (transpose(u) @ columns) * (before * after)[..., None]
+    action = (sign[..., None, None] * (transpose(vt) @ coordinates)).reshape(rhs.shape)
+    largest = sigma[..., 0]
+    reciprocal = np.divide(sigma[..., -1], largest, out=np.zeros_like(largest), where=largest > 0)
+    return determinant, action, reciprocal
+
+
+_SCAN_LIMIT = 1 << 11  # above this many parallel recurrences a plain loop over k moves less memory
+
+
+def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
+    """All z_k of z_{k+1} = a_k z_k + b_k along axis 0.
+
+    In NumPy, for few recurrences a parallel prefix scan: it composes neighbouring affine maps in
+    log2(K) vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the
+    recurrence. For many, the recurrence itself, each step vectorised over all of them.
+
+    Args:
+        factor: a, shape (K, ...), broadcastable against ``shift``.
+        shift: b, shape (K, ...).
+        start: z_0, broadcastable against (...).
+
+    Returns:
+        z_0 … z_K, shape (K + 1, ...).
+    """
+    shape = np.broadcast_shapes(factor.shape, shift.shape)
+    if kernels.compiled is not None:
+        lanes = (shape[0], int(np.prod(shape[1:])))
+        z: Array = kernels.compiled.affine_scan(
+            np.broadcast_to(factor, shape).reshape(lanes),
+            np.broadcast_to(shift, shape).reshape(lanes),
+            np.broadcast_to(np.asarray(start, dtype=np.float64), shape[1:]).reshape(lanes[1]),
+        )
+        return z.reshape(shape[0] + 1, *shape[1:])
+    out = np.empty((shape[0] + 1, *shape[1:]))
+    out[0] = start
+    if np.prod(shape[1:], dtype=np.int64) > _SCAN_LIMIT:
+        for k in range(shape[0]):
+            np.multiply(factor[k], out[k], out=out[k + 1])
+            out[k + 1] += shift[k]
+        return out
+    a, b = np.broadcast_to(factor, shape).copy(), np.broadcast_to(shift, shape).copy()
+    step = 1
+    while step < len(b):
+        # Right-hand sides are formed before they are stored: the two slices overlap.
+        b[step:] = b[step:] + a[step:] * b[:-step]
+        a[step:] = a[step:] * a[:-step]
+        step *= 2
+    out[1:] = a * out[0] + b
+    return out

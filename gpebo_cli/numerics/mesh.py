@@ -1,0 +1,478 @@
+"""A mesh of elements in time and the piecewise polynomials that live on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from math import prod
+
+import numpy as np
+
+from gpebo_cli import kernels
+from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.numerics.linalg import affine_scan
+from gpebo_cli.numerics.radau import RadauRule
+
+# Functions that jump are decided this far (relative to the element) inside its ends, so that both
+# ends of an element see the limit from within. Nodes in between decide for themselves: a jump
+# that nobody announced then shows up as an unresolved element, not as a wrong number.
+_INSIDE = 1e-3
+_CHUNK = 1 << 22  # numbers gathered at once when sampling
+_COEFFICIENTS = 4  # of the last ones, from which the next is predicted
+SHARE = 1e-3  # of the largest component: what is smaller is measured against that
+_FOOT = 1e-8  # of its final size: what a component was before may be that wrong
+_MOST_KINDS = 24  # in one call of a kernel
+_WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
+_MANY = 2000  # times, from which on sampling them by element pays
+_KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
+_SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
+_JOINED = (2, 4, 8)  # as many elements become one
+_MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Elements [edges[k], edges[k+1]], each with the points of one Radau rule."""
+
+    edges: Array  # (K + 1,) ascending
+    rule: RadauRule
+
+    @property
+    def size(self) -> int:
+        """Number of elements K."""
+        return len(self.edges) - 1
+
+    @cached_property
+    def steps(self) -> Array:
+        """Element lengths, shape (K,)."""
+        return np.asarray(self.edges[1:] - self.edges[:-1])
+
+    @property
+    def points(self) -> Array:
+        """Left end and nodes of every element, shape (K, s + 1)."""
+        return self._places[0]
+
+    @property
+    def inside(self) -> Array:
+        """Where functions that jump are decided, shape (K, s + 1)."""
+        return self._places[1]
+
+    @cached_property
+    def _places(self) -> tuple[Array, Array]:
+        """Points, and where functions that jump are decided."""
+        if kernels.compiled is not None:
+            places: tuple[Array, Array] = kernels.compiled.mesh_points(
+                self.edges, self.rule.points, _INSIDE
+            )
+            return places
+        points = self.edges[:-1, None] + self.steps[:, None] * self.rule.points
+        points[:, -1] = self.edges[1:]
+        inside = points.copy()
+        inside[:, 0] += _INSIDE * self.steps
+        inside[:, -1] -= _INSIDE * self.steps
+        return points, inside
+
+    def split(self, parts: IntArray) -> tuple[Mesh, IntArray]:
+        """Cut element k into ``parts[k]`` equal ones; ``parts`` has shape (K,).
+
+        Returns:
+            The new mesh, and for each new element the old one it equals, or −1 if it is new.
+        """
+        if kernels.compiled is not None:
+            finer, kept = kernels.compiled.split(self.edges, parts.astype(np.intp, copy=False))
+            return Mesh(finer, self.rule), kept
+        parent = np.repeat(np.arange(self.size), parts)
+        first = np.cumsum(parts) - parts
+        position = np.arange(len(parent)) - first[parent]
+        left = self.edges[parent] + self.steps[parent] * (position / parts[parent])
+        edges = np.append(left, self.edges[-1])
+        return Mesh(edges, self.rule), np.where(parts[parent] == 1, parent, -1)
+
+    def joined(
+        self, values: Array, counts: IntArray, tol: float, keep: Array, longest: float = np.inf
+    ) -> Mesh:
+        """Neighbours of equal length joined where a polynomial over all of them does as well.
+
+        Compared at all points of the short elements, so that nothing they have seen is lost.
+
+        Args:
+            values: point values (K, s + 1, c) of signals.
+            counts: how many of them are of one kind (kinds,), one kind after the other.
+            tol: by how much a value may change, relative to the signal's own size so far.
+            keep: edges (B,) that stay.
+            longest: no element is joined to one that is longer.
+
+        Returns:
+            this mesh itself, where nothing is joined.
+        """
+        inner = set(np.searchsorted(self.edges, keep).tolist()) if len(keep) else set()
+        bounds = [0, *sorted(inner - {0, self.size}), self.size]
+        if len(bounds) > _MANY_PIECES + 1:
+            return self
+        if kernels.compiled is not None:
+            edges = kernels.compiled.joined(
+                values, counts, self.edges, np.array(bounds), tol, longest, _FOOT, SHARE, _TINY,
+                *_all_joining(self.rule),
+            )
+            return self if len(edges) == len(self.edges) else Mesh(edges, self.rule)
+        pieces = list(pairwise(bounds))
+        scale = _scale_so_far(values, counts, np.full(len(counts), _TINY))[:, None]
+        stays = np.ones(self.size + 1, dtype=bool)
+        for count in _JOINED:
+            first = np.concatenate([np.arange(a, b - count + 1, count) for a, b in pieces])
+            # What could not be joined to less will not be joined to more.
+            half = count // 2
+            inside = np.arange(1, half) if half > 1 else np.zeros(0, dtype=np.intp)
+            ready = ~stays[first[:, None] + np.concatenate([inside, half + inside])].any(axis=1)
+            first = first[ready & (count * self.steps[first] <= longest)]
+            together = first[:, None] + np.arange(count)
+            seen = values[together]  # (groups, count, s + 1, c)
+            flat = seen.reshape(len(first), count * seen.shape[2], seen.shape[3])
+            change = np.abs(joining_change(self.rule, count) @ flat).reshape(seen.shape)
+            change /= scale[together]
+            first = first[change.max(axis=(1, 2, 3), initial=0.0) <= tol]
+            if not len(first):
+                break
+            stays[first[:, None] + np.arange(1, count)] = False
+        return self if stays.all() else Mesh(self.edges[stays], self.rule)
+
+    def sampler(self, t: Array, inside: Array | None = None) -> Sampler:
+        """Interpolation from this mesh to the times ``t`` (N,).
+
+        At an edge the element that contains ``inside`` is used; by default the one to the right.
+        """
+        t = np.asarray(t, dtype=np.float64)
+        if t.size > _KEPT_TIMES:
+            return self._new_sampler(t, inside)
+        asked = (t.tobytes(), None if inside is None else inside.tobytes())
+        for known, sampler in self._samplers:
+            if known == asked:
+                return sampler
+        sampler = self._new_sampler(t, inside)
+        self._samplers.insert(0, (asked, sampler))
+        del self._samplers[_KEPT_SAMPLERS:]
+        return sampler
+
+    @cached_property
+    def _samplers(self) -> list[tuple[tuple[bytes, bytes | None], Sampler]]:
+        """The last few: all signals of a run are reported at the same few sets of times."""
+        return []
+
+    def _new_sampler(self, t: Array, inside: Array | None) -> Sampler:
+        # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
+        # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
+        rule = self.rule
+        if kernels.compiled is not None:
+            return Sampler(*kernels.compiled.sampler(
+                self.edges, rule.points, rule.barycentric, t, inside, _SNAP, _EXACT
+            ))
+        belongs = t + _SNAP * np.abs(t) if inside is None else inside
+        element = np.searchsorted(self.edges, belongs, side="right") - 1
+        element = np.clip(element, 0, self.size - 1)
+        local = (t - self.edges[element]) / self.steps[element]
+        distance = local[:, None] - rule.points
+        exact = np.abs(distance) < _EXACT
+        hit = exact.any(axis=1)
+        with np.errstate(divide="ignore"):
+            weights = rule.barycentric / np.where(exact, 1.0, distance)
+        weights[hit] = exact[hit]
+        weights /= weights.sum(axis=1, keepdims=True)
+        return Sampler(element, weights)
+
+
+@lru_cache(maxsize=64)
+def joining_change(rule: RadauRule, count: int) -> Array:
+    """By how much point values of ``count`` equal elements change if one polynomial replaces them.
+
+    Values at the points of the joined element are read from the polynomials of the short ones.
+    Shape (count (s + 1), count (s + 1)), for the point values one element after the other.
+    """
+    there, back = _joining(rule, count)
+    return np.asarray((there @ back).T - np.eye(len(there)))
+
+
+def _joining(rule: RadauRule, count: int) -> tuple[Array, Array]:
+    """From the points of ``count`` equal elements to those of one over all of them, and back.
+
+    Weights of shapes (count (s + 1), s + 1) and (s + 1, count (s + 1)), applied from the right.
+    """
+    short = Mesh(np.arange(count + 1) / count, rule)
+    joined = Mesh(np.array([0.0, 1.0]), rule)
+    size = count * len(rule.points)
+    unit = np.eye(size).reshape(count, len(rule.points), size)
+    there = short.sampler(joined.points.ravel(), joined.inside.ravel())(unit)
+    back = joined.sampler(short.points.ravel()).weights
+    return np.ascontiguousarray(there.T), np.ascontiguousarray(back.T)
+
+
+@lru_cache(maxsize=16)
+def _all_joining(rule: RadauRule) -> tuple[Array, ...]:
+    """What :func:`joining_change` is made of, for each of _JOINED: for the kernel."""
+    return tuple(matrix for count in _JOINED for matrix in _joining(rule, count))
+
+
+@dataclass(frozen=True, eq=False)
+class Sampler:
+    """Barycentric interpolation to fixed times; apply it to any signal of the same mesh."""
+
+    element: IntArray  # (N,)
+    weights: Array  # (N, s + 1)
+
+    def __call__(self, values: Array) -> Array:
+        """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
+        flat = _flat(values)
+        if kernels.compiled is not None and (flat.shape[2] <= _WIDE or self._grouped is None):
+            sampled: Array = kernels.compiled.sample(self.element, self.weights, flat)
+            return sampled.reshape(len(sampled), *values.shape[2:])
+        out = np.empty((len(self.element), flat.shape[2]))
+        if self._grouped is not None:
+            self._by_element(flat, out)
+        else:
+            chunk = max(1, _CHUNK // max(1, flat.shape[1] * flat.shape[2]))
+            for i in range(0, len(out), chunk):
+                part = slice(i, i + chunk)
+                gathered = flat[self.element[part]]
+                out[part] = np.matmul(self.weights[part, None, :], gathered)[:, 0, :]
+        return out.reshape(len(out), *values.shape[2:])
+
+    @cached_property
+    def _grouped(self) -> tuple[IntArray, IntArray, int] | None:
+        """Where many ascending times share elements: the elements, their ends in t, most times."""
+        if len(self.element) < _MANY:
+            return None
+        changes = np.diff(self.element)
+        ends = np.append(np.flatnonzero(changes) + 1, len(self.element))
+        most = int(np.diff(ends, prepend=0).max())
+        if (changes < 0).any() or len(ends) * most > 2 * len(self.element):
+            return None
+        return self.element[ends - 1], ends, most
+
+    def _by_element(self, flat: Array, out: Array) -> None:
+        """One product per element with all its times: nothing is gathered per time."""
+        if self._grouped is None:
+            return
+        elements, ends, most = self._grouped
+        starts = np.append(0, ends[:-1])
+        points, columns = flat.shape[1:]
+        chunk = max(1, _CHUNK // max(1, most * (points + columns)))
+        for i in range(0, len(elements), chunk):
+            first, last = starts[i], ends[min(i + chunk, len(ends)) - 1]
+            counts = (ends - starts)[i : i + chunk]
+            group = np.repeat(np.arange(len(counts)), counts)
+            place = np.arange(last - first) - np.repeat(starts[i : i + chunk] - first, counts)
+            weights = np.zeros((len(counts), most, points))
+            weights[group, place] = self.weights[first:last]
+            out[first:last] = np.matmul(weights, flat[elements[i : i + chunk]])[group, place]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A signal given by its values at the points of a mesh, shape (K, s + 1, ...).
+
+    Within an element it is the interpolating polynomial of degree s; it may jump between elements.
+    """
+
+    mesh: Mesh
+    values: Array  # (K, s + 1, …)
+
+    def __call__(self, t: Array, inside: Array | None = None) -> Array:
+        """Values at the times t (N,), shape (N, ...); at edges see :meth:`Mesh.sampler`."""
+        return self.mesh.sampler(t, inside)(self.values)
+
+    @property
+    def final(self) -> Array:
+        """Value at the end of the mesh."""
+        return np.asarray(self.values[-1, -1])
+
+    def local_integral(self) -> Trajectory:
+        """∫ from the left end of each element, starting at zero again in the next one."""
+        return self._integral(on=False)
+
+    def integral(self) -> Trajectory:
+        """∫ from the start of the mesh, by the mesh's own quadrature (order 2s − 1 at the ends)."""
+        return self._integral(on=True)
+
+    def _integral(self, *, on: bool) -> Trajectory:
+        """On from the elements before, or from each left end."""
+        rule, mesh, flat = self.mesh.rule, self.mesh, _flat(self.values)
+        if kernels.compiled is not None and flat.shape[2] <= _WIDE:
+            out = kernels.compiled.integral(rule.integration, mesh.steps, flat, on)
+            return Trajectory(mesh, out.reshape(self.values.shape))
+        out = np.zeros(flat.shape)
+        out[:, 1:] = mesh.steps[:, None, None] * np.matmul(rule.integration, flat[:, 1:])
+        if on:
+            total = np.cumsum(out[:, -1], axis=0)
+            out[1:] += total[:-1, None]
+        return Trajectory(mesh, out.reshape(self.values.shape))
+
+    def low_pass(self, rate: Array | float, start: Array | None = None) -> Trajectory:
+        """Z of Z' = −λ (Z − S): the filter λ/(p + λ) applied to this signal S.
+
+        Args:
+            rate: λ > 0 in 1/s, a scalar () or an array that broadcasts against one value of the
+                signal.
+            start: Z at the start, of the shape of one value; None: 0.
+        """
+        mesh, rule = self.mesh, self.mesh.rule
+        shape = self.values.shape[2:]
+        rates = np.broadcast_to(np.asarray(rate, dtype=np.float64), shape).ravel()
+        if kernels.compiled is not None:
+            at_start = np.zeros(len(rates)) if start is None else start.ravel()
+            filtered = kernels.compiled.low_pass(
+                rule.differentiation, mesh.steps, _flat(self.values), rates, at_start
+            )
+            if filtered is None:
+                raise np.linalg.LinAlgError("a pivot is zero")
+            return Trajectory(mesh, filtered.reshape(self.values.shape))
+        flat = self.values.reshape(mesh.size, rule.stages + 1, -1)
+        distinct, which = np.unique(rates, return_inverse=True)
+        at_start = np.zeros(flat.shape[2]) if start is None else start.ravel()
+        out = np.empty_like(flat)
+        batch = max(1, _CHUNK // (mesh.size * rule.stages**2))
+        for first in range(0, len(distinct), batch):
+            some = distinct[first : first + batch]
+            columns = [np.flatnonzero(which == first + i) for i in range(len(some))]
+            _filter(mesh, some, columns, flat, at_start, out)
+        return Trajectory(mesh, out.reshape(self.values.shape))
+
+
+def _flat(values: Array) -> Array:
+    """Values (K, s + 1, …) as (K, s + 1, c)."""
+    if values.ndim == 3:
+        return values
+    return values.reshape(values.shape[0], values.shape[1], prod(values.shape[2:]))
+
+
+def _filter(
+    mesh: Mesh, rates: Array, columns: Sequence[IntArray], values: Array, start: Array, out: Array
+) -> None:
+    """Z of Z' = −λ (Z − S) from ``start``, for the columns of S that each rate λ belongs to.
+
+    Columns that share a rate share a factorisation; all rates are solved in one batch.
+    """
+    rule = mesh.rule
+    hl = rates[:, None, None, None] * mesh.steps[:, None, None]  # h λ, (rates, K, 1, 1)
+    right = np.zeros((len(rates), mesh.size, rule.stages, 1 + max(map(len, columns))))
+    right[..., 0] = rule.differentiation.sum(axis=1)  # the response to the left end
+    first = np.zeros((len(rates), right.shape[-1] - 1))
+    for i, those in enumerate(columns):
+        first[i, : len(those)] = start[those]
+        right[i, :, :, 1 : 1 + len(those)] = hl[i] * values[:, 1:, those]
+    operator = rule.differentiation + hl * np.eye(rule.stages)
+    solved = np.asarray(np.linalg.solve(operator, right), dtype=np.float64)
+    last = np.moveaxis(solved[:, :, -1], 0, 1)  # (K, rates, 1 + columns)
+    starts = affine_scan(last[..., :1], last[..., 1:], first)[:-1]
+    for i, those in enumerate(columns):
+        left = starts[:, i, None, : len(those)]
+        out[:, :1, those] = left
+        out[:, 1:, those] = solved[i, :, :, :1] * left + solved[i, :, :, 1 : 1 + len(those)]
+
+
+def unresolved(values: Array, rule: RadauRule, floor: float = 0.0) -> Array:
+    """:func:`unresolved_kinds` of signals of one kind, values (K, s + 1, …); shape (K,)."""
+    return unresolved_kinds([(values, floor)], rule)
+
+
+def unresolved_kinds(kinds: Sequence[tuple[Array, float]], rule: RadauRule) -> Array:
+    """How far each element is from resolving its signals, relative to the signals' own size.
+
+    The first Legendre coefficient that an element leaves out (see :func:`legendre_tail`) against
+    the largest value of that component so far: in a system that grows, what is an invisible error
+    beside the end of the horizon is what the end is made of.
+
+    Args:
+        kinds: point values (K, s + 1, c) of signals of one kind each, and the size below which a
+            signal of that kind is rounding, see :func:`signal_scale`.
+        rule: the mesh's rule.
+
+    Returns:
+        shape (K,).
+    """
+    if kernels.compiled is not None and len(kinds) <= _MOST_KINDS:
+        tail: Array = kernels.compiled.tails(
+            rule.to_legendre, used_coefficients(rule), _FOOT, SHARE,
+            *[either for kind in kinds for either in kind],
+        )
+        return tail
+    seen = [(values, floor) for values, floor in kinds if values.shape[2]]
+    if not seen:
+        return np.zeros(len(kinds[0][0]))
+    if len(seen) > 1 and sum(values.size for values, _ in seen) > _CHUNK:
+        return np.asarray(np.max([unresolved_kinds([kind], rule) for kind in seen], axis=0))
+    counts = np.array([values.shape[2] for values, _ in seen])
+    floors = np.maximum([floor for _, floor in seen], _TINY)
+    values = seen[0][0] if len(seen) == 1 else np.concatenate([v for v, _ in seen], axis=2)
+    scale = _scale_so_far(values, counts, floors)
+    ratio = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))
+    # Powers are monotone: the worst component of each degree first, then its power.
+    worst = np.minimum((ratio / scale[:, None]).max(axis=2), 1.0)
+    return np.asarray((worst ** _to_next(rule)).max(axis=1))
+
+
+def used_coefficients(rule: RadauRule) -> int:
+    """How many of the last Legendre coefficients predict the next one."""
+    return min(_COEFFICIENTS, rule.stages - 1)
+
+
+def _to_next(rule: RadauRule) -> Array:
+    """(ρ^j)^this = ρ^(s + 1) for the degrees j that are used."""
+    s = rule.stages
+    return (s + 1.0) / np.arange(s + 1 - used_coefficients(rule), s + 1)
+
+
+def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
+    """Size of what an element's polynomial of degree s leaves out, shape (K, c).
+
+    Each of the last few coefficients |c_j| ≈ scale ρ^j predicts the next one after the last,
+    scale ρ^(s+1); the largest prediction counts. Several, because single coefficients vanish by
+    accident, two of them where the signal is odd or even.
+    """
+    # Of degrees s + 1 − used … s:
+    last = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))
+    size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
+    predicted = size * np.minimum(last / size, 1.0) ** _to_next(rule)[:, None]
+    return np.asarray(predicted.max(axis=1))
+
+
+def _scale_so_far(values: Array, counts: IntArray, floors: Array) -> Array:
+    """Size of each component up to each element, (K, c), floored as in :func:`signal_scale`.
+
+    Also floored at a share of the final size, so that the foot of a pulse costs nothing. Components
+    of one kind, ``counts`` of them, stand together and share a floor.
+    """
+    size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
+    size = np.maximum(size, _FOOT * size[-1])
+    largest = np.maximum.reduceat(size, np.cumsum(counts) - counts, axis=1)
+    level = np.maximum(SHARE * largest, floors)
+    return np.asarray(np.maximum(size, np.repeat(level, counts, axis=1)))
+
+
+def signal_scale(values: Array, floor: float = 0.0) -> Array:
+    """Size of each component over the mesh (c,).
+
+    A component more than three orders below the largest one, or below ``floor``, is measured
+    against that: rounding in the large ones reaches it.
+    """
+    size = np.abs(values).max(axis=(0, 1))
+    return np.asarray(np.maximum(size, max(SHARE * float(size.max(initial=0.0)), floor, _TINY)))
+
+
+def initial_mesh(start: float, stop: float, breakpoints: Sequence[float] | Array,
+                 elements: int, rule: RadauRule) -> Mesh:
+    """About ``elements`` equal elements, with every breakpoint (B,), in seconds, an edge."""
+    if not len(breakpoints):
+        # The same numbers as np.linspace without its end.
+        edges: Array = np.arange(elements + 1, dtype=np.float64)
+        edges *= (stop - start) / elements
+        edges += start
+        edges[-1] = stop
+        return Mesh(edges, rule)
+    cuts = np.unique(np.concatenate([[start], np.asarray(breakpoints, dtype=float), [stop]]))
+    cuts = cuts[(cuts >= start) & (cuts <= stop)]
+    counts = np.maximum(1, np.rint(elements * np.diff(cuts) / (stop - start))).astype(int)
+    pieces = [np.linspace(a, b, c, endpoint=False)
+              for a, b, c in zip(cuts[:-1], cuts[1:], counts, strict=True)]
+    return Mesh(np.append(np.concatenate(pieces), stop), rule)

@@ -1,0 +1,117 @@
+"""Radau IIA collocation: nodes, integration matrix, and the Legendre view of an element.
+
+Order 2s − 1, L-stable and stiffly accurate (Hairer & Wanner, Solving ODEs II, IV.5): the right
+end of an element is a node, so algebraic constraints hold there exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from gpebo_cli.model.descriptor import Array
+
+ComplexArray = NDArray[np.complex128]
+
+_QR_STEPS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class RadauRule:
+    """The s-stage rule on the unit interval.
+
+    An element is stored by its values at ``points`` = (0, c_1, …, c_s), the left end and the
+    nodes: a polynomial of degree s.
+    """
+
+    stages: int
+    nodes: Array  # (s,) c, ascending, last one is 1
+    integration: Array  # (s, s) R with R_ij = ∫_0^{c_i} ℓ_j
+    differentiation: Array  # (s, s) D = R^{-1}
+    points: Array  # (s + 1,) 0 and the nodes
+    barycentric: Array  # (s + 1,) weights of ``points``
+    to_legendre: Array  # (s + 1, s + 1) values at ``points`` -> Legendre coefficients
+
+    @property
+    def order(self) -> int:
+        """Order of the values at element ends."""
+        return 2 * self.stages - 1
+
+    def interpolation(self, places: Array) -> Array:
+        """From values at ``points`` to those at ``places`` (M,) in [0, 1], shape (M, s + 1)."""
+        return _interpolation(self, places.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _interpolation(rule: RadauRule, places: bytes) -> Array:
+    """:meth:`RadauRule.interpolation`, of float64; not to be written to."""
+    x = 2.0 * np.frombuffer(places) - 1.0
+    matrix = np.asarray(legendre.legvander(x, rule.stages) @ rule.to_legendre)
+    matrix.flags.writeable = False
+    return matrix
+
+
+@lru_cache(maxsize=16)
+def radau_rule(stages: int) -> RadauRule:
+    """The Radau IIA rule with ``stages`` nodes (2 to 16)."""
+    s = stages
+    coefficients = np.zeros(s + 1)
+    coefficients[s - 1], coefficients[s] = 1.0, -1.0  # roots of P_{s-1} − P_s, 1 among them
+    x = np.sort(legendre.legroots(coefficients).real)
+    slope = legendre.legder(coefficients)
+    for _ in range(2):  # Newton: the companion eigenvalues are good to 1e-13 only
+        x = x - legendre.legval(x, coefficients) / legendre.legval(x, slope)
+    x[-1] = 1.0
+
+    values = legendre.legvander(x, s)  # P_0 … P_s at the nodes
+    primitive = np.empty((s, s))  # ∫_{-1}^{x_i} P_j = (P_{j+1} − P_{j−1}) / (2j + 1)
+    primitive[:, 0] = x + 1.0
+    for j in range(1, s):
+        primitive[:, j] = (values[:, j + 1] - values[:, j - 1]) / (2 * j + 1)
+    integration = np.asarray(
+        0.5 * np.linalg.solve(values[:, :s].T, primitive.T).T, dtype=np.float64
+    )
+
+    points = np.concatenate([[0.0], 0.5 * (x + 1.0)])
+    differences = points[:, None] - points[None, :]
+    np.fill_diagonal(differences, 1.0)
+    weights = 1.0 / np.prod(4.0 * differences, axis=1)  # 4: capacity of the interval, no underflow
+    at_points = legendre.legvander(2.0 * points - 1.0, s)
+    return RadauRule(
+        stages=s,
+        nodes=points[1:],
+        integration=integration,
+        differentiation=np.asarray(np.linalg.inv(integration), dtype=np.float64),
+        points=points,
+        barycentric=weights / np.abs(weights).max(),
+        to_legendre=np.asarray(np.linalg.inv(at_points), dtype=np.float64),
+    )
+
+
+@lru_cache(maxsize=16)
+def differentiation_schur(stages: int) -> tuple[ComplexArray, ComplexArray]:
+    """D = U T Uᴴ with unitary U and upper triangular T, by shifted QR iteration.
+
+    Eigenvectors of D would do the same with a diagonal T, but they are nearly dependent: their
+    condition number grows exponentially with the stages.
+    """
+    T = radau_rule(stages).differentiation.astype(np.complex128)
+    U = np.eye(stages, dtype=np.complex128)
+    size = float(np.linalg.norm(T))
+    for last in range(stages - 1, 0, -1):
+        part = slice(0, last + 1)
+        for _ in range(_QR_STEPS):
+            if np.abs(T[last, :last]).max() <= np.finfo(float).eps * size:
+                break
+            values = np.linalg.eigvals(T[part, part])
+            shift = values[np.argmin(np.abs(values - T[last, last]))] * np.eye(last + 1)
+            Q, R = np.linalg.qr(T[part, part] - shift)
+            T[part, part] = R @ Q + shift
+            T[part, last + 1 :] = Q.conj().T @ T[part, last + 1 :]
+            U[:, part] = U[:, part] @ Q
+        T[last, :last] = 0.0
+    return U, T

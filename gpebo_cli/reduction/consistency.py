@@ -1,0 +1,139 @@
+"""Consistent values: at the start, and after a jump of the input.
+
+Two different questions. At the start the user's x0 may break constraints, and the differential
+part of it is kept. At a jump the solution is already running and what happens to it is decided
+by the equation itself, in the sense of distributions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb, factorial
+
+import numpy as np
+
+from gpebo_cli import kernels
+from gpebo_cli.errors import ModelError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.reduction.derivative_array import StrangenessFree, Structure, reduce
+
+_UNMOVED = 32 * float(np.finfo(float).eps)  # what moves by less, relatively, has not moved
+_PLAIN = 1e-8  # pivots above this, relatively, need no singular values
+_SMALL = 32  # largest number of states for the compiled kernel
+_IMPULSE = 1e-9  # impulses below this share of the state's size are rounding
+
+
+def consistent_state(reduced: StrangenessFree, x0: Array) -> Array:
+    """The consistent x nearest to x0 in its differential part, shape (n,).
+
+    Minimises ‖E (x − x0)‖ subject to A2 x + f2 = 0. Unique, because E has full column rank on
+    the kernel of A2.
+
+    Args:
+        reduced: the strangeness-free equations at times of which the start is the first.
+        x0: the state asked for (n,).
+    """
+    E, A2, f2 = reduced.E[0], reduced.A2[0], reduced.f2[0]
+    if len(A2) == 0:
+        return x0.copy()
+    if kernels.compiled is not None and len(x0) <= _SMALL:
+        known, nearest = kernels.compiled.consistent(E, A2, f2, x0, _PLAIN, _UNMOVED)
+        if known[0]:
+            return np.asarray(nearest)
+    U, sigma, Vt = np.linalg.svd(A2)
+    a = len(sigma)
+    particular = Vt[:a].T @ ((U.T @ (-f2 - A2 @ x0)) / sigma)  # of A2 δ = −(A2 x0 + f2)
+    kernel = Vt[a:].T
+    free = np.linalg.lstsq(E @ kernel, -E @ particular, rcond=None)[0]
+    x = x0 + particular + kernel @ free
+    # What did not move keeps the digits it was given.
+    rounding = _UNMOVED * max(np.abs(x).max(), np.abs(x0).max())
+    return np.where(np.abs(x - x0) <= rounding, x0, x)
+
+
+@dataclass(frozen=True, eq=False)
+class Jump:
+    """What a jump of the input does at one time."""
+
+    after: Array  # (n,) the state just after
+    impulses: Array  # (μ, n) coefficients of δ, δ', … in x
+
+
+def jump(
+    system: DescriptorSystem, structure: Structure, t: float, width: float, before: Array
+) -> Jump:
+    """The state just after time t, given the limit from the left.
+
+    With x = x_regular + Σ_k w_{k+1} δ^(k) and a step w_0 = x(t+) − x(t−), the coefficient of
+    δ^(j) in E x' = A x + f (f jumps but has no impulse) gives, j = 0 … μ,
+
+        Σ_{k≥j} (−1)^{k−j} C(k, k−j) [ E^(k−j) w_k − A^(k−j) w_{k+1} ] = 0,      w_{μ+1} = 0,
+
+    beside the constraints after the jump. Keeping the differential part (minimal ‖E w_0‖) was
+    rejected: where an input's impulse drives a differential state it is wrong. In
+    x1' = x3, x2' = 2 x3, 0 = x1 − u, a unit step of u moves x2 by 2, not by 0.
+
+    Raises:
+        ModelError: E or A jumps at a time where the state has an impulse, so that their product
+            means nothing, or no state after the jump satisfies the equations.
+    """
+    mu, n = structure.mu, system.n
+    now = np.array([t])
+    after = system.coefficients.taylor(now, max(mu, 1), now + width)
+    reduced = reduce(system, structure, now, now + width)
+    levels = mu + 1
+    blocks = np.zeros((levels, n, levels, n))
+    for j in range(levels):
+        for k in range(j, levels):
+            sign = (-1.0) ** (k - j) * comb(k, k - j) * factorial(k - j)
+            blocks[j, :, k] += sign * after.E[k - j, 0]
+            if k + 1 < levels:
+                blocks[j, :, k + 1] -= sign * after.A[k - j, 0]
+    constraints = np.zeros((structure.a, levels, n))
+    constraints[:, 0] = reduced.A2[0]
+    system_matrix = np.concatenate(
+        [blocks.reshape(levels * n, levels * n), constraints.reshape(structure.a, levels * n)]
+    )
+    right = np.zeros(len(system_matrix))
+    right[levels * n :] = -(reduced.f2[0] + reduced.A2[0] @ before)
+    # Rows by their own size: an equation in microfarads weighs as much as one in ohms.
+    size = np.abs(system_matrix).max(axis=1)
+    size[size == 0] = 1.0
+    w, *_ = np.linalg.lstsq(system_matrix / size[:, None], right / size, rcond=1e-12)
+    residual = np.abs(system_matrix @ w - right) / size
+    scale = max(1e-300, float(np.abs(right / size).max(initial=0.0)), float(np.abs(before).max()))
+    if residual.max(initial=0.0) > 1e-7 * scale:
+        raise ModelError(
+            f"plant {system.name}: the jump at t = {t:.6g} has no solution "
+            f"(residual {residual.max() / scale:.1e}): no state after it satisfies the equations; "
+            "use an input without it, or a horizon that ends before"
+        )
+    w = w.reshape(levels, n)
+    significant = np.abs(w[1:]) > _IMPULSE * scale
+    impulses = np.where(significant, w[1:], 0.0)
+    _refuse_ambiguous_products(system, t, width, w[0], impulses, scale)
+    return Jump(before + w[0], impulses)
+
+
+def _refuse_ambiguous_products(
+    system: DescriptorSystem, t: float, width: float, step: Array, impulses: Array, scale: float
+) -> None:
+    """E or A may jump only where it is not multiplied by an impulse."""
+    now = np.array([t])
+    left = system.coefficients.taylor(now, 0, now - width)
+    right = system.coefficients.taylor(now, 0, now + width)
+    for name, change, factors in (
+        ("E", right.E[0, 0] - left.E[0, 0], [step, *impulses]),
+        ("A", right.A[0, 0] - left.A[0, 0], list(impulses)),
+    ):
+        for factor in factors:
+            product = np.abs(change @ factor)
+            if product.max(initial=0.0) > 1e-9 * scale * max(1.0, float(np.abs(change).max())):
+                raise ModelError(
+                    f"plant {system.name}: {name} jumps at t = {t:.6g} where the state has an "
+                    "impulse or a jump of its own, and their product is undefined; take the "
+                    "conserved quantity (charge, momentum) as the state"
+                )
+
+
+

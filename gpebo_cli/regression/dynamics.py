@@ -1,0 +1,75 @@
+"""Parameters that move by known dynamics: η' = 𝔸 η + 𝕓 (observer.remedy: current_coordinates)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import Trajectory
+
+_TOLERANCE = 1e-12
+_MAX_ELEMENTS = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """𝔸 and 𝕓 on one mesh."""
+
+    A: Trajectory  # (p, p)
+    b: Trajectory  # (p,)
+    forgetting: float  # 1/s ρ: what is known of directions that decay must fade as fast as it grows
+
+
+def filtered(
+    outer: Trajectory, rates: Array, gains: Array, dynamics: Dynamics, start: Array | None = None
+) -> Trajectory:
+    """[Ω | 𝒴] (p, p + 1) with Ω η = 𝒴 at every time, for η that moves.
+
+        Ω' = −(Λ + ρI)Ω − 𝔸ᵀΩ − Ω𝔸 + Γψᵀψ,    𝒴' = −(Λ + ρI)𝒴 − 𝔸ᵀ𝒴 + Ω𝕓 + Γψᵀy
+
+    Nothing in it grows as solutions of η' = 𝔸η do; in directions that decay, Ω would grow as the
+    square of their inverse, which the forgetting ρ makes up for.
+
+    Args:
+        outer: [ψᵀψ | ψᵀy] (p, p + 1).
+        rates: diagonal of Λ, (p,).
+        gains: diagonal of Γ, (p,).
+        dynamics: 𝔸, 𝕓 and ρ.
+        start: [Ω | 𝒴] at the start; None: 0.
+
+    Raises:
+        SolverError: not resolved.
+    """
+    p = outer.values.shape[2]
+    start = np.zeros((p, p + 1)) if start is None else start
+    eye = np.eye(p)
+    decay = np.diag(rates + dynamics.forgetting)
+
+    def of_omega(t: Array, inside: Array) -> Coefficients:
+        A = dynamics.A(t, inside)
+        left = -(decay + transpose(A))
+        M = np.einsum("nij,kl->nikjl", left, eye) - np.einsum("ij,nlk->nikjl", eye, A)
+        f = gains[:, None] * outer(t, inside)[..., :p]
+        return Coefficients(None, M.reshape(-1, p * p, p * p), f.reshape(-1, p * p, 1))
+
+    problem = LinearProblem(of_omega, start[:, :p].reshape(-1, 1), name="filter of the regressor")
+    omega = solve(problem, outer.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
+
+    def of_rhs(t: Array, inside: Array) -> Coefficients:
+        sampled = omega(t, inside)[..., 0].reshape(-1, p, p)
+        f = np.einsum("nij,nj->ni", sampled, dynamics.b(t, inside))
+        f = f + gains * outer(t, inside)[..., p]
+        return Coefficients(None, -(decay + transpose(dynamics.A(t, inside))), f[..., None])
+
+    # From the mesh of Ω on: in one of its elements Ω is a polynomial.
+    problem = LinearProblem(of_rhs, start[:, p:], name="filter of the regression")
+    rhs = solve(problem, omega.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
+    t, inside = rhs.mesh.points.ravel(), rhs.mesh.inside.ravel()
+    both = np.concatenate(
+        [omega(t, inside).reshape(-1, p, p), rhs.values.reshape(-1, p, 1)], axis=2
+    )
+    return Trajectory(rhs.mesh, both.reshape(*rhs.mesh.points.shape, p, p + 1))

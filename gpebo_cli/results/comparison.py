@@ -1,0 +1,272 @@
+"""Finished runs side by side: a table, error curves overlaid, metrics over gains, heat maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.results import style
+from gpebo_cli.results.finished import METRICS, Case, read_errors
+from gpebo_cli.results.style import Axis, Curve, Panel, compose, line, number_text, symbol
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Value = str | float
+
+SORT = METRICS[0]
+_MOST_CURVES = len(style.LINES)  # more do not stay apart
+_MIN_POINTS = 3  # fewer are not a curve
+_MOST_MAPS = 8
+_METRIC_LABELS = {
+    "seconds_to_1pct_parameters": "parameters to 1 % (s)",
+    "seconds_to_1pct_states": "states to 1 % (s)",
+    "final_error_parameters": "final error, parameters",
+    "final_error_states": "final error, states",
+    "rms_error_states": "RMS error, states",
+}
+
+
+def row(case: Case) -> dict[str, Value]:
+    """One row of the table: run, case, what was chosen, gains, metrics (NaN: never)."""
+    return {"run": case.run, "case": float(case.number), **_chosen(case), **case.metrics}
+
+
+def names(cases: Sequence[Case]) -> list[str]:
+    """Columns of the table: of all cases, in order of first appearance, metrics last."""
+    known = dict.fromkeys(name for case in cases for name in row(case))
+    return [*(name for name in known if name not in METRICS), *METRICS]
+
+
+def varying(cases: Sequence[Case]) -> list[str]:
+    """Those of the choices (settings and gains) that are not the same for all who have them.
+
+    A gain that only some estimators have follows from the estimator and says nothing new.
+    """
+    values: dict[str, set[Value]] = {}
+    for case in cases:
+        for name, value in _chosen(case).items():
+            values.setdefault(name, set()).add(value)
+    return [name for name, found in values.items() if len(found) > 1]
+
+
+def ordered(cases: Sequence[Case], by: str, *, reverse: bool = False) -> list[Case]:
+    """Cases sorted by a column; those without a value are last either way."""
+
+    def missing(case: Case) -> bool:
+        value = row(case).get(by)
+        return value is None or (isinstance(value, float) and math.isnan(value))
+
+    def key(case: Case) -> tuple[bool, float, str]:
+        value = row(case)[by]
+        number = _as_number(value)
+        return math.isnan(number), 0.0 if math.isnan(number) else number, str(value)
+
+    present = sorted((c for c in cases if not missing(c)), key=key, reverse=reverse)
+    return [*present, *(c for c in cases if missing(c))]
+
+
+def figures(cases: Sequence[Case], metric: str) -> Iterator[tuple[str, Figure]]:
+    """Draw, one at a time: error curves, metrics over each number that varies, heat maps.
+
+    Args:
+        cases: in the order in which they matter: of many, the error curves of a few evenly
+            spaced ones are drawn.
+        metric: what heat maps show.
+
+    Raises:
+        GpeboError: tables of a run are missing.
+    """
+    yield "errors", compose(error_panels(cases))
+    # Sorted by name: the files are called the same however the cases are sorted.
+    numbers = sorted(name for name in varying(cases) if _is_axis(cases, name))
+    for name in numbers:
+        panels = metric_panels(cases, name)
+        if panels:
+            yield f"over_{name}", compose(panels)
+    for across, up in combinations(numbers, 2):
+        for k, (label, members) in enumerate(_groups(cases, (across, up)).items()):
+            grid = heat_grid(members, across, up, metric)
+            if k < _MOST_MAPS and grid is not None:
+                suffix = f"_{k + 1}" if k else ""
+                name = f"{metric}_over_{across}_and_{up}{suffix}"
+                yield name, _heat_map(*grid, (across, up, metric), label)
+
+
+def error_panels(cases: Sequence[Case]) -> list[Panel]:
+    """Norms of the errors of parameters and states over time, a curve per case."""
+    count = len(cases)
+    places = np.linspace(0, count - 1, min(count, _MOST_CURVES)).round().astype(int)
+    chosen = [cases[int(place)] for place in places]
+    label = _labels(cases)
+    curves = read_errors(chosen)
+    labels = [label(case) for case in chosen]
+    note = f"{len(chosen)} of {count} cases:" if len(chosen) < count else ""
+    of_parameters, of_states = (
+        tuple(
+            Curve(c.t, getattr(c, part), text, line(k))
+            for k, (c, text) in enumerate(zip(curves, labels, strict=True))
+        )
+        for part in ("parameters", "states")
+    )
+    return [
+        Panel(
+            "‖parameter error‖", of_parameters, log=True, legend=True, note=note,
+            size=max(c.parameter_size for c in curves),
+        ),
+        Panel("‖state error‖", of_states, log=True, size=max(c.state_size for c in curves)),
+    ]
+
+
+def metric_panels(cases: Sequence[Case], name: str) -> list[Panel]:
+    """Every metric over the number ``name``, doubly logarithmic: a curve for each other choice.
+
+    None if there are fewer than three points on every curve, or more curves than stay apart.
+    """
+    groups = {
+        label: members
+        for label, members in _groups(cases, (name,)).items()
+        if len({_choice(case, name) for case in members}) >= _MIN_POINTS
+    }
+    if not 0 < len(groups) <= _MOST_CURVES:
+        return []
+    axis = Axis(name, symbol(name), log=True)
+    panels: list[Panel] = []
+    for metric in METRICS:
+        curves = []
+        for k, (label, members) in enumerate(groups.items()):
+            x = np.array([_choice(case, name) for case in members])
+            y = np.array([case.metrics[metric] for case in members])
+            order = np.argsort(x, kind="stable")
+            curves.append(Curve(x[order], y[order], label, replace(line(k), dots=True)))
+        if any(np.isfinite(c.y).any() and np.nanmax(c.y) > 0 for c in curves):
+            first = not panels
+            panels.append(
+                Panel(
+                    _METRIC_LABELS[metric], tuple(curves), log=True, axis=axis,
+                    legend=first and len(curves) > 1,
+                )
+            )
+    return panels
+
+
+def heat_grid(
+    cases: Sequence[Case], across: str, up: str, metric: str
+) -> tuple[Array, Array, Array] | None:
+    """Values of ``across`` (K,), of ``up`` (J,) and the metric (J, K), NaN where there is none.
+
+    None unless both have at least two values and most of the grid is there: a list of pairs is
+    no map.
+    """
+    x = np.unique([_choice(case, across) for case in cases])
+    y = np.unique([_choice(case, up) for case in cases])
+    if min(len(x), len(y)) < 2 or 2 * len(cases) < len(x) * len(y):
+        return None
+    values = np.full((len(y), len(x)), np.nan)
+    for case in cases:
+        j, k = (np.searchsorted(v, _choice(case, n)) for v, n in ((y, up), (x, across)))
+        values[j, k] = case.metrics[metric]
+    return (x, y, values) if np.isfinite(values).any() else None
+
+
+def _heat_map(
+    x: Array, y: Array, values: Array, columns: tuple[str, str, str], label: str
+) -> Figure:
+    """One cell per case, all of the same size: gains are spaced by factors, as a rule."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import LogNorm, Normalize
+    from matplotlib.figure import Figure
+
+    across, up, metric = columns
+    finite = values[np.isfinite(values)]
+    low, high = float(finite.min()), float(finite.max())
+    log = low > 0 and high > 10 * low
+    norm = LogNorm(low, high) if log else Normalize(low, high)
+    with style.our_rc():
+        figure = Figure(figsize=(style.WIDTH, 2.6), dpi=style.DPI)
+        FigureCanvasAgg(figure)
+        axes = figure.add_axes((0.19, 0.17, 0.60, 0.71))
+        axes.set_facecolor("#DDDDDD")  # no value: never reached, or no such case
+        image = axes.imshow(
+            np.ma.masked_invalid(values), origin="lower", aspect="auto", norm=norm, cmap="cividis",
+            interpolation="nearest",
+        )
+        for axis, numbers, name in ((axes.xaxis, x, across), (axes.yaxis, y, up)):
+            places = np.unique(np.linspace(0, len(numbers) - 1, min(len(numbers), 5)).astype(int))
+            axis.set_ticks(places, [number_text(float(numbers[p])) for p in places])
+            axis.set_label_text(symbol(name))
+        bar = figure.colorbar(image, cax=figure.add_axes((0.82, 0.17, 0.04, 0.71)))
+        ends = np.geomspace(low, high, 4) if log else np.linspace(low, high, 4)
+        bar.set_ticks([])
+        bar.ax.yaxis.set_ticks(ends, [f"{value:.2g}" for value in ends])
+        bar.ax.yaxis.minorticks_off()
+        title = _METRIC_LABELS[metric] + (f"; {label}" if label else "")
+        figure.text(0.02, 0.97, style.shorten(title, style.WIDTH), va="top")
+    return figure
+
+
+def _chosen(case: Case) -> dict[str, Value]:
+    return {**case.settings, **case.gains}
+
+
+def _choice(case: Case, name: str) -> float:
+    return _as_number(_chosen(case).get(name, np.nan))
+
+
+def _as_number(value: Value) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        return math.nan
+
+
+def _is_axis(cases: Sequence[Case], name: str) -> bool:
+    """Whether a choice is a positive number wherever there is one: a gain, a tolerance, a time."""
+    values = [_chosen(case)[name] for case in cases if name in _chosen(case)]
+    return all(0 < _as_number(value) < math.inf for value in values)
+
+
+def _groups(cases: Sequence[Case], without: tuple[str, ...]) -> dict[str, list[Case]]:
+    """Cases that have ``without``, by all their other choices that vary, in words."""
+    relevant = [case for case in cases if all(name in _chosen(case) for name in without)]
+    others = [name for name in varying(relevant) if name not in without]
+    groups: dict[str, list[Case]] = {}
+    for case in relevant:
+        groups.setdefault(_words(case, others), []).append(case)
+    return groups
+
+
+def _labels(cases: Sequence[Case]) -> Callable[[Case], str]:
+    """A function from a case to its shortest name that tells it from the others."""
+    others = varying(cases)
+    words = [_words(case, others) for case in cases]
+    runs = {case.run for case in cases}
+    if len(set(words)) == len(cases):
+        return lambda case: _words(case, others)
+    if len(runs) == len(cases):
+        return lambda case: case.run
+    return lambda case: ", ".join(
+        filter(None, (case.run if len(runs) > 1 else "", _words(case, others)))
+    )
+
+
+def _words(case: Case, chosen: Sequence[str]) -> str:
+    """``drem, γ = 10⁸``: names are left out where the value says it all."""
+    parts = []
+    values = _chosen(case)
+    for name in chosen:
+        value = values.get(name)
+        if value is None:
+            continue
+        number = _as_number(value)
+        if math.isfinite(number):
+            parts.append(f"{symbol(name)} = {number_text(number)}")
+        else:
+            parts.append(str(value) if name in ("plant", "estimator") else f"{name} = {value}")
+    return ", ".join(parts)

@@ -1,0 +1,66 @@
+"""The run folder: tables, summary, configuration and figures of one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gpebo_cli.experiment.result import RunResult
+from gpebo_cli.results import tables
+from gpebo_cli.results.figures import FIGURES, draw
+from gpebo_cli.results.files import make_folder, remove_files, write_text
+from gpebo_cli.results.provenance import Provenance, provenance
+from gpebo_cli.results.style import save
+from gpebo_cli.results.summary import summary_text
+
+TABLES = ("signals.csv", "regression.csv", "excitation.csv", "estimates.csv", "cases.csv")
+NOISE_TABLE = "noise.csv"  # only where more than one seed was asked for
+
+
+def write_run(
+    result: RunResult, folder: Path, config_text: str, made_by: Provenance | None = None
+) -> None:
+    """Write everything a run leaves behind to ``folder``, which is created where needed.
+
+    What the run does not have (without an observer: all but the plant's signals) is not written,
+    and files of the same names from an earlier run in the same folder are removed: none of
+    them tells of another run than the others. ``summary.json`` comes last, so that a folder
+    that has one is complete.
+
+    Args:
+        result: the run; ``settings.output.figures`` chooses the figures.
+        folder: where to write.
+        config_text: the resolved configuration, as YAML.
+        made_by: versions and commit; by default those of this process.
+
+    Raises:
+        ConfigError: a figure asked for does not exist; nothing has been written then.
+        GpeboError: a file cannot be written; the message names it.
+    """
+    wanted = result.settings.output.figures
+    figures = draw(result, None if wanted is True else wanted or [])
+    make_folder(folder)
+    _remove_earlier(folder)
+
+    write_text(folder / "config.yaml", config_text)
+    tables.write_signals(folder / "signals.csv", result.system, result.signals)
+    regression, estimation = result.regression, result.estimation
+    if regression is not None:
+        tables.write_regression(folder / "regression.csv", regression)
+    if result.excitation is not None:
+        tables.write_excitation(folder / "excitation.csv", result.excitation)
+    if estimation is not None:
+        tables.write_estimates(folder / "estimates.csv", result.system.states, estimation)
+    if estimation is not None and result.metrics is not None:
+        tables.write_cases(folder / "cases.csv", estimation, result.metrics)
+    if estimation is not None and result.noise is not None:
+        tables.write_noise(folder / NOISE_TABLE, estimation, result.noise)
+    for name, figure in figures:
+        make_folder(folder / "figures")
+        save(figure, folder / "figures" / f"{name}.png")
+    write_text(folder / "summary.json", summary_text(result, made_by or provenance()))
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Remove what an earlier run left, by name: a folder may hold files that are not ours."""
+    remove_files(folder / name for name in ("summary.json", *TABLES, NOISE_TABLE))
+    remove_files(folder / "figures" / f"{name}.png" for name in FIGURES)

@@ -1,0 +1,149 @@
+"""The folder that ``gpebo figures`` writes: pictures, their tables, and a page of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.experiment.result import RunResult
+from gpebo_cli.results import circuit
+from gpebo_cli.results.figures import describe, overlay
+from gpebo_cli.results.files import make_folder, remove_files, write_text
+from gpebo_cli.results.names import FORMATS
+from gpebo_cli.results.page import Picture, Section, case_table
+from gpebo_cli.results.series import blocks, csv_text, differences, reference_text
+from gpebo_cli.results.studies import CAPTIONS, REFERENCE, STUDIES, Study, heading, stem
+from gpebo_cli.results.style import Panel, compose, save
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A recipe that has been run: once (under the name ``""``), or once per name of a sweep."""
+
+    name: str
+    title: str
+    reference: str
+    runs: Mapping[str, RunResult]
+
+
+def figures_of(recipe: Recipe) -> dict[str, list[Panel]]:
+    """Panels of all figures of a recipe, in the order in which they are shown."""
+    study = STUDIES.get(recipe.name, Study())
+    if "" in recipe.runs:
+        return dict(describe(recipe.runs[""], study.figures))
+    return {"estimators": panels} if (panels := overlay(recipe.runs)) else {}
+
+
+def write_recipe(
+    folder: Path, recipe: Recipe, figures: Mapping[str, list[Panel]], formats: Sequence[str]
+) -> Section:
+    """Draw ``figures`` into ``folder``, a CSV file beside each; earlier ones are removed.
+
+    Args:
+        folder: of this recipe.
+        recipe: what was run.
+        figures: what :func:`figures_of` returned.
+        formats: some of :data:`gpebo_cli.results.names.FORMATS`, ``png`` among them.
+
+    Raises:
+        GpeboError: a file cannot be written.
+    """
+    make_folder(folder)
+    remove_files(p for s in (*FORMATS, "csv") for p in sorted(folder.glob(f"fig*.{s}")))
+    study = STUDIES.get(recipe.name, Study())
+    pictures = []
+    if study.is_the_papers and circuit.available():
+        write_text(folder / f"{stem('circuit')}.csv", circuit.netlist())
+        alt = "Circuit diagram: " + "; ".join(map(_branch_text, circuit.BRANCHES)) + "."
+        pictures.append(_save(folder, "circuit", circuit.circuit(), study, alt, formats))
+    for name, panels in figures.items():
+        write_text(folder / f"{stem(name)}.csv", csv_text(blocks(panels)))
+        pictures.append(_save(folder, name, compose(panels), study, _alt(name, panels), formats))
+    runs = recipe.runs
+    return Section(
+        name=recipe.name,
+        title=recipe.title,
+        reference=recipe.reference,
+        note=study.note,
+        verdicts=tuple(run.verdict for run in runs.values()) if len(runs) == 1 else (),
+        table=case_table([(name, row) for name, run in runs.items() for row in _cases(run)]),
+        pictures=tuple(pictures),
+    )
+
+
+def lacks_circuit(names: Sequence[str]) -> bool:
+    """Whether one of the recipes wants the circuit drawn and there is nothing to draw it with."""
+    return not circuit.available() and any(
+        name in STUDIES and STUDIES[name].is_the_papers for name in names
+    )
+
+
+def write_references(folder: Path, recipe: str, figures: Mapping[str, list[Panel]]) -> None:
+    """Write the reference tables of a recipe to ``folder``/recipe."""
+    make_folder(folder / recipe)
+    for name, panels in figures.items():
+        if name in REFERENCE:
+            write_text(folder / recipe / f"{stem(name)}.csv", reference_text(panels))
+
+
+def check_references(
+    folder: Path, recipe: str, figures: Mapping[str, list[Panel]]
+) -> Iterator[str]:
+    """Compare a recipe with its tables in ``folder``/recipe; a line per curve that differs."""
+    by_file = {stem(name): panels for name, panels in figures.items()}
+    for path in sorted((folder / recipe).glob("*.csv")):
+        where = f"{recipe}/{path.stem}"
+        panels = by_file.get(path.stem)
+        if panels is None:
+            yield f"{where}: there is a reference, but no such figure any more"
+        else:
+            yield from (f"{where}, {text}" for text in differences(panels, path))
+
+
+def _save(
+    folder: Path, name: str, figure: Figure, study: Study, alt: str, formats: Sequence[str]
+) -> Picture:
+    for suffix in formats:
+        save(figure, folder / f"{stem(name)}.{suffix}")
+    width, height = figure.canvas.get_width_height()
+    return Picture(
+        stem=stem(name),
+        heading=heading(name, study),
+        text=CAPTIONS[name].text,
+        alt=alt,
+        size=(width, height),
+        formats=tuple(formats),
+    )
+
+
+def _alt(name: str, panels: Sequence[Panel]) -> str:
+    """What a picture shows, for those who do not see it; the numbers are in its table."""
+    curves = dict.fromkeys(curve.label for panel in panels for curve in panel.curves)
+    axes = ", ".join(panel.label + (" (logarithmic)" if panel.log else "") for panel in panels)
+    legend = ", ".join(label for label in curves if label)
+    text = f"Line chart of {CAPTIONS[name].text} over {panels[0].axis.label}: {axes}."
+    return f"{text} Curves: {legend}." if legend else text
+
+
+def _branch_text(branch: circuit.Branch) -> str:
+    ends = ("ground" if node == circuit.GROUND else node for node in (branch.start, branch.end))
+    current = f" with current {branch.current}" if branch.current else ""
+    return f"{branch.element} from {' to '.join(ends)}{current}"
+
+
+def _cases(run: RunResult) -> list[dict[str, float]]:
+    """Gains and metrics of each case, as in ``cases.csv``."""
+    estimation, metrics = run.estimation, run.metrics
+    if estimation is None or metrics is None:
+        return []
+    names = [field.name for field in fields(Metrics)]
+    return [
+        {**case, **{name: float(getattr(metrics, name)[i]) for name in names}}
+        for i, case in enumerate(estimation.cases)
+    ]

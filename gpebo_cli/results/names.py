@@ -1,0 +1,32 @@
+"""Names that the shell completes: of figures and metrics, without importing what makes them."""
+
+FIGURE_NAMES = (
+    "signals",
+    "regressor",
+    "states",
+    "estimates",
+    "estimates_a",
+    "estimates_b",
+    "parameters",
+    "parameter_error",
+    "state_error",
+    "state_error_a",
+    "state_error_b",
+    "gram",
+    "delta",
+    "gains",
+    "error_norms",
+)
+"""Every figure of a run, a function of that name in ``outputs/figures.py``, in this order."""
+
+METRICS = (
+    "seconds_to_1pct_parameters",
+    "seconds_to_1pct_states",
+    "final_error_parameters",
+    "final_error_states",
+    "rms_error_states",
+)
+"""What is measured of every case, the fields of :class:`gpebo_cli.experiment.result.Metrics`."""
+
+FORMATS = ("png", "pdf", "svg")
+"""Of the files of figures."""

@@ -1,0 +1,169 @@
+"""The numbers of a figure: its panels as a CSV table, and their comparison with a reference.
+
+Tolerances of the comparison, for a curve ``y`` and its reference ``r``:
+
+    |y − r| ≤ RELATIVE |r| + ABSOLUTE · max(size, max |r|)
+
+``ABSOLUTE`` = 1e-9 is 100 times the solver's tolerance of 1e-11 of each signal's size: two
+machines that round differently may choose other elements, and what each is allowed adds up over a
+run. Errors below that share of the signal are the solver's, not the estimator's; they are 1e-14
+here and 1e-13 there, and no one should be told.
+
+``RELATIVE`` = 1e-3 is for the logarithmic figures. An error decays as e^(−I), I = γ∫Δ², so what
+changes Δ by a share δ changes it by 2Iδ, and I is 21 where it reaches the level above. Of Δ, a
+determinant, the tolerance of 1e-11 grows by the condition of its matrix, 3e4 when the parameters
+begin to move: 1e-5; other nodes of the scalar laws add some 5e-5, as they do to the time to 1 %,
+which is interpolated between them; the path through solve_ivp, another method, is off by 7e-4.
+All of that passes, and none of it could be seen: a thousandth of a value is less than a tenth of a
+line's width. A gain that is off by 2e-4 does not pass.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.results.style import MAX_PANELS, Panel, drawn
+
+RELATIVE = 1e-3
+ABSOLUTE = 1e-9
+
+_REFERENCE_ROWS = 41
+
+
+@dataclass(frozen=True)
+class Column:
+    """One curve: ``values`` (N,), NaN where nothing is drawn, and what they are judged by."""
+
+    name: str
+    values: Array
+    log: bool
+    size: float
+
+
+@dataclass(frozen=True)
+class Block:
+    """Curves over the same ``x`` (N,)."""
+
+    name: str  # of x
+    x: Array
+    columns: tuple[Column, ...]
+
+
+def blocks(panels: Sequence[Panel]) -> list[Block]:
+    """Everything that is drawn of ``panels``, curves over the same points together."""
+    found: list[Block] = []
+    for panel in panels[:MAX_PANELS]:
+        for curve in panel.curves:
+            name = f"{panel.label}: {curve.label}" if curve.label else panel.label
+            column = Column(name, drawn(panel, curve), panel.log, panel.size)
+            for k, block in enumerate(found):
+                if np.array_equal(block.x, curve.x):
+                    found[k] = Block(block.name, block.x, (*block.columns, column))
+                    break
+            else:
+                x = panel.axis.name
+                found.append(Block(f"{x} of {name}" if found else x, curve.x, (column,)))
+        if panel.vertical is not None:
+            time, name = panel.vertical
+            found.append(Block(name, np.array([time]), ()))
+    return found
+
+
+def csv_text(table: Sequence[Block], digits: int = 17) -> str:
+    """A header and rows; blocks stand side by side, the shorter ones end in empty cells."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(
+        name for block in table for name in (block.name, *(c.name for c in block.columns))
+    )
+    columns = [v for block in table for v in (block.x, *(c.values for c in block.columns))]
+    cells = ([_cell(value, digits) for value in column.tolist()] for column in columns)
+    writer.writerows(zip_longest(*cells, fillvalue=""))
+    return text.getvalue()
+
+
+def _cell(value: float, digits: int) -> str:
+    return "" if np.isnan(value) else f"{value:.{digits}g}"
+
+
+def reference_text(panels: Sequence[Panel]) -> str:
+    """The first block in 41 rows and 10 digits: small enough to be committed."""
+    first = blocks(panels)[0]
+    rows = np.unique(np.linspace(0, len(first.x) - 1, _REFERENCE_ROWS).round().astype(np.intp))
+    columns = tuple(
+        Column(c.name, c.values[rows], c.log, c.size) for c in first.columns
+    )
+    return csv_text([Block(first.name, first.x[rows], columns)], digits=10)
+
+
+def differences(panels: Sequence[Panel], reference: Path) -> Iterator[str]:
+    """Curves of ``panels`` that differ from those in a file that :func:`reference_text` made.
+
+    Yields:
+        One line per curve: which one, where it differs most and by how much.
+
+    Raises:
+        ConfigError: ``reference`` is not such a file.
+    """
+    header, table = _read(reference)
+    block = blocks(panels)[0]
+    ours = {column.name: column for column in block.columns}
+    if header[0] != block.name:
+        yield f"{header[0]} is now {block.name}"
+        return
+    for name in ours.keys() - set(header[1:]):
+        yield f"{name}: there is no such curve in the reference"
+    x = table[:, 0]
+    near = np.abs(block.x[:, None] - x).argmin(axis=0)
+    if not np.allclose(block.x[near], x, rtol=1e-9, atol=1e-9 * float(np.ptp(block.x))):
+        yield f"{header[0]} does not have the values of the reference among its own"
+        return
+    for name, expected in zip(header[1:], table[:, 1:].T, strict=True):
+        column = ours.get(name)
+        if column is None:
+            yield f"{name}: there is no such curve any more"
+        elif found := _difference(column, near, expected):
+            k, text = found
+            yield f"{name}: at {block.name} = {x[k]:.6g} {text}"
+
+
+def _difference(column: Column, rows: Array, reference: Array) -> tuple[int, str] | None:
+    """Row of the largest difference, in tolerances, and a text; None if all is within."""
+    values = column.values[rows]
+    if column.log:  # what is not drawn there is zero, and zero or 1e-17 is the same to us
+        values, reference = np.nan_to_num(values), np.nan_to_num(reference)
+    size = max(column.size, float(np.nanmax(np.abs(reference), initial=0.0)))
+    allowed = RELATIVE * np.abs(reference) + ABSOLUTE * size
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess = np.abs(values - reference) / allowed
+    excess = np.where(np.isnan(values) == np.isnan(reference), np.nan_to_num(excess), np.inf)
+    k = int(excess.argmax())
+    if excess[k] <= 1.0:
+        return None
+    return k, (
+        f"it is {values[k]:.6g}, the reference {reference[k]:.6g}; they differ by "
+        f"{abs(values[k] - reference[k]):.2g}, {allowed[k]:.2g} is allowed"
+    )
+
+
+def _read(path: Path) -> tuple[list[str], Array]:
+    try:
+        with open(path, encoding="utf-8", newline="") as stream:
+            header, *rows = csv.reader(stream)
+        table = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:  # no rows, rows of different lengths, or words in them
+        raise ConfigError(f"{path} is not a table of numbers, as --update writes them") from error
+    if table.ndim != 2 or table.shape[1] != len(header) or np.isnan(table[:, 0]).any():
+        raise ConfigError(f"{path} is not a table of numbers, as --update writes them")
+    return header, table

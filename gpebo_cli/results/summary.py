@@ -1,0 +1,196 @@
+"""``summary.json``: everything about a run that is not a table, as strict JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli.evidence.excitation import Excitation
+from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.experiment.result import (
+    EstimationResult,
+    Fit,
+    RecordingResult,
+    RunResult,
+    SimulationResult,
+    StateChange,
+)
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.results.provenance import Provenance
+
+MAX_LISTED_CASES = 100  # beyond, cases.csv is the place to look and the summary gives ranges
+
+
+def summary_text(result: RunResult, made_by: Provenance) -> str:
+    """Render :func:`summary` as strict JSON: NaN and infinities are ``null``."""
+    content = plain(summary(result, made_by))
+    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
+    """Summarise a run as nested dicts in the order they are printed; parts it lacks are None."""
+    system, simulation = result.system, result.simulation
+    regression, estimation = result.regression, result.estimation
+    return {
+        "status": "done",
+        "verdict": result.verdict,
+        "plant": system.name,
+        "title": system.title,
+        "reference": system.reference,
+        "observer": result.settings.observer.name,
+        "sample_time": result.settings.observer.sample_time,
+        "estimator": dict(result.settings.estimator) if estimation else None,
+        "noise": (
+            asdict(result.settings.noise) if result.signals.measured_outputs is not None else None
+        ),
+        **_simulation(system, simulation),
+        "recording": _recording(result.recording),
+        "parameters": _parameters(result.estimation),
+        "assumptions": [
+            {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
+            for a in result.assumptions
+        ],
+        "warnings": result.warnings,
+        "excitation": _excitation(result.excitation),
+        "estimator_requirement": _requirement(estimation),
+        "cases": _cases(estimation, result.metrics),
+        "error_estimate": {
+            "states": simulation.error_estimate if simulation else None,
+            "regression": regression.error_estimate if regression else None,
+        },
+        "fit": _fit(result.fit),
+        "elements": simulation.elements if simulation else None,
+        "timings": dict(result.timings),
+        "versions": made_by.versions,
+        "git": {"commit": made_by.git.commit, "dirty": made_by.git.dirty} if made_by.git else None,
+    }
+
+
+def plain(value: object) -> Any:
+    """Reduce ``value`` to what strict JSON knows; a number that is not finite becomes None."""
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (Sequence, set, frozenset)):
+        return [plain(item) for item in value]
+    return str(value)
+
+
+def _change(change: StateChange) -> dict[str, float]:
+    return {"from": change.given, "to": change.used, "change": change.used - change.given}
+
+
+def _simulation(
+    system: DescriptorSystem, simulation: SimulationResult | None
+) -> dict[str, Any]:
+    """Index, consistent start and jumps of the simulated plant; None for each of a recording."""
+    if simulation is None:
+        keys = ("index", "strangeness_index", "differential", "algebraic", "initial_state",
+                "jumps", "impulses")
+        return dict.fromkeys(keys)
+    return {
+        "index": simulation.index,
+        "strangeness_index": simulation.strangeness_index,
+        "differential": simulation.differential,
+        "algebraic": simulation.algebraic,
+        "initial_state": {
+            "given": dict(zip(system.states, system.initial_state, strict=True)),
+            "used": dict(zip(system.states, simulation.initial_state, strict=True)),
+            "moved": {change.state: _change(change) for change in simulation.moved},
+        },
+        "jumps": [
+            {"time": change.time, "state": change.state, **_change(change)}
+            for change in simulation.jumps
+        ],
+        "impulses": [{"time": time, "state": state} for time, state in simulation.impulses],
+    }
+
+
+def _recording(recording: RecordingResult | None) -> dict[str, Any] | None:
+    if recording is None:
+        return None
+    names = ("file", "sha256", "rows", "hold", "first", "last", "known_states", "elements")
+    return {name: getattr(recording, name) for name in names}
+
+
+def _fit(fit: Fit | None) -> dict[str, Any] | None:
+    if fit is None:
+        return None
+    listed = fit.residual if len(fit.residual) <= MAX_LISTED_CASES else None
+    finite = fit.residual[np.isfinite(fit.residual)]
+    return {
+        "rms_Y": fit.size,
+        "rms_residual": listed,
+        "least_rms_residual": finite.min() if finite.size else None,
+    }
+
+
+def _parameters(estimation: EstimationResult | None) -> dict[str, float] | None:
+    if estimation is None:
+        return None
+    return dict(zip(estimation.names, estimation.true_parameters[-1], strict=True))
+
+
+def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:
+    if excitation is None:
+        return None
+    # Before one window has passed the trailing window is a shorter one, which is no evidence.
+    full = excitation.t - excitation.t[0] >= excitation.window * (1 - 1e-9)
+    levels = excitation.pe_level[full & np.isfinite(excitation.pe_level)]
+    return {
+        "is_ie": excitation.is_ie,
+        "t_c": excitation.t_c,
+        "rho": excitation.rho,
+        "lambda_min": excitation.lambda_min,
+        "condition": excitation.condition,
+        "weakest_direction": excitation.weakest_direction.components,
+        "pe_level_min": levels.min() if levels.size else None,
+        "window": excitation.window,
+    }
+
+
+def _requirement(estimation: EstimationResult | None) -> dict[str, Any] | None:
+    if estimation is None:
+        return None
+    requirement: Requirement = estimation.requirement
+    return {
+        "name": requirement.name,
+        "holds": requirement.holds,
+        "evidence": requirement.evidence,
+        "text": requirement.text,
+    }
+
+
+def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> object:
+    """List the cases with gains and metrics; ranges of the metrics when they are many."""
+    if estimation is None or metrics is None:
+        return None
+    columns = {field.name: np.asarray(getattr(metrics, field.name)) for field in fields(Metrics)}
+    if len(estimation.cases) <= MAX_LISTED_CASES:
+        return [
+            {"case": case, "gains": gains, **{name: col[case] for name, col in columns.items()}}
+            for case, gains in enumerate(estimation.cases)
+        ]
+    return {
+        "count": len(estimation.cases),
+        **{name: _range(column[np.isfinite(column)]) for name, column in columns.items()},
+    }
+
+
+def _range(finite: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
+    """Give the smallest and largest of those that are finite, and how many those are."""
+    smallest, largest = (finite.min(), finite.max()) if finite.size else (None, None)
+    return {"min": smallest, "max": largest, "finite": finite.size}
