@@ -20,7 +20,7 @@ from gpebo_cli.observers.canonical import (
     transition_decay,
     unknown_input_matrices,
 )
-from gpebo_cli.observers.gpebo import observer_matrices
+from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -188,7 +188,7 @@ def test_D3_reduced_matrix():
         "C": [[1, 2, 0, 0]], "initial_state": [0] * 4,
     })
     t = np.zeros(1)
-    found = observer_matrices(system, t, t, 1e-10).A0[0, :2, :2]
+    found = observer_matrices(system, t, t, 1e-10).dynamics[0]
     expected = A[:2, :2] - A[:2, 2:] @ np.linalg.inv(A[2:, 2:]) @ A[2:, :2]
     np.testing.assert_allclose(found, expected, atol=1e-12)
     with pytest.raises(ValueError, match="mismatch"):

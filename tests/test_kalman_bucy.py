@@ -22,8 +22,8 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers import SignalNoise, observe
-from gpebo_cli.observers import gpebo as basis_observer
 from gpebo_cli.observers.kalman_bucy import noise_model, reduced_system
+from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.observers.riccati import run_filter
 from gpebo_cli.settings import (
     NoiseSettings,
@@ -54,7 +54,7 @@ def assumption(result: RunResult, name: str):
 
 
 def in_basis(system: DescriptorSystem, t: Array, inside: Array, u: Array, y: Array, like=None):
-    o = basis_observer.observer_matrices(system, t, inside, 1e-10, like)
+    o = observer_matrices(system, t, inside, 1e-10, like)
     return reduced_system(o, u, y), o.split.basis, o
 
 
@@ -70,7 +70,7 @@ def test_model_holds_on_the_true_state_whatever_the_noise(name):
     s, basis, o = in_basis(system, t, t, u, y)
 
     def zeta(at: Array) -> Array:
-        P = basis_observer.observer_matrices(system, at, at, 1e-10).projector
+        P = observer_matrices(system, at, at, 1e-10).projector
         w = (P @ signals.states(at)[..., None])[..., 0] @ basis
         return np.concatenate([np.broadcast_to(system.theta, (len(at), system.q)), w], axis=1)
 

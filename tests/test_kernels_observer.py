@@ -18,8 +18,10 @@ from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers import gpebo, observe
+from gpebo_cli.observers import observe
 from gpebo_cli.observers.observation import AffineStateMap, largest_entry, log_norm
+from gpebo_cli.observers.reduced import extension, matrices
+from gpebo_cli.observers.reduced.regression import regression_signals
 from gpebo_cli.regression import linear as regressions
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import (
@@ -117,7 +119,7 @@ def found_or_refused(compute):
 def test_observer_matrices(drawn, normalise, weighted):
     system, t = drawn
     scale = np.linspace(0.5, 1.0, system.r) if weighted else None
-    one, other = by_both(lambda: found_or_refused(lambda: gpebo.observer_matrices(
+    one, other = by_both(lambda: found_or_refused(lambda: matrices.observer_matrices(
         system, t, t, RANK_TOL, normalise=normalise, output_scale=scale
     )))
     if isinstance(one, str) or isinstance(other, str):
@@ -125,7 +127,7 @@ def test_observer_matrices(drawn, normalise, weighted):
         return
     same_matrices(one, other)
     again, expected = by_both(lambda: found_or_refused(
-        lambda: gpebo.observer_matrices(system, t, t, RANK_TOL, one)
+        lambda: matrices.observer_matrices(system, t, t, RANK_TOL, one)
     ))
     if isinstance(again, str):
         assert again == expected
@@ -169,7 +171,7 @@ def test_a_change_of_rank_is_refused_by_the_same_words():
 
     def text():
         with pytest.raises(ModelError, match=r"rank of E changes from 2 .* at t = 5") as caught:
-            gpebo.observer_matrices(system, t, t, RANK_TOL)
+            matrices.observer_matrices(system, t, t, RANK_TOL)
         return str(caught.value)
 
     one, other = by_both(text)
@@ -188,7 +190,7 @@ def test_assumption_1_is_refused_by_the_same_words():
 
     def text():
         with pytest.raises(ModelError, match=r"Assumption 1 .* fails at t = 11:") as caught:
-            gpebo.observer_matrices(system, np.arange(12.0), np.arange(12.0), RANK_TOL)
+            matrices.observer_matrices(system, np.arange(12.0), np.arange(12.0), RANK_TOL)
         return str(caught.value)
 
     one, other = by_both(text)
@@ -208,8 +210,8 @@ def test_signals_of_the_regression(shape, count, constant, seed):
     A, G = rng.normal(size=(N, rows, k)), rng.normal(size=(N, rows, q))
     g_y, Q1 = rng.normal(size=(count, rows)), rng.normal(size=(N, rows, b))
     H = rng.normal(size=(N, n, b))
-    one, other = by_both(lambda: gpebo.regression_signals(
-        z, q, basis, A, g_y, G, Q1, H, np.ones(N)
+    one, other = by_both(lambda: regression_signals(
+        z, q, basis, matrices.AlgebraicEquations(A, g_y, G, Q1, H, np.ones(N))
     ))
     for name in ("Y", "psi", "offset", "gain", "Y_scale", "psi_scale"):
         close(getattr(one, name), getattr(other, name), 100.0)
@@ -227,14 +229,14 @@ def test_signals_of_the_regression(shape, count, constant, seed):
 def test_what_drives_the_extension(m, r, q, k, count, constant, seed):
     rng = np.random.default_rng(seed)
     N = 1 if constant else count
-    matrices = gpebo.ObserverMatrices(
+    made = matrices.ObserverMatrices(
         split=None, rows=None, output_scale=None, dynamics=np.zeros((1, k, k)),
         from_unknowns=rng.normal(size=(N, k, q)), from_signals=rng.normal(size=(N, k, m + r)),
         algebraic=None, on_basis=None, g_signals=rng.normal(size=(N, 5, m + r)), G=None,
         range=None, elimination=None, injectivity=None,
     )
     u, y = rng.normal(size=(count, m)), rng.normal(size=(count, r))
-    one, other = by_both(lambda: gpebo._driven(matrices, u, y, 1 + q + k))
+    one, other = by_both(lambda: extension._driven(made, u, y, 1 + q + k))
     for found, expected in zip(one, other, strict=True):
         close(found, expected, 10.0)
 
@@ -244,12 +246,12 @@ def test_the_weakest_time(count, n, b, constant, seed):
     rng = np.random.default_rng(seed)
     H = rng.normal(size=(1 if constant else count, n, b))
     injectivity = rng.uniform(0.5, 1.0, count)
-    one, other = by_both(lambda: gpebo._weakest(injectivity, H))
+    one, other = by_both(lambda: matrices.weakest(injectivity, H))
     close(one[0], other[0])
     assert one[1] == other[1] or abs(one[0] - other[0]) < 10 * EPS
     for bad in (np.inf, np.nan):
         injectivity[count // 2] = bad
-        assert by_both(lambda: gpebo._weakest(injectivity, H)) == ((np.inf, 0), (np.inf, 0))
+        assert by_both(lambda: matrices.weakest(injectivity, H)) == ((np.inf, 0), (np.inf, 0))
 
 
 @given(st.integers(0, 20), st.integers(1, 16), st.integers(0, 2), st.integers(0, 2), seeds)

@@ -9,7 +9,7 @@ from plants import reference, shipped
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
-from gpebo_cli.observers.gpebo import observer_matrices
+from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -153,10 +153,10 @@ def test_equal_to_the_papers_block_formulas(varying, q):
         B2, F2 = np.vstack([B[n_a:], np.zeros((r, 2))]), np.vstack([F[n_a:], np.zeros((r, q))])
         y = np.vstack([np.zeros((n_b, r)), np.eye(r)])
         np.testing.assert_allclose(
-            ours.A0[k, :n_a, :n_a], A11 - A12 @ dagger @ rest, atol=1e-11)
-        np.testing.assert_allclose(ours.from_inputs[k, :n_a], B1 - A12 @ dagger @ B2, atol=1e-11)
-        np.testing.assert_allclose(ours.from_outputs[k, :n_a], A12 @ dagger @ y, atol=1e-11)
-        np.testing.assert_allclose(ours.D0[k, :n_a], F1 - A12 @ dagger @ F2, atol=1e-11)
+            ours.dynamics[k], A11 - A12 @ dagger @ rest, atol=1e-11)
+        np.testing.assert_allclose(ours.from_signals[k, :, :2], B1 - A12 @ dagger @ B2, atol=1e-11)
+        np.testing.assert_allclose(ours.from_signals[k, :, 2:], A12 @ dagger @ y, atol=1e-11)
+        np.testing.assert_allclose(ours.from_unknowns[k], F1 - A12 @ dagger @ F2, atol=1e-11)
         # the paper's ψ_1 and ψ_2 are the last r rows of the residual
         psi_2 = C[:, n_a:] @ dagger @ rest - C[:, :n_a]
         literal = (ours.residual[k] @ ours.algebraic[k])[-r:, :n_a]

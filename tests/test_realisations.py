@@ -18,7 +18,7 @@ from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import observe
-from gpebo_cli.observers.gpebo import observer_matrices
+from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.settings import (
     NoiseSettings,
     ObserverSettings,

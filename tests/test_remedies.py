@@ -27,7 +27,7 @@ from gpebo_cli.experiment.assumptions import check
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
-from gpebo_cli.observers.gpebo import observer_matrices
+from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.regression.dynamics import filtered
 from gpebo_cli.regression.linear import ExtensionState, Reset, largest
 from gpebo_cli.settings import (
@@ -91,7 +91,7 @@ def observed(name, horizon=20.0, **observer):
 def test_the_plant_is_the_one_that_needs_a_remedy():
     system = plant_from_mapping(UNBOUNDED)
     o = observer_matrices(system, np.zeros(1), np.zeros(1), 1e-10)
-    eigenvalues = np.sort_complex(np.linalg.eigvals(o.A0[0][:3, :3]))
+    eigenvalues = np.sort_complex(np.linalg.eigvals(o.dynamics[0]))
     np.testing.assert_allclose(eigenvalues, [0.33, 0.64 - 1.01j, 0.64 + 1.01j], atol=1e-12)
 
 

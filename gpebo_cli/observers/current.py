@@ -20,15 +20,11 @@ import numpy as np
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers.gpebo import (
-    Assembled,
-    ReducedSystem,
-    assumptions,
-    on_mesh,
-    regression_signals,
-)
-from gpebo_cli.observers.gpebo import reduce as reduced_system
+from gpebo_cli.observers.gpebo import assumptions
 from gpebo_cli.observers.observation import AffineStateMap, Observation
+from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
+from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
+from gpebo_cli.observers.reduced.regression import Assembled, on_mesh, regression_signals
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import ObserverSettings, SolverSettings
@@ -74,17 +70,16 @@ def observe(
         A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
         A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
         b[:, q:] = (o.from_signals @ signals)[:, :, 0]
-        g_y = (o.g_signals @ signals)[:, :, 0]
-        extras = (o.on_basis, g_y, o.G, o.range, o.elimination, o.injectivity)
         zero = np.zeros((1, 1, 1))
         kernel = np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n))
-        return Coefficients(None, zero, np.zeros((len(t), 1, 1)), (*extras, A, b, kernel))
+        seen = (*o.equations(signals), A, b, kernel)
+        return Coefficients(None, zero, np.zeros((len(t), 1, 1)), seen)
 
     def assembled(extras: tuple[Array, ...]) -> tuple[Assembled, Array, Array]:
         flat = [e.reshape(e.shape[0] * e.shape[1], *e.shape[2:]) for e in extras]
         *parts, A, b, kernel = flat
         z = np.broadcast_to(identity, (len(A), *identity.shape))
-        a = regression_signals(z, q, basis, *parts)
+        a = regression_signals(z, q, basis, AlgebraicEquations(*parts))
         a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
         if rotates:
             a = _with_kernel(a, kernel, q)

@@ -37,9 +37,10 @@ from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers.gpebo import Injection, ObserverMatrices, ReducedSystem, observe_reduced
-from gpebo_cli.observers.gpebo import reduce as reduced_system
+from gpebo_cli.observers.gpebo import observe_reduced
 from gpebo_cli.observers.observation import Observation
+from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
+from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices
 from gpebo_cli.settings import ObserverSettings, SolverSettings
 
 _TOLERANCE = 1e-6  # of S

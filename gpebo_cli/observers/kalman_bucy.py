@@ -37,6 +37,8 @@ from gpebo_cli.observers import gpebo
 from gpebo_cli.observers.extension import initial_extension
 from gpebo_cli.observers.observability import WindowGramians, window_gramians
 from gpebo_cli.observers.observation import AffineStateMap, Observation, Reconstruction
+from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
+from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.observers.riccati import Filtered, StateSpace, run_filter
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import ObserverSettings, SolverSettings
@@ -79,7 +81,7 @@ class ReducedSystem:
     projector: Array  # (N, states, states) P
 
 
-def reduced_system(o: gpebo.ObserverMatrices, u: Array, y: Array) -> ReducedSystem:
+def reduced_system(o: ObserverMatrices, u: Array, y: Array) -> ReducedSystem:
     """The reduced system from the observer's matrices and signals, w in coordinates of its basis.
 
     Args:
@@ -200,16 +202,16 @@ def observe(
     evidence = gpebo.observe(system, inputs, outputs, settings, solver)
     mesh, q = inputs.mesh, system.q
     points, points_inside = mesh.points.ravel(), mesh.inside.ravel()
-    first = gpebo.observer_matrices(
+    first = observer_matrices(
         system, points, points_inside, solver.rank_tol, normalise=True
     )
     basis = first.split.basis
 
     def reduced(t: Array, inside: Array) -> ReducedSystem:
-        o = gpebo.observer_matrices(system, t, inside, solver.rank_tol, first)
+        o = observer_matrices(system, t, inside, solver.rank_tol, first)
         return reduced_system(o, inputs(t, inside), outputs(t, inside))
 
-    V1, initial = gpebo.initial_basis(first.projector[0], first.split.rank, system.states)
+    V1, initial = initial_basis(first.projector[0], first.split.rank, system.states)
     fixed = basis.shape[1] == first.split.rank
     labels = tuple(name.removeprefix("e0_") for name in initial) if fixed else system.states
     names = (*system.unknowns, *(f"w_{label}" for label in labels))

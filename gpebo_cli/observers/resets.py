@@ -26,22 +26,21 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.extension import initial_extension
-from gpebo_cli.observers.gpebo import (
-    Assembled,
-    Extension,
-    ReducedSystem,
-    assumptions,
-    extend,
-    initial_basis,
-    on_mesh,
-)
-from gpebo_cli.observers.gpebo import reduce as reduced_system
+from gpebo_cli.observers.gpebo import assumptions
 from gpebo_cli.observers.observation import (
     AffineStateMap,
     Observation,
     error_of_extension,
     log_norm,
 )
+from gpebo_cli.observers.reduced.extension import (
+    Extension,
+    ReducedSystem,
+    extend,
+    reduced_system,
+)
+from gpebo_cli.observers.reduced.regression import Assembled, on_mesh
+from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.regression.linear import (
     ExtensionState,
     LinearRegression,

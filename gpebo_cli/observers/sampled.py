@@ -22,13 +22,9 @@ from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.extension import initial_extension
-from gpebo_cli.observers.gpebo import (
-    ObserverMatrices,
-    initial_basis,
-    observer_matrices,
-    regression_signals,
-    split_in_frame,
-)
+from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
+from gpebo_cli.observers.reduced.regression import regression_signals
+from gpebo_cli.observers.reduced.split import initial_basis, split_in_frame
 from gpebo_cli.recordings.hold import edges, held
 from gpebo_cli.regression.linear import SampledRegression
 from gpebo_cli.settings import ObserverSettings, SolverSettings
@@ -146,11 +142,8 @@ class SampledObserver:
         """Regression and state map from [ξ_a | ξ_b | Φ] at the samples, z (K, k, ·)."""
         system = self.system
         o = self._matrices(t, t)
-        g_y = (o.g_signals @ np.hstack([u, y])[:, :, None])[:, :, 0]
-        assembled = regression_signals(
-            z, system.q, self.basis, o.on_basis, g_y, o.G, o.range, o.elimination,
-            o.injectivity,
-        )
+        equations = o.equations(np.hstack([u, y])[:, :, None])
+        assembled = regression_signals(z, system.q, self.basis, equations)
         rows = np.concatenate([assembled.psi, assembled.Y[:, :, None]], axis=2)
         if self.regression == "paper":
             rows = rows[:, -system.r :]

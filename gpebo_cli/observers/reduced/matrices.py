@@ -1,0 +1,316 @@
+"""Every matrix of the observer, and how the algebraic states are eliminated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from gpebo_cli import kernels
+from gpebo_cli.errors import ModelError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.numerics.linalg import joined, orthonormal_complement, transpose
+from gpebo_cli.observers.reduced.split import (
+    TINY,
+    Frame,
+    Split,
+    axes_frame,
+    constant_split,
+    entry_sizes,
+    fits,
+    split_by_svd,
+    split_in_frame,
+    within_frame,
+)
+from gpebo_cli.regression.linear import SMALL_SPECTRUM
+
+_SMALL = 24  # states, up to which NumPy's calls cost more than the kernels' plain loops
+
+
+class AlgebraicEquations(NamedTuple):
+    """0 = 𝒜 w + 𝒜 v + g_y + G θ at N times, and how v = Q x is eliminated from them."""
+
+    on_basis: Array  # (N, e + r, k) 𝒜 B
+    g_y: Array  # (N, e + r) of the signals
+    G: Array  # (N, e + r, q)
+    range: Array  # (N, e + r, n_b) Q1 of K = H Q1ᵀ and R = I − Q1 Q1ᵀ
+    elimination: Array  # (N, n, n_b) H
+    injectivity: Array  # (N,) see ``ObserverMatrices``
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverMatrices:
+    """Every matrix of the observer at N times, known functions of t only.
+
+    With 𝒜 V2 = Q1 R1 (V2 spans the kernel of E), K = H Q1ᵀ with H = V2 R1⁻¹, and the projector
+    on the residual is I − Q1 Q1ᵀ. Matrices that do not depend on time have a leading axis of 1.
+    """
+
+    split: Split
+    rows: Array  # (n,) constants by which the equations were divided
+    output_scale: Array  # (r,) √w, by which rows of C and y were multiplied
+    dynamics: Array  # (N, k, k) BᵀA_0 B
+    from_unknowns: Array  # (N, k, q) BᵀD_0
+    from_signals: Array  # (N, k, m + r) Bᵀb_0 = from_signals [u; y]
+    algebraic: Array  # (N, e + r, n) 𝒜
+    on_basis: Array  # (N, e + r, k) 𝒜 B
+    g_signals: Array  # (N, e + r, m + r) g_y = g_signals [u; y]
+    G: Array  # (N, e + r, q)
+    range: Array  # (N, e + r, n_b) Q1
+    elimination: Array  # (N, n, n_b) H
+    # At most the smallest singular value of 𝒜 on ker E relative to ‖𝒜‖, at least 1/√n_b of it.
+    injectivity: Array  # (N,)
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs r."""
+        return int(self.algebraic.shape[1] - self.split.equations.shape[1])
+
+    @property
+    def projector(self) -> Array:
+        """P = E⁺E, (N, n, n)."""
+        return self.split.projector
+
+    @property
+    def residual(self) -> Array:
+        """R = I − 𝒜 Q K, (N, e + r, e + r)."""
+        return orthonormal_complement(self.range)
+
+    def equations(self, signals: Array) -> AlgebraicEquations:
+        """The algebraic equations with the signals [u; y] (N, m + r, 1)."""
+        g_y = (self.g_signals @ signals)[:, :, 0]
+        return AlgebraicEquations(
+            self.on_basis, g_y, self.G, self.range, self.elimination, self.injectivity
+        )
+
+    def injected(self, gain: Array) -> ObserverMatrices:
+        """The same w, driven by gain · (𝒜 w + g_y + G θ) too, for a gain (N, k, e + r).
+
+        The gain must be N = N R with columns in range P: R (𝒜 w + g_y + G θ) = 0 is all that w
+        has to fulfil, and w must stay in range P.
+        """
+        return replace(
+            self,
+            dynamics=self.dynamics - gain @ self.on_basis,
+            from_unknowns=self.from_unknowns - gain @ self.G,
+            from_signals=self.from_signals - gain @ self.g_signals,
+        )
+
+
+# (matrices at the times t (N,), t, inside) -> gain (N, k, e + r) of ``ObserverMatrices.injected``
+Injection = Callable[[ObserverMatrices, Array, Array], Array]
+
+
+def row_sizes(entries: Array) -> Array:
+    """Size of each row of E over the times, shape (n,), one for rows that are zero.
+
+    Dividing equations by constants changes nothing, but an equation in picofarads would else look
+    like a rank deficiency of E. Powers of two: no rounding.
+
+    Args:
+        entries: the size of each entry of E over the times, (n, n).
+    """
+    size = entries.max(axis=1, initial=0.0)
+    return np.asarray(np.exp2(np.rint(np.log2(np.where(size > 0, size, 1.0)))))
+
+
+def observer_matrices(
+    system: DescriptorSystem, t: Array, inside: Array, rank_tol: float,
+    like: ObserverMatrices | None = None, *, normalise: bool = False,
+    output_scale: Array | None = None,
+) -> ObserverMatrices:
+    """Evaluate the observer's matrices at the times t (N,).
+
+    Args:
+        system: the model.
+        t: times.
+        inside: where functions that jump are decided.
+        rank_tol: singular values below this, relative, are zero.
+        like: those of other times, whose basis and scaling of the equations are kept.
+        normalise: divide the equations by their sizes first, see :func:`row_sizes`.
+        output_scale: √w (r,) of the outputs' weights; default: that of ``like``, else ones.
+
+    Raises:
+        ModelError: the rank of E is not constant, or Assumption 1 fails; names the time and the
+            singular value.
+    """
+    turning = like is not None and like.split.frame is None
+    c = system.coefficients.taylor(t, 1 if turning else 0, inside)
+    constant = system.coefficients.constant
+
+    def value(name: str) -> Array:
+        matrix: Array = getattr(c, name)[0]
+        return matrix[:1] if name in constant else matrix
+
+    model = _Model(value("E"), value("A"), value("B"), value("F"), value("C"))
+    if like is not None:
+        rows, scale = like.rows, like.output_scale
+    else:
+        entries = entry_sizes(model.E)
+        rows = row_sizes(entries) if normalise else np.ones(system.n)
+        scale = np.ones(system.r)
+    if output_scale is not None:
+        scale = output_scale
+    if kernels.compiled is not None and system.n <= _SMALL:
+        frame = axes_frame(entries) if like is None else like.split.frame
+        found = None if frame is None else _in_frame(model, rows, scale, frame, rank_tol)
+        if found is not None:
+            return found
+
+    def slope() -> Array:
+        known = c if turning else system.coefficients.taylor(t, 1, inside)
+        return np.asarray(known.E[1][: len(model.E)])
+
+    return _by_steps(system, model, rows, scale, t, rank_tol, like, slope)
+
+
+class _Model(NamedTuple):
+    """The plant's matrices at N times; a leading axis of 1 means constant in time."""
+
+    E: Array
+    A: Array
+    B: Array
+    F: Array
+    C: Array
+
+
+def _in_frame(
+    model: _Model, rows: Array, scale: Array, frame: Frame, rank_tol: float
+) -> ObserverMatrices | None:
+    """What :func:`_by_steps` finds if the frame is that of E at all times, in one call.
+
+    None where it is not, and where singular values have to tell.
+    """
+    (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
+     from_signals) = kernels.compiled.in_frame(  # type: ignore[union-attr]
+        *model, rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
+    )
+    rank = frame.domain.shape[1]
+    outside, size, inner, inverse, weakest = sizes.tolist()
+    if not (fits(outside, size, rank, inner, inverse, rank_tol) and weakest > rank_tol):
+        return None
+    return ObserverMatrices(
+        within_frame(frame, pinv), rows, scale, dynamics, from_unknowns, from_signals, algebraic,
+        on_basis, g_signals, G, Q1, H, injectivity,
+    )
+
+
+def _by_steps(
+    system: DescriptorSystem, model: _Model, rows: Array, scale: Array, t: Array, rank_tol: float,
+    like: ObserverMatrices | None, slope: Callable[[], Array],
+) -> ObserverMatrices:
+    """The observer's matrices from those of the plant at the times t (N,) and Ė (N or 1, n, n)."""
+    m, q, r = system.m, system.q, system.r
+    E, A, B, F, C = model
+    if (rows != 1.0).any():
+        E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
+    C = scale[:, None] * C
+    if like is None:
+        split = constant_split(E, system.states, rank_tol)
+    else:
+        frame = like.split.frame
+        split = None if frame is None else split_in_frame(E, frame, rank_tol)
+    if split is None:
+        known = None if like is None else like.split.basis
+        split = split_by_svd(system, E, slope() / rows[:, None], t, rank_tol, known)
+
+    L, pinv, basis = split.equations, split.pinv, split.basis
+    algebraic = joined(L @ A, C, axis=1)  # 𝒜 = [Π A; C]
+    on_basis = algebraic @ basis
+    e = L.shape[1]
+    of_y = np.zeros((1, e + r, r))
+    of_y[0, e:] = -np.diag(scale)
+    below = np.zeros((1, r, m + q))
+    of_u_theta = joined(joined(L @ B, L @ F, axis=2), below, axis=1)
+    # g_y = [Π B u; −y] and G = [Π F; 0]
+    g_signals, G = joined(of_u_theta[:, :, :m], of_y, axis=2), of_u_theta[:, :, m:]
+    Q1, H, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
+    Lambda = pinv @ A if split.turn is None else pinv @ A + split.turn  # Λ = E⁺A + Ṗ
+    # [A_0 | D_0 | of u and y] = [Λ | E⁺F | E⁺B, 0] − Λ K [𝒜 | G | g_signals]
+    direct = joined(
+        Lambda @ basis, pinv @ F, pinv @ B, np.zeros((1, len(basis.T), r)), axis=2
+    )
+    through = joined(on_basis, G, g_signals, axis=2)
+    whole = direct - (Lambda @ H) @ (transpose(Q1) @ through)
+    k = basis.shape[1]
+    dynamics = whole[:, :, :k]
+    return ObserverMatrices(
+        split=split,
+        rows=rows,
+        output_scale=scale,
+        dynamics=dynamics[:1] if len(E) == len(A) == len(C) == 1 else dynamics,
+        from_unknowns=whole[:, :, k : k + q],
+        from_signals=whole[:, :, k + q :],
+        algebraic=algebraic,
+        on_basis=on_basis,
+        g_signals=g_signals,
+        G=G,
+        range=Q1,
+        elimination=H,
+        injectivity=injectivity,
+    )
+
+
+def _eliminate(
+    system: DescriptorSystem, algebraic: Array, kernel: Array, t: Array, rank_tol: float
+) -> tuple[Array, Array, Array]:
+    """Q1 and H of K = (𝒜 Q)⁺ = H Q1ᵀ, and a bound of the singular value behind Assumption 1.
+
+    With Q = V2 V2ᵀ and 𝒜 V2 = Q1 R1, (𝒜 Q)⁺ = V2 R1⁻¹ Q1ᵀ. σ_min(R1) is at least 1/‖R1⁻¹‖_F;
+    it is computed itself only where that bound leaves a doubt.
+    """
+    on_kernel = algebraic @ kernel
+    size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), TINY)
+    n_b = kernel.shape[2]
+    if n_b == 0:
+        return on_kernel, kernel[:1], np.full(len(size), np.inf)
+    Q1, R1 = np.linalg.qr(on_kernel)
+    try:
+        inverse = np.asarray(np.linalg.inv(R1), dtype=np.float64)
+        bound = 1.0 / (np.linalg.norm(inverse, axis=(1, 2)) * size)
+    except np.linalg.LinAlgError:
+        inverse, bound = R1, np.zeros(len(R1))
+    doubtful = np.flatnonzero(~(bound > rank_tol))
+    if len(doubtful):
+        smallest = np.linalg.svd(R1[doubtful], compute_uv=False)[:, -1] / size[doubtful]
+        if (smallest <= rank_tol).any():
+            k = int(np.argmax(smallest <= rank_tol))
+            raise ModelError(
+                f"plant {system.name}: Assumption 1 (impulse observability) fails at "
+                f"t = {t[doubtful[k]]:.6g}: [ΠA; C] has singular value {smallest[k]:.1e} on the "
+                "kernel of E; an output that sees the algebraic states is needed"
+            )
+    return Q1, kernel @ inverse, bound
+
+
+def weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
+    """The smallest singular value over all times, relative to ‖𝒜‖, and where it is.
+
+    ‖H‖_F took the place of ‖H‖_2 = 1/σ_min. Only times whose bound is below the true value at
+    the time of the smallest bound can be weaker.
+
+    Args:
+        injectivity: (N,) and
+        elimination: H (N or 1, n, n_b), as in ``ObserverMatrices``.
+    """
+    if kernels.compiled is not None and 0 < elimination.shape[2] <= SMALL_SPECTRUM:
+        found: Array | None = kernels.compiled.weakest(injectivity, elimination)
+        if found is not None:  # else not all is finite
+            return float(found[0]), int(found[1])
+    if not np.isfinite(injectivity).all():
+        return float(np.inf), 0
+    H = elimination if len(elimination) > 1 else np.repeat(elimination, len(injectivity), axis=0)
+
+    def exact(which: IntArray) -> Array:
+        norms = np.linalg.norm(H[which], axis=(1, 2)) / np.linalg.norm(H[which], 2, axis=(1, 2))
+        return np.asarray(injectivity[which] * norms)
+
+    first = np.array([int(np.argmin(injectivity))])
+    # Where n_b = 1 the norms are the same but for rounding, and the first remains a candidate.
+    limit = max(exact(first)[0], injectivity[first[0]])
+    candidates = np.flatnonzero(injectivity <= limit)
+    values = exact(candidates)
+    k = int(np.argmin(values))
+    return float(values[k]), int(candidates[k])

@@ -1,0 +1,116 @@
+"""What is left of the algebraic equations: Y = ψη, and x = offset + gain η."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli import kernels
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
+from gpebo_cli.regression.linear import outer_products
+
+_SMALL = 24  # states, up to which NumPy's calls cost more than the kernels' plain loops
+_VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """Everything algebraic in ξ_a, ξ_b, Φ, u and y at N times, all rows of the residual."""
+
+    Y: Array  # (N, e + r)
+    psi: Array  # (N, e + r, p)
+    offset: Array  # (N, n)
+    gain: Array  # (N, n, p)
+    Y_scale: float  # size of the terms of Y and ψ before they cancel
+    psi_scale: float
+    elimination: Array  # (N, n, n_b) and
+    injectivity: Array  # (N,) as in ``ObserverMatrices``
+
+    def kinds(self) -> list[tuple[Array, float]]:
+        """Everything the mesh has to resolve, with the size below which it is rounding."""
+        squares, right = _products(self.psi, self.Y)
+        Y, psi = 1e-3 * self.Y_scale, 1e-3 * self.psi_scale
+        return [
+            (self.Y, Y),
+            (self.psi, psi),
+            (self.offset, 0.0),
+            (self.gain, 0.0),
+            (squares, psi * self.psi_scale),
+            (right, psi * self.Y_scale),
+        ]
+
+    def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
+        """Rows of the residual that make up the regression."""
+        if regression != "paper":
+            in_psi, in_Y = self._row_sizes()
+            large = (in_psi > _VANISHING * self.psi_scale) | (in_Y > _VANISHING * self.Y_scale)
+            kept: IntArray = large.nonzero()[0]
+            if len(kept):
+                return kept
+        rows = self.Y.shape[1]
+        return np.arange(rows - system.r, rows)  # eq. (regpsi)
+
+    def _row_sizes(self) -> tuple[Array, Array]:
+        """Largest entry of each row of ψ and of Y over the times, (e + r,) both."""
+        if kernels.compiled is not None:
+            sizes: tuple[Array, Array] = kernels.compiled.residual_sizes(self.psi, self.Y)
+            return sizes
+        return np.abs(self.psi).max(axis=(0, 2), initial=0.0), np.abs(self.Y).max(axis=0)
+
+
+def _products(psi: Array, Y: Array) -> tuple[Array, Array]:
+    """ψᵀψ (N, p, p) and ψᵀY (N, p) of ψ (N, rows, p) and Y (N, rows)."""
+    if kernels.compiled is not None and psi.shape[2] <= _SMALL:
+        products: tuple[Array, Array] = kernels.compiled.products(psi, Y)
+        return products
+    both = outer_products(psi, Y)
+    return both[..., :-1], both[..., -1]
+
+
+def regression_signals(
+    z: Array, q: int, basis: Array, equations: AlgebraicEquations
+) -> Assembled:
+    """All rows of Y and ψ, and the state's offset and gain, at N times.
+
+    Args:
+        z: [ξ_a | ξ_b | Φ] in the coordinates of ``basis``, (N, k, 1 + q + n_a).
+        q: number of unknown parameters.
+        basis: B (n, k).
+        equations: at the same times.
+    """
+    algebraic, g_y, G, Q1, H, injectivity = equations
+    if kernels.compiled is not None and len(basis) <= _SMALL:
+        Y, psi, offset, gain, sizes = kernels.compiled.regression_signals(
+            z, q, basis, algebraic, g_y, G, Q1, H
+        )
+        Y_scale, psi_scale = sizes.tolist()
+        return Assembled(Y, psi, offset, gain, Y_scale, psi_scale, H, injectivity)
+    signs = np.ones(z.shape[2])
+    signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
+    signed = z * signs
+    terms = algebraic @ signed  # [𝒜 ξ_a + g_y | −𝒜 ξ_b − G | 𝒜 Φ]
+    Y_scale = max(float(np.abs(part).max(initial=0.0)) for part in (terms[:, :, 0], g_y))
+    terms[:, :, 0] += g_y
+    terms[:, :, 1 : 1 + q] -= G
+    seen = transpose(Q1) @ terms
+    left = terms - Q1 @ seen  # R (…)
+    state = basis @ signed - H @ seen  # w − K (…): the state, signed likewise
+    return Assembled(
+        Y=left[:, :, 0],
+        psi=left[:, :, 1:],
+        offset=state[:, :, 0],
+        gain=-state[:, :, 1:],  # [X_w ξ_b + X_θ | −X_w Φ]
+        Y_scale=Y_scale,
+        psi_scale=float(np.abs(terms[:, :, 1:]).max(initial=0.0)),
+        elimination=H,
+        injectivity=injectivity,
+    )
+
+
+def on_mesh(mesh: Mesh, signal: Array) -> Trajectory:
+    """A signal (K (s + 1), …) at the points of a mesh, as values (K, s + 1, …)."""
+    return Trajectory(mesh, signal.reshape(*mesh.points.shape, *signal.shape[1:]))
