@@ -18,6 +18,10 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from gpebo_cli.errors import ConfigError
 
+if typing.TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
 T = TypeVar("T")
 
 _SHOWN = 60  # characters of a wrong value that a message repeats
@@ -129,12 +133,12 @@ def _scalar(value: object, kind: Any) -> Any:
         return value if isinstance(value, kind) else None
     if kind is int and isinstance(value, int) and not isinstance(value, bool):
         return value  # not by way of float: integers beyond 2**53 are kept
-    number = _number(value)
-    if number is None or not math.isfinite(number):
+    found = _number(value)
+    if found is None or not math.isfinite(found):
         return None
     if kind is float:
-        return number
-    return int(number) if number == int(number) else None
+        return found
+    return int(found) if found == int(found) else None
 
 
 def _alternative(value: object, kind: Any, alternatives: Sequence[Any], where: str) -> Any:
@@ -157,6 +161,72 @@ def _number(value: object) -> float | None:
         return float(value)
     except (ValueError, OverflowError):
         return None
+
+
+Accepted = Literal["positive", "nonnegative", "finite"]
+_WANTED = {
+    "positive": "a positive number", "nonnegative": "0 or a positive number",
+    "finite": "a finite number",
+}
+
+
+def number(value: object, where: str, accept: Accepted = "positive") -> float:
+    """One number, which may come as text.
+
+    Raises:
+        ConfigError: not a number, not finite, or not as ``accept`` has it.
+    """
+    found = _number(value)
+    if found is None and hasattr(value, "item"):  # a scalar of NumPy's
+        found = _number(value.item())
+    low = {"positive": 5e-324, "nonnegative": 0.0, "finite": -math.inf}[accept]
+    if found is None or not math.isfinite(found) or found < low:
+        raise ConfigError(f"{where}: expected {_WANTED[accept]}, got {shown(value)}")
+    return found
+
+
+def per_name(
+    value: object, names: Sequence[str], noun: str, where: str, accept: Accepted = "nonnegative",
+    absent: float | None = None,
+) -> NDArray[np.float64]:
+    """A number for every name, shape (names,), from one for all, a list, or a mapping by name.
+
+    Args:
+        value: what is given.
+        names: of signals, states or parameters.
+        noun: what they are, for messages.
+        where: the setting, for messages.
+        accept: which numbers.
+        absent: for a name that a mapping leaves out; None: it has to name all.
+
+    Raises:
+        ConfigError: the wrong number of values, an unknown or missing name, or a wrong number.
+    """
+    import numpy as np
+
+    known = f"the {noun}s are {', '.join(names) or 'none'}"
+    if isinstance(value, Mapping):
+        for key in value:
+            if key not in names:
+                raise ConfigError(
+                    f"{where}: there is no {noun} {key!r}; {known}" + nearest(str(key), names)
+                )
+        missing = [name for name in names if name not in value]
+        if missing and absent is None:
+            raise ConfigError(f"{where}: no value for {missing[0]!r}; {known}")
+        given = [value.get(name, absent) for name in names]
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        if len(value) != len(names):
+            raise ConfigError(
+                f"{where} has {len(value)} values but there are {len(names)} {noun}s "
+                f"({', '.join(names)})"
+            )
+        given = list(value)
+    else:
+        return np.full(len(names), number(value, where, accept))
+    return np.array([
+        number(one, f"{where}.{name}", accept) for name, one in zip(names, given, strict=True)
+    ])
 
 
 def _name(key: object, where: str) -> str:

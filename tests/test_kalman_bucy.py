@@ -231,7 +231,7 @@ def test_a_wandering_unknown_is_followed():
     [
         ({"P0": {"theta9": 1.0}}, "observer.P0: there is no estimate 'theta9'"),
         ({"P0": [1.0]}, "observer.P0 has 1 values"),
-        ({"process": -1.0}, "observer.process: expected finite numbers, 0 or more, got -1"),
+        ({"process": -1.0}, "observer.process: expected 0 or a positive number, got -1"),
     ],
 )
 def test_settings_that_do_not_fit(settings, message):

@@ -270,11 +270,11 @@ def test_vector_laws_follow_a_regression_that_jumps(name):
 
 
 @pytest.mark.parametrize(("noise", "message"), [
-    ({"outputs": -1.0}, "0 or more, got -1 for y"),
-    ({"outputs": [0.1, 0.2]}, r"noise.outputs has 2 values, one for each output"),
+    ({"outputs": -1.0}, "noise.outputs: expected 0 or a positive number, got -1"),
+    ({"outputs": [0.1, 0.2]}, r"noise.outputs has 2 values but there are 1 outputs"),
     ({"outputs": {"yy": 0.1}}, "there is no output 'yy'; the outputs are y; did you mean y?"),
     ({"inputs": {"y": 0.1}}, "there is no input 'y'"),
-    ({"quantisation": float("nan")}, "noise.quantisation: expected finite"),
+    ({"quantisation": float("nan")}, "noise.quantisation: expected 0 or a positive"),
     ({"sample_time": 0.0}, "noise.sample_time"),
     ({"sample_time": float("inf")}, "noise.sample_time"),
     ({"outputs": 1.0, "sample_time": 1e-7}, "2e\\+08 samples over 20 s.*max_elements is 200000"),
@@ -291,7 +291,7 @@ def test_wrong_settings_are_refused_before_anything_is_run(noise, message):
 
 
 @pytest.mark.parametrize(("words", "message"), [
-    (["noise=gaussian", "noise.outputs=-1"], "noise.outputs: expected finite numbers, 0 or more"),
+    (["noise=gaussian", "noise.outputs=-1"], "noise.outputs: expected 0 or a positive"),
     (["noise=gaussian", "noise.outputs={yy:1}"], "did you mean y?"),
     (["noise=gaussian", "noise.sample_time=0"], "noise.sample_time: expected a positive number"),
     (["noise=gaussian", "noise.sample_time=1e-9"], "2e+10 samples"),

@@ -219,9 +219,9 @@ def test_weights_of_the_canonical_observer():
 
 
 @pytest.mark.parametrize(("weights", "message"), [
-    ([1.0], "observer.weights has 1 values, one for each output is needed"),
+    ([1.0], "observer.weights has 1 values but there are 2 outputs"),
     ({"y3": 1.0}, "there is no output 'y3'; the outputs are y1, y2"),
-    ([1.0, -1.0], "got -1 for y2"),
+    ([1.0, -1.0], "observer.weights.y2: expected 0 or a positive number, got -1"),
     ([0.0, 0.0], "at least one output must have a positive weight"),
 ])
 def test_wrong_weights(weights, message):

@@ -26,10 +26,11 @@ from gpebo_cli.evidence.excitation import segment_level, window_level
 from gpebo_cli.experiment.assumptions import check
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.regression.dynamics import filtered
-from gpebo_cli.regression.linear import ExtensionState, Reset, largest
+from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.settings import (
     NoiseSettings,
     ObserverSettings,
@@ -449,7 +450,7 @@ class Outsider:
 
 @pytest.mark.parametrize(
     ("remedy", "message"),
-    [("reset", "no argument known"), ("current_coordinates", "cannot follow a state")],
+    [("reset", "go on after a reset"), ("current_coordinates", "follow a state")],
 )
 def test_estimators_of_other_packages_are_refused_where_they_cannot_go_on(remedy, message):
     settings_of = Settings(
@@ -462,7 +463,7 @@ def test_estimators_of_other_packages_are_refused_where_they_cannot_go_on(remedy
 
 @pytest.mark.parametrize("name", ["ls_drem", "lion", "fct"])
 def test_estimators_that_cannot_follow_are_refused(name):
-    with pytest.raises(ConfigError, match="accepted: estimator=drem, mre, least_squares or g"):
+    with pytest.raises(ConfigError, match="these can: drem, gradient, least_squares, mre"):
         run(UNBOUNDED, 5.0, estimator={"name": name}, remedy="current_coordinates")
 
 
@@ -514,7 +515,7 @@ def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
     [
         (["observer.remedy=resets"], "did you mean reset?"),
         (["observer.remedy=reset", "observer.reset_interval=-1"], "expected a positive number"),
-        (["observer.remedy=current_coordinates", "estimator=lion"], "cannot follow"),
+        (["observer.remedy=current_coordinates", "estimator=lion"], "estimator that can follow"),
         (["observer.remedy=output_injection", "observer.injection=[[1,2],[3]]"], "6 (states)"),
     ],
 )

@@ -25,7 +25,8 @@ from gpebo_cli.experiment.sampled import SampledRun
 from gpebo_cli.experiment.stream import Stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.recordings.table import Samples
-from gpebo_cli.regression.linear import SampledRegression, outer_products
+from gpebo_cli.regression.linear import outer_products
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import DataSettings, ObserverSettings, Settings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -167,7 +168,7 @@ def test_least_squares_at_samples_is_a_batch_solution(hold):
     block = regression(hold=hold)
     f0, alpha, beta = 0.3, 2.0, 0.4
     settings = {"name": "least_squares", "f0": f0, "alpha": alpha, "beta": beta, "initial": 0.7}
-    recursion = estimators.recursion(estimators.build(settings), "least_squares", ["a", "b", "c"])
+    recursion = estimators.build(settings).recursive(["a", "b", "c"])
     estimate = recursion.update(block).parameters[0, -1]
     age = block.t[-1] - block.t
     weight = np.exp(-beta * age)
@@ -249,13 +250,13 @@ def test_a_quotient_that_is_rounding_moves_nothing():
 @pytest.mark.parametrize("name", ["gradient", "mre", "lion", "fct"])
 def test_estimators_of_continuous_time_say_what_there_is(name):
     with pytest.raises(ConfigError, match="drem, least_squares, ls_drem"):
-        estimators.recursion(estimators.build({"name": name}), name, ["a"])
+        estimators.able(estimators.build({"name": name}), estimators.Recursive, "samples")
 
 
 def test_forgetting_with_a_bound_is_refused():
     settings = {"name": "ls_drem", "beta": 1, "bound": 1e6}
     with pytest.raises(ConfigError, match=r"estimator\.bound"):
-        estimators.recursion(estimators.build(settings), "ls_drem", ["a"])
+        estimators.build(settings).recursive(["a"])
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def test_logspace_is_one_job_for_each_value(uninterrupted):
 
 
 def test_logspace_has_the_numbers_of_the_axis_of_one_run():
-    from gpebo_cli.estimators._base import axis
+    from gpebo_cli.estimators import axis
 
     text = "logspace(-3, 7, 23)"
     assert [float(v) for v in logspace(text, "g").split(",")] == list(axis(text, "g"))

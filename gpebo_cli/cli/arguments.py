@@ -197,7 +197,7 @@ def logspace(text: str, where: str) -> str | None:
     """
     if not _LOGSPACE.match(f"{where}={text}"):
         return None
-    from gpebo_cli.estimators._base import axis  # the same numbers as in one run, to the last bit
+    from gpebo_cli.estimators import axis  # the same numbers as in one run, to the last bit
 
     return ",".join(f"{value:g}" if float(f"{value:g}") == value else repr(value)
                     for value in axis(text, where))

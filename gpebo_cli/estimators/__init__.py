@@ -1,111 +1,85 @@
-"""Estimators, found by name: a module here with a dataclass is an estimator.
+"""Estimators: what the rest of gpebo asks for, and what an author of one imports.
 
-Adding one is one module (whose dataclass carries the settings and has ``cases`` and
-``estimate``), exported as ``ESTIMATOR``, and one config in ``conf/estimator``. Another package adds
-one as an entry point in the group ``gpebo.estimators``, which names the dataclass.
+An estimator is a module here with a dataclass exported as ``ESTIMATOR`` and one file in
+``conf/estimator``. Another package adds one as an entry point in the group ``gpebo.estimators``.
+All that an author needs is imported from here (docs/howto/estimator.md); the modules that begin
+with an underscore may change.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from functools import cache
-from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
-from typing import cast
-
-from gpebo_cli.errors import ConfigError
-from gpebo_cli.estimators._recursive import InformationRoot, Recursion
+from gpebo_cli.estimators._base import (
+    GainEstimator,
+    ResumableEstimator,
+    axis,
+    combinations,
+    gain,
+)
+from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
+from gpebo_cli.estimators._information import Information, information
+from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reached
+from gpebo_cli.estimators._mixing import mix
+from gpebo_cli.estimators._recursive import InformationRoot, KreisselmeierFilter, ScalarLaw
+from gpebo_cli.estimators._registry import GROUP, able, build, names, settings_of
 from gpebo_cli.estimators._segments import estimate
-from gpebo_cli.regression.linear import Estimates, Estimator
-from gpebo_cli.schema import nearest, read
-
-GROUP = "gpebo.estimators"
-"""The entry points under which other packages offer estimators."""
+from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
+from gpebo_cli.evidence.excitation import persistent
+from gpebo_cli.findings import Requirement
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.estimator import (
+    Estimates,
+    Estimator,
+    Moving,
+    Recursion,
+    Recursive,
+    Resumable,
+    ResumableEstimates,
+    SampledEstimates,
+)
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState, Reset
+from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.schema import number, per_name
 
 __all__ = [
-    "GROUP", "Estimates", "Estimator", "InformationRoot", "Recursion", "build", "estimate",
+    "GROUP",
+    "Estimates",
+    "Estimator",
+    "ExtensionState",
+    "FilteredEstimator",
+    "GainEstimator",
+    "Information",
+    "InformationRoot",
+    "KreisselmeierFilter",
+    "LinearRegression",
+    "MixedEstimates",
+    "Moving",
+    "Recursion",
+    "Recursive",
+    "Requirement",
+    "Reset",
+    "Resumable",
+    "ResumableEstimates",
+    "ResumableEstimator",
+    "SampledEstimates",
+    "SampledRegression",
+    "ScalarLaw",
+    "Trajectory",
+    "VectorEstimates",
+    "VectorLaw",
+    "able",
+    "axis",
+    "build",
+    "combinations",
+    "estimate",
+    "gain",
+    "information",
+    "kreisselmeier",
+    "lion",
+    "low_pass",
+    "mix",
     "names",
-    "recursion", "settings_of",
+    "number",
+    "per_name",
+    "persistent",
+    "reached",
+    "settings_of",
 ]
-
-
-def names() -> list[str]:
-    """Every estimator there is, those of other packages included."""
-    return sorted({*_ours(), *_theirs()})
-
-
-@cache
-def _ours() -> tuple[str, ...]:
-    return tuple(p.stem for p in Path(__file__).parent.glob("*.py") if p.stem[0] != "_")
-
-
-def _theirs() -> dict[str, EntryPoint]:
-    """Estimators that installed packages bring. A name of ours is ours."""
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
-
-
-def build(settings: Mapping[str, object]) -> Estimator:
-    """The estimator that ``settings["name"]`` asks for, with the remaining keys as its settings.
-
-    Raises:
-        ConfigError: unknown name or key, with the nearest known one.
-    """
-    estimator = _find(settings)
-    rest = {k: v for k, v in settings.items() if k not in ("name", "title", "reference")}
-    built = cast(Estimator, read(estimator, rest, "estimator"))
-    _ = built.cases  # gains are read here, so that a wrong one is found before anything is run
-    return built
-
-
-def settings_of(settings: Mapping[str, object]) -> list[str]:
-    """The settings that the estimator called ``settings["name"]`` has.
-
-    Raises:
-        ConfigError: unknown name, with the nearest known one.
-    """
-    return [field.metadata.get("key", field.name) for field in fields(_find(settings))]
-
-
-def _find(settings: Mapping[str, object]) -> type:
-    name = settings.get("name")
-    if name not in _ours() and name in (theirs := _theirs()):
-        return _load(theirs[str(name)])
-    if name not in _ours():
-        raise ConfigError(
-            f"estimator.name: {name!r} is not an estimator; known: {', '.join(names())}"
-            + nearest(str(name), names())
-        )
-    return cast("type", import_module(f"{__name__}.{name}").ESTIMATOR)
-
-
-def _load(entry: EntryPoint) -> type:
-    """The dataclass that another package's entry point names."""
-    where = f"estimator.name: {entry.name} of {entry.dist.name if entry.dist else entry.value}"
-    try:
-        found = entry.load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{where} cannot be imported: {error}") from error
-    if not (isinstance(found, type) and is_dataclass(found)):
-        raise ConfigError(f"{where} is not a dataclass; {entry.value} must name one")
-    return found
-
-
-def recursion(estimator: Estimator, name: str, parameters: Sequence[str]) -> Recursion:
-    """The estimator called ``name`` at samples.
-
-    Raises:
-        ConfigError: there is it in continuous time only; names those that there are at samples.
-    """
-    make = getattr(estimator, "recursive", None)
-    if make is None:
-        there = [
-            other for other in sorted(_ours())
-            if hasattr(import_module(f"{__name__}.{other}").ESTIMATOR, "recursive")
-        ]
-        raise ConfigError(
-            f"estimator={name} works in continuous time only; at samples there are "
-            f"{', '.join(there)}"
-        )
-    return cast(Recursion, make(parameters))

@@ -1,4 +1,4 @@
-"""How gains become an axis.
+"""How gains become an axis, and what every estimator has: cases, gains, a start.
 
 An estimator sees a regression Y = ψη and times at which to report; it knows nothing of plants.
 Its gains may each be a number, a list, or ``logspace(a, b, n)``: every combination is one case,
@@ -8,25 +8,124 @@ and all cases are computed from one pass over the regression.
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from itertools import product
 from math import prod
+from typing import Any
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.estimator import Estimates, ResumableEstimates
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.schema import Accepted, number, per_name
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
 _MAX_CASES = 10_000_000
 _MANY = 8  # numbers, from which on looking at them one by one is what takes the time
 
 
-def axis(value: object, where: str, *, positive: bool = True) -> tuple[float, ...]:
+@dataclass(frozen=True)
+class _Gain:
+    """What is written beside a field that is a gain."""
+
+    accept: Accepted
+    by_parameter: bool
+
+
+def gain(default: object, accept: Accepted = "positive", *, by_parameter: bool = False) -> Any:
+    """A field of an estimator that is a gain: a number, a list, or ``logspace(a, b, n)``.
+
+    Args:
+        default: its value where nothing is said.
+        accept: which numbers it may be.
+        by_parameter: whether it may also be a mapping by parameter, which makes one case.
+    """
+    return field(default=default, metadata={"gain": _Gain(accept, by_parameter)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainEstimator(ABC):
+    """Settings of an estimator: fields declared by :func:`gain`, and where η̂ starts.
+
+    Attributes:
+        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
+    """
+
+    initial: object = 0.0
+
+    def axes(self) -> dict[str, Sequence[float]]:
+        """The gains as axes, in the order in which they are declared.
+
+        Raises:
+            ConfigError: a gain is no gain.
+        """
+        axes: dict[str, Sequence[float]] = {}
+        for own in fields(self):
+            declared = own.metadata.get("gain")
+            if declared is None:
+                continue
+            value, where = getattr(self, own.name), f"estimator.{own.name}"
+            if declared.by_parameter and isinstance(value, Mapping):
+                for key, of_one in value.items():
+                    axes[f"{own.name}_{key}"] = (number(of_one, f"{where}.{key}", declared.accept),)
+            else:
+                axes[own.name] = axis(value, where, declared.accept)
+        return axes
+
+    @property
+    def cases(self) -> tuple[Mapping[str, float], ...]:
+        """Every combination of the gains; the last one that is declared varies fastest."""
+        return combinations(self.axes())
+
+    def gains(self, name: str, parameters: Sequence[str]) -> Array:
+        """The values of one gain, shape (g, 1), or (1, p) where it is a mapping by parameter.
+
+        Raises:
+            ConfigError: a mapping that does not name every parameter.
+        """
+        value, where = getattr(self, name), f"estimator.{name}"
+        if isinstance(value, Mapping):
+            return per_name(value, parameters, "parameter", where, "positive")[None]
+        return np.array(axis(value, where))[:, None]
+
+    def start(self, parameters: Sequence[str]) -> Array:
+        """η̂ at the start, shape (p,).
+
+        Raises:
+            ConfigError: the wrong number of values, an unknown name, or not a number.
+        """
+        return per_name(self.initial, parameters, "parameter", "estimator.initial", "finite")
+
+    @abstractmethod
+    def estimate(self, regression: LinearRegression, t: Array) -> Estimates:
+        """Prepare the estimates at the times t (M,), ascending."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResumableEstimator(GainEstimator):
+    """A :class:`GainEstimator` that can go on after a reset (observer.remedy: reset)."""
+
+    def estimate(self, regression: LinearRegression, t: Array) -> ResumableEstimates:
+        """Prepare the estimates at the times t (M,), ascending; nothing is known before."""
+        return self.resume(regression, t, ())
+
+    @abstractmethod
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
+    ) -> ResumableEstimates:
+        """The same at the times t (M,), from the extensions that are known at the start."""
+
+
+def axis(value: object, where: str, accept: Accepted = "positive") -> tuple[float, ...]:
     """The values of one gain: a number, a list of numbers, or ``logspace(a, b, n)``.
 
     Raises:
-        ConfigError: anything else, an empty list, or a value that is not finite and positive.
+        ConfigError: anything else, an empty list, or a value that is not accepted.
 
     Examples:
         >>> axis("logspace(0, 2, 3)", "estimator.gamma")
@@ -39,16 +138,21 @@ def axis(value: object, where: str, *, positive: bool = True) -> tuple[float, ..
         raise ConfigError(f"{where} is an empty list; give a number, a list or logspace(a, b, n)")
     if len(items) > _MANY and set(map(type, items)) <= {float, np.float64}:
         values = np.array(items)
-        if np.isfinite(values).all() and (values.min() > 0.0 or not positive):
+        if np.isfinite(values).all() and values.min() > 0.0:
             return tuple(values.tolist())
-    return tuple(number(item, where, positive=positive) for item in items)
+    return tuple(number(item, where, accept) for item in items)
 
 
 def _from_text(text: str, where: str) -> object:
     match = _LOGSPACE.fullmatch(text.strip())
     if match is None:
-        return [text]  # a number that YAML left as text, 1e10 for instance
-    low, high = (number(part, where, positive=False) for part in match.groups()[:2])
+        try:
+            return float(text)  # a number that YAML left as text, 1e10 for instance
+        except ValueError:
+            raise ConfigError(
+                f"{where}: {text!r} is not a positive number, a list of them, or logspace(a, b, n)"
+            ) from None
+    low, high = (number(part, where, "finite") for part in match.groups()[:2])
     count = number(match[3], where)
     if count != int(count) or not 1 <= count <= _MAX_CASES or max(abs(low), abs(high)) > 300:
         raise ConfigError(
@@ -56,24 +160,6 @@ def _from_text(text: str, where: str) -> object:
             f"whole number of values up to {_MAX_CASES}"
         )
     return [float(x) for x in np.logspace(low, high, int(count))]
-
-
-def number(value: object, where: str, *, positive: bool = True) -> float:
-    """One finite number (and positive, unless told otherwise) or a ConfigError."""
-    wanted = "a positive number" if positive else "a finite number"
-    if isinstance(value, str):
-        try:
-            value = float(value)
-        except ValueError:
-            raise ConfigError(
-                f"{where}: {value!r} is not {wanted}, a list of them, or logspace(a, b, n)"
-            ) from None
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise ConfigError(f"{where}: expected {wanted}, got {value!r}")
-    result = float(value)
-    if not np.isfinite(result) or (positive and result <= 0):
-        raise ConfigError(f"{where}: expected {wanted}, got {value!r}")
-    return result
 
 
 def combinations(axes: Mapping[str, Sequence[float]]) -> tuple[Mapping[str, float], ...]:
@@ -93,29 +179,3 @@ def combinations(axes: Mapping[str, Sequence[float]]) -> tuple[Mapping[str, floa
         ((name, only),) = axes.items()
         return tuple([{name: value} for value in only])
     return tuple(dict(zip(axes, values, strict=True)) for values in product(*axes.values()))
-
-
-def per_parameter(
-    value: object, parameters: Sequence[str], where: str, *, positive: bool = False
-) -> Array:
-    """A number for every parameter, shape (p,), from a number, a list, or a mapping by name.
-
-    Raises:
-        ConfigError: the wrong number of values, an unknown name, or not a number.
-    """
-    p = len(parameters)
-    names = ", ".join(parameters)
-    if isinstance(value, Mapping):
-        unknown = [key for key in value if key not in parameters]
-        missing = [name for name in parameters if name not in value]
-        if unknown or missing:
-            problem = f"unknown {unknown[0]!r}" if unknown else f"no value for {missing[0]!r}"
-            raise ConfigError(f"{where}: {problem}; the parameters are {names}")
-        return np.array([number(value[k], f"{where}.{k}", positive=positive) for k in parameters])
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        if len(value) != p:
-            raise ConfigError(
-                f"{where} has {len(value)} values but there are {p} parameters ({names})"
-            )
-        return np.array([number(v, where, positive=positive) for v in value])
-    return np.full(p, number(value, where, positive=positive))

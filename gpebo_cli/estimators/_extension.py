@@ -20,10 +20,10 @@ def kreisselmeier(
     Λ = diag(``rates``): one filter λ_i/(p + λ_i) per row, as in the paper (Section V); all rates
     equal is the classical extension. Since Λ multiplies rows, Ω η = 𝒴 holds for any rates.
     """
-    return resolved_low_pass(regression.outer, rates[:, None], start)
+    return low_pass(regression.outer, rates[:, None], start)
 
 
-def resolved_low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Trajectory:
+def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Trajectory:
     """``signal.low_pass(rate)`` on a mesh fine enough for the filter's own transient.
 
     Args:
@@ -62,4 +62,4 @@ def lion(regression: LinearRegression, rates: Array, start: Array | None = None)
     both = np.concatenate([psi, with_realisations(psi, regression.Y.values)], axis=-1)
     rows = np.arange(regression.p) % both.shape[2]
     signal = Trajectory(regression.mesh, both[:, :, rows])
-    return resolved_low_pass(signal, rates[:, None], start)
+    return low_pass(signal, rates[:, None], start)

@@ -8,14 +8,14 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.estimators._vector import VectorLaw
+from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.linear import ExtensionState
+from gpebo_cli.regression.resets import ExtensionState
 
-_ONE_PERCENT = float(np.log(100.0))
 _DIGITS = 1e-12  # reciprocal condition of Ω below which nothing is left of some direction
 
 
@@ -40,7 +40,7 @@ class FollowingEstimates:
         """γ∫Δ², less what η grows by, has to pull the error down."""
         energy = float(Trajectory(self.mixed.mesh, self.mixed.values**2).integral().final)
         gain = float(self.gains.min())
-        needed = self.grown + _ONE_PERCENT
+        needed = self.grown + DECAY
         return Requirement(
             name="γ∫Δ² above the growth of the state",
             holds=gain * energy >= needed,
@@ -115,6 +115,6 @@ class SolvedEstimates:
             ])
         except np.linalg.LinAlgError as error:
             raise SolverError(
-                "observer.remedy=current_coordinates: F⁻¹ of least_squares is singular, because "
+                "observer.remedy=current_coordinates: F⁻¹ is singular, because "
                 "A_0 has directions that decay too fast; use output_injection or reset"
             ) from error

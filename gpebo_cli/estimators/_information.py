@@ -17,11 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.estimators._extension import resolved_low_pass
+from gpebo_cli.estimators._extension import low_pass
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.regression.linear import ExtensionState, LinearRegression, largest
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
 
 _PICARD_ROUNDS = 200
 
@@ -86,7 +87,7 @@ def information(
     if bound is None:
         start = None if known is None else beta * known.values
         # β ∫ e^{−β(t−s)} (·) ds
-        filtered = resolved_low_pass(regression.outer, np.array(beta), start)
+        filtered = low_pass(regression.outer, np.array(beta), start)
         mesh = filtered.mesh
         memory = np.exp(-beta * (mesh.points - mesh.edges[0]))
         if known is not None:

@@ -2,106 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
-from gpebo_cli.estimators._base import axis, number, per_parameter
+from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
+from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.regression.linear import ExtensionState, LinearRegression, largest
-
-ONE_PERCENT = float(np.log(100.0))
-
-
-def gain_axis(gamma: object, where: str) -> dict[str, Sequence[float]]:
-    """Axes of γ: one axis, or for a gain per parameter one axis of length one each."""
-    if isinstance(gamma, Mapping):
-        return {
-            f"gamma_{key}": (number(value, f"{where}.{key}"),) for key, value in gamma.items()
-        }
-    return {"gamma": axis(gamma, where)}
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.schema import per_name
 
 
-def gain_matrix(gamma: object, parameters: Sequence[str], where: str) -> Array:
-    """γ of every value of the axis, shape (g, 1), or (1, p) for a gain per parameter."""
-    if isinstance(gamma, Mapping):
-        return per_parameter(gamma, parameters, where, positive=True)[None]
-    return np.array(axis(gamma, where))[:, None]
-
-
-def filter_rates(rates: object, parameters: tuple[str, ...]) -> Array:
+def filter_rates(rates: object, parameters: Sequence[str]) -> Array:
     """One λ per parameter, shape (p,); by default 0.1, 0.2, 0.3, …"""
     if rates is None:
         return 0.1 * np.arange(1.0, len(parameters) + 1.0)
-    return per_parameter(rates, parameters, "estimator.lambda", positive=True)
+    return per_name(rates, parameters, "parameter", "estimator.lambda", "positive")
 
 
-# (regression, rates, start) -> [Ω | 𝒴]
-Extension = Callable[[LinearRegression, Array, Array | None], Trajectory]
+@dataclass(frozen=True, kw_only=True)
+class FilteredEstimator(ResumableEstimator):
+    """Filters as the extension, then mixing and the scalar law.
 
+    Attributes:
+        gamma: γ, a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
+            parameter (one gain each).
+        rates: λ of the filters, a number, one per parameter, or a mapping by parameter; None is
+            0.1, 0.2, 0.3, …, for three parameters the paper's choice.
+        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
+    """
 
-def estimate_mixed(
-    regression: LinearRegression, t: Array, extend: Extension, settings: MixedSettings,
-    known: Sequence[ExtensionState], *, linear: bool = False,
-) -> MixedEstimates:
-    """Extend by filters, mix, and keep what the closed form needs at the times t (M,)."""
-    names = regression.parameters
-    extended = extend(
-        regression, filter_rates(settings.rates, names), known[0].values if known else None
-    )
-    return MixedEstimates(
-        groups=(mix(extended, t, regression.floor),),
-        at_end=lambda: (reached(regression, extended, known, linear=linear),),
-        start=per_parameter(settings.initial, names, "estimator.initial"),
-        gains=gain_matrix(settings.gamma, names, "estimator.gamma"),
-        condition="Δ not in L2",
-        realisations=regression.realisations,
-    )
+    gamma: object = gain(1e10, by_parameter=True)
+    rates: object = field(default=None, metadata={"key": "lambda"})
+
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
+    ) -> MixedEstimates:
+        """Extend, mix, and keep what the closed form needs at the times t (M,)."""
+        names = regression.parameters
+        before = known[0].values if known else None
+        extended = self.extend(regression, filter_rates(self.rates, names), before)
+        return MixedEstimates(
+            groups=(mix(extended, t, regression.floor),),
+            at_end=lambda: (reached(self.size(regression), extended, known),),
+            start=self.start(names),
+            gains=self.gains("gamma", names),
+            condition="Δ not in L2",
+            realisations=regression.realisations,
+        )
+
+    @abstractmethod
+    def extend(self, regression: LinearRegression, rates: Array, start: Array | None) -> Trajectory:
+        """[Ω | 𝒴] (p, p + c) with filters of the ``rates`` (p,), from ``start`` or 0."""
+
+    @abstractmethod
+    def size(self, regression: LinearRegression) -> float:
+        """What no filter exceeds."""
 
 
 def reached(
-    regression: LinearRegression, extended: Trajectory, known: Sequence[ExtensionState],
-    *, linear: bool = False,
+    size: float, extended: Trajectory, known: Sequence[ExtensionState]
 ) -> ExtensionState:
-    """[Ω | 𝒴] (p, p + 1) at the end.
-
-    No filter exceeds the largest ψᵀψ, or for Lion's filters ψ, that went in.
-    """
-    level = largest(regression.outer.values)
-    if linear:
-        level = np.sqrt(regression.p * level)
-    level = max(level, known[0].level) if known else level
+    """[Ω | 𝒴] (p, p + 1) at the end, of filters whose input is of that ``size``."""
+    level = max(size, known[0].level) if known else size
     return ExtensionState(extended.final, level, surplus=1.0)
 
 
-class MixedSettings(Protocol):
-    """What every filtered and mixed estimator is set by."""
-
-    @property
-    def gamma(self) -> object:
-        """γ of the scalar laws."""
-        ...
-
-    @property
-    def rates(self) -> object:
-        """λ of the filters."""
-        ...
-
-    @property
-    def initial(self) -> object:
-        """η̂ at the start."""
-        ...
-
-
 def energy_requirement(
-    condition: str, gain: float, energy: float, needed: float = ONE_PERCENT,
+    condition: str, gain: float, energy: float, needed: float = DECAY,
     needed_for: str = "1 % of the initial error",
 ) -> Requirement:
     """Whether ∫Δ² is enough at the smallest gain: the error shrinks by e^{−γ∫Δ²}."""
@@ -134,7 +110,7 @@ class MixedEstimates:
     gains: Array  # (g, p or 1)
     condition: str
     at_end: Callable[[], tuple[ExtensionState, ...]]  # of each group; asked for at resets only
-    needed: float = ONE_PERCENT  # of γ∫Δ²
+    needed: float = DECAY  # of γ∫Δ²
     needed_for: str = "1 % of the initial error"
     transform: Transform | None = None
     realisations: tuple[int, ...] = ()

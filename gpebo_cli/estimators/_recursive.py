@@ -12,42 +12,19 @@ gain and any sample time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
-
 import numpy as np
 
 from gpebo_cli.estimators._information import Spectrum
 from gpebo_cli.estimators._scalar import mean_decay
-from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
-from gpebo_cli.regression.linear import SampledRegression, outer_products
+from gpebo_cli.regression.estimator import SampledEstimates
+from gpebo_cli.regression.linear import outer_products
+from gpebo_cli.regression.samples import SampledRegression
 
 _SINGULAR = 1e-10  # below this ratio of singular values of S the quotient 𝐘/Δ is rounding
 _SINGULAR_FILTER = 1e-14  # the same for Ω, where squares have been formed
 _TINY = float(np.finfo(np.float64).tiny)
-
-
-@dataclass(frozen=True, eq=False)
-class SampledEstimates:
-    """η̂ of every case at K samples."""
-
-    parameters: Array  # (G, K, p)
-    delta: Array | None  # (1 or G, K), None where nothing is mixed
-
-
-class Recursion(Protocol):
-    """An estimator that takes samples as they come; it changes as it does so."""
-
-    def update(self, regression: SampledRegression) -> SampledEstimates:
-        """Take K samples and give the estimates at each."""
-        ...
-
-    @property
-    def requirement(self) -> Requirement:
-        """What the estimator needs of the regressor, and what it got so far."""
-        ...
 
 
 class InformationRoot:

@@ -2,69 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from inspect import signature
-from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators._registry import able
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.linear import (
+from gpebo_cli.regression.estimator import (
     Estimates,
     Estimator,
-    ExtensionState,
-    LinearRegression,
-    Reset,
+    Moving,
+    Resumable,
+    ResumableEstimates,
 )
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState, Reset
 
-
-class Resumable(Estimates, Protocol):
-    """Estimates from which the next segment can go on."""
-
-    @property
-    def reached(self) -> tuple[ExtensionState, ...]:
-        """The extensions at the end of the regression: what ``estimate`` takes as ``known``."""
-        ...
-
-    def parameters(self, cases: slice, start: Array | None = None) -> Array:
-        """η̂ of some cases at the times, shape (g, M, p).
-
-        Args:
-            cases: which.
-            start: η̂ of each of them (g, p) at the start of the regression; None: the settings'.
-        """
-        ...
-
-
-class Resuming(Protocol):
-    """An estimator that can go on after a reset."""
-
-    def estimate(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
-    ) -> Resumable:
-        """As ``Estimator.estimate`` at the times t (M,), from extensions that are known.
-
-        Args:
-            regression: Y = ψη without resets.
-            t: times.
-            known: the extensions at its start; none: they start at zero.
-        """
-        ...
-
-
-@runtime_checkable
-class Following(Protocol):
-    """An estimator that can follow parameters that move."""
-
-    def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array
-    ) -> Estimates:
-        """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending."""
-        ...
+_FOLLOW = "observer.remedy=current_coordinates needs an estimator that can follow a state"
+_GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
 
 
 def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Estimates:
@@ -77,43 +33,30 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
         ConfigError: the estimator cannot follow parameters that move, or go on after a reset.
     """
     if regression.dynamics is not None:
-        if not isinstance(estimator, Following):
-            raise ConfigError(
-                "observer.remedy=current_coordinates: this estimator cannot follow a state; "
-                "accepted: estimator=drem, mre, least_squares or gradient"
-            )
-        return estimator.estimate_moving(regression, regression.dynamics, t)
+        moving = able(estimator, Moving, _FOLLOW)
+        return moving.estimate_moving(regression, regression.dynamics, t)
     if not regression.resets:
         return estimator.estimate(regression, t)
     segments = regression.segments
     first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
-    parts: list[Resumable] = []
+    parts: list[ResumableEstimates] = []
     known: tuple[ExtensionState, ...] = ()
-    resuming = _resuming(estimator)
+    resumable = able(estimator, Resumable, _GO_ON)
     for k, (segment, own) in enumerate(zip(segments, np.split(t, first), strict=True)):
         if k > 0:
             reset = regression.resets[k - 1]
             known = tuple(state.after(reset) for state in parts[-1].reached)
         # Besides the times that are asked for, the end, where the next one takes over.
         times = np.append(own, segment.mesh.edges[-1])
-        parts.append(resuming.estimate(segment, times, known))
+        parts.append(resumable.resume(segment, times, known))
     return Chain(tuple(parts), regression.resets, tuple(int(k) for k in first))
-
-
-def _resuming(estimator: Estimator) -> Resuming:
-    if "known" not in signature(estimator.estimate).parameters:
-        raise ConfigError(
-            "observer.remedy=reset: this estimator cannot go on after a reset (its estimate() has "
-            "no argument known, docs/howto/estimator.md); use another remedy"
-        )
-    return cast(Resuming, estimator)
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
     """Estimates of each segment at its own times and its end."""
 
-    parts: tuple[Resumable, ...]
+    parts: tuple[ResumableEstimates, ...]
     resets: tuple[Reset, ...]
     first: tuple[int, ...]  # index of each but the first segment's first time
 

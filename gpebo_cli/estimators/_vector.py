@@ -12,7 +12,8 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.linear import ExtensionState, with_realisations
+from gpebo_cli.regression.linear import with_realisations
+from gpebo_cli.regression.resets import ExtensionState
 
 _MAX_ELEMENTS = 200_000
 _TOLERANCE = 1e-11

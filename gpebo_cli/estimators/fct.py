@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.estimators._base import number
+from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._mixed import MixedEstimates
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.estimators.ls_drem import LsDrem
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.regression.linear import ExtensionState, LinearRegression
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.schema import number
 
 
-@dataclass(frozen=True)
-class FiniteTime:
+@dataclass(frozen=True, kw_only=True)
+class FiniteTime(ResumableEstimator):
     """DREM plus w_c = min(e^{−γ∫Δ²}, 1 − μ), η̂_f = (η̂ − w_c η̂(0))/(1 − w_c).
 
     Exact, not asymptotic, once γ∫Δ² ≥ −ln(1 − μ).
@@ -31,23 +33,24 @@ class FiniteTime:
 
     extension: Literal["kreisselmeier", "least_squares"] = "kreisselmeier"
     mu: float = 0.1
-    gamma: object = 1e10
-    rates: object = field(default=None, metadata={"key": "lambda"})
-    alpha: object = 1.0
-    f0: object = 1e-4
-    beta: object = 0.0
+    alpha: object = gain(1.0)
+    f0: object = gain(1e-4)
+    beta: object = gain(0.0, "nonnegative")
     bound: object = None
-    initial: object = 0.0
+    gamma: object = gain(1e10, by_parameter=True)
+    rates: object = field(default=None, metadata={"key": "lambda"})
 
     @property
     def inner(self) -> Drem | LsDrem:
         """The asymptotic estimator that is corrected."""
         if self.extension == "kreisselmeier":
-            return Drem(self.gamma, self.rates, self.initial)
-        return LsDrem(self.gamma, self.alpha, self.f0, self.beta, self.bound, self.initial)
+            return Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
+        return LsDrem(
+            gamma=self.gamma, alpha=self.alpha, f0=self.f0, beta=self.beta, bound=self.bound,
+            initial=self.initial,
+        )
 
-    @property
-    def cases(self) -> tuple[Mapping[str, float], ...]:
+    def axes(self) -> dict[str, Sequence[float]]:
         """Those of the inner estimator.
 
         Raises:
@@ -56,16 +59,16 @@ class FiniteTime:
         mu = number(self.mu, "estimator.mu")
         if not mu < 1:
             raise ConfigError(f"estimator.mu must lie between 0 and 1, got {mu:g}")
-        return self.inner.cases
+        return self.inner.axes()
 
-    def estimate(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> MixedEstimates:
         """The inner estimates at the times t (M,) with the correction on top.
 
         After a reset the law starts anew from the corrected estimate.
         """
-        inner = self.inner.estimate(regression, t, known)
+        inner = self.inner.resume(regression, t, known)
         mu = float(self.mu)
 
         def correct(eta: Array, energy: Array, start: Array) -> Array:

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.estimators._base import combinations, per_parameter
-from gpebo_cli.estimators._mixed import gain_axis, gain_matrix
+from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.linear import ExtensionState, LinearRegression
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
 
 
-@dataclass(frozen=True)
-class Gradient:
+@dataclass(frozen=True, kw_only=True)
+class Gradient(ResumableEstimator):
     """η̂' = γ ψᵀ(Y − ψη̂): converges exponentially if and only if ψ is persistently exciting.
 
     Attributes:
@@ -27,23 +27,17 @@ class Gradient:
         initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
-    gamma: object = 10.0
-    initial: object = 0.0
+    gamma: object = gain(10.0, by_parameter=True)
 
-    @property
-    def cases(self) -> tuple[Mapping[str, float], ...]:
-        """One case per gain; a gain per parameter is one case."""
-        return combinations(gain_axis(self.gamma, "estimator.gamma"))
-
-    def estimate(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()  # noqa: ARG002
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]  # noqa: ARG002
     ) -> VectorEstimates:
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         information = Trajectory(regression.mesh, regression.outer.values[..., : regression.p])
-        gains = gain_matrix(self.gamma, regression.parameters, "estimator.gamma")
+        gains = self.gains("gamma", regression.parameters)
         return VectorEstimates(
             law=VectorLaw(regression.psi, regression.psi, regression.Y, regression.floor),
-            start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
+            start=self.start(regression.parameters),
             gains=gains,
             t=np.asarray(t),
             realisations=regression.realisations,
@@ -54,7 +48,7 @@ class Gradient:
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
     ) -> VectorEstimates:
         """η̂' = 𝔸η̂ + 𝕓 + Γψᵀ(Y − ψη̂) at the times t (M,)."""
-        plain = self.estimate(regression, t)
+        plain = self.resume(regression, t, ())
         return replace(plain, law=replace(plain.law, dynamics=dynamics))
 
 

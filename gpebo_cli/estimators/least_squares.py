@@ -8,18 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.estimators._base import axis, combinations, number, per_parameter
+from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._following import SolvedEstimates
 from gpebo_cli.estimators._information import Spectrum, information
-from gpebo_cli.estimators._recursive import InformationRoot, SampledEstimates, spectrum
+from gpebo_cli.estimators._recursive import InformationRoot, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.dynamics import Dynamics, filtered
-from gpebo_cli.regression.linear import ExtensionState, LinearRegression, SampledRegression
+from gpebo_cli.regression.estimator import SampledEstimates
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.schema import number
 
 
-@dataclass(frozen=True)
-class LeastSquares:
+@dataclass(frozen=True, kw_only=True)
+class LeastSquares(ResumableEstimator):
     """η̂' = α F ψᵀ(Y − ψη̂), F' = −α F ψᵀψ F + β F, F(0) = I/f₀.
 
     Without forgetting η̂ = (f₀ I + α G)⁻¹ (f₀ η̂₀ + α h): it converges as f₀/(α λ_min(G)).
@@ -32,16 +36,10 @@ class LeastSquares:
         initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
-    alpha: object = 1.0
-    f0: object = 1e-6
-    beta: object = 0.0
+    alpha: object = gain(1.0)
+    f0: object = gain(1e-6)
+    beta: object = gain(0.0, "nonnegative")
     bound: object = None
-    initial: object = 0.0
-
-    @property
-    def cases(self) -> tuple[Mapping[str, float], ...]:
-        """Every combination of α, f₀ and β."""
-        return combinations(self.axes())
 
     def axes(self) -> dict[str, Sequence[float]]:
         """The gains as axes, f₀ checked against the bound.
@@ -49,13 +47,7 @@ class LeastSquares:
         Raises:
             ConfigError: a gain is no gain, or M is below 1/f₀.
         """
-        axes: dict[str, Sequence[float]] = {
-            "alpha": axis(self.alpha, "estimator.alpha"),
-            "f0": axis(self.f0, "estimator.f0"),
-            "beta": axis(self.beta, "estimator.beta", positive=False),
-        }
-        if min(axes["beta"]) < 0:
-            raise ConfigError("estimator.beta: forgetting rates must be 0 or positive")
+        axes = super().axes()
         bound = self.covariance_bound
         if bound is not None and bound < 1.0 / min(axes["f0"]):
             raise ConfigError(
@@ -113,11 +105,11 @@ class LeastSquares:
         """
         if self.covariance_bound is not None:
             raise ConfigError(
-                "observer.remedy=current_coordinates: least_squares forgets at a constant rate; "
+                "observer.remedy=current_coordinates: least squares forgets at a constant rate; "
                 "accepted: estimator.bound=null"
             )
         p = regression.p
-        start = per_parameter(self.initial, regression.parameters, "estimator.initial")
+        start = self.start(regression.parameters)
         prior = np.column_stack([np.eye(p), start])
         ones = np.ones(p)
         return SolvedEstimates(tuple(
@@ -128,8 +120,8 @@ class LeastSquares:
             for case in self.cases
         ))
 
-    def estimate(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> LeastSquaresEstimates:
         """Everything but the gains, at the times t (M,).
 
@@ -139,7 +131,7 @@ class LeastSquares:
         return LeastSquaresEstimates(
             self.cases,
             [spectrum for spectrum, _ in found],
-            per_parameter(self.initial, regression.parameters, "estimator.initial"),
+            self.start(regression.parameters),
             tuple(reached for _, reached in found),
             regression.realisations,
         )
@@ -198,7 +190,7 @@ class RecursiveLeastSquares:
 
     def __init__(self, settings: LeastSquares, parameters: Sequence[str]) -> None:
         self._cases = settings.cases
-        self._start = per_parameter(settings.initial, parameters, "estimator.initial")
+        self._start = settings.start(parameters)
         betas, self._which = np.unique([c["beta"] for c in self._cases], return_inverse=True)
         self._root = InformationRoot(len(parameters), betas)
         self._ratios = np.zeros(len(self._cases))

@@ -6,30 +6,28 @@ estimator that Proposition 1 needs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.estimators._base import combinations, per_parameter
+from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._information import Information, Spectrum, information
-from gpebo_cli.estimators._mixed import (
-    MixedEstimates,
-    energy_requirement,
-    gain_axis,
-    gain_matrix,
-)
+from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement
 from gpebo_cli.estimators._mixing import SINGULAR, filled
-from gpebo_cli.estimators._recursive import SampledEstimates, ScalarLaw, quotient_of
+from gpebo_cli.estimators._recursive import ScalarLaw, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.regression.linear import ExtensionState, LinearRegression, SampledRegression
+from gpebo_cli.regression.estimator import SampledEstimates
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.samples import SampledRegression
 
 
-@dataclass(frozen=True)
-class LsDrem:
+@dataclass(frozen=True, kw_only=True)
+class LsDrem(ResumableEstimator):
     """H = I − z f₀ F, Δ = det H, 𝐘 = adj(H)(ĝ − z f₀ F ĝ₀), then η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i).
 
     ĝ and F are the estimate and the covariance of the least-squares part, z' = −βz its memory.
@@ -42,24 +40,23 @@ class LsDrem:
         initial: η̂ (and ĝ) at the start.
     """
 
-    gamma: object = 10.0
-    alpha: object = 1.0
-    f0: object = 1e-4
-    beta: object = 0.0
+    alpha: object = gain(1.0)
+    f0: object = gain(1e-4)
+    beta: object = gain(0.0, "nonnegative")
     bound: object = None
-    initial: object = 0.0
+    gamma: object = gain(10.0, by_parameter=True)
 
     @property
     def least_squares(self) -> LeastSquares:
         """The part that extends the regressor."""
-        return LeastSquares(self.alpha, self.f0, self.beta, self.bound, self.initial)
-
-    @property
-    def cases(self) -> tuple[Mapping[str, float], ...]:
-        """Every combination of α, f₀, β and γ, γ fastest."""
-        return combinations(
-            {**self.least_squares.axes(), **gain_axis(self.gamma, "estimator.gamma")}
+        return LeastSquares(
+            alpha=self.alpha, f0=self.f0, beta=self.beta, bound=self.bound, initial=self.initial
         )
+
+    def axes(self) -> dict[str, Sequence[float]]:
+        """α, f₀, β and γ, checked as the least-squares part checks them."""
+        self.least_squares.axes()
+        return super().axes()
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLsDrem:
         """The same at samples.
@@ -69,8 +66,8 @@ class LsDrem:
         """
         return RecursiveLsDrem(self, parameters)
 
-    def estimate(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,)."""
         part = self.least_squares
@@ -87,8 +84,8 @@ class LsDrem:
                 for info, case in zip(infos, part.cases, strict=True)
             ),
             at_end=lambda: tuple(info.reached for info in infos),
-            start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
-            gains=gain_matrix(self.gamma, regression.parameters, "estimator.gamma"),
+            start=self.start(regression.parameters),
+            gains=self.gains("gamma", regression.parameters),
             condition="IE",
             realisations=regression.realisations,
         )
@@ -100,9 +97,8 @@ class RecursiveLsDrem:
     def __init__(self, settings: LsDrem, parameters: Sequence[str]) -> None:
         part = settings.least_squares
         self._part, self._cases = part.recursive(parameters), part.cases
-        self._gains = gain_matrix(settings.gamma, parameters, "estimator.gamma")
-        start = per_parameter(settings.initial, parameters, "estimator.initial")
-        self._law = ScalarLaw(start, self._gains, len(self._cases))
+        self._gains = settings.gains("gamma", parameters)
+        self._law = ScalarLaw(settings.start(parameters), self._gains, len(self._cases))
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""

@@ -6,24 +6,27 @@ The worked example of how an estimator is added (docs/howto/estimator.md): this 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gpebo_cli.estimators._base import combinations, number, per_parameter
+from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import gain_axis, gain_matrix, reached
+from gpebo_cli.estimators._mixed import reached
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered
-from gpebo_cli.regression.linear import ExtensionState, LinearRegression
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.schema import number
 
 
-@dataclass(frozen=True)
-class MemoryExtension:
+@dataclass(frozen=True, kw_only=True)
+class MemoryExtension(ResumableEstimator):
     """η̂' = γ (𝒴 − Ω η̂) with Ω, 𝒴 from filters λ/(p + λ) of ψᵀψ, ψᵀY.
 
     One λ for all rows: Ω is then symmetric and positive semidefinite, which the law needs.
@@ -35,24 +38,18 @@ class MemoryExtension:
         initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
-    gamma: object = 100.0
+    gamma: object = gain(100.0, by_parameter=True)
     rate: object = field(default=0.2, metadata={"key": "lambda"})
-    initial: object = 0.0
 
-    @property
-    def cases(self) -> tuple[Mapping[str, float], ...]:
-        """One case per gain; a gain per parameter is one case."""
-        return combinations(gain_axis(self.gamma, "estimator.gamma"))
-
-    def estimate(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState] = ()
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> VectorEstimates:
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         extended = kreisselmeier(
             regression, self._rates(regression.p), known[0].values if known else None
         )
-        estimates = self._estimates(regression, extended, t)
-        return replace(estimates, reached=(reached(regression, extended, known),))
+        state = reached(largest(regression.outer.values), extended, known)
+        return replace(self._estimates(regression, extended, t), reached=(state,))
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
@@ -72,7 +69,7 @@ class MemoryExtension:
         mesh, values = extended.mesh, extended.values
         omega = Trajectory(mesh, values[..., :p])
         identity = np.broadcast_to(np.eye(p), values[..., :p].shape)
-        gains = gain_matrix(self.gamma, regression.parameters, "estimator.gamma")
+        gains = self.gains("gamma", regression.parameters)
         return VectorEstimates(
             law=VectorLaw(
                 M=Trajectory(mesh, identity),
@@ -80,7 +77,7 @@ class MemoryExtension:
                 b=Trajectory(mesh, values[..., p:]),
                 floor=regression.floor,
             ),
-            start=per_parameter(self.initial, regression.parameters, "estimator.initial"),
+            start=self.start(regression.parameters),
             gains=gains,
             t=np.asarray(t),
             realisations=regression.realisations,

@@ -11,16 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli import kernels
+from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, Requirement
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import SMALL_SPECTRUM, largest
 from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
-from gpebo_cli.regression.linear import (
-    SMALL_SPECTRUM,
-    ExtensionState,
-    LinearRegression,
-    SampledRegression,
-    largest,
-)
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
 RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
@@ -277,7 +275,7 @@ def persistent(outer: Trajectory, gain: float) -> Requirement:
     length = float(mesh.edges[-1] - mesh.edges[0]) / WINDOWS
     t = np.linspace(mesh.edges[0], mesh.edges[-1], 10 * WINDOWS + 1)
     level = float(np.nanmin(window_level(outer, t, length)))
-    needed = float(np.log(100.0)) / WINDOWS
+    needed = DECAY / WINDOWS
     return Requirement(
         name="PE",
         holds=gain * level >= needed,

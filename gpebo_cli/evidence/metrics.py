@@ -13,6 +13,7 @@ import numpy as np
 from gpebo_cli.model.descriptor import Array
 
 SETTLED = 0.01  # share of an error at the start, below which it has settled
+DECAY = -float(np.log(SETTLED))  # exponent of an exponential that has settled
 
 
 @dataclass(frozen=True)

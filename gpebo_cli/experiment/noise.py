@@ -19,7 +19,6 @@ Samples are boundaries of elements, so that what is held jumps between elements 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, factorial, pi
 
@@ -28,7 +27,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.schema import nearest
+from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings
 from gpebo_cli.simulation.simulate import Signals
 
@@ -77,44 +76,10 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
         raise ConfigError(f"noise.seed: expected 0 or more, got {settings.seed}")
     outputs, inputs = system.outputs, system.inputs
     return NoiseLevels(
-        per_signal(settings.outputs, outputs, "output", "noise.outputs"),
-        per_signal(settings.inputs, inputs, "input", "noise.inputs"),
-        per_signal(settings.quantisation, outputs, "output", "noise.quantisation"),
+        per_name(settings.outputs, outputs, "output", "noise.outputs", absent=0.0),
+        per_name(settings.inputs, inputs, "input", "noise.inputs", absent=0.0),
+        per_name(settings.quantisation, outputs, "output", "noise.quantisation", absent=0.0),
     )
-
-
-def per_signal(
-    value: float | Sequence[float] | Mapping[str, float], names: Sequence[str], noun: str,
-    where: str, absent: float = 0.0,
-) -> Array:
-    """One number ≥ 0 per signal, from one for all, a list in their order, or a mapping by name.
-
-    Raises:
-        ConfigError: the wrong length, an unknown name, or a number that is negative or not finite.
-    """
-    listed = ", ".join(names) or "none"
-    if isinstance(value, Mapping):
-        for key in value:
-            if key not in names:
-                raise ConfigError(
-                    f"{where}: there is no {noun} {key!r}; the {noun}s are {listed}"
-                    + nearest(str(key), names)
-                )
-        numbers = np.array([value.get(name, absent) for name in names], dtype=np.float64)
-    elif isinstance(value, Sequence):
-        if len(value) != len(names):
-            raise ConfigError(
-                f"{where} has {len(value)} values, one for each {noun} is needed ({listed})"
-            )
-        numbers = np.array(value, dtype=np.float64)
-    else:
-        numbers = np.full(len(names), value, dtype=np.float64)
-    for name, number in zip(names, numbers, strict=True):
-        if not (np.isfinite(number) and number >= 0):
-            raise ConfigError(
-                f"{where}: expected finite numbers, 0 or more, got {number:g} for {name}"
-            )
-    return numbers
 
 
 @dataclass(frozen=True, eq=False)

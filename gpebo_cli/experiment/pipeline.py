@@ -27,7 +27,7 @@ from gpebo_cli.numerics.linalg import SMALL
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Observation, StateMap, check_remedy, observe, signal_noise
 from gpebo_cli.observers.observation import AffineStateMap
-from gpebo_cli.regression.linear import SampledRegression
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 
 _SAMPLES_AT_ONCE = 2048

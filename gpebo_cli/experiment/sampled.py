@@ -18,7 +18,7 @@ from gpebo_cli.findings import Assumption, Direction, Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers.observation import InitialError
 from gpebo_cli.observers.sampled import SampledState, sampled_observer
-from gpebo_cli.regression.linear import SampledRegression
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 
 
@@ -59,10 +59,12 @@ class SampledRun:
         )
         if estimator is None:
             estimator = estimators.build(settings.estimator)
-        name = str(settings.estimator["name"])
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases
         self.parameters = self._observer.parameters
-        self._recursion = estimators.recursion(estimator, name, self.parameters)
+        self._recursion = estimators.able(
+            estimator, estimators.Recursive,
+            "observer.sample_time needs an estimator that works at samples",
+        ).recursive(self.parameters)
         self._gram = InformationRoot(len(self.parameters), np.zeros(1))
         self._rho = settings.excitation.rho
         self._start = start

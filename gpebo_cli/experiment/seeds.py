@@ -23,7 +23,8 @@ from gpebo_cli.experiment.result import NoiseStatistics
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers import Observation
-from gpebo_cli.regression.linear import Estimator, LinearRegression
+from gpebo_cli.regression.estimator import Estimator
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import NoiseSettings, ObserverSettings
 from gpebo_cli.simulation.simulate import Signals
 

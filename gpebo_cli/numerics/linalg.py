@@ -16,6 +16,7 @@ from gpebo_cli.model.descriptor import Array
 # Rows of matrices, up to which LAPACK's calls cost more than what they compute: by elimination, and
 # where singular values are wanted.
 SMALL, _SMALL_SPECTRUM = 16, 8
+SMALL_SPECTRUM = 16  # the same for eigenvalues of symmetric matrices
 
 
 def transpose(a: Array) -> Array:
@@ -120,3 +121,19 @@ def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
         step *= 2
     out[1:] = a * out[0] + b
     return out
+
+
+def largest(extended: Array) -> float:
+    """‖Ω‖₂ of [Ω | 𝒴] (..., p, p + c), the largest of all."""
+    p = extended.shape[-2]
+    return spectral_norm(extended, p) if extended.size else 0.0
+
+
+def spectral_norm(matrices: Array, columns: int) -> float:
+    """‖·‖₂ of the first columns of matrices (..., a, b), the largest of all."""
+    if kernels.compiled is not None and min(matrices.shape[-2], columns) <= SMALL_SPECTRUM:
+        found: float | None = kernels.compiled.spectral_norm(matrices, columns)
+        if found is not None:  # else not all is finite
+            return found
+    norms = np.linalg.norm(matrices[..., :columns], 2, axis=(-2, -1))
+    return float(norms.max(initial=0.0))

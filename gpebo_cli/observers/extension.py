@@ -11,9 +11,8 @@ from math import isfinite
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment.noise import per_signal
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.schema import nearest
+from gpebo_cli.schema import nearest, per_name
 from gpebo_cli.settings import ObserverSettings
 
 
@@ -65,7 +64,7 @@ def output_scale(settings: ObserverSettings, system: DescriptorSystem) -> Array:
     """
     if settings.weights is None:
         return np.ones(system.r)
-    weights = per_signal(settings.weights, system.outputs, "output", "observer.weights", 1.0)
+    weights = per_name(settings.weights, system.outputs, "output", "observer.weights", absent=1.0)
     if not weights.any():
         raise ConfigError("observer.weights: at least one output must have a positive weight")
     return np.asarray(np.sqrt(weights / weights.max()))

@@ -28,7 +28,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.experiment.noise import per_signal
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
@@ -41,6 +40,7 @@ from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matr
 from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.observers.riccati import Filtered, StateSpace, run_filter
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.schema import per_name
 from gpebo_cli.settings import ObserverSettings, SolverSettings
 
 _LEVEL = 1e-8  # of M's largest eigenvalue over all windows, in units of P(0)⁻¹: below, no evidence
@@ -218,7 +218,7 @@ def observe(
     w0 = basis.T @ V1 @ initial_extension(settings, system, initial)
     start = np.concatenate([np.zeros(q), w0])
     P0 = _initial_covariance(settings, names, q, basis.T @ V1)
-    process = per_signal(settings.process, names, "estimate", "observer.process")
+    process = per_name(settings.process, names, "estimate", "observer.process", absent=0.0)
     model_noise = noise_model(
         reduced(points, points_inside), noise, process, settings.regularisation
     )
@@ -285,7 +285,7 @@ def _initial_covariance(
     settings: ObserverSettings, names: tuple[str, ...], q: int, V: Array
 ) -> Array:
     """P(start) (n, n), within the range of the coordinates V (n_w, n_a) of V1."""
-    variances = per_signal(settings.P0, names, "estimate", "observer.P0", _INITIAL_VARIANCE)
+    variances = per_name(settings.P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
     inside = np.zeros((len(names), len(names)))
     inside[:q, :q] = np.eye(q)
     inside[q:, q:] = V @ V.T

@@ -11,8 +11,10 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import spectral_norm
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.regression.linear import Estimator, LinearRegression, spectral_norm
+from gpebo_cli.regression.estimator import Estimator
+from gpebo_cli.regression.linear import LinearRegression
 
 # η̂ (g, M, p) at fixed times -> x̂ (g, M, n), NaN for a state the observer does not see
 Reconstruction = Callable[[Array], Array]

@@ -24,6 +24,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.extension import initial_extension
 from gpebo_cli.observers.gpebo import assumptions
@@ -41,13 +42,8 @@ from gpebo_cli.observers.reduced.extension import (
 )
 from gpebo_cli.observers.reduced.regression import Assembled, on_mesh
 from gpebo_cli.observers.reduced.split import initial_basis
-from gpebo_cli.regression.linear import (
-    ExtensionState,
-    LinearRegression,
-    Reset,
-    largest,
-    outer_products,
-)
+from gpebo_cli.regression.linear import LinearRegression, outer_products
+from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.settings import ObserverSettings, SolverSettings
 
 _GROWTH = 100.0  # of Φ between resets: two digits

@@ -26,7 +26,7 @@ from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matr
 from gpebo_cli.observers.reduced.regression import regression_signals
 from gpebo_cli.observers.reduced.split import initial_basis, split_in_frame
 from gpebo_cli.recordings.hold import edges, held
-from gpebo_cli.regression.linear import SampledRegression
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ObserverSettings, SolverSettings
 
 _STAGES = 4  # per sample, order 7: beyond what any hold is good for

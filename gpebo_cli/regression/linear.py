@@ -2,93 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.resets import ExtensionState, Reset
 
-_SINGULAR = 1e-14  # share of the largest singular value below which one is rounding
-_SYMMETRIC = 1e-8  # below this share of Ω, what is not symmetric is rounding
-SMALL_SPECTRUM = 16  # size of symmetric matrices, up to which LAPACK's calls cost more than it does
 _FEW_COLUMNS = 32  # of a product, up to which BLAS costs more than what there is to add up
-SURPLUS = 1e4  # integrals: what is known may outweigh what one segment teaches by this factor
-
-
-@dataclass(frozen=True, eq=False)
-class Reset:
-    """From ``time`` on the regression is about η₊ = T η + τ (observer.remedy: reset)."""
-
-    time: float
-    transform: Array  # (p, p) T, invertible
-    shift: Array  # (p,) τ
-    floor: float  # size below which η₊ is rounding: it may be the difference of known numbers
-    keep: float = 1.0  # share of what is known that still counts
-
-    def parameters(self, eta: Array) -> Array:
-        """η₊ of η (..., p)."""
-        return np.asarray(eta @ self.transform.T + self.shift)
-
-
-@dataclass(frozen=True, eq=False)
-class ExtensionState:
-    """What is known of η at one time: Ω η = 𝒴, and how much of it is new."""
-
-    values: Array  # [Ω | 𝒴] (p, p + 1)
-    level: float  # size that data of one segment alone have given Ω, the largest so far
-    memory: float = 1.0  # z of least squares with forgetting
-    surplus: float = SURPLUS  # how many times ``level`` a reset may make of Ω
-
-    def after(self, reset: Reset) -> ExtensionState:
-        """The same knowledge of η₊ = T η + τ.
-
-        S Ω T⁻¹ η₊ = S (𝒴 + Ω T⁻¹ τ) holds for any S. S = T⁻ᵀ, Ω₊ = T⁻ᵀ Ω T⁻¹, keeps a Gram matrix
-        one. Directions that T shrinks are those in which η₊ is known the better, without bound.
-        What exceeds ``surplus`` times that which a segment's data amount to is cut down to it by
-        a row of S: float64 holds 16 digits, and those of the other directions are needed. It is
-        1e4 for integrals, which add up over segments, and 1 for filters, which do not.
-
-        With Ω = KᵀL, equal factors for a Gram matrix, the columns of L T⁻¹ are of very different
-        sizes; QR with the largest first keeps them apart, and a row of R is cut as a whole.
-        """
-        omega, rhs = self.values[:, :-1], self.values[:, -1]
-        symmetric = bool(np.abs(omega - omega.T).max() <= _SYMMETRIC * np.abs(omega).max())
-        u, size, vt = np.linalg.svd(0.5 * (omega + omega.T) if symmetric else omega)
-        root = np.sqrt(size)
-        rhs = np.divide(
-            u.T @ rhs, root, out=np.zeros_like(root),
-            where=size > max(_SINGULAR * size[0], np.finfo(float).tiny),
-        )  # of L η
-        U, sigma, Vt = np.linalg.svd(reset.transform)
-        inverse = Vt.T / np.maximum(sigma, _SINGULAR * sigma[0])  # T⁻¹ = inverse Uᵀ
-        left, right = root[:, None] * (u.T @ inverse), root[:, None] * (vt @ inverse)
-        order = np.argsort(-np.linalg.norm(right, axis=0), kind="stable")
-        q, r = np.linalg.qr(right[:, order])
-        limit = np.sqrt(self.surplus * self.level)
-        share = _share(r, limit)
-        right[:, order] = share * r
-        rhs = share[:, 0] * (q.T @ rhs) + right @ (U.T @ reset.shift)
-        if symmetric:
-            left = right.T  # equal but for rounding, which would add up from reset to reset
-        else:
-            left = (share * (q.T @ left)).T
-            left *= _share(left, limit * np.sqrt(len(left)))
-        values = U @ left @ np.column_stack([right @ U.T, rhs])
-        return replace(self, values=reset.keep * values)
-
-
-def _share(rows: Array, limit: float) -> Array:
-    """Factors (m, 1) ≤ 1 that bring rows (m, p) down to a length."""
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.asarray(np.divide(limit, length, out=np.ones_like(length), where=length > limit))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,79 +115,3 @@ def outer_products(psi: Array, Y: Array) -> Array:
 def with_realisations(psi: Array, Y: Array) -> Array:
     """Y (..., rows, c), with c = 1 where it has one realisation only."""
     return Y if Y.ndim == psi.ndim else Y[..., None]
-
-
-@dataclass(frozen=True, eq=False)
-class SampledRegression:
-    """Y = ψη at K successive samples, with what the sample before them had.
-
-    Integrals over a step between samples are taken as the hold rule has it: of the newest sample
-    (zoh), or the mean of both ends (linear).
-    """
-
-    t: Array  # (K,)
-    steps: Array  # (K,) seconds since the sample before; 0 for the first of all
-    rows: Array  # (K + 1, rows, p + 1) [ψ | Y], first that of the sample before (the first: itself)
-    hold: str  # zoh or linear
-
-    @property
-    def p(self) -> int:
-        """Number of parameters."""
-        return int(self.rows.shape[2]) - 1
-
-    def weighted(self) -> Array:
-        """Rows whose squares add up to ∫[ψ | Y]ᵀ[ψ | Y] over each step, (K, ·, p + 1)."""
-        if self.hold == "zoh":
-            return np.asarray(np.sqrt(self.steps)[:, None, None] * self.rows[1:])
-        both = np.concatenate([self.rows[:-1], self.rows[1:]], axis=1)
-        return np.asarray(np.sqrt(0.5 * self.steps)[:, None, None] * both)
-
-
-def largest(extended: Array) -> float:
-    """‖Ω‖₂ of [Ω | 𝒴] (..., p, p + c), the largest of all."""
-    p = extended.shape[-2]
-    return spectral_norm(extended, p) if extended.size else 0.0
-
-
-def spectral_norm(matrices: Array, columns: int) -> float:
-    """‖·‖₂ of the first columns of matrices (..., a, b), the largest of all."""
-    if kernels.compiled is not None and min(matrices.shape[-2], columns) <= SMALL_SPECTRUM:
-        found: float | None = kernels.compiled.spectral_norm(matrices, columns)
-        if found is not None:  # else not all is finite
-            return found
-    norms = np.linalg.norm(matrices[..., :columns], 2, axis=(-2, -1))
-    return float(norms.max(initial=0.0))
-
-
-class Estimates(Protocol):
-    """The answer of one estimator on fixed times, for any of its cases."""
-
-    def delta(self, t: Array) -> Array | None:
-        """Δ at the times t (M,), shape (1 or cases, M), or None where nothing is mixed."""
-        ...
-
-    @property
-    def requirement(self) -> Requirement:
-        """What the estimator needs of the regressor, and what it got."""
-        ...
-
-    def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases at the times, shape (g, M, p), or (g, M, p, c) as Y has it."""
-        ...
-
-
-class Estimator(Protocol):
-    """Settings of one estimator; immutable."""
-
-    @property
-    def cases(self) -> tuple[Mapping[str, float], ...]:
-        """Every combination of gains, by name."""
-        ...
-
-    def estimate(self, regression: LinearRegression, t: Array) -> Estimates:
-        """Prepare the estimates at the times t (M,), ascending.
-
-        Raises:
-            ConfigError: a setting's length does not match the parameters.
-        """
-        ...

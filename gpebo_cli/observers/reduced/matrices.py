@@ -11,7 +11,7 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import joined, orthonormal_complement, transpose
+from gpebo_cli.numerics.linalg import SMALL_SPECTRUM, joined, orthonormal_complement, transpose
 from gpebo_cli.observers.reduced.split import (
     TINY,
     Frame,
@@ -24,7 +24,6 @@ from gpebo_cli.observers.reduced.split import (
     split_in_frame,
     within_frame,
 )
-from gpebo_cli.regression.linear import SMALL_SPECTRUM
 
 _SMALL = 24  # states, up to which NumPy's calls cost more than the kernels' plain loops
 

@@ -1,0 +1,133 @@
+"""What an estimator is to the rest: settings that make estimates from a regression.
+
+``Estimator`` and ``Estimates`` are the least there must be. What more an estimator can do it shows
+by a method: :class:`Resumable` goes on after a reset, :class:`Moving` follows parameters that
+move, :class:`Recursive` works at samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.samples import SampledRegression
+
+
+class Estimates(Protocol):
+    """The answer of one estimator on fixed times, for any of its cases."""
+
+    def delta(self, t: Array) -> Array | None:
+        """Δ at the times t (M,), shape (1 or cases, M), or None where nothing is mixed."""
+        ...
+
+    @property
+    def requirement(self) -> Requirement:
+        """What the estimator needs of the regressor, and what it got."""
+        ...
+
+    def parameters(self, cases: slice) -> Array:
+        """η̂ of some cases at the times, shape (g, M, p), or (g, M, p, c) as Y has it."""
+        ...
+
+
+class Estimator(Protocol):
+    """Settings of one estimator; immutable."""
+
+    @property
+    def cases(self) -> tuple[Mapping[str, float], ...]:
+        """Every combination of gains, by name."""
+        ...
+
+    def estimate(self, regression: LinearRegression, t: Array) -> Estimates:
+        """Prepare the estimates at the times t (M,), ascending.
+
+        Raises:
+            ConfigError: a setting's length does not match the parameters.
+        """
+        ...
+
+
+class ResumableEstimates(Estimates, Protocol):
+    """Estimates from which the next segment can go on."""
+
+    @property
+    def reached(self) -> tuple[ExtensionState, ...]:
+        """The extensions at the end of the regression: what ``resume`` takes as ``known``."""
+        ...
+
+    def parameters(self, cases: slice, start: Array | None = None) -> Array:
+        """η̂ of some cases at the times, shape (g, M, p).
+
+        Args:
+            cases: which.
+            start: η̂ of each of them (g, p) at the start of the regression; None: the settings'.
+        """
+        ...
+
+
+@runtime_checkable
+class Resumable(Protocol):
+    """An estimator that can go on after a reset."""
+
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
+    ) -> ResumableEstimates:
+        """As ``Estimator.estimate`` at the times t (M,), from extensions that are known.
+
+        Args:
+            regression: Y = ψη without resets.
+            t: times.
+            known: the extensions at its start; none: they start at zero.
+        """
+        ...
+
+
+@runtime_checkable
+class Moving(Protocol):
+    """An estimator that can follow parameters that move."""
+
+    def estimate_moving(
+        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+    ) -> Estimates:
+        """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SampledEstimates:
+    """η̂ of every case at K samples."""
+
+    parameters: Array  # (G, K, p)
+    delta: Array | None  # (1 or G, K), None where nothing is mixed
+
+
+class Recursion(Protocol):
+    """An estimator that takes samples as they come; it changes as it does so."""
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each."""
+        ...
+
+    @property
+    def requirement(self) -> Requirement:
+        """What the estimator needs of the regressor, and what it got so far."""
+        ...
+
+
+@runtime_checkable
+class Recursive(Protocol):
+    """An estimator that works at samples, too."""
+
+    def recursive(self, parameters: Sequence[str]) -> Recursion:
+        """The same at samples, for parameters of these names.
+
+        Raises:
+            ConfigError: a setting that there is in continuous time only.
+        """
+        ...

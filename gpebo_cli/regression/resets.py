@@ -1,0 +1,81 @@
+"""What a reset does to a regression's parameters, and to what is known of them (theory 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array
+
+_SINGULAR = 1e-14  # share of the largest singular value below which one is rounding
+_SYMMETRIC = 1e-8  # below this share of Ω, what is not symmetric is rounding
+SURPLUS = 1e4  # integrals: what is known may outweigh what one segment teaches by this factor
+
+
+@dataclass(frozen=True, eq=False)
+class Reset:
+    """From ``time`` on the regression is about η₊ = T η + τ (observer.remedy: reset)."""
+
+    time: float
+    transform: Array  # (p, p) T, invertible
+    shift: Array  # (p,) τ
+    floor: float  # size below which η₊ is rounding: it may be the difference of known numbers
+    keep: float = 1.0  # share of what is known that still counts
+
+    def parameters(self, eta: Array) -> Array:
+        """η₊ of η (..., p)."""
+        return np.asarray(eta @ self.transform.T + self.shift)
+
+
+@dataclass(frozen=True, eq=False)
+class ExtensionState:
+    """What is known of η at one time: Ω η = 𝒴, and how much of it is new."""
+
+    values: Array  # [Ω | 𝒴] (p, p + 1)
+    level: float  # size that data of one segment alone have given Ω, the largest so far
+    memory: float = 1.0  # z of least squares with forgetting
+    surplus: float = SURPLUS  # how many times ``level`` a reset may make of Ω
+
+    def after(self, reset: Reset) -> ExtensionState:
+        """The same knowledge of η₊ = T η + τ.
+
+        S Ω T⁻¹ η₊ = S (𝒴 + Ω T⁻¹ τ) holds for any S. S = T⁻ᵀ, Ω₊ = T⁻ᵀ Ω T⁻¹, keeps a Gram matrix
+        one. Directions that T shrinks are those in which η₊ is known the better, without bound.
+        What exceeds ``surplus`` times that which a segment's data amount to is cut down to it by
+        a row of S: float64 holds 16 digits, and those of the other directions are needed. It is
+        1e4 for integrals, which add up over segments, and 1 for filters, which do not.
+
+        With Ω = KᵀL, equal factors for a Gram matrix, the columns of L T⁻¹ are of very different
+        sizes; QR with the largest first keeps them apart, and a row of R is cut as a whole.
+        """
+        omega, rhs = self.values[:, :-1], self.values[:, -1]
+        symmetric = bool(np.abs(omega - omega.T).max() <= _SYMMETRIC * np.abs(omega).max())
+        u, size, vt = np.linalg.svd(0.5 * (omega + omega.T) if symmetric else omega)
+        root = np.sqrt(size)
+        rhs = np.divide(
+            u.T @ rhs, root, out=np.zeros_like(root),
+            where=size > max(_SINGULAR * size[0], np.finfo(float).tiny),
+        )  # of L η
+        U, sigma, Vt = np.linalg.svd(reset.transform)
+        inverse = Vt.T / np.maximum(sigma, _SINGULAR * sigma[0])  # T⁻¹ = inverse Uᵀ
+        left, right = root[:, None] * (u.T @ inverse), root[:, None] * (vt @ inverse)
+        order = np.argsort(-np.linalg.norm(right, axis=0), kind="stable")
+        q, r = np.linalg.qr(right[:, order])
+        limit = np.sqrt(self.surplus * self.level)
+        share = _share(r, limit)
+        right[:, order] = share * r
+        rhs = share[:, 0] * (q.T @ rhs) + right @ (U.T @ reset.shift)
+        if symmetric:
+            left = right.T  # equal but for rounding, which would add up from reset to reset
+        else:
+            left = (share * (q.T @ left)).T
+            left *= _share(left, limit * np.sqrt(len(left)))
+        values = U @ left @ np.column_stack([right @ U.T, rhs])
+        return replace(self, values=reset.keep * values)
+
+
+def _share(rows: Array, limit: float) -> Array:
+    """Factors (m, 1) ≤ 1 that bring rows (m, p) down to a length."""
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(np.divide(limit, length, out=np.ones_like(length), where=length > limit))
