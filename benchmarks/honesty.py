@@ -309,7 +309,7 @@ def measure(case: Case) -> Outcome:
     error = np.abs(result.signals.states(times) - truth).max(axis=0) / np.abs(truth).max(axis=0)
     # What the truth itself cannot be known better than.
     rounding = 4 * np.finfo(float).eps
-    ratio = float((np.maximum(error - rounding, 0.0) / np.full(case.system.n, result.error_estimate)).max())
+    ratio = float((np.maximum(error - rounding, 0.0) / result.error_estimate).max())
     return Outcome(case.what, seconds, "", float(error.max()), ratio)
 
 

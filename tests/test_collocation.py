@@ -10,8 +10,8 @@ from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics.collocation import (
-    Coefficients,
     Constraints,
+    LinearEquation,
     LinearProblem,
     solve,
     solve_constant,
@@ -52,7 +52,7 @@ def oscillator(t, inside):
     E[:, 0, 0] = E[:, 1, 1] = 1.0
     A[:, 0, 1], A[:, 1, 0] = 1.0, -1.0
     A[:, 2, 0], A[:, 2, 1], A[:, 2, 2] = 1.0, t, -1.0
-    return Coefficients(E, A, np.zeros((n, 3, 1)))
+    return LinearEquation(E, A, np.zeros((n, 3, 1)))
 
 
 @pytest.mark.parametrize("stages", [2, 3, 4])
@@ -73,7 +73,7 @@ def test_order_of_convergence(stages):
 def test_constant_coefficients_give_the_matrix_exponential(n, seed, horizon):
     A = np.random.default_rng(seed).normal(size=(n, n))
     mesh = initial_mesh(0.0, horizon, [], 4, radau_rule(9))
-    constant = Coefficients(None, A[None], np.zeros((1, n, n)))
+    constant = LinearEquation(None, A[None], np.zeros((1, n, n)))
     problem = LinearProblem(lambda t, inside: constant, np.eye(n))
     result = solve(problem, mesh, tol=1e-11, max_elements=10_000)
     truth = expm(horizon * A)
@@ -88,7 +88,7 @@ def test_refinement_reaches_the_tolerance_where_the_signal_is_fast(tol):
 
     def pulse(t, inside):
         f = -2.0 * 2500.0 * (t - 6.1) * np.exp(-2500.0 * (t - 6.1) ** 2)
-        return Coefficients(None, np.zeros((len(t), 1, 1)), f[:, None, None])
+        return LinearEquation(None, np.zeros((len(t), 1, 1)), f[:, None, None])
 
     mesh = initial_mesh(0.0, 10.0, [], 24, radau_rule(9))
     result = solve(LinearProblem(pulse, np.zeros((1, 1))), mesh, tol=tol, max_elements=10_000)
@@ -106,7 +106,7 @@ def test_a_stiff_transient_is_resolved_and_forgotten():
     def stiff(t, inside):
         n = len(t)
         f = (1e8 * np.cos(t) - np.sin(t))[:, None, None]
-        return Coefficients(None, np.full((n, 1, 1), -1e8), f)
+        return LinearEquation(None, np.full((n, 1, 1), -1e8), f)
 
     mesh = initial_mesh(0.0, 10.0, [], 8, radau_rule(9))
     result = solve(LinearProblem(stiff, np.array([[3.0]])), mesh, tol=1e-10, max_elements=10_000)
@@ -120,7 +120,7 @@ def test_an_unannounced_singularity_is_an_error_that_names_the_time():
     def singular(t, inside):
         with np.errstate(divide="ignore"):
             f = 1.0 / np.sqrt(np.abs(t - 0.7))
-        return Coefficients(None, np.zeros((len(t), 1, 1)), f[:, None, None])
+        return LinearEquation(None, np.zeros((len(t), 1, 1)), f[:, None, None])
 
     mesh = initial_mesh(0.0, 1.0, [], 8, radau_rule(9))
     with pytest.raises(SolverError, match=r"t = 0\.(69|7)"):
@@ -129,7 +129,7 @@ def test_an_unannounced_singularity_is_an_error_that_names_the_time():
 
 def test_a_solution_that_overflows_is_an_error():
     mesh = initial_mesh(0.0, 1.0, [], 8, radau_rule(9))
-    constant = Coefficients(None, np.full((1, 1, 1), 1e4), np.zeros((1, 1, 1)))
+    constant = LinearEquation(None, np.full((1, 1, 1), 1e4), np.zeros((1, 1, 1)))
     problem = LinearProblem(lambda t, inside: constant, np.ones((1, 1)))
     with pytest.raises(SolverError):
         solve(problem, mesh, tol=1e-10, max_elements=50_000)
@@ -179,7 +179,7 @@ def test_constraints_given_apart_change_nothing():
         basis[:, 2, 1] = t
         turn = np.array([[1.0, 0.3], [-0.4, 2.0]]) * (1.0 + (np.arange(len(t)) % 3))[:, None, None]
         constraints = Constraints(basis @ turn, np.zeros((len(t), 3, 1)))
-        return Coefficients(whole.E[:, :2], whole.A[:, :2], whole.f[:, :2], (), constraints)
+        return LinearEquation(whole.E[:, :2], whole.A[:, :2], whole.f[:, :2], (), constraints)
 
     mesh = initial_mesh(0.0, 4.0, [], 6, radau_rule(7))
     start = [[1.0], [0.0], [1.0]]
@@ -251,7 +251,7 @@ def test_elements_are_joined_where_one_polynomial_does_as_well():
 def test_long_elements_that_seem_to_grow_beyond_all_numbers_are_cut():
     """x' = 2 sin(t) x has the period of an element, whose map is 19 and not 1 before it is cut."""
     def coefficients(t, inside):
-        return Coefficients(None, 2 * np.sin(t)[:, None, None], np.zeros((len(t), 1, 1)))
+        return LinearEquation(None, 2 * np.sin(t)[:, None, None], np.zeros((len(t), 1, 1)))
 
     mesh = initial_mesh(0.0, 400 * 2 * np.pi, [], 400, radau_rule(8))
     problem = LinearProblem(coefficients, np.ones((1, 1)))
@@ -263,7 +263,7 @@ def test_long_elements_that_seem_to_grow_beyond_all_numbers_are_cut():
 
 def test_growth_beyond_all_numbers_is_named_with_its_time():
     def coefficients(t, inside):
-        return Coefficients(None, np.ones((1, 1, 1)), np.zeros((len(t), 1, 1)))
+        return LinearEquation(None, np.ones((1, 1, 1)), np.zeros((len(t), 1, 1)))
 
     mesh = initial_mesh(0.0, 1000.0, [], 250, radau_rule(14))
     with pytest.raises(SolverError, match=r"not finite from t = 70"):

@@ -12,7 +12,7 @@ from kernel_paths import COMPILED, by_both, needs_kernels
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics import collocation as linear
-from gpebo_cli.numerics.collocation import Coefficients, Constraints, LinearProblem, solve
+from gpebo_cli.numerics.collocation import Constraints, LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved_kinds
 from gpebo_cli.numerics.radau import radau_rule
 
@@ -36,13 +36,13 @@ def random_equation(rng, points, n, d, columns, varies, *, identity=False):
         return rng.normal(size=(points if varies[kind] else 1, *shape))
 
     if identity:
-        return Coefficients(None, values(1, n, n), values(2, n, columns))
+        return LinearEquation(None, values(1, n, n), values(2, n, columns))
     basis = values(3, n, d)
     E = 0.2 * values(0, d, n) + np.eye(d, n)
     if d == n:
-        return Coefficients(E, values(1, n, n), values(2, n, columns))
+        return LinearEquation(E, values(1, n, n), values(2, n, columns))
     constraints = Constraints(basis + 3.0 * np.eye(n, d), values(4, n, columns))
-    return Coefficients(E, values(1, d, n), values(2, d, columns), (), constraints)
+    return LinearEquation(E, values(1, d, n), values(2, d, columns), (), constraints)
 
 
 @st.composite
@@ -107,7 +107,7 @@ def test_noise_is_seen_alike(seed, columns, stages):
 
 def test_growth_beyond_all_numbers_is_noticed_at_the_same_element():
     mesh = initial_mesh(0.0, 1000.0, [], 100, radau_rule(9))
-    c = Coefficients(None, np.array([[[1.0]]]), np.zeros((1, 1, 1)))
+    c = LinearEquation(None, np.array([[[1.0]]]), np.zeros((1, 1, 1)))
     problem = LinearProblem(lambda t, inside: c, np.ones((1, 1)))
     maps = linear._element_maps(problem, mesh, None, c)
     one, other = by_both(lambda: linear._chain(maps, problem, mesh, {})[1])
@@ -118,7 +118,7 @@ def test_growth_beyond_all_numbers_is_noticed_at_the_same_element():
 def test_a_singular_system_is_the_same_error(constant):
     mesh = initial_mesh(0.0, 1.0, [], 3, radau_rule(5))
     zeros = np.zeros((1 if constant else mesh.points.size, 2, 2))
-    c = Coefficients(zeros, zeros, np.ones((1, 2, 1)))
+    c = LinearEquation(zeros, zeros, np.ones((1, 2, 1)))
     problem = LinearProblem(lambda t, inside: c, np.ones((2, 1)), name="toy")
 
     def message():
@@ -135,7 +135,7 @@ def test_what_is_not_a_number_stays(bad):
     mesh = initial_mesh(0.0, 1.0, [], 3, radau_rule(5))
     f = np.ones((mesh.points.size, 2, 1))
     f[8] = bad  # in the second element
-    c = Coefficients(None, np.full((1, 2, 2), 0.3), f)
+    c = LinearEquation(None, np.full((1, 2, 2), 0.3), f)
     problem = LinearProblem(lambda t, inside: c, np.ones((2, 1)))
 
     def finite():
@@ -148,7 +148,7 @@ def test_what_is_not_a_number_stays(bad):
 def test_refinement_takes_the_same_way():
     def pulse(t, inside):
         f = np.exp(-2500.0 * (t - 6.1) ** 2)
-        return Coefficients(None, -np.ones((1, 1, 1)), f[:, None, None])
+        return LinearEquation(None, -np.ones((1, 1, 1)), f[:, None, None])
 
     def result():
         mesh = initial_mesh(0.0, 10.0, [], 24, radau_rule(9))
@@ -169,7 +169,7 @@ def test_elimination_swaps_rows(n, columns, stages):
     rng = np.random.default_rng(n)
     mesh = Mesh(np.array([0.0, 0.3, 0.5]), radau_rule(stages))
     points = mesh.points.size
-    c = Coefficients(
+    c = LinearEquation(
         np.eye(n)[None, ::-1].copy(), 1e-3 * rng.normal(size=(points, n, n)),
         rng.normal(size=(points, n, columns)),
     )

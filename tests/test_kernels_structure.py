@@ -15,17 +15,12 @@ from plants import DATA, problem, shipped
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Coefficients, DescriptorSystem
-from gpebo_cli.reduction import consistency, derivative_array
+from gpebo_cli.reduction import consistency, derivative_array, strangeness_free
+from gpebo_cli.reduction import structure as structures
 from gpebo_cli.reduction.consistency import consistent_state
-from gpebo_cli.reduction.derivative_array import (
-    Bases,
-    Pivots,
-    StrangenessFree,
-    Structure,
-    analyse,
-    balance,
-    reduce,
-)
+from gpebo_cli.reduction.derivative_array import balance
+from gpebo_cli.reduction.strangeness_free import StrangenessFree, strangeness_free_form
+from gpebo_cli.reduction.structure import Bases, Pivots, Structure, analyse
 
 pytestmark = needs_kernels
 
@@ -154,7 +149,7 @@ def test_the_same_bounds(drawn):
     t = np.linspace(0.1, 0.9, 23)
     c = system.coefficients.taylor(t, structure.mu)
     (one, first), (other, second) = by_both(
-        lambda: derivative_array._judged(t, c, structure.mu, structure.scaling, 1e-10, False)
+        lambda: structures._judged(t, c, structure.mu, structure.scaling, 1e-10, False)
     )
     assert (first is None) == (second is None)
     assert (one.a, one.failure) == (other.a, other.failure)
@@ -176,7 +171,7 @@ def alone(E, A):
 def test_what_is_wrong_at_one_time_is_said_of_that_time(where):
     E, A = np.zeros((10, 2, 2)) + np.diag([1.0, 0.0]), np.zeros((10, 2, 2)) + np.eye(2)
     A[where, 1, 1] = 0.0
-    one, other = by_both(lambda: derivative_array._judged(
+    one, other = by_both(lambda: structures._judged(
         np.arange(10.0), alone(E, A), 0, balance(alone(E, A)), 1e-10, False
     ))
     assert one[1] is other[1] is None
@@ -246,7 +241,7 @@ def test_the_same_equations(drawn, count):
     structure = outcome(system)
     assume(isinstance(structure, Structure))
     t = np.linspace(0.0, 1.0, count)
-    one, other = by_both(lambda: reduce(system, structure, t, t))
+    one, other = by_both(lambda: strangeness_free_form(system, structure, t, t))
     assert_same_equations(one, other)
 
 
@@ -268,7 +263,7 @@ def test_the_same_equations_of_published_problems(path):
     if isinstance(structure, str):
         return
     t = np.linspace(*data["tspan"], 101)
-    one, other = by_both(lambda: reduce(system, structure, t, t))
+    one, other = by_both(lambda: strangeness_free_form(system, structure, t, t))
     assert_same_equations(one, other)
     np.testing.assert_allclose(
         *by_both(lambda: consistent_state(one, system.initial_state + 0.3)), atol=1e-12
@@ -277,14 +272,19 @@ def test_the_same_equations_of_published_problems(path):
 
 def test_small_plants_need_no_lapack(monkeypatch):
     """What the kernels leave to NumPy they leave to it everywhere; so they must not, here."""
-    for name in ("_levels", "_all_levels", "_by_elimination", "forcing", "_inverse"):
-        monkeypatch.setattr(derivative_array, name, None)
+    for module, name in (
+        (structures, "_levels"), (structures, "_all_levels"),
+        (strangeness_free, "_by_elimination"), (strangeness_free, "forcing"),
+        (strangeness_free, "inverse_or_none"),
+    ):
+        monkeypatch.setattr(module, name, None)
     monkeypatch.setattr(np.linalg, "svd", None)
     for path in FILES:
         data, system = problem(path)
         structure = outcome(system, *data["tspan"])
         if isinstance(structure, Structure):
-            reduced = reduce(system, structure, np.zeros(3) + data["tspan"][0], np.zeros(3))
+            t = np.zeros(3) + data["tspan"][0]
+            reduced = strangeness_free_form(system, structure, t, t)
             assert np.isfinite(consistent_state(reduced, system.initial_state)).all()
 
 
@@ -292,13 +292,15 @@ def test_large_plants_use_lapack(monkeypatch):
     system = random_system(8, 3, [2, 1])
     expected = outcome(system)
     assert isinstance(expected, Structure)
-    monkeypatch.setattr(derivative_array, "_SMALL", 5)
+    monkeypatch.setattr(structures, "SMALL", 5)
+    monkeypatch.setattr(strangeness_free, "SMALL", 5)
     monkeypatch.setattr(consistency, "_SMALL", 5)
     monkeypatch.setattr(kernels, "compiled", Without("start", "all_levels", "levels", "reduced"))
     structure = outcome(system)
     assert_same_structure(structure, expected)
     t = np.linspace(0, 1, 9)
-    assert np.isfinite(consistent_state(reduce(system, structure, t, t), np.ones(6))).all()
+    reduced = strangeness_free_form(system, structure, t, t)
+    assert np.isfinite(consistent_state(reduced, np.ones(6))).all()
 
 
 class Without:
@@ -323,7 +325,7 @@ def test_times_at_which_the_pivots_will_not_do():
     structure = outcome(system, 0.0, 0.9)
     assert isinstance(structure, Structure)
     for t in (np.linspace(-0.12, 0.88, 51), np.linspace(-0.021, -0.0201, 20)):
-        one, other = by_both(lambda t=t: reduce(system, structure, t, t))
+        one, other = by_both(lambda t=t: strangeness_free_form(system, structure, t, t))
         assert_same_equations(one, other)
         x, E, f = one.offset, one.E, np.einsum("nij,nj->ni", np.ones((len(t), 2, 1)), one.u)
         lost = np.linalg.svd(E)[0][:, :, 1:]
@@ -364,7 +366,7 @@ def test_dips(seed, count, infinite):
     values = np.round(10.0 ** rng.uniform(-4, 0, (count, 3)), 3)
     if infinite:
         values[:, rng.integers(3)] = np.inf
-    one, other = by_both(lambda: derivative_array._dips(values))
+    one, other = by_both(lambda: structures._dips(values))
     assert one[0] == other[0]
     # Equal ones may come in any order, and the last of them may be another.
     assert [(c, values[k, c]) for c, k in one[1]] == [(c, values[k, c]) for c, k in other[1]]
@@ -376,7 +378,7 @@ def test_consistent_states(seed, d, blocks):
     system = random_system(seed, d, blocks)
     structure = outcome(system)
     assume(isinstance(structure, Structure))
-    reduced = reduce(system, structure, np.array([0.2, 0.4]), np.array([0.2, 0.4]))
+    reduced = strangeness_free_form(system, structure, np.array([0.2, 0.4]), np.array([0.2, 0.4]))
     x0 = np.random.default_rng(seed).normal(size=system.n)
     one, other = by_both(lambda: consistent_state(reduced, x0))
     size = np.abs(other).max()
@@ -415,7 +417,7 @@ def test_a_consistent_state_of_dependent_constraints_is_left_to_singular_values(
 def test_growth_in_closed_form(seed, d, count):
     matrices = np.random.default_rng(seed).normal(size=(count, d, d))
     expected = np.linalg.eigvals(matrices).real.max(axis=1)
-    found = derivative_array._largest_real_parts(matrices)
+    found = structures._largest_real_parts(matrices)
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
@@ -433,7 +435,7 @@ def test_singular_values(seed, n, mu, lost):
     for a in range(n + 1):
         for column in range(3):
             one, other = by_both(
-                lambda a=a, k=column: derivative_array._line(t, c, mu, plain, 1e-10, a, k)
+                lambda a=a, k=column: structures._line(t, c, mu, plain, 1e-10, a, k)
             )
             if column == 0:
                 known = other > 1e-6  # else the left kernel is not, and its constraints are not
@@ -545,13 +547,17 @@ def test_matrices_may_lie_anywhere(monkeypatch):
     assert not isinstance(structure.reference, Bases)
     t = np.linspace(0, 1, 21)
     c = system.coefficients.taylor(t, structure.mu)
-    expected = reduce(system, structure, t, t, c)
-    monkeypatch.setattr(derivative_array, "forcing", None)  # nor a reason to leave it to NumPy
+    expected = strangeness_free_form(system, structure, t, t, c)
+    monkeypatch.setattr(strangeness_free, "forcing", None)  # nor a reason to leave it to NumPy
     turned = {name: np.asfortranarray(value) for name, value in c._asdict().items()}
-    assert_same_equations(reduce(system, structure, t, t, Coefficients(**turned)), expected)
+    assert_same_equations(
+        strangeness_free_form(system, structure, t, t, Coefficients(**turned)), expected
+    )
     twice = {name: np.repeat(value, 2, axis=1)[:, ::2] for name, value in c._asdict().items()}
-    assert_same_equations(reduce(system, structure, t, t, Coefficients(**twice)), expected)
+    assert_same_equations(
+        strangeness_free_form(system, structure, t, t, Coefficients(**twice)), expected
+    )
     back = {name: value[:, ::-1].copy()[:, ::-1] for name, value in c._asdict().items()}
     assert_same_equations(
-        reduce(system, replace(structure), t, t, Coefficients(**back)), expected
+        strangeness_free_form(system, replace(structure), t, t, Coefficients(**back)), expected
     )

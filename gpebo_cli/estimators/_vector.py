@@ -9,7 +9,7 @@ import numpy as np
 
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import with_realisations
@@ -55,7 +55,7 @@ class VectorLaw:
         E = np.zeros((1, p + k, p + k))
         E[0, :p, :p] = np.eye(p)
 
-        def coefficients(t: Array, inside: Array) -> Coefficients:
+        def coefficients(t: Array, inside: Array) -> LinearEquation:
             signals = packed(t, inside)
             A = np.zeros((len(t), p + k, p + k))
             A[:, :p, p:] = gains[:, None] * np.swapaxes(signals[:, :, :p], 1, 2)
@@ -66,7 +66,7 @@ class VectorLaw:
             if self.dynamics is not None:
                 A[:, :p, :p] = self.dynamics.A(t, inside)
                 f[:, :p] = self.dynamics.b(t, inside)[:, :, None]
-            return Coefficients(E, A, f)
+            return LinearEquation(E, A, f)
 
         first = packed.values[0, 0]
         residual = first[:, 2 * p :] - (first[:, p : 2 * p] @ start)[:, None]

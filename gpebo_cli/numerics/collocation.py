@@ -48,7 +48,7 @@ class Constraints(NamedTuple):
     offset: Array  # (N, n, columns)
 
 
-class Coefficients(NamedTuple):
+class LinearEquation(NamedTuple):
     """The equation at N times; a leading axis of 1 means constant in time.
 
     With ``constraints``, E, A and f are the d differential equations only.
@@ -105,7 +105,7 @@ class LinearProblem:
     (K, s + 1, c), size below which that kind is rounding).
     """
 
-    coefficients: Callable[[Array, Array], Coefficients]
+    coefficients: Callable[[Array, Array], LinearEquation]
     start: Array  # (n, columns)
     monitor: Monitor | None = None
     name: str = "equation"
@@ -141,7 +141,7 @@ def solve(
     tol: float,
     max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None,
-    known: Coefficients | None = None,
+    known: LinearEquation | None = None,
 ) -> LinearSolution:
     """Solve on ``mesh``, refined until every signal is resolved to ``tol``.
 
@@ -324,7 +324,7 @@ def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArra
 
 def _element_maps(
     problem: LinearProblem, mesh: Mesh, elements: BoolArray | None,
-    known: Coefficients | None = None,
+    known: LinearEquation | None = None,
 ) -> _ElementMaps:
     """Solve the block systems of some elements, None: all, in chunks of bounded memory."""
     n, columns = problem.start.shape
@@ -359,7 +359,7 @@ def _element_maps(
     return _ElementMaps(whole[0], whole[1], tuple(whole[2:]))
 
 
-def _is_constant(c: Coefficients) -> bool:
+def _is_constant(c: LinearEquation) -> bool:
     """Whether everything but the forcing is constant in time."""
     matrices = [c.A] if c.E is None else [c.A, c.E]
     if c.constraints is not None:
@@ -367,13 +367,13 @@ def _is_constant(c: Coefficients) -> bool:
     return all(len(matrix) == 1 for matrix in matrices)
 
 
-def _at_points(c: Coefficients, part: slice) -> Coefficients:
+def _at_points(c: LinearEquation, part: slice) -> LinearEquation:
     """The coefficients at some of their times."""
 
     def some(values: Array) -> Array:
         return values if len(values) == 1 else values[part]
 
-    return Coefficients(
+    return LinearEquation(
         None if c.E is None else some(c.E), some(c.A), some(c.f), tuple(map(some, c.extras)),
         None if c.constraints is None else Constraints(*map(some, c.constraints)),
     )
@@ -394,7 +394,7 @@ def _at_nodes(values: Array, k: int, s: int) -> Array:
 
 
 def _solve_elements(
-    problem: LinearProblem, rule: RadauRule, h: Array, t: Array, c: Coefficients
+    problem: LinearProblem, rule: RadauRule, h: Array, t: Array, c: LinearEquation
 ) -> _ElementMaps:
     k, s = len(h), rule.stages
     n = len(problem.start)
@@ -419,7 +419,7 @@ def _solve_elements(
     return _ElementMaps(from_left, particular, extras)
 
 
-def _is_small_system(c: Coefficients, s: int, n: int) -> bool:
+def _is_small_system(c: LinearEquation, s: int, n: int) -> bool:
     """Whether the kernel is faster."""
     return (
         s * c.A.shape[1] <= _SMALL_SYSTEM
@@ -428,7 +428,7 @@ def _is_small_system(c: Coefficients, s: int, n: int) -> bool:
     )
 
 
-def _solve_small_elements(rule: RadauRule, h: Array, c: Coefficients) -> tuple[Array, Array]:
+def _solve_small_elements(rule: RadauRule, h: Array, c: LinearEquation) -> tuple[Array, Array]:
     """:func:`_solve_equal_elements` or :func:`_solve_distinct_elements` in C, times T, plus p."""
     basis, offset = (None, None) if c.constraints is None else c.constraints
     solved: tuple[Array, Array] | None = kernels.compiled.element_maps(  # type: ignore[union-attr]
@@ -439,7 +439,7 @@ def _solve_small_elements(rule: RadauRule, h: Array, c: Coefficients) -> tuple[A
     return solved
 
 
-def _forcing(rule: RadauRule, h: Array, c: Coefficients) -> Array:
+def _forcing(rule: RadauRule, h: Array, c: LinearEquation) -> Array:
     """What drives z at the nodes, f + A p − E (D p)/h, shape (k, s, d, columns)."""
     k, s = len(h), rule.stages
     f = _at_nodes(c.f, k, s)
@@ -453,7 +453,7 @@ def _forcing(rule: RadauRule, h: Array, c: Coefficients) -> Array:
     return np.asarray(f + _at_nodes(c.A, k, s) @ p - slope)
 
 
-def _solve_distinct_elements(rule: RadauRule, h: Array, c: Coefficients, n: int) -> Array:
+def _solve_distinct_elements(rule: RadauRule, h: Array, c: LinearEquation, n: int) -> Array:
     """Block systems (D_ij/h E_i T_j − δ_ij A_i T_i) z_j = …, one factorisation per element.
 
     Returns:
@@ -490,7 +490,7 @@ def _solve_distinct_elements(rule: RadauRule, h: Array, c: Coefficients, n: int)
 
 
 def _solve_equal_elements(
-    rule: RadauRule, h: Array, c: Coefficients, n: int
+    rule: RadauRule, h: Array, c: LinearEquation, n: int
 ) -> tuple[Array, Array]:
     """With constant E, A and T, elements of one length share one factorisation.
 

@@ -6,12 +6,13 @@ singular value: a one-column product of size 1e-17 has rank 0, not 1.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from math import prod
 
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 
 # Rows of matrices, up to which LAPACK's calls cost more than what they compute: by elimination, and
 # where singular values are wanted.
@@ -31,6 +32,26 @@ def joined(*parts: Array, axis: int) -> Array:
         [p if len(p) == count else np.broadcast_to(p, (count, *p.shape[1:])) for p in parts],
         axis=axis,
     )
+
+
+def frobenius_norm(matrix: Array) -> Array:
+    """Frobenius norms (N,) of matrices (N, i, j), at least the smallest positive number."""
+    return np.asarray(np.sqrt(np.einsum("nij,nij->n", matrix, matrix)) + np.finfo(float).tiny)
+
+
+def inverse_or_none(whole: Array) -> tuple[Array, BoolArray]:
+    """Inverses (N, n, n), and at which of the N there is none."""
+    try:
+        inverse = np.asarray(np.linalg.inv(whole), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(whole, np.inf)
+        for k, one in enumerate(whole):
+            with suppress(np.linalg.LinAlgError):
+                inverse[k] = np.linalg.inv(one)
+    finite = np.isfinite(inverse)
+    if finite.all():
+        return inverse, np.zeros(len(inverse), dtype=bool)
+    return inverse, np.asarray(~finite.all(axis=(1, 2)))
 
 
 def orthonormal_complement(basis: Array) -> Array:

@@ -29,7 +29,7 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.extension import initial_extension, output_scale
 from gpebo_cli.observers.observation import (
@@ -125,13 +125,13 @@ def observe(
     xi_a0 = initial_extension(settings, system, names)
     start = np.concatenate([xi_a0[:, None], np.zeros((n_a, q)), np.eye(n_a)], axis=1)
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
         b = canonical_blocks(system, t, inside)
         f_a = np.einsum("nij,nj->ni", b.B[:, :n_a], inputs(t, inside))
         rest = np.zeros((len(t), n_a, n_a))
         f = np.concatenate([f_a[:, :, None], b.F_a, rest], axis=2)
         seen = (b.C[:, suitable, :n_a], outputs(t, inside)[:, suitable])
-        return Coefficients(None, b.A_a, f, seen)
+        return LinearEquation(None, b.A_a, f, seen)
 
     def regress(values: Array, C: Array, y: Array) -> tuple[Array, Array]:
         """Y and ψ of Proposition 3 at the points of the mesh."""
@@ -399,7 +399,7 @@ def transition_decay(M: Trajectory) -> float:
     The values of M have shape (K, s + 1, 2, 2).
     """
     problem = LinearProblem(
-        lambda t, inside: Coefficients(None, M(t, inside), np.zeros((1, 2, 2))),
+        lambda t, inside: LinearEquation(None, M(t, inside), np.zeros((1, 2, 2))),
         np.eye(2),
         name="M_w",
     )
@@ -460,7 +460,7 @@ def estimate_zb(zb: UnknownInputObserver, t: Array, za: Array) -> Array:
         mesh, zb.from_y.values[..., None] * y_w[:, :, None, :] + zb.forcing.values[..., None]
     )
     problem = LinearProblem(
-        lambda t, inside: Coefficients(None, zb.M(t, inside), driven(t, inside)),
+        lambda t, inside: LinearEquation(None, zb.M(t, inside), driven(t, inside)),
         np.repeat(zb.start[:, None], g, axis=1),
         name="observer of z_b",
     )

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers.gpebo import assumptions
 from gpebo_cli.observers.observation import AffineStateMap, Observation
@@ -64,7 +64,7 @@ def observe(
     identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
     p = q + k
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
         o = reduced.matrices(t, inside)
         signals = reduced.signals(t, inside)
         A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
@@ -73,7 +73,7 @@ def observe(
         zero = np.zeros((1, 1, 1))
         kernel = np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n))
         seen = (*o.equations(signals), A, b, kernel)
-        return Coefficients(None, zero, np.zeros((len(t), 1, 1)), seen)
+        return LinearEquation(None, zero, np.zeros((len(t), 1, 1)), seen)
 
     def assembled(extras: tuple[Array, ...]) -> tuple[Assembled, Array, Array]:
         flat = [e.reshape(e.shape[0] * e.shape[1], *e.shape[2:]) for e in extras]

@@ -34,7 +34,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.gpebo import observe_reduced
@@ -121,14 +121,14 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     parts = np.clip(np.ceil(mesh.steps * speed / _PER_ELEMENT), 1, _MOST_PARTS).astype(np.intp)
     mesh, _ = mesh.split(parts)
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
         o = reduced.matrices(t, inside)
         A = np.broadcast_to(o.dynamics, (len(t), n, n))
         c = o.residual @ o.algebraic @ basis / size
         H = np.empty((len(t), 2 * n, 2 * n))
         H[:, :n, :n], H[:, :n, n:] = -transpose(A), transpose(c) @ c
         H[:, n:, :n], H[:, n:, n:] = kappa**2 * (basis.T @ o.projector @ basis), A
-        return Coefficients(None, H, np.zeros((len(t), 2 * n, n)))
+        return LinearEquation(None, H, np.zeros((len(t), 2 * n, n)))
 
     def again(reached: Array) -> Array:
         return np.concatenate([np.eye(n), _quotient(reached)])

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 
@@ -63,9 +63,9 @@ def window_gramians(
         SolverError: the tolerance cannot be reached.
     """
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
         A, W = model(t, inside)
-        return Coefficients(None, A, np.zeros((len(A), n, n)), (W,))
+        return LinearEquation(None, A, np.zeros((len(A), n, n)), (W,))
 
     def products(values: Array, extras: tuple[Array, ...]) -> Array:
         return np.asarray(transpose(values) @ extras[0] @ values)

@@ -23,7 +23,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.extension import initial_extension
@@ -246,8 +246,8 @@ def growth_times(reduced: ReducedSystem) -> Array:
     d = basis.shape[1]
     eye = np.eye(d)
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
-        return Coefficients(
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
+        return LinearEquation(
             None, reduced.matrices(t, inside).dynamics, np.zeros((len(t), d, d))
         )
 

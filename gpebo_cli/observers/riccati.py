@@ -31,7 +31,7 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, Monitor, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, Monitor, solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 
@@ -197,11 +197,11 @@ def run_filter(
             "noise"
         )
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
         m, extras = model(t, inside)
         scaled = m._replace(Q=m.Q / variance, N=m.N / variance, V=m.V / variance)
         H, f = hamiltonian(scaled)
-        return Coefficients(None, H, f, extras)
+        return LinearEquation(None, H, f, extras)
 
     def signals(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
         P, estimate = quotient(values)

@@ -18,7 +18,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.extension import initial_extension
@@ -104,12 +104,12 @@ class SampledObserver:
         signals = np.concatenate([np.append(state.u, state.y)[None], np.hstack([u, y])])
         signal = held(times, signals, self.hold)
 
-        def coefficients(at: Array, inside: Array) -> Coefficients:
+        def coefficients(at: Array, inside: Array) -> LinearEquation:
             o = self._matrices(at, inside)
             f = np.zeros((len(at), *self.start.shape))
             f[:, :, :1] = o.from_signals @ signal(at, inside)[:, :, None]
             f[:, :, 1 : 1 + self.system.q] = o.from_unknowns
-            return Coefficients(None, o.dynamics, f)
+            return LinearEquation(None, o.dynamics, f)
 
         cuts = self.system.coefficients.breakpoints(float(times[0]), float(times[-1]))
         solution = solve(

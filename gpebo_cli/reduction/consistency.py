@@ -15,7 +15,8 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.reduction.derivative_array import StrangenessFree, Structure, reduce
+from gpebo_cli.reduction.strangeness_free import StrangenessFree, strangeness_free_form
+from gpebo_cli.reduction.structure import Structure
 
 _UNMOVED = 32 * float(np.finfo(float).eps)  # what moves by less, relatively, has not moved
 _PLAIN = 1e-8  # pivots above this, relatively, need no singular values
@@ -80,7 +81,7 @@ def jump(
     mu, n = structure.mu, system.n
     now = np.array([t])
     after = system.coefficients.taylor(now, max(mu, 1), now + width)
-    reduced = reduce(system, structure, now, now + width)
+    reduced = strangeness_free_form(system, structure, now, now + width)
     levels = mu + 1
     blocks = np.zeros((levels, n, levels, n))
     for j in range(levels):

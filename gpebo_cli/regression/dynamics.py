@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 
@@ -49,21 +49,21 @@ def filtered(
     eye = np.eye(p)
     decay = np.diag(rates + dynamics.forgetting)
 
-    def of_omega(t: Array, inside: Array) -> Coefficients:
+    def of_omega(t: Array, inside: Array) -> LinearEquation:
         A = dynamics.A(t, inside)
         left = -(decay + transpose(A))
         M = np.einsum("nij,kl->nikjl", left, eye) - np.einsum("ij,nlk->nikjl", eye, A)
         f = gains[:, None] * outer(t, inside)[..., :p]
-        return Coefficients(None, M.reshape(-1, p * p, p * p), f.reshape(-1, p * p, 1))
+        return LinearEquation(None, M.reshape(-1, p * p, p * p), f.reshape(-1, p * p, 1))
 
     problem = LinearProblem(of_omega, start[:, :p].reshape(-1, 1), name="filter of the regressor")
     omega = solve(problem, outer.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
 
-    def of_rhs(t: Array, inside: Array) -> Coefficients:
+    def of_rhs(t: Array, inside: Array) -> LinearEquation:
         sampled = omega(t, inside)[..., 0].reshape(-1, p, p)
         f = np.einsum("nij,nj->ni", sampled, dynamics.b(t, inside))
         f = f + gains * outer(t, inside)[..., p]
-        return Coefficients(None, -(decay + transpose(dynamics.A(t, inside))), f[..., None])
+        return LinearEquation(None, -(decay + transpose(dynamics.A(t, inside))), f[..., None])
 
     # From the mesh of Ω on: in one of its elements Ω is a polynomial.
     problem = LinearProblem(of_rhs, start[:, p:], name="filter of the regression")

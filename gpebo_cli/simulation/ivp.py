@@ -21,7 +21,8 @@ from gpebo_cli.numerics.collocation import (
     unresolved_signals,
 )
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.reduction.derivative_array import Structure, derivative_array, forcing, scaled
+from gpebo_cli.reduction.derivative_array import derivative_array, forcing, scaled
+from gpebo_cli.reduction.structure import Structure
 
 _MAX_ROUNDS = 12
 

@@ -11,11 +11,17 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
-from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.model.descriptor import Coefficients as ModelCoefficients
-from gpebo_cli.numerics.collocation import (
+from gpebo_cli.model.descriptor import (
+    MATRIX_NAMES,
+    Array,
+    BoolArray,
     Coefficients,
+    DescriptorSystem,
+    IntArray,
+)
+from gpebo_cli.numerics.collocation import (
     Constraints,
+    LinearEquation,
     LinearProblem,
     LinearSolution,
     solve,
@@ -24,7 +30,8 @@ from gpebo_cli.numerics.collocation import (
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
-from gpebo_cli.reduction.derivative_array import StrangenessFree, Structure, analyse, reduce
+from gpebo_cli.reduction.strangeness_free import StrangenessFree, strangeness_free_form
+from gpebo_cli.reduction.structure import Structure, analyse
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 
@@ -80,7 +87,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
     mesh, c = _known_resolved(system, structure, mesh, cuts, solver)
-    first = reduce(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
+    first = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
     x0 = _initial_state(system, first)
 
     happened: dict[float, tuple[Array, Jump]] = {}
@@ -88,8 +95,8 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     for cut in map(float, cuts):
         restarts[cut] = _restart(system, structure, cut, _width(mesh.edges, cut), happened)
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
-        return _equations(reduce(system, structure, t, inside))
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
+        return _equations(strangeness_free_form(system, structure, t, inside))
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
         u, C = extras
@@ -126,7 +133,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
 def _known_resolved(
     system: DescriptorSystem, structure: Structure, mesh: Mesh, cuts: Array,
     solver: SolverSettings,
-) -> tuple[Mesh, ModelCoefficients]:
+) -> tuple[Mesh, Coefficients]:
     """The mesh that the known functions ask for, and all of them at its points.
 
     Elements are cut until the inputs are resolved, as far as cutting helps: the solution's mesh
@@ -135,7 +142,7 @@ def _known_resolved(
     are joined again: what is narrow has been looked for on the short ones. But not where the state
     may grow or decay much within one of them: an element that does not resolve growth may hide it.
     """
-    def evaluated(mesh: Mesh) -> ModelCoefficients:
+    def evaluated(mesh: Mesh) -> Coefficients:
         return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
 
     longest = _SHORT / max(structure.rate, _TINY)
@@ -174,7 +181,7 @@ def _known_resolved(
 
 
 def _overlooked(
-    system: DescriptorSystem, c: ModelCoefficients, mesh: Mesh, tol: float
+    system: DescriptorSystem, c: Coefficients, mesh: Mesh, tol: float
 ) -> BoolArray:
     """Elements (K,) with something narrow between their nodes, a pulse of an input for instance.
 
@@ -236,7 +243,7 @@ def _growth_resolved(structure: Structure, mesh: Mesh, solver: SolverSettings) -
 
 
 def _known_kinds(
-    system: DescriptorSystem, c: ModelCoefficients, mesh: Mesh
+    system: DescriptorSystem, c: Coefficients, mesh: Mesh
 ) -> tuple[Array, IntArray]:
     """Every function of the model with its derivatives, (K, s + 1, c), and how many of each kind.
 
@@ -267,14 +274,14 @@ def _known_kinds(
     return values, np.array([kind.shape[2] for kind in kinds], dtype=np.intp)
 
 
-def _equations(reduced: StrangenessFree) -> Coefficients:
+def _equations(reduced: StrangenessFree) -> LinearEquation:
     """The strangeness-free equations in the form that the collocation takes."""
     extras = (reduced.u, reduced.C)
     f1 = reduced.f1[:, :, None]
     if reduced.basis is None or reduced.offset is None:
-        return Coefficients(reduced.E1, reduced.A1, f1, extras)
+        return LinearEquation(reduced.E1, reduced.A1, f1, extras)
     constraints = Constraints(reduced.basis, reduced.offset[:, :, None])
-    return Coefficients(reduced.E1, reduced.A1, f1, extras, constraints)
+    return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints)
 
 
 def _initial_state(system: DescriptorSystem, reduced: StrangenessFree) -> Array:
@@ -325,10 +332,10 @@ def _integrate(
 ) -> LinearSolution:
     """The independent path: the underlying ODE of the derivative array, by scipy."""
 
-    def explicit(t: Array, inside: Array) -> Coefficients:
+    def explicit(t: Array, inside: Array) -> LinearEquation:
         A, f = ivp.underlying_ode(system, structure, t, inside)
         c = system.coefficients.taylor(t, 0, inside)
-        return Coefficients(None, A, f[:, :, None], (c.u[0], c.C[0]))
+        return LinearEquation(None, A, f[:, :, None], (c.u[0], c.C[0]))
 
     ode = LinearProblem(
         explicit, problem.start, problem.monitor, problem.name, problem.floor

@@ -9,7 +9,7 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, LinearSolution, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.extension import output_scale
 from gpebo_cli.observers.observation import largest_entry, log_norm
@@ -134,14 +134,14 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     system, solver, basis = reduced.system, reduced.solver, reduced.basis
     q, n_a = system.q, reduced.rank
 
-    def equations(o: ObserverMatrices, u: Array, y: Array) -> Coefficients:
+    def equations(o: ObserverMatrices, u: Array, y: Array) -> LinearEquation:
         f, g_y = _driven(o, u, y, 1 + q + n_a)
         seen = AlgebraicEquations(
             o.on_basis, g_y, o.G, o.range, o.elimination, o.injectivity
         )
-        return Coefficients(None, o.dynamics, f, seen)
+        return LinearEquation(None, o.dynamics, f, seen)
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
         u, y = reduced.inputs(t, inside), reduced.outputs(t, inside)
         return equations(reduced.matrices(t, inside), u, y)
 

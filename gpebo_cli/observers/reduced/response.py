@@ -8,7 +8,7 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
 
@@ -38,11 +38,11 @@ def respond(
     """
     errors = Trajectory(mesh, np.concatenate([e_u, e_y], axis=2))
 
-    def coefficients(t: Array, inside: Array) -> Coefficients:
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
         o, e = matrices(t, inside), errors(t, inside)
         R = o.residual[:, kept]
         seen = (R @ o.algebraic @ o.split.basis, (R @ o.g_signals) @ e)
-        return Coefficients(None, o.dynamics, o.from_signals @ e, seen)
+        return LinearEquation(None, o.dynamics, o.from_signals @ e, seen)
 
     size = matrices(mesh.edges[:1], mesh.inside[0, :1]).split.basis.shape[1]
     start = np.zeros((size, e_y.shape[-1]))

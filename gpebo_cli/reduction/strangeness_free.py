@@ -1,0 +1,224 @@
+"""The strangeness-free equations at many times, once the structure is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli import kernels
+from gpebo_cli.errors import ModelError
+from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem
+from gpebo_cli.numerics.linalg import frobenius_norm, inverse_or_none, transpose
+from gpebo_cli.reduction.derivative_array import SMALL, derivative_array, forcing, scaled, who
+from gpebo_cli.reduction.structure import RESIDUAL, Bases, Pivots, Structure
+
+_MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
+_LOOKS = 32  # times at which the sensitivity to rounding is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class StrangenessFree:
+    """E1 x' = A1 x + f1 (d rows) and 0 = A2 x + f2 (a rows) at N times.
+
+    Where there are constraints, the consistent states are x = T z + offset with z = E1 x. The
+    matrices have a leading axis of 1 when E and A are constant.
+    """
+
+    E1: Array  # (N or 1, d, n)
+    A1: Array  # (N or 1, d, n)
+    f1: Array  # (N, d)
+    A2: Array  # (N or 1, a, n)
+    f2: Array  # (N, a)
+    basis: Array | None  # (N, n, d) T, of the kernel of A2, with E1 T = I; None if a = 0
+    offset: Array | None  # (N, n)
+    # By how much relative rounding of each state and of f2 reaches each state through the
+    # constraints, the most at some of the times.
+    amplification: Array  # (n, n + 1)
+    E: Array  # (N, n, n) the model's own
+    u: Array  # (N, m) the inputs and
+    C: Array  # (N, r, n) the output matrix at the same times
+
+
+def strangeness_free_form(
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array,
+    c: Coefficients | None = None,
+) -> StrangenessFree:
+    """The strangeness-free equations at the times t (N,), one sweep over all of them.
+
+    ``c`` are the model's coefficients there to the order μ, where they are at hand.
+
+    Elimination on the pivots of one reference time where that is well conditioned, singular
+    vectors at the times where it is not.
+
+    Raises:
+        ModelError: a rank differs from that of ``structure``; names the time.
+    """
+    mu, scaling = structure.mu, structure.scaling
+    if c is None:
+        c = system.coefficients.taylor(t, mu, inside)
+    if kernels.compiled is not None and (mu + 1) * system.n <= SMALL:
+        found = _reduced_compiled(structure, len(t), c)
+        if found is not None:
+            return found
+    f = forcing(c)
+    count = slice(0, 1) if structure.time_invariant else slice(None)
+    E, A = c.E[:, count], c.A[:, count]
+    e, aa = scaled(Coefficients(E, A, c.B, c.F, c.C, c.u, c.theta), scaling)
+    M, N = derivative_array(e, aa, mu)
+    # [Â2 | f2] = Z2ᵀ [N | g] with g = (f_0, …, f_μ)
+    weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
+    g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
+    reference = structure.reference
+    some = slice(0, None, _every(len(t)))
+    if isinstance(reference, Bases):
+        Z1 = reference.Z1
+        A2, f2 = transpose(reference.Z2) @ N, transpose(reference.Z2) @ g
+        size = np.abs(transpose(reference.Z2)) @ np.abs(np.concatenate(
+            [np.broadcast_to(N, (len(g), *N.shape[1:]))[some], g[some]], axis=2
+        ))
+        inverse, poor = inverse_or_none(np.concatenate([transpose(Z1) @ e[0], A2], axis=1))
+    else:
+        Z1, A2, f2, size, inverse, poor = _by_elimination(reference, e[0], M, N, g, some)
+        if poor.any():
+            Z1 = np.repeat(Z1, len(t), axis=0)
+            Z1[poor], Z2 = _by_singular_vectors(
+                system, structure, e[0][poor], M[poor], N[poor], t[poor]
+            )
+            A2[poor], f2[poor] = transpose(Z2) @ N[poor], transpose(Z2) @ g[poor]
+            # What the elimination made grow there is not used, and amplifies nothing.
+            looked = np.arange(len(t))[some]
+            again = poor[looked]
+            terms = np.abs(np.concatenate([N[poor], g[poor]], axis=2))
+            size[again] = (np.abs(transpose(Z2)) @ terms)[(np.cumsum(poor) - 1)[looked[again]]]
+            whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
+            inverse[poor], poor[poor] = inverse_or_none(whole)
+    if poor.any():
+        raise ModelError(
+            f"{who(system)}: the equations do not determine the state near "
+            f"t = {t[int(np.argmax(poor))]:.9g}"
+        )
+    # Back to the model's own states: only rows stay scaled, and row scalings do not matter.
+    W1 = transpose(Z1) * scaling.rows
+    inverse = scaling.columns[:, None] * inverse
+    d = structure.d
+    sensitivity = np.abs(inverse[some if len(inverse) > 1 else slice(None), :, d:])
+    amplification = (sensitivity @ size).max(axis=0)
+    amplification[:, :-1] /= scaling.columns
+    return StrangenessFree(
+        E1=W1 @ E[0],
+        A1=W1 @ A[0],
+        f1=_apply(W1, f[0]),
+        A2=A2 / scaling.columns,
+        f2=f2[:, :, 0],
+        basis=inverse[:, :, :d] / scaling.time if structure.a else None,  # the scaled E is E/τ
+        offset=-(inverse[:, :, d:] @ f2)[:, :, 0] if structure.a else None,
+        amplification=amplification,
+        E=E[0],
+        u=c.u[0],
+        C=c.C[0],
+    )
+
+
+def _every(count: int) -> int:
+    """At every how many of so many times the sensitivity to rounding is looked at."""
+    return max(1, count // _LOOKS)
+
+
+def _reduced_compiled(
+    structure: Structure, count: int, c: Coefficients
+) -> StrangenessFree | None:
+    """:func:`strangeness_free_form`; None where the reference will not do at some time."""
+    compiled: Any = kernels.compiled
+    s, reference, E = structure.scaling, structure.reference, c.E[0]
+    model = (c.E, c.A, s.rows, s.columns, s.time, structure.mu, c.B, c.F, c.u, c.theta)
+    if isinstance(reference, Bases):
+        E = E[:1]
+        found = compiled.reduced_constant(*model, reference.Z1, reference.Z2, _every(count))
+    else:
+        found = compiled.reduced(
+            *model, reference.rows, reference.columns, reference.rank, reference.Z1,
+            _every(count), _MAX_GROWTH, RESIDUAL,
+        )
+    known, E1, A1, f1, A2, f2, basis, offset, amplification = found
+    if not known[0]:
+        return None
+    if not structure.a:
+        basis = offset = None
+    return StrangenessFree(
+        E1, A1, f1, A2, f2, basis, offset, amplification, E, c.u[0], c.C[0]
+    )
+
+
+def _by_elimination(
+    pivots: Pivots, E: Array, M: Array, N: Array, g: Array, some: slice
+) -> tuple[Array, Array, Array, Array, Array, BoolArray]:
+    """Z1 (1, n, d), Â2 (N, a, n), f2 (N, a, 1) on the reference pivots, [Z1ᵀE; Â2]⁻¹.
+
+    Before the inverse, the size of the terms of [Â2 | f2] at ``some`` times; the last one says
+    where the pivots will not do.
+    """
+    count, n, r = len(M), E.shape[1], pivots.rank
+    right = np.concatenate([N, g], axis=2)[:, pivots.rows]
+    poor = np.zeros(count, dtype=bool)
+    if r < len(pivots.rows):
+        M = M[:, pivots.rows[:, None], pivots.columns]
+        try:
+            X = transpose(np.asarray(
+                np.linalg.solve(transpose(M[:, :r, :r]), transpose(M[:, r:, :r])),
+                dtype=np.float64,
+            ))
+        except np.linalg.LinAlgError:
+            everywhere = np.ones(count, dtype=bool)
+            left = right[:, r:]
+            size = np.abs(left[some])
+            A2, f2 = left[:, :, :n], left[:, :, n:]
+            return pivots.Z1[None], A2, f2, size, np.zeros_like(E), everywhere
+        residual = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:])
+        poor = (residual > RESIDUAL * frobenius_norm(M)) | (frobenius_norm(X) > _MAX_GROWTH)
+        constraints = right[:, r:] - X @ right[:, :r]
+        size = np.abs(right[some, r:]) + np.abs(X[some]) @ np.abs(right[some, :r])
+    else:
+        constraints = right[:, r:]
+        size = np.abs(constraints[some])
+    A2 = constraints[:, :, :n]
+    whole = np.concatenate([pivots.Z1.T @ E, A2], axis=1)
+    scale = np.maximum(np.abs(whole).max(axis=2), np.finfo(float).tiny)
+    inverse, singular = inverse_or_none(whole / scale[:, :, None])
+    poor |= singular | (frobenius_norm(inverse) > _MAX_GROWTH)
+    return pivots.Z1[None], A2, constraints[:, :, n:], size, inverse / scale[:, None, :], poor
+
+
+def _by_singular_vectors(
+    system: DescriptorSystem, structure: Structure, E: Array, M: Array, N: Array, t: Array
+) -> tuple[Array, Array]:
+    """Orthonormal Z1 and Z2 at times where the reference pivots will not do."""
+    a = structure.a
+    r = M.shape[1] - a
+    U, sigma, _ = np.linalg.svd(M)
+    _check_gap(system, structure, sigma, r, t)
+    Z2 = U[:, :, r:]
+    T2 = transpose(np.linalg.svd(transpose(Z2) @ N)[2])[:, :, a:]
+    return np.linalg.svd(E @ T2, full_matrices=False)[0], Z2
+
+
+def _apply(matrix: Array, vectors: Array) -> Array:
+    """matrix (N or 1, i, j) times vectors (N, j)."""
+    return np.asarray(np.matmul(matrix, vectors[:, :, None])[:, :, 0])
+
+
+def _check_gap(
+    system: DescriptorSystem, structure: Structure, sigma: Array, r: int, t: Array
+) -> None:
+    size = sigma[:, 0]
+    zero = sigma[:, r:].max(axis=1, initial=0.0) > 1e3 * structure.rank_tol * size
+    lost = sigma[:, r - 1] <= structure.rank_tol * size if r else np.zeros(len(sigma), bool)
+    bad = zero | lost
+    if bad.any():
+        k = int(np.argmax(bad))
+        value = sigma[k, r] if zero[k] else sigma[k, r - 1]
+        raise ModelError(
+            f"{who(system)}: the rank of the derivative array changes near t = {t[k]:.9g} "
+            f"(singular value {value / size[k]:.1e}); choose a horizon that avoids this time"
+        )
