@@ -20,11 +20,9 @@ from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, quotient_of, spectrum
-from gpebo_cli.experiment.pipeline import run_experiment
-from gpebo_cli.experiment.sampled import SampledRun
-from gpebo_cli.experiment.stream import Stream
+from gpebo_cli.experiment.online import Online
+from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.recordings.table import Samples
 from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import DataSettings, ObserverSettings, Settings, TimeSettings
@@ -136,8 +134,8 @@ def test_it_does_not_matter_how_samples_are_grouped():
     u, y = signals(system, t)
     for name in ("ls_drem", "least_squares", "drem"):
         settings = Settings(plant={}, estimator={"name": name})
-        whole = SampledRun(settings, system, "linear", t[0]).feed(t, u, y)
-        parts = SampledRun(settings, system, "linear", t[0])
+        whole = Online(settings, system, "linear", t[0]).feed(t, u, y)
+        parts = Online(settings, system, "linear", t[0])
         cuts = [0, 1, 2, 9, 40, 60]
         made = [
             parts.feed(t[a:b], u[a:b], y[a:b]) for a, b in pairwise(cuts)
@@ -151,11 +149,11 @@ def test_what_is_remembered_does_not_grow():
     system = shipped("circuit")
     t = np.arange(0.0, 4.0, 0.01)
     u, y = signals(system, t)
-    stream = SampledRun(Settings(plant={}, estimator={"name": "ls_drem"}), system, "zoh", 0.0)
+    online = Online(Settings(plant={}, estimator={"name": "ls_drem"}), system, "zoh", 0.0)
     sizes = []
     for part in (slice(0, 100), slice(100, 200), slice(200, 400)):
-        stream.feed(t[part], u[part], y[part])
-        kept = {k: v for k, v in vars(stream).items() if k not in ("_system", "_observer")}
+        online.feed(t[part], u[part], y[part])
+        kept = {k: v for k, v in vars(online).items() if k not in ("_system", "_observer")}
         sizes.append(len(pickle.dumps(kept)))
     assert max(sizes) < 1.1 * min(sizes)
 
@@ -288,15 +286,13 @@ STREAM = Settings(
 )
 def test_what_a_stream_cannot_do(changes, part):
     with pytest.raises(ConfigError, match=part):
-        Stream(replace(STREAM, **changes), shipped("circuit"))
+        stream(replace(STREAM, **changes), shipped("circuit"))
 
 
 def test_a_stream_has_one_case():
-    stream = Stream(replace(STREAM, estimator={"name": "drem", "gamma": [1, 2]}),
-                    shipped("circuit"))
-    row = Samples(np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 6)))
+    several = replace(STREAM, estimator={"name": "drem", "gamma": [1, 2]})
     with pytest.raises(ConfigError, match="2 cases"):
-        stream.feed(row)
+        stream(several, shipped("circuit"))
 
 
 # Streams as processes -------------------------------------------------------------------------

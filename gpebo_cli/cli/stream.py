@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment.stream import Stream
+from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.recordings.table import LineReader, samples
 from gpebo_cli.settings import Settings
@@ -31,29 +31,31 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
         ConfigError: a row is wrong, or there is none; estimates of the rows before it are out.
         ModelError: an assumption fails.
     """
-    stream = Stream(settings, system)
+    begin, online = stream(settings, system), None
     reader = LineReader(_SOURCE, system)
-    started = False
     while True:
         piece = os.read(0, _PIECE)
         rows, wrong = reader.feed(piece, last=not piece)
         if rows and reader.header is not None:
-            table = stream.feed(samples(reader.header, np.array(rows), system))
-            _write(_text(table) if started else _line(stream.columns) + _text(table))
-            started = True
+            came = samples(reader.header, np.array(rows), system)
+            head = ""
+            if online is None:
+                online = begin(float(came.t[0]))
+                names = [f"{name}_hat" for name in (*online.parameters, *system.states)]
+                head = ",".join(["t", *names, "lambda_min"]) + "\n"
+            made = online.feed(came.t, came.inputs, came.outputs)
+            estimates = np.hstack([made.parameters[0], made.states[0]])
+            table = np.column_stack([came.t, estimates, made.gram_eigenvalues[:, :1]])
+            _write(head + _text(table))
         if wrong:
             raise ConfigError(wrong)
         if not piece:
             break
-    if not started:
+    if online is None:
         what = "is empty" if reader.header is None else "has no rows below its header"
         raise ConfigError(f"{_SOURCE} {what}")
-    sys.stderr.write(f"{stream.verdict}\n")
+    sys.stderr.write(f"{stream_verdict(online)}\n")
     return 0
-
-
-def _line(names: list[str]) -> str:
-    return ",".join(names) + "\n"
 
 
 def _text(table: Array) -> str:

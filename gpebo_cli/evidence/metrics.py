@@ -27,6 +27,25 @@ class Metrics:
     rms_error_states: Array  # (G,)
 
 
+def measure(t: Array, parameter_error: Array, state_error: Array) -> Metrics:
+    """Metrics of errors (G, M, p) and (G, M, n) at the times t (M,).
+
+    Over what the observer sees and what is known of the truth; NaN where that is nothing.
+    """
+    out = np.full((5, len(parameter_error)), np.nan)
+    known = ~np.isnan(parameter_error[0, -1])
+    if known.any() or not known.size:
+        norm = np.linalg.norm(parameter_error[..., known], axis=2)
+        out[0] = settling_time(t, norm)
+        out[2] = np.abs(parameter_error[:, -1, known]).max(axis=1, initial=0.0)
+    known = ~np.isnan(state_error[0, -1])
+    if known.any():
+        norm = np.linalg.norm(state_error[..., known], axis=2)
+        out[1], out[4] = settling_time(t, norm), time_rms(t, norm)
+        out[3] = np.abs(state_error[:, -1, known]).max(axis=1)
+    return Metrics(*out)
+
+
 def settling_time(t: Array, error: Array, fraction: float = SETTLED) -> Array:
     """Time after which a nonnegative error stays below a fraction of its initial value.
 

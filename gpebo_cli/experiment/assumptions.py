@@ -12,11 +12,11 @@ import numpy as np
 
 from gpebo_cli.errors import GpeboError, ModelError
 from gpebo_cli.evidence.excitation import Excitation, assess
-from gpebo_cli.experiment.noise import NoiseLevels, noise_levels
+from gpebo_cli.experiment.noise import NoiseLevels, noise_levels, signal_noise
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers import observe, signal_noise
+from gpebo_cli.observers import observe
 from gpebo_cli.recordings.load import load
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Simulation, simulate

@@ -27,6 +27,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.observers import SignalNoise
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings
 from gpebo_cli.simulation.simulate import Signals
@@ -80,6 +81,12 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
         per_name(settings.inputs, inputs, "input", "noise.inputs", absent=0.0),
         per_name(settings.quantisation, outputs, "output", "noise.quantisation", absent=0.0),
     )
+
+
+def signal_noise(settings: NoiseSettings, levels: NoiseLevels) -> SignalNoise:
+    """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12."""
+    outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
+    return SignalNoise(levels.inputs, outputs, settings.sample_time)
 
 
 @dataclass(frozen=True, eq=False)

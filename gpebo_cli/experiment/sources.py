@@ -9,14 +9,14 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.assumptions import of_simulation
-from gpebo_cli.experiment.noise import NoiseLevels, check_samples, measure
+from gpebo_cli.experiment.noise import NoiseLevels, check_samples, measure, noise_levels
 from gpebo_cli.experiment.result import RecordingResult, SimulationResult, StateChange
 from gpebo_cli.experiment.verdict import simulation_verdict
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.recordings.load import Recording, load
-from gpebo_cli.settings import Settings, TimeSettings
+from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
 
 _MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
@@ -70,7 +70,7 @@ def simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels)
     )
 
 
-def recorded(settings: Settings, system: DescriptorSystem) -> Source:
+def recorded(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) -> Source:  # noqa: ARG001  a source like the other
     """Signals of a recording; nobody knows what θ was when it was made.
 
     Raises:
@@ -86,31 +86,52 @@ def recorded(settings: Settings, system: DescriptorSystem) -> Source:
     )
 
 
-def check_noise(settings: Settings, levels: NoiseLevels) -> None:
-    """Refuse noise on a recording, and more samples of noise than elements.
-
-    Raises:
-        ConfigError: says what is possible.
-    """
-    if levels.silent:
-        return
-    if settings.data.name == "csv":
-        raise ConfigError("noise is for simulations; a recording (data=csv) has its own")
-    check_samples(settings.time.horizon, settings.noise.sample_time, settings.solver.max_elements)
-
-
-def check_time(time: TimeSettings) -> None:
-    """Refuse a span or a grid of a simulation that is none.
+def check(settings: Settings, levels: NoiseLevels) -> None:
+    """Refuse what no source can give: noise on a recording, a span or a grid that is none, ….
 
     Raises:
         ConfigError: names the key and what it may be.
     """
+    time, recorded = settings.time, settings.data.name == "csv"
+    if recorded and settings.observer.name == "none":
+        raise ConfigError(
+            "observer=none simulates the plant, and data=csv does not; choose one of them"
+        )
+    if recorded and not levels.silent:
+        raise ConfigError("noise is for simulations; a recording (data=csv) has its own")
+    if not levels.silent:
+        check_samples(time.horizon, settings.noise.sample_time, settings.solver.max_elements)
+    if recorded:
+        return
     if not (np.isfinite(time.horizon) and time.horizon > 0):
         raise ConfigError(f"time.horizon must be a positive number of seconds, got {time.horizon}")
     if not np.isfinite(time.start):
         raise ConfigError(f"time.start must be a finite time, got {time.start}")
     if time.samples < 2:
         raise ConfigError(f"time.samples must be at least 2, got {time.samples}")
+
+
+def check_stream(settings: Settings, system: DescriptorSystem) -> None:
+    """Refuse what would need to know how a recording goes on: its rows come one after the other.
+
+    Raises:
+        ConfigError: names the key and what it may be.
+    """
+    if not noise_levels(settings.noise, system).silent:
+        raise ConfigError("noise is for simulations; what is streamed has its own")
+    if settings.data.hold == "cubic":
+        raise ConfigError(
+            "data.hold=cubic needs to know the samples to come; a stream takes zoh or linear"
+        )
+    if settings.observer.sample_time is not None:
+        raise ConfigError(
+            "observer.sample_time: the rows of a stream are the samples; leave it null"
+        )
+    if np.isfinite([settings.time.start, settings.time.horizon]).any():
+        raise ConfigError(
+            "a stream begins with its first row and ends with its last; leave time.start and "
+            "time.horizon null"
+        )
 
 
 def _grid(settings: Settings, start: float, stop: float) -> Array:

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isfinite
 
 import numpy as np
 
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
-from gpebo_cli.experiment.result import EstimationResult, Fit, SimulationResult
+from gpebo_cli.experiment.result import Fit, SimulationResult
+from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 
 
 def verdict(
-    excitation: Excitation, estimation: EstimationResult, metrics: Metrics, fit: Fit | None = None
+    excitation: Excitation, cases: Sequence[Mapping[str, float]], requirement: Requirement,
+    metrics: Metrics | None = None, fit: Fit | None = None,
 ) -> str:
     """The last line: exciting or not and from when on, and how well the state is known.
 
     Without true states: how well the estimates explain the data.
     """
     if excitation.is_ie:
+        since = "" if excitation.t_c is None else f" from t = {excitation.t_c:.4g} s on"
         first = (
-            f"interval-exciting from t = {excitation.t_c:.4g} s on "
+            f"interval-exciting{since} "
             f"(λ_min(G) = {excitation.lambda_min:.3g} at the end, ρ = {excitation.rho:.2g})"
         )
     else:
@@ -31,9 +34,8 @@ def verdict(
             f"{excitation.rho:.2g}; not excited: {excitation.weakest_direction}"
         )
     parts = [first]
-    judged = _best_case(metrics)
-    if judged is not None:
-        best = judged
+    best = None if metrics is None else _best_case(metrics)
+    if metrics is not None and best is not None:
         seconds = metrics.seconds_to_1pct_states[best]
         reached = f"below 1 % after {seconds:.4g} s" if isfinite(seconds) else "never below 1 %"
         parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end, {reached}")
@@ -46,10 +48,10 @@ def verdict(
             f"|Y − ψη̂| with the final estimates is {fit.residual[best]:.2g}, |Y| is "
             f"{fit.size:.2g} (root mean squares)"
         )
-    label = _case_label(estimation.cases[best])
+    label = _case_label(cases[best])
     line = "; ".join(parts) + (f" ({label})" if label else "")
-    if not estimation.requirement.holds:
-        line += f"; {estimation.requirement.name} not met: {estimation.requirement.text}"
+    if not requirement.holds:
+        line += f"; {requirement.name} not met: {requirement.text}"
     return line
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment.noise import NoiseLevels
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import canonical, current, gpebo, injection, kalman_bucy, resets
@@ -13,7 +12,7 @@ from gpebo_cli.observers.kalman_bucy import SignalNoise
 from gpebo_cli.observers.observation import Observation, StateMap
 from gpebo_cli.settings import NoiseSettings, ObserverSettings, SolverSettings
 
-__all__ = ["Observation", "SignalNoise", "StateMap", "check_remedy", "observe", "signal_noise"]
+__all__ = ["Observation", "SignalNoise", "StateMap", "check_remedy", "observe"]
 
 _OBSERVERS = {"gpebo": gpebo.observe, "canonical": canonical.observe}
 _REMEDIES = {
@@ -28,12 +27,6 @@ _KEYS = {
     "injection": "output_injection", "reset_interval": "reset", "reset_times": "reset",
     "reset_keep": "reset",
 }
-
-
-def signal_noise(settings: NoiseSettings, levels: NoiseLevels) -> SignalNoise:
-    """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12."""
-    outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
-    return SignalNoise(levels.inputs, outputs, settings.sample_time)
 
 
 def observe(
