@@ -7,8 +7,6 @@ from collections.abc import Callable
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
-from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.linear import LinearRegression
 
 Row = Callable[[np.ndarray], np.ndarray]  # times (…) -> ψ (…, p)
@@ -19,14 +17,12 @@ def regression(
     disturbance: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> LinearRegression:
     """One-row regression Y = ψη (+ disturbance) on a uniform mesh."""
-    mesh: Mesh = initial_mesh(0.0, horizon, [], elements, radau_rule(9))
-    rows = psi(mesh.points)
-    Y = rows @ eta
-    if disturbance is not None:
-        Y = Y + disturbance(mesh.points)
-    names = tuple(f"p{i + 1}" for i in range(len(eta)))
-    return LinearRegression(
-        Trajectory(mesh, Y[..., None]), Trajectory(mesh, rows[..., None, :]), names, 2.0
+    def Y(t: np.ndarray) -> np.ndarray:
+        return (psi(t) @ eta + (0.0 if disturbance is None else disturbance(t)))[..., None]
+
+    names = [f"p{i + 1}" for i in range(len(eta))]
+    return LinearRegression.from_functions(
+        lambda t: psi(t)[..., None, :], Y, names, horizon, elements
     )
 
 

@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ import yaml
 from examples import ROOT, blocks, commands, gpebo, python, shell
 
 from gpebo_cli import __all__ as public
-from gpebo_cli import __version__
+from gpebo_cli import __version__, estimators
 from gpebo_cli.cli import usage
 from gpebo_cli.cli.app import COMMANDS
 
@@ -92,6 +93,18 @@ def test_the_plant_page_runs(tmp_path):
     (source,) = blocks(text, "python")
     (shown,) = blocks(text, "text")
     assert python(source, tmp_path) == shown
+
+
+def test_the_estimator_page_runs(tmp_path):
+    text = (ROOT / "docs" / "howto" / "estimator.md").read_text()
+    (script,) = blocks(text, "sh")
+    module = f"exec {shlex.quote(sys.executable)} -m pytest -p no:xdist"
+    assert "3 passed" in shell(script.replace("python -m pytest", module), tmp_path)
+    (shown,) = blocks(text, "python")
+    assert shown == (tmp_path / "ridge" / "ridge.py").read_text()
+    for name in set(re.findall(r"`(\w+)`", text.partition("## What there is")[2])):
+        if re.match(r"[A-Z]\w+[a-z]", name):
+            assert name in estimators.__all__, name
 
 
 def test_the_notebook_runs_and_its_outputs_are_real(tmp_path):

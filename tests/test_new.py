@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
+import tomllib
+
 import pytest
 import yaml
-from examples import ROOT, gpebo
+from examples import ROOT, gpebo, shell
 
 from gpebo_cli.cli.check import _ADVICE
-from gpebo_cli.cli.new import TEMPLATE
+from gpebo_cli.cli.new import files
 from gpebo_cli.model.plant import KEYS
 
 
@@ -35,8 +39,24 @@ def test_it_can_be_written_elsewhere(tmp_path):
     assert "--config-dir 'my models' plant=tank" in done.stdout
 
 
+def test_an_estimator_passes_its_test_and_is_found_once_it_is_installed(tmp_path):
+    done = gpebo("new", "estimator", "two_words", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    written = done.stdout.splitlines()[:4]
+    assert written == [
+        "two_words.py", "estimator/two_words.yaml", "test_two_words.py", "pyproject.toml",
+    ]
+    assert "3 passed" in shell(f"{shlex.quote(sys.executable)} -m pytest -q -p no:xdist", tmp_path)
+    assert "class TwoWords(GainEstimator)" in (tmp_path / "two_words.py").read_text()
+    entry = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]["entry-points"]
+    assert entry == {"gpebo.estimators": {"two_words": "two_words:TwoWords"}}
+    again = gpebo("new", "estimator", "two_words", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "two_words.py exists already" in again.stderr
+
+
 def test_every_key_is_explained():
-    assert set(yaml.safe_load(TEMPLATE.format(name="a", folder="."))) == set(KEYS)
+    assert set(yaml.safe_load(files("plant", "a")["plant/a.yaml"])) == set(KEYS)
 
 
 @pytest.mark.parametrize(
@@ -51,9 +71,12 @@ def test_every_key_is_explained():
         (["plant"], "needs one name, as in gpebo new plant tank; got none"),
         (["plant", "a", "b"], "got 'a', 'b'"),
         (["plnt", "a"], "did you mean plant?"),
-        ([], "known: plant, as in gpebo new plant tank"),
+        ([], "known: plant, estimator, as in gpebo new plant tank"),
         (["plant", "a", "--confg-dir", "b"], "did you mean --config-dir?"),
         (["plant", "a", "--config-dir"], "--config-dir needs a folder"),
+        (["estimator", "ls_drem"], "ls_drem comes with gpebo"),
+        (["estimator", "a-b"], "a-b cannot be the name of a Python module"),
+        (["estimator", "random"], "random cannot be the name of a Python module"),
     ],
 )
 def test_what_it_refuses(tmp_path, words, expected):
@@ -92,7 +115,7 @@ MISTAKES = [
 def test_check_says_what_to_fix(tmp_path, right, wrong, code, expected):
     (tmp_path / "plant").mkdir()
     path = tmp_path / "plant" / "tank.yaml"
-    text = TEMPLATE.format(name="tank", folder=".")
+    text = files("plant", "tank")["plant/tank.yaml"]
     assert right in text
     path.write_text(text.replace(right, wrong, 1))
     done = gpebo("check", "--config-dir", ".", "plant=tank", cwd=tmp_path)

@@ -1,7 +1,8 @@
-"""``gpebo new plant NAME``: a commented plant file that runs as it stands."""
+"""``gpebo new KIND NAME``: commented files that run, or pass their test, as they stand."""
 
 from __future__ import annotations
 
+import keyword
 import os
 import re
 import shlex
@@ -13,61 +14,21 @@ from gpebo_cli.cli.options import CONFIG_DIR, parse
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.schema import nearest, shown
 
-KINDS = ("plant",)
+_PACKAGE = {"{name}.py": "{kind}.py", "{kind}/{name}.yaml": "{kind}.yaml",
+            "test_{name}.py": "test_{kind}.py", "pyproject.toml": "pyproject.toml"}
+KINDS = {"plant": {"plant/{name}.yaml": "plant.yaml"}, "estimator": _PACKAGE}
+"""For each kind the files that are written, and the template of each."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,79}")
 _WORDS = ("null", "true", "false", "yes", "no", "on", "off", "nan", "inf")  # mean more in YAML
-
-TEMPLATE = """\
-# A plant is data: text that gpebo reads and never executes.
-#
-#   E(t) x' = A(t) x + B(t) u(t) + F(t) θ,    y = C(t) x
-#
-# This one is an example that runs as it stands. Change it a line at a time, and ask
-#
-#   gpebo check --config-dir {folder} plant={name}
-#
-# what holds and what does not. An entry is a number or an expression in t (seconds) and in the
-# parameters:   + - * / **   sin cos tan exp log sqrt sinh cosh tanh abs sign   pi
-# d(a) is the derivative of a in time, step(t - 3) is 0 before t = 3 and 1 from then on.
-
-name: {name}
-title: heated tank, an unknown loss of heat      # shown by gpebo list plants
-reference: null                                  # where the model is from
-
-# (Cap T)' = q + loss        the tank's temperature T: stored heat changes by what comes in
-#        0 = -k T - q + P    the heat q that reaches the tank: no derivative, so an algebraic state
-#        y = T + q/2         what is measured
-parameters:                     # known; each may use t and those above it
-  k: 0.8
-  Cap: 2 + 0.5*sin(t/2)
-states: [T, q]                  # E and A have one row and one column for each
-inputs:                         # known signals; B has a column for each
-  P: 3 + 2*sin(t)
-unknowns:                       # θ, constant, to be estimated; F has a column for each.
-  loss: -0.4                    # The value is the truth, which only the simulation gets to see
-outputs: [y]                    # C has a row for each
-
-E:                              # (Cap T)' = Cap T' + Cap' T, the last term goes into A
-  - [Cap, 0]
-  - [0, 0]                      # a row of zeros: an algebraic equation
-A:
-  - [-d(Cap), 1]
-  - [-k, -1]
-B:
-  - [0]
-  - [1]
-F:
-  - [1]
-  - [0]
-C:
-  - [1, 0.5]
-
-initial_state: {{T: 1, q: 0}}     # q need not be right: gpebo finds the consistent one and says so
-
-units: {{T: K, q: W, P: W, loss: W, y: K}}         # labels of figures
-observer_defaults:
-  xi_a0: {{T: 0}}                 # where the observer starts; it does not know T(0)
+_RUNS = """\
+it runs as it stands:      gpebo run --config-dir {folder} {kind}={name}
+when you have changed it:  gpebo check --config-dir {folder} {kind}={name}
+"""
+_INSTALLED = """\
+its test passes as it stands:       python -m pytest {folder}
+to use it, install it, then run it: pip install -e {folder}
+                                    gpebo run --config-dir {folder} {kind}={name}
 """
 
 
@@ -84,20 +45,33 @@ def main(words: list[str]) -> int:
         sys.stdout.write(NEW_HELP)
         return 0
     kind, name, folder = _parse(words)
-    path = Path(folder, kind, f"{name}.yaml")
-    _check_name(kind, name, path)
+    paths = {Path(folder, path): text for path, text in files(kind, name, folder).items()}
+    _check_name(kind, name, list(paths))
 
     from gpebo_cli.results.files import make_folder, write_text
 
-    make_folder(path.parent)
-    where = shlex.quote(folder)
-    write_text(path, TEMPLATE.format(name=name, folder=where))
-    sys.stdout.write(
-        f"{path}\n"
-        f"it runs as it stands:      gpebo run --config-dir {where} {kind}={name}\n"
-        f"when you have changed it:  gpebo check --config-dir {where} {kind}={name}\n"
-    )
+    for path, text in paths.items():
+        make_folder(path.parent)
+        write_text(path, text)
+        sys.stdout.write(f"{path}\n")
+    said = _RUNS if len(paths) == 1 else _INSTALLED
+    sys.stdout.write(said.format(folder=shlex.quote(folder), kind=kind, name=name))
     return 0
+
+
+def files(kind: str, name: str, folder: str = ".") -> dict[str, str]:
+    """The text of every file that is written, by its path below the folder."""
+    classname = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
+    words = {"mine": name, "Mine": classname, "KIND": kind, "FOLDER": shlex.quote(folder)}
+    pattern = re.compile(rf"\b({'|'.join(words)})(?=\b|s\b)")
+    home = Path(__file__).parent / "templates"
+    return {
+        path.format(kind=kind, name=name): pattern.sub(
+            lambda match: words[match[1]],
+            (home / template.format(kind=kind)).read_text(encoding="utf-8"),
+        )
+        for path, template in KINDS[kind].items()
+    }
 
 
 def _parse(words: list[str]) -> tuple[str, str, str]:
@@ -118,16 +92,25 @@ def _parse(words: list[str]) -> tuple[str, str, str]:
     return given[0], given[1].removesuffix(".yaml"), os.path.expanduser(options.config_dir or ".")
 
 
-def _check_name(kind: str, name: str, path: Path) -> None:
+def _check_name(kind: str, name: str, paths: list[Path]) -> None:
     if not _NAME.fullmatch(name) or name.lower() in _WORDS:
         raise ConfigError(
             f"gpebo new {kind}: {shown(name)} cannot be a name; it is a letter, then letters, "
             f"digits, _ and - (80 at most), and none of {', '.join(_WORDS)}"
+        )
+    module = len(paths) > 1
+    taken = keyword.iskeyword(name) or name in sys.stdlib_module_names
+    if module and (taken or not name.isidentifier()):
+        raise ConfigError(
+            f"gpebo new {kind}: {name} cannot be the name of a Python module; it is a letter, then "
+            "letters, digits and _, and no word or module of Python's own"
         )
     if name in choices(conf_folder(), kind):
         raise ConfigError(
             f"gpebo new {kind}: {name} comes with gpebo, and yours would be ignored; choose "
             "another name"
         )
-    if path.exists() or path.is_symlink():
-        raise ConfigError(f"{path} exists already; remove it, or choose another name")
+    for path in paths:
+        if path.exists() or path.is_symlink():
+            where = "another folder (--config-dir)" if module else "another name"
+            raise ConfigError(f"{path} exists already; remove it, or choose {where}")

@@ -15,7 +15,7 @@ commands:
   compare DIR …       one table and figures over finished runs and sweeps
   figures [NAME …]    the paper's figures and tables, in outputs/paper
   list [KIND]         what there is: plants, observers, estimators, experiments
-  new plant NAME      a commented plant file of your own, which runs as it stands
+  new KIND NAME       a plant or an estimator of your own, commented, which works as it stands
   completion SHELL    completion of commands, groups and names for bash, zsh or fish
 
 options:
@@ -100,16 +100,20 @@ examples:
 """
 
 NEW_HELP = """\
-usage: gpebo new plant NAME [--config-dir DIR]
+usage: gpebo new {plant|estimator} NAME [--config-dir DIR]
 
-Writes DIR/plant/NAME.yaml, by default below the current folder: a plant with every key explained,
-which runs as it stands. Nothing that exists is overwritten.
+Writes below DIR, by default the current folder; nothing that exists is overwritten.
+
+  plant      DIR/plant/NAME.yaml: every key explained; it runs as it stands
+  estimator  DIR/NAME.py, its settings DIR/estimator/NAME.yaml, its test DIR/test_NAME.py, and
+             DIR/pyproject.toml, by which gpebo finds it once it is installed; the test passes
 
 examples:
   gpebo new plant tank
   gpebo run --config-dir . plant=tank
   gpebo new plant boiler --config-dir models
   gpebo check --config-dir models plant=boiler
+  gpebo new estimator ridge --config-dir ridge
 """
 
 COMPLETION_HELP = """\

@@ -23,6 +23,7 @@ from gpebo_cli.estimators._segments import estimate
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.estimator import (
     Estimates,
@@ -41,6 +42,7 @@ from gpebo_cli.schema import number, per_name
 
 __all__ = [
     "GROUP",
+    "Array",
     "Estimates",
     "Estimator",
     "ExtensionState",

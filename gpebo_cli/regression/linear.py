@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -11,7 +12,8 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
@@ -36,6 +38,24 @@ class LinearRegression:
     resets: tuple[Reset, ...] = ()  # at edges of the mesh, in the order of time
     floor: float = 0.0  # size below which parameters are rounding
     dynamics: Dynamics | None = None  # of parameters that move; then there are no resets
+
+    @classmethod
+    def from_functions(
+        cls, psi: Callable[[Array], Array], Y: Callable[[Array], Array],
+        parameters: Sequence[str], horizon: float, elements: int = 80,
+    ) -> LinearRegression:
+        """A regression whose ψ and Y are given as smooth functions of time, without a plant.
+
+        Args:
+            psi: times (K, s + 1) in seconds to ψ (K, s + 1, rows, p).
+            Y: the same times to Y (K, s + 1, rows).
+            parameters: p names.
+            horizon: it ends there; it starts at 0.
+            elements: of the mesh, on each of which ψ and Y are polynomials of degree 9.
+        """
+        mesh = initial_mesh(0.0, horizon, [], elements, radau_rule(9))
+        rows = Trajectory(mesh, psi(mesh.points))
+        return cls(Trajectory(mesh, Y(mesh.points)), rows, tuple(parameters), largest(rows.values))
 
     @property
     def mesh(self) -> Mesh:
