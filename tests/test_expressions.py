@@ -67,7 +67,8 @@ UNARY = st.sampled_from(
         "sin({})", "cos({})", "tanh({})", "exp(sin({}))", "log(2 + sin({}))", "sqrt(2 + cos({}))",
         "sinh(cos({}))", "cosh(sin({}))", "tan(0.5*sin({}))", "-({})", "+({})", "({})**2",
         "({})**3", "(2 + cos({}))**-1", "(2 + sin({}))**-3", "(2 + sin({}))**2.5", "2**sin({})",
-        "(2 - sin({}))**-0.5", "d({})", "1/(3 + cos({}))",
+        "(2 - sin({}))**-0.5", "d({})", "1/(3 + cos({}))", "asin(sin({})/2)", "acos(sin({})/2)",
+        "atan({})", "asinh({})", "acosh(2 + sin({}))", "atanh(sin({})/2)", "erf({})",
     ]
 )  # fmt: skip
 BINARY = st.sampled_from(
@@ -100,6 +101,7 @@ def test_random_expressions_agree_with_symbolic_differentiation(text: str, t: fl
         "2**-t", "t**3**2/100", "d(t**3)", "d(d(sin(t)*exp(t)))", "d(t*d(t*d(sin(t))))",
         "d(3*t + 1)*t", "d(p)*p", "1e-3*t", "t - t + 3", "log(exp(t))", "(t/2)**0.5", "p**0",
         "tanh(sin(t))", "d(tan(t/4))", "1/d(d(t**2))",
+        "asin(t)", "acos(t**2)", "atan(3*t)", "asinh(t - 2)", "acosh(1 + t)", "atanh(t)", "erf(t)",
         "(t/2 + 1)**1025/9e99", "(t + 0.3)**-1025",
     ],
 )  # fmt: skip
@@ -143,6 +145,41 @@ def test_long_arrays_are_evaluated_in_parts(monkeypatch: pytest.MonkeyPatch) -> 
     np.testing.assert_array_equal(taylor(expressions, t, 2, inside), whole)
 
 
+@pytest.mark.parametrize(
+    ("text", "side"),
+    [("min(t, 0.5)*t", "0.5*t"), ("max(sin(t), t**2)", "sin(t)"), ("min(cos(t), exp(t))", "cos(t)"),
+     ("max(t, max(1 + t**2, 0))", "1 + t**2")],
+)  # fmt: skip
+def test_derivatives_of_min_and_max_are_those_of_their_side(text: str, side: str) -> None:
+    want = derivatives(side, 0.7, 6)
+    np.testing.assert_allclose(derivatives(text, 0.7, 6), want, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("order", [0, 2])
+def test_min_and_max_take_the_side_that_is_asked_for(order: int) -> None:
+    texts = ["min(t, 1)", "max(1, t)", "min(sin(t), cos(t))"]
+    expressions = [read(text) for text in texts]
+    middle = math.pi / 4
+    cuts = breakpoints(expressions, 0.0, 2.0)
+    np.testing.assert_allclose(cuts, [middle, 1.0], rtol=1e-14)
+    t = np.array([1.0, 1.0, middle, middle])
+    values = taylor(expressions, t, order, t + np.array([-1e-3, 1e-3] * 2))
+    if order:
+        np.testing.assert_array_equal(values[1, :2, :2], [[1, 0], [0, 1]])
+        np.testing.assert_allclose(values[1, 2:, 2], [math.sqrt(0.5), -math.sqrt(0.5)])
+    np.testing.assert_array_equal(values[0, :2, :2], 1.0)
+
+
+def test_min_and_max_are_one_of_the_two_to_the_last_bit() -> None:
+    t = np.linspace(-3, 3, 1001)
+    low, high, a, b = taylor(
+        [read("min(1e9*t, sin(7*t))"), read("max(1e9*t, sin(7*t))"), read("1e9*t"),
+         read("sin(7*t)")], t, 0,
+    )[0].T  # fmt: skip
+    np.testing.assert_array_equal(low, np.minimum(a, b))
+    np.testing.assert_array_equal(high, np.maximum(a, b))
+
+
 # Constants
 
 
@@ -152,6 +189,8 @@ def test_long_arrays_are_evaluated_in_parts(monkeypatch: pytest.MonkeyPatch) -> 
         (3, 3.0), (-0.5, -0.5), ("3", 3.0), ("1e-3", 1e-3), ("-2**2", -4.0), ("2**3**2", 512.0),
         ("pi/2", math.pi / 2), ("sin(pi/6)", 0.5), ("2*(1 + 3)/4 - 1", 1.0), (" 1\n + 2 ", 3.0),
         ("d(7)", 0.0), ("d(2*t + 1)", 2.0), ("d(d(t))", 0.0), ("t - t + 3", 3.0), ("0*t", 0.0),
+        ("min(2, 3)", 2.0), ("max(2, 3)", 3.0), ("max(t, t + 2) - t", 2.0),
+        ("atan(1)", math.pi / 4),
         ("abs(-2)", 2.0), ("sign(-3)", -1.0), ("sign(0)", 0.0), ("log(exp(2))", 2.0),
         ("t**0", 1.0), ("0**0", 1.0), ("a*2", 6.0), ("sqrt(16)", 4.0), (Fraction(1, 4), 0.25),
         (np.int64(4), 4.0), (np.float32(0.5), 0.5), ("-(-(3))", 3.0), ("0x10", 16.0),

@@ -24,8 +24,11 @@ pytestmark = needs_kernels
 ATOMS = ["t", "2", "0.5", "pi", "-1", "step(t - 0.3)", "step(0.6 - t)"]
 UNARY = ["sin({})", "cos({})", "exp({})", "tanh({})", "sinh({})", "cosh({})", "-({})", "d({})",
          "abs({})", "sign({})", "log(3 + tanh({}))", "sqrt(2 + sin({}))", "tan(tanh({})/2)",
-         "(2 + cos({}))**-3", "(2 + cos({}))**1.7", "({})**3"]  # fmt: skip
-BINARY = ["({}) + ({})", "({}) - ({})", "({})*({})", "({})/(2 + sin({}))", "tanh({})*cos({})"]
+         "(2 + cos({}))**-3", "(2 + cos({}))**1.7", "({})**3", "asin(tanh({})/2)",
+         "acos(tanh({})/2)", "atan({})", "asinh({})", "acosh(2 + cos({}))", "atanh(cos({})/2)",
+         "erf({})"]  # fmt: skip
+BINARY = ["min({}, {})", "max({}, {})", "({}) + ({})", "({}) - ({})", "({})*({})",
+          "({})/(2 + sin({}))", "tanh({})*cos({})"]
 
 
 @st.composite
@@ -99,7 +102,8 @@ def test_sine_and_cosine_to_the_last_place(size):
 
 @pytest.mark.parametrize("text", [
     "1/t", "log(t)", "sqrt(t)", "1/(1 + exp(500*t))", "d(log(t))", "exp(exp(10*t))", "t**-2",
-    "abs(t)/t", "t**0.5", "sinh(800*t)", "sign(log(t))", "1e308*t*10", "log(t - abs(t) - 1)",
+    "asin(t)", "acosh(1 + t)", "atanh(t)", "abs(t)/t", "t**0.5",
+    "sinh(800*t)", "sign(log(t))", "1e308*t*10", "log(t - abs(t) - 1)",
 ])  # fmt: skip
 @pytest.mark.parametrize("order", [0, 1, 3])
 def test_what_is_refused_is_refused_with_the_same_words(text, order):
@@ -145,11 +149,12 @@ def test_the_kernel_is_what_evaluates_a_plant():
     coefficients = plant().coefficients
     t = np.linspace(0.0, 1.0, 5)
     assert coefficients._assembly.taylor(t, 2) is not None
-    assert COMPILED.jets(t, t, *coefficients._assembly._plan(2, apart=False)) is not None
+    none = np.zeros((0, 5))
+    assert COMPILED.jets(t, t, none, *coefficients._assembly._plan(2, apart=False)) is not None
 
 
 def test_jets_refuses_programs_that_lead_out_of_the_arrays():
-    t = np.zeros(3)
+    t, none = np.zeros(3), np.zeros((0, 3))
     good = list(plant().coefficients._assembly._plan(1, apart=False))
 
     def changed(place, index, value):
@@ -157,7 +162,7 @@ def test_jets_refuses_programs_that_lead_out_of_the_arrays():
         other[place][index] = value
         return other
 
-    assert COMPILED.jets(t, t, *good) is not None
+    assert COMPILED.jets(t, t, none, *good) is not None
     for place, index, value, what in [
         (0, (0, 0), 99, "operations: no such one as 99"),
         (0, (0, 1), 1, "rows: no such one as 1"),
@@ -166,21 +171,23 @@ def test_jets_refuses_programs_that_lead_out_of_the_arrays():
         (0, (0, 2), -50, "left operands"),
         (2, (0, 0), 50, "rows of results"),
         (2, (0, 0), -50, "rows of results"),
-        (3, (0, 0), 7, "matrices: no such one as 7"),
+        (3, (0, 0), 10, "matrices: no such one as 10"),
         (3, (0, 1), 9, "entries: no such one as"),
     ]:
         with pytest.raises(ValueError, match=what):
-            COMPILED.jets(t, t, *changed(place, index, value))
+            COMPILED.jets(t, t, none, *changed(place, index, value))
     with pytest.raises(ValueError, match="times: 3 and 2"):
-        COMPILED.jets(t, t[:2], *good)
+        COMPILED.jets(t, t[:2], none, *good)
+    with pytest.raises(ValueError, match="times of signals: 2 and 3"):
+        COMPILED.jets(t, t, np.zeros((1, 2)), *good)
     with pytest.raises(ValueError, match="orders of a matrix"):
-        COMPILED.jets(t, t, *good[:4], *(matrix[:1] for matrix in good[4:]))
+        COMPILED.jets(t, t, none, *good[:4], *(matrix[:1] for matrix in good[4:]))
     with pytest.raises(ValueError, match="times in a matrix"):
-        COMPILED.jets(t, t, *good[:4], *(np.repeat(matrix, 2, axis=1) for matrix in good[4:]))
+        COMPILED.jets(t, t, none, *good[:4], *(np.repeat(matrix, 2, axis=1) for matrix in good[4:]))
     with pytest.raises(TypeError, match="arguments, expected"):
-        COMPILED.jets(t, t, *good[:4])
-    with pytest.raises(TypeError, match="argument 6 must be an array"):
-        COMPILED.jets(t, t, *good[:4], None)
+        COMPILED.jets(t, t, none, *good[:4])
+    with pytest.raises(TypeError, match="argument 7 must be an array"):
+        COMPILED.jets(t, t, none, *good[:4], None)
 
 
 # --- the mesh ---

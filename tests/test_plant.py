@@ -97,7 +97,7 @@ def test_circuit_names_and_values() -> None:
     assert system.units["e2"] == system.units["V"] == "V"
     assert system.units["il"] == system.units["y"] == "A"
     assert system.observer_defaults == {"xi_a0": {"e1": 1, "e2": 0, "il": 0}}
-    assert system.coefficients.constant == {"B", "C", "F", "theta"}
+    assert system.coefficients.constant == {"B", "C", "F", "theta", "phi", "D", "H"}
     assert "2407.14373" in system.reference
 
 
@@ -167,10 +167,12 @@ def test_shapes_and_broadcast_constants() -> None:
     source: CoefficientSource = system.coefficients
     c = source.taylor(TIMES, 3)
     shapes = {"E": (2, 2), "A": (2, 2), "B": (2, 2), "F": (2, 1), "C": (1, 2), "u": (2,)}
-    shapes["theta"] = (1,)
+    shapes |= {"theta": (1,), "phi": (2,), "D": (1, 2), "H": (1, 1)}
     for key in MATRIX_NAMES:
         assert getattr(c, key).shape == (4, 5, *shapes[key])
-    assert source.constant == {"E", "F", "C", "theta"}
+    assert source.constant == {"E", "F", "C", "theta", "phi", "D", "H"}
+    assert source.zero == {"phi", "D", "H"}
+    assert not source.signals
     np.testing.assert_array_equal(c.C[:, 3], [[[1, 1.5]], [[0, 0]], [[0, 0]], [[0, 0]]])
     np.testing.assert_array_equal(c.B[:2, 2], [[[1, 0], [0, 1.7]], [[0, 0], [0, 1]]])
     np.testing.assert_allclose(c.A[0, :, 0, 0], -np.cos(TIMES), rtol=1e-15)
@@ -304,7 +306,28 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "parameter not defined": (lambda: mine(parameters={"k": "1/0"}), "parameters.k = '1/0'"),
     "matrix of a state": (lambda: mine(A=[["x1", 1], [0, 1]]), "A[0][0] = 'x1': x1 is a state"),
-    "matrix of an input": (lambda: mine(A=[[0, "V"], [0, 1]]), "A[0][1] = 'V': V is an input"),
+    "input in E": (
+        lambda: mine(E=[[1, "V"], [0, 1]]),
+        "E[0][1] = 'V': V is an input and may not stand in E: its derivative would be needed",
+    ),
+    "output in E": (
+        lambda: mine(parameters={"R": 1, "k": 2, "z": "1 + y"}, E=[["2*z", 0], [0, 1]]),
+        "E[0][0] = '2*z': y is an output and may not stand in E: its derivative would be needed",
+    ),
+    "output in C": (
+        lambda: mine(C=[["y", 1]]), "C[0][0] = 'y': y is an output and may not stand in C",
+    ),
+    "output in D": (lambda: mine(D=[["y", 1]]), "y is an output and may not stand in D"),
+    "signal in an input": (
+        lambda: mine(parameters={"k": "1 + y"}, inputs={"V": "k", "I": 1}),
+        "inputs.V = 'k': y is an output and may not stand in inputs.V",
+    ),
+    "d of a signal": (lambda: mine(A=[["d(V*t)", 0], [0, 1]]), "d(.) of something with V in it"),
+    "state in phi": (lambda: mine(phi=["x1", 0]), "phi[0] = 'x1': x1 is a state and cannot"),
+    "short phi": (lambda: mine(phi=[1]), "phi has 1 entry but there are 2 states (x1, x2)"),
+    "phi of text": (lambda: mine(phi="t"), "phi must be a list of 2 entries, one for each row"),
+    "wide D": (lambda: mine(D=[[1]]), "D has 1 column but there are 2 inputs (V, I)"),
+    "tall H": (lambda: mine(H=[[1], [2]]), "H has 2 rows but there is 1 output (y)"),
     "matrix of an unknown": (lambda: mine(A=[[0, 1], ["theta", 1]]), "theta is an unknown"),
     "input of an input": (lambda: mine(inputs={"V": 1, "I": "V"}), "inputs.I = 'V': V is an input"),
     "unknown of a state": (lambda: mine(unknowns={"a": "t + x1"}), "x1 is a state"),

@@ -28,7 +28,7 @@
 #endif
 
 /* Arguments of one call, and results under way: whatever happens, `release` gives all back. */
-#define MOST_HELD 32
+#define MOST_HELD 48
 typedef struct {
     PyObject *const *given; /* the arguments of the call */
     Py_ssize_t count;       /* how many */

@@ -4,9 +4,9 @@
 
 #include <fenv.h>
 
-#define MOST_MATRICES 8
+#define MOST_MATRICES 12
 #define MOST_AXES 8
-#define GIVEN 2 /* rows that the caller gives: t, inside */
+#define GIVEN 2 /* rows that are always given: t, inside; those of signals follow */
 #define REFUSED (FE_INVALID | FE_DIVBYZERO | FE_OVERFLOW)
 #define IN_CACHE ((npy_intp)1 << 14) /* numbers in all rows of a block */
 
@@ -28,6 +28,13 @@ enum {
     SINH,
     COSH,
     TANH,
+    ASIN,
+    ACOS,
+    ATAN,
+    ASINH,
+    ACOSH,
+    ATANH,
+    ERF,
     SIGN,
     OPERATIONS
 };
@@ -40,14 +47,18 @@ typedef struct {
 /* The rows of one block of times. */
 typedef struct {
     const double *given[GIVEN];
-    double *memory; /* rows GIVEN, GIVEN + 1, … of `length` numbers each */
+    const double *signals; /* rows GIVEN, … of `stride` numbers each, up to row `first` */
+    npy_intp stride, first;
+    double *memory; /* the rows from `first` on, of `length` numbers each */
     npy_intp length;
     const double *constants;
 } Rows;
 
 static inline const double *row_of(const Rows *rows, npy_intp index)
 {
-    return index < GIVEN ? rows->given[index] : rows->memory + (index - GIVEN) * rows->length;
+    if (index >= rows->first)
+        return rows->memory + (index - rows->first) * rows->length;
+    return index < GIVEN ? rows->given[index] : rows->signals + (index - GIVEN) * rows->stride;
 }
 
 /* z = x `op` y over a block, where either operand may be a constant. */
@@ -84,7 +95,7 @@ static inline const double *row_of(const Rows *rows, npy_intp index)
 EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, npy_intp count)
 {
     const npy_intp left = operation->left, right = operation->right;
-    double *restrict z = rows->memory + (operation->result - GIVEN) * rows->length;
+    double *restrict z = rows->memory + (operation->result - rows->first) * rows->length;
     switch (operation->what) {
     case ADD: BINARY(+); break;
     case SUBTRACT: BINARY(-); break;
@@ -102,6 +113,13 @@ EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, np
     case SINH: UNARY(sinh(x[i])); break;
     case COSH: UNARY(cosh(x[i])); break;
     case TANH: UNARY(tanh(x[i])); break;
+    case ASIN: UNARY(asin(x[i])); break;
+    case ACOS: UNARY(acos(x[i])); break;
+    case ATAN: UNARY(atan(x[i])); break;
+    case ASINH: UNARY(asinh(x[i])); break;
+    case ACOSH: UNARY(acosh(x[i])); break;
+    case ATANH: UNARY(atanh(x[i])); break;
+    case ERF: UNARY(erf(x[i])); break;
     default: UNARY(x[i] > 0.0 ? 1.0 : x[i] < 0.0 ? -1.0 : x[i] == 0.0 ? 0.0 : x[i]);
     }
 }
@@ -121,15 +139,15 @@ static int outside(const char *what, npy_intp value)
 
 /* How many rows the operations use, those given included; 0 with an exception if they are none
    that can be run. */
-static npy_intp rows_used(PyArrayObject *code, npy_intp constants)
+static npy_intp rows_used(PyArrayObject *code, npy_intp given, npy_intp constants)
 {
     const Operation *operation = PyArray_DATA(code);
-    npy_intp rows = GIVEN;
+    npy_intp rows = given;
     for (npy_intp k = 0; k < size(code, 0); k++, operation++) {
         const npy_intp what = operation->what, left = operation->left, right = operation->right;
         if (what < 0 || what >= OPERATIONS)
             return outside("operations", what);
-        if (operation->result < GIVEN || operation->result > rows)
+        if (operation->result < given || operation->result > rows)
             return outside("rows", operation->result);
         const int unary = what >= NEGATIVE, constant = what == POWER || what == GREATER_EQUAL;
         if (left >= rows || left < -constants || (left < 0 && (unary || constant || right < 0)))
@@ -221,8 +239,8 @@ static int scatter(const Rows *rows, npy_intp row, double *out, npy_intp stride,
     return finite;
 }
 
-/* jets(t (N,), inside (N,), code (operations, 4), constants (c,), results (orders, outputs),
-        targets (outputs, 2), matrix (orders, 1, …), …)
+/* jets(t (N,), inside (N,), signals (rows, N), code (operations, 4), constants (c,),
+        results (orders, outputs), targets (outputs, 2), matrix (orders, 1, …), …)
 
    Matrices (orders, N, …): each as it is given, the same at all times, but for the entries that
    the targets (matrix, entry) name; those are the outputs of the code, see
@@ -231,17 +249,19 @@ static int scatter(const Rows *rows, npy_intp row, double *out, npy_intp stride,
 static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
-    enum { FIRST = 6 };
+    enum { FIRST = 7 };
     Call call;
     const npy_intp matrices = count - FIRST;
     if (!begin(&call, given, count, matrices < 1 || matrices > MOST_MATRICES ? FIRST + 1 : count))
         return NULL;
     PyArrayObject *t = doubles(&call, 0, 1), *inside = t ? doubles(&call, 1, 1) : NULL;
-    PyArrayObject *code = inside ? indices(&call, 2, 2) : NULL;
-    PyArrayObject *constants = code ? doubles(&call, 3, 1) : NULL;
-    PyArrayObject *rows_of_results = constants ? indices(&call, 4, 2) : NULL;
-    PyArrayObject *targets = rows_of_results ? indices(&call, 5, 2) : NULL;
+    PyArrayObject *signals = inside ? doubles(&call, 2, 2) : NULL;
+    PyArrayObject *code = signals ? indices(&call, 3, 2) : NULL;
+    PyArrayObject *constants = code ? doubles(&call, 4, 1) : NULL;
+    PyArrayObject *rows_of_results = constants ? indices(&call, 5, 2) : NULL;
+    PyArrayObject *targets = rows_of_results ? indices(&call, 6, 2) : NULL;
     if (targets == NULL || !same("times", size(t, 0), size(inside, 0)) ||
+        !same("times of signals", size(signals, 1), size(t, 0)) ||
         !same("numbers of an operation", size(code, 1), 4) ||
         !same("numbers of a target", size(targets, 1), 2) ||
         !same("outputs and targets", size(rows_of_results, 1), size(targets, 0)))
@@ -262,7 +282,8 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
             return failed(&call);
     }
     int varies[MOST_MATRICES] = {0};
-    const npy_intp used = rows_used(code, size(constants, 0));
+    const npy_intp known = GIVEN + size(signals, 0);
+    const npy_intp used = rows_used(code, known, size(constants, 0));
     if (!used || !targets_fit(targets, once, matrices, varies))
         return failed(&call);
     const npy_intp *results_rows = PyArray_DATA(rows_of_results);
@@ -275,7 +296,9 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
     npy_intp block = IN_CACHE / used;
     block = block < 32 ? 32 : block > 512 ? 512 : block;
     block = block > times ? times : block;
-    Rows rows = {{NULL, NULL}, scratch(&call, (used - GIVEN) * block), block, data(constants)};
+    Rows rows = {
+        {NULL, NULL}, NULL, times, known, scratch(&call, (used - known) * block), block,
+        data(constants)};
     if (rows.memory == NULL)
         return failed(&call);
     double *out[MOST_MATRICES] = {NULL};
@@ -304,6 +327,7 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
         const npy_intp here = times - first < block ? times - first : block;
         rows.given[0] = data(t) + first;
         rows.given[1] = data(inside) + first;
+        rows.signals = data(signals) + first;
         run(&rows, PyArray_DATA(code), operations, here);
         const npy_intp *target = PyArray_DATA(targets);
         for (npy_intp j = 0; j < outputs; j++, target += 2) {

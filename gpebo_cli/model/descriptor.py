@@ -1,13 +1,15 @@
-"""The model: a linear time-varying descriptor system, its names and its known functions of time.
+"""The model: a descriptor system affine in its state, its names and its known functions.
 
-    E(t) x' = A(t) x + B(t) u(t) + F(t) θ,      y = C(t) x                (paper, eq. 1)
+    E(t) x' = A x + B u + F θ + φ,      y = C x + D u + H θ                (paper, eq. 1, and more)
 
-with n states, m inputs, q unknown parameters and r outputs. θ is constant to whoever
-estimates it; in a simulation it may vary all the same.
+with n states, m inputs, q unknown parameters and r outputs. A, B, F and φ may depend on (t, u, y),
+C, D and H on (t, u): on what is measured. The paper has functions of t alone, and neither φ nor
+D nor H. θ is constant to whoever estimates it; in a simulation it may vary all the same.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -18,7 +20,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-MATRIX_NAMES = ("E", "A", "B", "F", "C", "u", "theta")
+MATRIX_NAMES = ("E", "A", "B", "F", "C", "u", "theta", "phi", "D", "H")
 
 
 class Coefficients(NamedTuple):
@@ -35,6 +37,17 @@ class Coefficients(NamedTuple):
     C: Array  # (K + 1, N, r, n)
     u: Array  # (K + 1, N, m)
     theta: Array  # (K + 1, N, q) true values of the unknowns, for the simulation only
+    phi: Array  # (K + 1, N, n)
+    D: Array  # (K + 1, N, r, m)
+    H: Array  # (K + 1, N, r, q)
+
+    def along(self, signals: Array) -> Coefficients:
+        """These with u as it was measured; ``signals`` as in :meth:`CoefficientSource.taylor`."""
+        orders, times, m = self.u.shape
+        u = np.zeros((orders, times, m))
+        given = signals[:orders, :, :m]
+        u[: len(given)] = given
+        return self._replace(u=u)
 
 
 class CoefficientSource(Protocol):
@@ -45,12 +58,34 @@ class CoefficientSource(Protocol):
         """Those of ``MATRIX_NAMES`` that do not depend on time."""
         ...
 
-    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:
+    @property
+    def zero(self) -> frozenset[str]:
+        """Those of ``constant`` that vanish: nothing needs to be computed with them."""
+        ...
+
+    @property
+    def signals(self) -> Mapping[str, frozenset[str]]:
+        """Names of the inputs and outputs that a matrix depends on, by matrix; most have none."""
+        ...
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
+    ) -> Coefficients:
         """Evaluate everything at the times ``t`` (shape (N,)) with derivatives up to ``order``.
 
         Functions that jump are decided at the times ``inside`` (default: ``t``), so that the end
         point of an interval can be given the limit from within that interval.
+
+        Matrices that depend on signals are evaluated along ``signals``: Taylor coefficients of
+        [u, y] at t, shape (J + 1, N, m + r). Coefficients beyond J count as zero, so J = 0 will
+        do for values (E depends on no signal, so its derivatives are right whatever J is).
+        ``u`` of the result is then that of the signals. None: u is the plant's own function of
+        time, and nothing may depend on y.
         """
+        ...
+
+    def truth(self, t: Array) -> Array:
+        """True values of the unknowns at the times ``t`` (N,), shape (N, q)."""
         ...
 
     def breakpoints(self, start: float, stop: float) -> Array:
@@ -78,6 +113,12 @@ class DescriptorSystem:
     observer_defaults: dict[str, object] = field(default_factory=dict)
 
     @property
+    def depends_on_outputs(self) -> bool:
+        """Whether some matrix depends on an output: the plant is not linear in its state."""
+        depends = self.coefficients.signals.values()
+        return any(not names.isdisjoint(self.outputs) for names in depends)
+
+    @property
     def theta_varies(self) -> bool:
         """Whether some unknown is not constant."""
         return bool(np.isnan(self.theta).any())
@@ -85,7 +126,7 @@ class DescriptorSystem:
     def theta_at(self, t: Array) -> Array:
         """True values of the unknowns at the times t (M,), shape (M, q); after a jump at one."""
         if self.theta_varies:
-            return np.asarray(self.coefficients.taylor(t, 0).theta[0])
+            return self.coefficients.truth(t)
         return np.broadcast_to(self.theta, (len(t), self.q))
 
     @property

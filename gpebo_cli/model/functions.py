@@ -1,6 +1,7 @@
 """Plants given as NumPy arrays and functions from Python, without any text.
 
-A matrix may be an array (constant) or a function of an array of times. Derivatives, which plants
+A matrix may be an array (constant) or a function of an array of times, and, where what is measured
+may stand in it, of the inputs and outputs at these times. Derivatives, which plants
 of higher index need, are taken from functions given for them, or else computed from the function
 itself at complex times: for an analytic f the Taylor coefficients at t are a discrete Fourier
 transform over a small circle around t,
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from inspect import Parameter, signature
 from typing import Any
 
 import numpy as np
@@ -22,9 +24,13 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, DescriptorSystem
 
-Function = Callable[[Any], Any]  # times (N,), real or complex -> (N, rows, columns) or (N, m)
+# (t), (t, u) or (t, u, y), t (N,), u (N, m) and y (N, r), real or complex -> (N, rows, columns), or
+# (N, m) for u, (N, n) for phi
+Function = Callable[..., Any]
 Entry = Array | Sequence[Any] | Function | Sequence[Function]
 
+# Of t, u and y; one where not said.
+_MOST_ARGUMENTS = {"A": 3, "B": 3, "F": 3, "phi": 3, "C": 2, "D": 2, "H": 2}
 _POINTS = 32  # on the circle
 _NOT_ANALYTIC = 1e-8  # difference between the circle's mean and the value at its centre
 
@@ -37,6 +43,8 @@ class FunctionCoefficients:
     fixed: Mapping[str, Array]  # constant matrices, (rows, columns)
     functions: Mapping[str, tuple[Function, ...]]  # f, and its derivatives as far as given
     radius: float
+    signals: Mapping[str, frozenset[str]]  # what a function is a function of, by its name
+    outputs: int  # r
     name: str = ""
 
     @property
@@ -44,43 +52,77 @@ class FunctionCoefficients:
         """Names of the matrices that are arrays."""
         return frozenset(self.fixed)
 
-    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:  # noqa: ARG002
+    @property
+    def zero(self) -> frozenset[str]:
+        """Names of the arrays that vanish."""
+        return frozenset(name for name, value in self.fixed.items() if not value.any())
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None  # noqa: ARG002
+    ) -> Coefficients:
         """Taylor coefficients up to ``order`` at the times t (N,); these functions do not jump.
 
-        Constant matrices come as read-only broadcast arrays.
+        Constant matrices come as read-only broadcast arrays. What is a function of u and y is
+        evaluated along ``signals``, (J + 1, N, m + r); None: along the plant's own u.
 
         Raises:
             ConfigError: a function returns the wrong shape, something not finite, or is not
-                analytic where a derivative of it is needed.
+                analytic where a derivative of it is needed; or y is needed and not known.
         """
-        out = {}
+        found = {"u": self._values("u", t, order, None)} if signals is None else {}
         for name in MATRIX_NAMES:
-            shape = self.shapes[name]
-            if name in self.fixed:
-                once = np.zeros((order + 1, 1, *shape))
-                once[0] = self.fixed[name]
-                out[name] = np.broadcast_to(once, (order + 1, len(t), *shape))
-            else:
-                values = np.zeros((order + 1, len(t), *shape))
-                self._fill(name, values, t)
-                out[name] = values
-        return Coefficients(**out)
+            depends = self.signals.get(name)
+            along = signals
+            if depends and signals is None:
+                if len(depends) > self.shapes["u"][0]:
+                    raise ConfigError(
+                        f"plant {self.name}: {name} depends on the outputs, which are not known "
+                        "here"
+                    )
+                along = np.concatenate(
+                    [found["u"], np.zeros((order + 1, len(t), self.outputs))], axis=2
+                )
+            if name not in found:
+                found[name] = self._values(name, t, order, along if depends else None)
+        c = Coefficients(**found)
+        return c if signals is None else c.along(signals)
+
+    def truth(self, t: Array) -> Array:
+        """True values of the unknowns at the times t (N,), shape (N, q)."""
+        return np.asarray(self._values("theta", t, 0, None)[0])
+
+    def _values(self, name: str, t: Array, order: int, signals: Array | None) -> Array:
+        """Taylor coefficients (order + 1, N, *shape) of one matrix."""
+        shape = self.shapes[name]
+        if name in self.fixed:
+            once = np.zeros((order + 1, 1, *shape))
+            once[0] = self.fixed[name]
+            return np.broadcast_to(once, (order + 1, len(t), *shape))
+        values = np.zeros((order + 1, len(t), *shape))
+        self._fill(name, values, t, signals)
+        return values
 
     def breakpoints(self, start: float, stop: float) -> Array:  # noqa: ARG002
         """None: functions are taken to be smooth."""
         return np.zeros(0)
 
-    def _fill(self, name: str, values: Array, t: Array) -> None:
-        given = self.functions[name]
+    def _fill(self, name: str, values: Array, t: Array, signals: Array | None) -> None:
+        """Fill ``values`` (order + 1, N, …), with derivatives as far as they are given."""
+        # A derivative that is given is one of time alone, so with signals only values are.
+        given = self.functions[name][: 1 if signals is not None else None]
+        none = np.zeros((len(t), 1))
         factorial = 1.0
         for k in range(min(len(given), len(values))):
             factorial *= max(k, 1)
-            values[k] = self._call(name, given[k], t).real / factorial
+            values[k] = self._call(name, given[k], t, signals, none).real / factorial
         if len(given) >= len(values):
             return
         circle = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
-        times = (t[:, None] + self.radius * circle).ravel()
-        around = self._call(name, given[0], times).reshape(len(t), _POINTS, *values.shape[2:])
+        away = np.tile(self.radius * circle, len(t))[:, None]
+        if signals is not None:
+            signals = np.repeat(signals[: len(values)], _POINTS, axis=1)
+        around = self._call(name, given[0], np.repeat(t, _POINTS), signals, away)
+        around = around.reshape(len(t), _POINTS, *values.shape[2:])
         spectrum = np.fft.fft(around, axis=1) / _POINTS
         size = max(float(np.abs(around).max(initial=0.0)), np.finfo(float).tiny)
         if np.abs(spectrum[:, 0] - values[0]).max(initial=0.0) > _NOT_ANALYTIC * size:
@@ -92,9 +134,19 @@ class FunctionCoefficients:
         for k in range(len(given), len(values)):
             values[k] = spectrum[:, k].real / self.radius**k
 
-    def _call(self, name: str, function: Function, t: Any) -> Any:
+    def _call(
+        self, name: str, function: Function, t: Any, signals: Array | None, away: Any
+    ) -> Any:
+        """The function at times t + away (N, 1), signals being the polynomials that they are."""
+        arguments: list[Any] = []
+        if signals is not None:
+            there = signals[-1] + 0.0 * away
+            for coefficient in signals[-2::-1]:
+                there = there * away + coefficient
+            arguments = [there[:, : self.shapes["u"][0]], there[:, self.shapes["u"][0] :]]
+        t = t + away[:, 0] if np.iscomplexobj(away) else t
         try:
-            value = np.asarray(function(t))
+            value = np.asarray(function(t, *arguments[: _arguments(function) - 1]))
         except TypeError as error:
             if not np.iscomplexobj(t):
                 raise
@@ -135,15 +187,20 @@ def system_from_functions(
     F: Entry | None = None,
     theta: Array | Sequence[float] | Function | Sequence[Function] = (),
     C: Entry | None = None,
+    phi: Entry | None = None,
+    D: Entry | None = None,
+    H: Entry | None = None,
     names: Names | None = None,
     radius: float = 0.1,
 ) -> DescriptorSystem:
-    """A descriptor system E x' = A x + B u + F θ, y = C x from arrays and functions.
+    """E x' = A x + B u + F θ + φ, y = C x + D u + H θ from arrays and functions.
 
     Args:
         name: of the plant, for messages and folders.
         E: an array (n, n), a function of times (N,) returning (N, n, n), or a list of such
-            functions: E, its first derivative, its second, … Likewise for the others.
+            functions: E, its first derivative, its second, … Likewise for the others. Functions
+            for A, B, F and phi may also take (t, u, y), those for C, D and H (t, u): the inputs
+            (N, m) and outputs (N, r) at these times.
         A: (n, n).
         initial_state: (n,), perhaps inconsistent.
         B: (n, m).
@@ -151,6 +208,9 @@ def system_from_functions(
         F: (n, q).
         theta: true values (q,) of the unknown parameters; functions return (N, q).
         C: (r, n).
+        phi: (n,), functions return (N, n).
+        D: (r, m).
+        H: (r, q).
         names: of states, inputs, unknowns and outputs.
         radius: of the circle of complex times for derivatives that are not given; a tenth of the
             time in which the functions change.
@@ -172,21 +232,36 @@ def system_from_functions(
     """
     x0 = np.asarray(initial_state, dtype=np.float64)
     n = len(x0)
-    q, m, r = _rows(theta), _columns(B, "B"), _rows(C)
+    names = names or Names()
+    q, m = _rows(theta), len(names.inputs) or _rows(u)
+    r = len(names.outputs) or _rows(C, m)
     if (u is None) != (B is None):
         raise ConfigError(f"plant {name}: B and u go together; one of them is missing")
-    names = names or Names()
-    shapes = {"E": (n, n), "A": (n, n), "B": (n, m), "F": (n, q), "C": (r, n), "u": (m,)}
-    shapes["theta"] = (q,)
+    shapes: dict[str, tuple[int, ...]] = {
+        "E": (n, n), "A": (n, n), "B": (n, m), "F": (n, q), "C": (r, n), "u": (m,), "theta": (q,),
+        "phi": (n,), "D": (r, m), "H": (r, q),
+    }  # fmt: skip
+    inputs, outputs = _labels(names.inputs, "u", m, name), _labels(names.outputs, "y", r, name)
     fixed: dict[str, Array] = {}
     functions: dict[str, tuple[Function, ...]] = {}
-    entries = {"E": E, "A": A, "B": B, "F": F, "C": C, "u": u, "theta": theta}
+    signals: dict[str, frozenset[str]] = {}
+    entries = {
+        "E": E, "A": A, "B": B, "F": F, "C": C, "u": u, "theta": theta, "phi": phi, "D": D, "H": H
+    }  # fmt: skip
     for key, entry in entries.items():
         listed: list[Any] = list(entry) if isinstance(entry, list | tuple) else [entry]
         if entry is None:
             fixed[key] = np.zeros(shapes[key])
         elif listed and all(callable(item) for item in listed):
             functions[key] = tuple(listed)
+            count = max(map(_arguments, listed))
+            if count > _MOST_ARGUMENTS.get(key, 1):
+                raise ConfigError(
+                    f"plant {name}: {key} takes {count} arguments, but may depend on "
+                    f"{', '.join('tuy'[: _MOST_ARGUMENTS.get(key, 1)])} only"
+                )
+            if count > 1:
+                signals[key] = frozenset(inputs if count == 2 else (*inputs, *outputs))
         else:
             value = np.asarray(entry, dtype=np.float64)
             if value.shape != shapes[key]:
@@ -197,38 +272,32 @@ def system_from_functions(
             fixed[key] = value
     return DescriptorSystem(
         name=name,
-        coefficients=FunctionCoefficients(shapes, fixed, functions, radius, name),
+        coefficients=FunctionCoefficients(shapes, fixed, functions, radius, signals, r, name),
         initial_state=x0,
         theta=fixed.get("theta", np.full(q, np.nan)),
         states=_labels(names.states, "x", n, name),
-        inputs=_labels(names.inputs, "u", m, name),
+        inputs=inputs,
         unknowns=_labels(names.unknowns, "theta", q, name),
-        outputs=_labels(names.outputs, "y", r, name),
+        outputs=outputs,
     )
 
 
-def _first(entry: Entry | None) -> Any:
-    """The entry's value at one time, to read its shape from."""
-    if entry is None:
-        return None
+def _arguments(function: Function) -> int:
+    """How many arguments a function has to be given."""
+    given = signature(function).parameters.values()
+    positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    return max(1, sum(p.kind in positional and p.default is Parameter.empty for p in given))
+
+
+def _rows(entry: Entry | None, inputs: int = 0) -> int:
+    """The first size of an entry, by its value at one time."""
     first: Any = entry
     if isinstance(first, list | tuple) and len(first) and callable(first[0]):
         first = first[0]
-    return np.asarray(first(np.zeros(1)))[0] if callable(first) else np.asarray(first)
-
-
-def _columns(entry: Entry | None, name: str) -> int:
-    value = _first(entry)
-    if value is None:
-        return 0
-    if value.ndim != 2:
-        raise ConfigError(f"{name} has {value.ndim} axes, expected rows and columns")
-    return int(value.shape[1])
-
-
-def _rows(entry: Entry | None) -> int:
-    value = _first(entry)
-    return 0 if value is None else int(value.shape[0])
+    if callable(first):
+        signals = [np.zeros((1, inputs))] * (_arguments(first) - 1)
+        first = np.asarray(first(np.zeros(1), *signals))[0]
+    return 0 if first is None else len(np.asarray(first))
 
 
 def _labels(given: Sequence[str], letter: str, count: int, plant: str) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from gpebo_cli.model.expressions import (
     parse,
     record,
     shorten,
+    signal,
 )
 from gpebo_cli.schema import nearest
 
@@ -42,12 +43,20 @@ KEYS = (
     "A",
     "B",
     "F",
+    "phi",
     "C",
+    "D",
+    "H",
     "initial_state",
     "units",
     "observer_defaults",
 )
 """Keys of a plant file; name, states, E, A and initial_state are required."""
+
+# Which signals may stand in what, and why not others.
+_OF_ALL = dict.fromkeys(("an input", "an output"), "")
+_OF_INPUTS = {"an input": "", "an output": "; y = C x + D u + H θ would contain itself"}
+_OF_TIME = dict.fromkeys(("an input", "an output"), ": its derivative would be needed")
 
 _PLANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,79}")  # it becomes part of a folder's name
 _YAML_BOOLEAN = "YAML reads on, off, yes and no as booleans"
@@ -89,23 +98,49 @@ class TextCoefficients:
 
     tape: Tape
     layouts: Mapping[str, _Layout]  # by the names in MATRIX_NAMES
+    unknowns: Tape  # theta on its own
+    signals: Mapping[str, frozenset[str]]  # what a matrix depends on, by the same names
+    outputs: frozenset[str]
+    name: str
 
     @cached_property
     def constant(self) -> frozenset[str]:
         """Those of ``MATRIX_NAMES`` that do not depend on time."""
         return frozenset(k for k, layout in self.layouts.items() if not len(layout.positions))
 
-    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:
+    @cached_property
+    def zero(self) -> frozenset[str]:
+        """Those of ``constant`` that vanish."""
+        return frozenset(k for k in self.constant if not self.layouts[k].fixed.any())
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
+    ) -> Coefficients:
         """All matrices at the times ``t`` (N,) in seconds, to ``order``; see the protocol.
 
         Raises:
-            ConfigError: an entry without a finite value or derivative; names it and the time.
+            ConfigError: an entry without a finite value or derivative; names it and the time. Or
+                a matrix depends on an output, and there are no signals.
         """
-        filled = self._assembly.taylor(np.asarray(t, dtype=np.float64), order, inside)
-        if filled is not None:
-            return Coefficients._make(filled)
-        values = self.tape.taylor(t, order, inside)
-        return Coefficients(**{k: self.layouts[k].assemble(values) for k in MATRIX_NAMES})
+        if signals is None:
+            for matrix, names in self.signals.items():
+                if not names.isdisjoint(self.outputs):
+                    raise ConfigError(
+                        f"plant {self.name}: {matrix} depends on the output "
+                        f"{min(names & self.outputs)}, which is not known here"
+                    )
+        t = np.asarray(t, dtype=np.float64)
+        filled = self._assembly.taylor(t, order, inside, signals)
+        if filled is None:
+            values = self.tape.taylor(t, order, inside, signals)
+            filled = tuple(self.layouts[k].assemble(values) for k in MATRIX_NAMES)
+        found = Coefficients._make(filled)
+        return found if signals is None else found.along(signals)
+
+    def truth(self, t: Array) -> Array:
+        """True values of the unknowns at the times ``t`` (N,), shape (N, q)."""
+        values: Array = self.unknowns.taylor(t, 0)[0]
+        return values
 
     @cached_property
     def _assembly(self) -> Assembly:
@@ -156,35 +191,55 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
         "an output": outputs,
     }
     elsewhere = _kind_of_name(plant, kinds)
+    signals = {
+        name: signal(name, place, elsewhere[name])
+        for place, name in enumerate((*inputs, *outputs))
+    }
     clash = [name for name in unknowns if name.startswith("e0_") and name[3:] in states]
     if clash:
         raise ConfigError(
             f"{plant}: the unknown {clash[0]} has the name of the estimated initial error of "
             f"the state {clash[0][3:]}; choose another name"
         )
-    parameters = _parameters(plant, mapping.get("parameters"), elsewhere)
+    parameters = _parameters(plant, mapping.get("parameters"), signals, elsewhere)
 
-    def read(value: object, where: str) -> Expression:
-        return parse(value, parameters, f"{plant}: {where}", elsewhere)
+    def read(value: object, where: str, allowed: Mapping[str, str] | None = None) -> Expression:
+        known = parameters if allowed is None else {**signals, **parameters}
+        expression = parse(value, known, f"{plant}: {where}", elsewhere)
+        _check_signals(expression, elsewhere, allowed or {}, where.partition("[")[0])
+        return expression
 
     rows = _Side("state", states)
+    u = [read(value, f"inputs.{label}") for label, value in inputs.items()]
+    driven, sought = _Side("input", tuple(inputs)), _Side("unknown", tuple(unknowns))
+    measured = _Side("output", outputs)
     sides = {
-        "E": (rows, rows),
-        "A": (rows, rows),
-        "B": (rows, _Side("input", tuple(inputs))),
-        "F": (rows, _Side("unknown", tuple(unknowns))),
-        "C": (_Side("output", outputs), rows),
+        "E": (rows, rows, _OF_TIME),
+        "A": (rows, rows, _OF_ALL),
+        "B": (rows, driven, _OF_ALL),
+        "F": (rows, sought, _OF_ALL),
+        "C": (measured, rows, _OF_INPUTS),
+        "D": (measured, driven, _OF_INPUTS),
+        "H": (measured, sought, _OF_INPUTS),
     }
     entries: dict[str, tuple[tuple[int, ...], list[Expression]]] = {}
-    for key, (down, across) in sides.items():
+    for key, (down, across, allowed) in sides.items():
         grid = _matrix(plant, key, mapping.get(key), down, across)
         shape = (len(down.names), len(across.names))
         entries[key] = (
             shape,
-            [read(value, f"{key}[{i}][{j}]") for i, row in enumerate(grid) for j, value in row],
+            [
+                read(value, f"{key}[{i}][{j}]", allowed)
+                for i, row in enumerate(grid)
+                for j, value in row
+            ],
         )
-    signals = [read(value, f"inputs.{label}") for label, value in inputs.items()]
-    entries["u"] = (len(inputs),), signals
+    known = _known_term(plant, mapping.get("phi"), rows)
+    entries["phi"] = (
+        (len(states),),
+        [read(value, f"phi[{i}]", _OF_ALL) for i, value in enumerate(known)],
+    )
+    entries["u"] = (len(inputs),), u
 
     theta = [read(value, f"unknowns.{label}") for label, value in unknowns.items()]
     entries["theta"] = (len(unknowns),), theta
@@ -193,7 +248,7 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
     return DescriptorSystem(
         name=name,
         states=states,
-        coefficients=_coefficients(entries),
+        coefficients=_coefficients(entries, u, frozenset(outputs), name),
         initial_state=np.array(initial),
         inputs=tuple(inputs),
         unknowns=tuple(unknowns),
@@ -207,8 +262,24 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
     )
 
 
+def _check_signals(
+    expression: Expression, kinds: Mapping[str, str], allowed: Mapping[str, str], key: str
+) -> None:
+    """Refuse signals that may not stand in what ``key`` names, also inside of parameters."""
+    for name in sorted(expression.node.signals):
+        why = allowed.get(kinds[name], "")
+        if kinds[name] not in allowed or why:
+            raise ConfigError(
+                f"{expression.where} = {shorten(expression.text)}: {name} is {kinds[name]} and "
+                f"may not stand in {key}{why}"
+            )
+
+
 def _coefficients(
     entries: Mapping[str, tuple[tuple[int, ...], Sequence[Expression]]],
+    inputs: Sequence[Expression],
+    outputs: frozenset[str],
+    name: str,
 ) -> TextCoefficients:
     varying: list[Expression] = []
     layouts: dict[str, _Layout] = {}
@@ -221,7 +292,13 @@ def _coefficients(
             np.arange(len(varying), len(varying) + len(positions), dtype=np.intp),
         )
         varying += [expressions[k] for k in positions]
-    return TextCoefficients(record(varying), layouts)
+    signals = {
+        key: frozenset[str]().union(*(e.node.signals for e in expressions))
+        for key, (_, expressions) in entries.items()
+    }
+    depending = {key: names for key, names in signals.items() if names}
+    truth = record(entries["theta"][1])
+    return TextCoefficients(record(varying, inputs), layouts, truth, depending, outputs, name)
 
 
 @dataclass(frozen=True)
@@ -245,7 +322,8 @@ def _listed(names: Sequence[str], limit: int = 8) -> str:
 
 
 def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{number} {noun if number == 1 else plural}"
 
 
 def _list(value: object) -> list[object] | None:
@@ -353,7 +431,9 @@ def _kind_of_name(plant: str, kinds: Mapping[str, Iterable[str]]) -> dict[str, s
     return seen
 
 
-def _parameters(plant: str, value: object, elsewhere: Mapping[str, str]) -> dict[str, Expression]:
+def _parameters(
+    plant: str, value: object, signals: Mapping[str, Expression], elsewhere: Mapping[str, str]
+) -> dict[str, Expression]:
     given = _named_values(plant, "parameters", value, "{R: 2 + sin(t)}")
     parameters: dict[str, Expression] = {}
     later = dict.fromkeys(given, "a parameter defined further down")
@@ -365,7 +445,8 @@ def _parameters(plant: str, value: object, elsewhere: Mapping[str, str]) -> dict
             )
         where = f"{plant}: parameters.{label}"
         later[label] = "this parameter itself"
-        parameters[label] = parse(item, parameters, where, {**elsewhere, **later})
+        known = {**signals, **parameters}
+        parameters[label] = parse(item, known, where, {**elsewhere, **later})
     return parameters
 
 
@@ -374,6 +455,8 @@ def _matrix(
 ) -> list[list[tuple[int, object]]]:
     """The entries of a matrix by row, each with its column; sizes checked."""
     n_rows, n_columns = len(down.names), len(across.names)
+    if (value is None or value == []) and key in ("D", "H"):
+        return [[(j, 0) for j in range(n_columns)] for _ in range(n_rows)]
     if value is None or value == []:
         if n_rows and n_columns:
             needed = across if down.noun == "state" else down
@@ -407,6 +490,21 @@ def _matrix(
     if widths[0] != n_columns:
         raise ConfigError(f"{plant}: {key} has {_count(widths[0], 'column')} but {across}")
     return grid
+
+
+def _known_term(plant: str, value: object, rows: _Side) -> list[object]:
+    """φ, one entry for each equation."""
+    if value is None or value == []:
+        return [0] * len(rows.names)
+    entries = _list(value)
+    if entries is None:
+        raise ConfigError(
+            f"{plant}: phi must be a list of {_count(len(rows.names), 'entry')}, one for each row "
+            f"of E, not {_show(value)}"
+        )
+    if len(entries) != len(rows.names):
+        raise ConfigError(f"{plant}: phi has {_count(len(entries), 'entry')} but {rows}")
+    return entries
 
 
 def _initial_values(plant: str, value: object, states: tuple[str, ...]) -> dict[str, object]:

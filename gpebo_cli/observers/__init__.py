@@ -52,6 +52,7 @@ def observe(
         ConfigError: settings that do not fit the plant.
         SolverError: the tolerance cannot be reached.
     """
+    refuse_beyond(system)
     check_remedy(settings)
     if settings.name == "kalman_bucy":
         if noise is None:
@@ -59,6 +60,22 @@ def observe(
         return kalman_bucy.observe(system, inputs, outputs, settings, solver, noise)
     run = _OBSERVERS[settings.name] if settings.remedy == "none" else _REMEDIES[settings.remedy]
     return run(system, inputs, outputs, settings, solver)
+
+
+def refuse_beyond(system: DescriptorSystem) -> None:
+    """Refuse a plant with terms that no observer here makes use of.
+
+    Raises:
+        ConfigError: names them.
+    """
+    source = system.coefficients
+    beyond = [key for key in ("phi", "D", "H") if key not in source.zero]
+    beyond += [f"{key} of {', '.join(sorted(names))}" for key, names in source.signals.items()]
+    if beyond:
+        raise ConfigError(
+            f"plant {system.name}: observers take E x' = A x + B u + F θ, y = C x with functions "
+            f"of t alone, and it has {beyond[0]}; use observer=none"
+        )
 
 
 def check_remedy(settings: ObserverSettings) -> None:

@@ -36,9 +36,9 @@ class Scaling:
 
 
 def forcing(c: Coefficients) -> Array:
-    """Taylor coefficients of f = B u + F θ, shape (K + 1, N, n)."""
+    """Taylor coefficients of f = B u + F θ + φ, shape (K + 1, N, n)."""
     orders = len(c.E)
-    f = np.zeros(c.E.shape[:3])
+    f = c.phi.copy()
     for k in range(orders):
         for i in range(k + 1):
             f[k] += np.einsum("nij,nj->ni", c.F[i], c.theta[k - i])

@@ -39,6 +39,7 @@ class StrangenessFree:
     E: Array  # (N, n, n) the model's own
     u: Array  # (N, m) the inputs and
     C: Array  # (N, r, n) the output matrix at the same times
+    direct: Array | None  # (N, r) D u + H θ, what the state has no part in; None: nothing
 
 
 def strangeness_free_form(
@@ -59,13 +60,13 @@ def strangeness_free_form(
     if c is None:
         c = system.coefficients.taylor(t, mu, inside)
     if kernels.compiled is not None and (mu + 1) * system.n <= SMALL:
-        found = _reduced_compiled(structure, len(t), c)
+        found = _reduced_compiled(structure, len(t), c, system.coefficients.zero)
         if found is not None:
             return found
     f = forcing(c)
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]
-    e, aa = scaled(Coefficients(E, A, c.B, c.F, c.C, c.u, c.theta), scaling)
+    e, aa = scaled(c._replace(E=E, A=A), scaling)
     M, N = derivative_array(e, aa, mu)
     # [Â2 | f2] = Z2ᵀ [N | g] with g = (f_0, …, f_μ)
     weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
@@ -118,7 +119,20 @@ def strangeness_free_form(
         E=E[0],
         u=c.u[0],
         C=c.C[0],
+        direct=direct_part(c, system.coefficients.zero),
     )
+
+
+def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
+    """D u + H θ at N times, (N, r): the part of the outputs that no state is in, if there is any.
+
+    Args:
+        c: the model there.
+        zero: names of matrices that vanish.
+    """
+    if {"D", "H"} <= zero:
+        return None
+    return _apply(c.D[0], c.u[0]) + _apply(c.H[0], c.theta[0])
 
 
 def _every(count: int) -> int:
@@ -127,12 +141,18 @@ def _every(count: int) -> int:
 
 
 def _reduced_compiled(
-    structure: Structure, count: int, c: Coefficients
+    structure: Structure, count: int, c: Coefficients, zero: frozenset[str]
 ) -> StrangenessFree | None:
     """:func:`strangeness_free_form`; None where the reference will not do at some time."""
     compiled: Any = kernels.compiled
     s, reference, E = structure.scaling, structure.reference, c.E[0]
-    model = (c.E, c.A, s.rows, s.columns, s.time, structure.mu, c.B, c.F, c.u, c.theta)
+    F, theta = c.F, c.theta
+    if "phi" not in zero:  # one more unknown, whose value is known to be 1
+        one = np.zeros((*theta.shape[:2], 1))
+        one[0] = 1.0
+        F = np.concatenate([F, c.phi[..., None]], axis=3)
+        theta = np.concatenate([theta, one], axis=2)
+    model = (c.E, c.A, s.rows, s.columns, s.time, structure.mu, c.B, F, c.u, theta)
     if isinstance(reference, Bases):
         E = E[:1]
         found = compiled.reduced_constant(*model, reference.Z1, reference.Z2, _every(count))
@@ -147,7 +167,8 @@ def _reduced_compiled(
     if not structure.a:
         basis = offset = None
     return StrangenessFree(
-        E1, A1, f1, A2, f2, basis, offset, amplification, E, c.u[0], c.C[0]
+        E1, A1, f1, A2, f2, basis, offset, amplification, E, c.u[0], c.C[0],
+        direct_part(c, zero),
     )
 
 

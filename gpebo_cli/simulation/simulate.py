@@ -30,7 +30,11 @@ from gpebo_cli.numerics.collocation import (
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
-from gpebo_cli.reduction.strangeness_free import StrangenessFree, strangeness_free_form
+from gpebo_cli.reduction.strangeness_free import (
+    StrangenessFree,
+    direct_part,
+    strangeness_free_form,
+)
 from gpebo_cli.reduction.structure import Structure, analyse
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
@@ -74,7 +78,7 @@ class Simulation:
 
 
 def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Simulation:
-    """Solve E x' = A x + B u + F θ from a consistent state near ``system.initial_state``.
+    """Solve E x' = A x + B u + F θ + φ from a consistent state near ``system.initial_state``.
 
     Raises:
         ModelError: not uniquely solvable, index too high, or a rank changes within the horizon.
@@ -99,10 +103,10 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         return _equations(strangeness_free_form(system, structure, t, inside))
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-        u, C = extras
+        u, C, *direct = extras
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
-        y, size = _outputs(C, values[..., 0])
+        y, size = _outputs(C, values[..., 0], *direct)
         return [(u, 0.0), (y, 1e-3 * max(size, floor))]
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
@@ -119,8 +123,8 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         )
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
-    u, C = solution.extras
-    y, _ = _outputs(C, x)
+    u, C, *direct = solution.extras
+    y, _ = _outputs(C, x, *direct)
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
         structure=structure,
@@ -276,7 +280,7 @@ def _known_kinds(
 
 def _equations(reduced: StrangenessFree) -> LinearEquation:
     """The strangeness-free equations in the form that the collocation takes."""
-    extras = (reduced.u, reduced.C)
+    extras = tuple(e for e in (reduced.u, reduced.C, reduced.direct) if e is not None)
     f1 = reduced.f1[:, :, None]
     if reduced.basis is None or reduced.offset is None:
         return LinearEquation(reduced.E1, reduced.A1, f1, extras)
@@ -313,17 +317,21 @@ def _restart(
     return restart
 
 
-def _outputs(C: Array, x: Array) -> tuple[Array, float]:
-    """y = C x at points (K, s + 1), and how large it could be: the largest of C times that of x."""
+def _outputs(C: Array, x: Array, direct: Array | None = None) -> tuple[Array, float]:
+    """y = C x + direct at points (K, s + 1), and how large it could be: C times x, the largest."""
     if kernels.compiled is not None:
         K, points, n = x.shape
         r = C.shape[2]
         y, size = kernels.compiled.outputs(
             C.reshape(C.shape[0] * C.shape[1], r, n), x.reshape(K * points, n)
         )
-        return y.reshape(K, points, r), size
-    size = float(np.abs(C).max(initial=0.0)) * float(np.abs(x).max(initial=0.0))
-    return np.asarray(np.matmul(C, x[..., None])[..., 0]), size
+        y = y.reshape(K, points, r)
+    else:
+        size = float(np.abs(C).max(initial=0.0)) * float(np.abs(x).max(initial=0.0))
+        y = np.asarray(np.matmul(C, x[..., None])[..., 0])
+    if direct is None:
+        return y, size
+    return y + direct, max(size, float(np.abs(direct).max(initial=0.0)))
 
 
 def _integrate(
@@ -335,7 +343,8 @@ def _integrate(
     def explicit(t: Array, inside: Array) -> LinearEquation:
         A, f = ivp.underlying_ode(system, structure, t, inside)
         c = system.coefficients.taylor(t, 0, inside)
-        return LinearEquation(None, A, f[:, :, None], (c.u[0], c.C[0]))
+        seen = c.u[0], c.C[0], direct_part(c, system.coefficients.zero)
+        return LinearEquation(None, A, f[:, :, None], tuple(e for e in seen if e is not None))
 
     ode = LinearProblem(
         explicit, problem.start, problem.monitor, problem.name, problem.floor

@@ -1,8 +1,10 @@
 """The language of plant files: real functions of time as text, with exact derivatives.
 
-Numbers, names, ``+ - * / **``, ``t``, ``pi``, ``sin cos tan exp log sqrt sinh cosh tanh abs
-sign``, ``d(.)`` for the time derivative, and ``step(t - t1)``, which is 0 before t1 and 1 from t1
-on (its argument may be any affine function of t; a falling one gives 1 before and 0 from t1 on).
+Numbers, names, ``+ - * / **``, ``t``, ``pi``, ``sin cos tan asin acos atan exp log sqrt sinh cosh
+tanh asinh acosh atanh erf abs sign``, ``min`` and ``max`` of two, ``d(.)`` for the time derivative,
+and ``step(t - t1)``, which is 0 before t1 and 1 from t1 on (its argument may be any affine function
+of t; a falling one gives 1 before and 0 from t1 on). Names may be those of signals: what depends
+on them is evaluated along their Taylor coefficients.
 
 Text is read by :func:`parse` into graphs of ``nodes``, recorded on a :class:`Tape` and evaluated
 in Taylor arithmetic (``jets``): derivatives of any order, no code generation, nothing executed.
@@ -12,7 +14,7 @@ intermediate value that overflows is refused even where the end result would be 
 """
 
 from gpebo_cli.model.expressions.breakpoints import breakpoints, breakpoints_of_tape
-from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten
+from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten, signal
 from gpebo_cli.model.expressions.tape import Assembly, Tape, record, taylor
 
 __all__ = [
@@ -25,5 +27,6 @@ __all__ = [
     "parse",
     "record",
     "shorten",
+    "signal",
     "taylor",
 ]

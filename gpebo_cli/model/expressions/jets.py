@@ -9,7 +9,9 @@ Every operation computes coefficients 0 to ``order`` and may be given longer arg
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,18 +117,66 @@ def exp(a: Jet, order: int) -> Jet:
     return e
 
 
-def log(a: Jet, order: int) -> Jet:
-    """g = log(a), from a g' = a'."""
-    g: Jet = [np.log(a[0])]
-    if len(a) == 1:
-        return g
-    w = weighted(a, order)
-    v: Jet = [0.0]  # k g[k]
+def _around_one(a: Jet, order: int) -> Jet:
+    """1 - a²."""
+    return multiply(subtract([1.0], a, order), add([1.0], a, order), order)
+
+
+# Each function whose derivative is a'/g, with what NumPy calls it and g as a function of a. Factors
+# such as (1 - a)(1 + a) keep the digits that 1 - a² would lose near 1.
+_PRIMITIVES: dict[str, tuple[Callable[[Coefficient], Coefficient], Callable[[Jet, int], Jet]]] = {
+    "log": (np.log, lambda a, _: a),
+    "atan": (np.arctan, lambda a, n: add([1.0], multiply(a, a, n), n)),
+    "atanh": (np.arctanh, _around_one),
+    "asin": (np.arcsin, lambda a, n: power(_around_one(a, n), 0.5, n)),
+    "acos": (np.arccos, lambda a, n: negative(power(_around_one(a, n), 0.5, n), n)),
+    "asinh": (np.arcsinh, lambda a, n: power(add([1.0], multiply(a, a, n), n), 0.5, n)),
+    "acosh": (np.arccosh, lambda a, n: power(negative(_around_one(a, n), n), 0.5, n)),
+}
+
+
+def primitive(name: str, a: Jet, order: int) -> Jet:
+    """y = f(a) for one of ``_PRIMITIVES``, from g y' = a'."""
+    function, of_argument = _PRIMITIVES[name]
+    y: Jet = [function(a[0])]
+    if len(a) == 1 or order == 0:
+        return y
+    w, g = weighted(a, order), of_argument(a, order)
+    v: Jet = [0.0]  # k y[k]
     for k in range(1, order + 1):
-        rest = (w[k] if k < len(w) else 0.0) - convolve(v, a, k, first=1)
-        v.append(np.divide(rest, a[0]))
-        g.append(v[k] / k)
-    return g
+        rest = (w[k] if k < len(w) else 0.0) - convolve(v, g, k, first=1)
+        v.append(np.divide(rest, g[0]))
+        y.append(v[k] / k)
+    return y
+
+
+def erf(a: Jet, order: int) -> Jet:
+    """y = erf(a), from y' = 2/√π exp(-a²) a'."""
+    from scipy.special import erf as of_values
+
+    y: Jet = [of_values(a[0])]
+    if len(a) == 1 or order == 0:
+        return y
+    w = weighted(a, order)
+    bell = exp(negative(multiply(a, a, order), order), order)
+    for k in range(1, order + 1):
+        y.append(convolve(w, bell, k, first=1) * (2.0 / math.sqrt(math.pi) / k))
+    return y
+
+
+def switched(name: str, decided: Coefficient, arguments: list[Jet], order: int) -> Jet:
+    """sign, abs, min or max, which of their sides being decided by the sign of ``decided``.
+
+    min and max are w a + (1 - w) b with w = 0 or 1: one of the two to the last bit.
+    """
+    sign = np.sign(decided)
+    if name == "sign":
+        return [sign]
+    if name == "abs":
+        return multiply([sign], arguments[0], order)
+    weight = 0.5 + (0.5 if name == "max" else -0.5) * sign
+    a, b, _ = arguments
+    return add(multiply([weight], a, order), multiply([1.0 - weight], b, order), order)
 
 
 def sine_and_cosine(a: Jet, order: int, hyperbolic: bool = False) -> tuple[Jet, Jet]:
@@ -168,7 +218,8 @@ UNARY: dict[str, Callable[[Jet, int], Jet]] = {
     "negative": negative,
     "derivative": derivative,
     "exp": exp,
-    "log": log,
+    "erf": erf,
+    **{name: partial(primitive, name) for name in _PRIMITIVES},
     "tan": tangent,
     "tanh": tanh,
 }

@@ -22,10 +22,12 @@ class FoldError(ValueError):
 class Node:
     """One operation. Compared by identity; equal work is found when a tape is recorded.
 
-    ``value`` is the number itself, the exponent of ``power`` or the instant of ``step``.
+    ``value`` is the number itself, the exponent of ``power``, the instant of ``step`` or the
+    place of ``signal`` among the signals.
     ``affine`` is (c, s) where the node is c + s t. ``derivatives`` is how deep d(.) is nested
     inside. ``smooth`` is how often the node may be differentiated before it jumps: 0 for
-    something that jumps itself, 1 for something with a kink.
+    something that jumps itself, 1 for something with a kink. ``signals`` are the names of the
+    inputs and outputs inside.
     """
 
     operation: str
@@ -34,6 +36,7 @@ class Node:
     affine: tuple[float, float] | None = None
     derivatives: int = 0
     smooth: float = math.inf
+    signals: frozenset[str] = frozenset()
 
     @property
     def is_number(self) -> bool:
@@ -42,6 +45,11 @@ class Node:
 
 
 TIME = Node("t", affine=(0.0, 1.0))
+
+
+def signal(name: str, place: int) -> Node:
+    """An input or output by its place among the signals, inputs first."""
+    return Node("signal", value=float(place), signals=frozenset([name]))
 
 
 def number(value: float) -> Node:
@@ -74,6 +82,7 @@ def _node(
         affine,
         max((argument.derivatives for argument in arguments), default=0),
         min((smooth, *(argument.smooth for argument in arguments))),
+        frozenset().union(*(argument.signals for argument in arguments)),
     )
 
 
@@ -186,6 +195,13 @@ FUNCTIONS: dict[str, Callable[[float], float]] = {
     "sinh": math.sinh,
     "cosh": math.cosh,
     "tanh": math.tanh,
+    "asin": math.asin,
+    "acos": math.acos,
+    "atan": math.atan,
+    "asinh": math.asinh,
+    "acosh": math.acosh,
+    "atanh": math.atanh,
+    "erf": math.erf,
     "abs": abs,
     "sign": sign,
 }
@@ -198,6 +214,14 @@ def function(name: str, a: Node) -> Node:
     if name == "sqrt":
         return power(a, number(0.5))
     return _node(name, a, smooth={"sign": 0.0, "abs": 1.0}.get(name, math.inf))
+
+
+def extremum(name: str, a: Node, b: Node) -> Node:
+    """``min`` or ``max`` of two: a where the sign of a - b says so, else b, with a kink between."""
+    difference = subtract(a, b)
+    if difference.is_number:
+        return a if (difference.value < 0) == (name == "min") else b
+    return _node(name, a, b, difference, smooth=1.0)
 
 
 def step(a: Node) -> Node:
@@ -218,6 +242,11 @@ def derivative(a: Node) -> Node:
     """da/dt."""
     if a.affine:
         return number(a.affine[1])
+    if a.signals:
+        raise FoldError(
+            f"d(.) of something with {min(a.signals)} in it: signals are measured, and nothing "
+            "measured is differentiated"
+        )
     if a.smooth < 1:
         raise FoldError("d(.) of something that jumps (step or sign) is an impulse, no function")
     if a.derivatives >= MAX_DERIVATIVES:

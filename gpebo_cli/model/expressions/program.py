@@ -21,10 +21,11 @@ _OPERATIONS = {
     name: code
     for code, name in enumerate((
         "add", "subtract", "multiply", "divide", "power", "greater_equal", "negative", "sqrt",
-        "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "sign",
+        "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "arcsin", "arccos", "arctan",
+        "arcsinh", "arccosh", "arctanh", "erf", "sign",
     ))
 }  # fmt: skip
-_GIVEN = 2  # rows that the caller gives: the times, and those at which jumps are decided
+_GIVEN = 2  # rows that are always given: the times, and those at which jumps are decided
 
 Key = tuple[int, int, int]  # operation and operands: rows, or constants as ~index
 
@@ -50,10 +51,15 @@ class Row(NDArrayOperatorsMixin):
 class Recorder:
     """The operations recorded so far; equal ones once."""
 
-    def __init__(self) -> None:
+    def __init__(self, signals: tuple[int, int] = (0, 0)) -> None:
         self.rows: dict[Key, Row] = {}
         self.constants: dict[float, int] = {}
         self.t, self.inside = Row(self, 0), Row(self, 1)
+        orders, number = signals
+        self.given = _GIVEN + orders * number
+        self.signals = [
+            [Row(self, _GIVEN + k * number + j) for k in range(orders)] for j in range(number)
+        ]
 
     def operand(self, value: Row | float) -> int:
         """A row by its index, a constant by ~index."""
@@ -68,7 +74,7 @@ class Recorder:
         if isinstance(right, Row) and name == "multiply" and _is_one(left):
             return right
         key = (_OPERATIONS[name], self.operand(left), self.operand(right))
-        return self.rows.setdefault(key, Row(self, _GIVEN + len(self.rows)))
+        return self.rows.setdefault(key, Row(self, self.given + len(self.rows)))
 
 
 def _is_one(value: Row | float) -> bool:
@@ -76,7 +82,7 @@ def _is_one(value: Row | float) -> bool:
 
 
 class Program(NamedTuple):
-    """Operations on rows. Rows 0 and 1 are given; a constant stands as ~index for a row."""
+    """Operations on rows. The first ones are given; a constant stands as ~index for a row."""
 
     code: IntArray  # (number, 4) operation, row of its result, left and right operand
     constants: Array  # (number,)
@@ -95,15 +101,15 @@ def finished(recorder: Recorder, places: Sequence[list[Any]], outputs: Iterable[
          for jet in (places[place] for place in outputs)]
         for k in range(order + 1)
     ]  # fmt: skip
-    operations = list(recorder.rows)
-    last = [-1] * (_GIVEN + len(operations))  # the operation that reads a row last
+    operations, given = list(recorder.rows), recorder.given
+    last = [-1] * (given + len(operations))  # the operation that reads a row last
     kept = [False] * len(last)
     for jet in places:
         for coefficient in jet:
             if isinstance(coefficient, Row):
                 kept[coefficient.index] = True
     for number in reversed(range(len(operations))):
-        if kept[_GIVEN + number]:
+        if kept[given + number]:
             for operand in operations[number][1:]:
                 if operand >= 0:
                     kept[operand] = True
@@ -112,11 +118,11 @@ def finished(recorder: Recorder, places: Sequence[list[Any]], outputs: Iterable[
         last[operand] = len(operations)
 
     free: list[int] = []
-    row_of = {0: 0, 1: 1}
+    row_of = {k: k for k in range(given)}
     code: list[tuple[int, int, int, int]] = []
-    rows = _GIVEN
+    rows = given
     for number, (operation, left, right) in enumerate(operations):
-        index = _GIVEN + number
+        index = given + number
         if not kept[index]:
             continue
         # Taken before the operands are free: no operation writes where it reads.
@@ -125,7 +131,7 @@ def finished(recorder: Recorder, places: Sequence[list[Any]], outputs: Iterable[
         else:
             row_of[index], rows = rows, rows + 1
         code.append((operation, row_of[index], row_of.get(left, left), row_of.get(right, right)))
-        free += [row_of[old] for old in {left, right} if old >= _GIVEN and last[old] == number]
+        free += [row_of[old] for old in {left, right} if old >= given and last[old] == number]
         if last[index] < 0:
             free.append(row_of[index])
     return Program(

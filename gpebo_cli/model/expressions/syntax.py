@@ -15,6 +15,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.expressions import nodes
@@ -24,10 +25,17 @@ from gpebo_cli.schema import nearest
 MAX_LENGTH = 100_000  # characters of one expression
 MAX_DEPTH = 200  # nesting; a sum or product of many terms is one level
 
-RESERVED = frozenset({"t", "pi", "d", "step", *nodes.FUNCTIONS})
+_CALLS: dict[str, tuple[int, Callable[..., Node]]] = {
+    **{name: (1, partial(nodes.function, name)) for name in nodes.FUNCTIONS},
+    **{name: (2, partial(nodes.extremum, name)) for name in ("min", "max")},
+    "d": (1, nodes.derivative),
+    "step": (1, nodes.step),
+}
+"""How many arguments each function takes, and what it makes of their nodes."""
+
+RESERVED = frozenset({"t", "pi", *_CALLS})
 """Names that mean something in every expression."""
 
-_CALLS: dict[str, Callable[[Node], Node]] = {"d": nodes.derivative, "step": nodes.step}
 _BINARY: dict[type[ast.operator], Callable[[Node, Node], Node]] = {
     ast.Add: nodes.add,
     ast.Sub: nodes.subtract,
@@ -36,7 +44,7 @@ _BINARY: dict[type[ast.operator], Callable[[Node, Node], Node]] = {
     ast.Pow: nodes.power,
 }
 _ACCEPTED = "accepted: numbers, names, + - * / **, t, pi, " + ", ".join(
-    [*nodes.FUNCTIONS, "d(.), step(t - t1)"]
+    [*nodes.FUNCTIONS, "min(., .), max(., .), d(.), step(t - t1)"]
 )
 _FOREIGN = re.compile(r"[^A-Za-z0-9_.+\-*/(), \t\r\n]")
 
@@ -61,6 +69,11 @@ class Expression:
         if not self.is_constant:
             raise ConfigError(f"{self.where} = {shorten(self.text)} must not depend on t")
         return self.node.value
+
+
+def signal(name: str, place: int, kind: str) -> Expression:
+    """An input or output (its ``kind``) by its place among the signals, inputs first."""
+    return Expression(nodes.signal(name, place), name, kind)
 
 
 def parse(
@@ -196,17 +209,17 @@ class _Reader:
         return node
 
     def _call(self, name: str, tree: ast.Call, depth: int) -> Node:
-        if name not in nodes.FUNCTIONS and name not in _CALLS:
-            known = [*nodes.FUNCTIONS, *_CALLS]
-            hint = nearest(name, known)
+        if name not in _CALLS:
+            hint = nearest(name, _CALLS)
             raise FoldError(
-                f"there is no function {shorten(name)}{hint} (accepted: {', '.join(known)})"
+                f"there is no function {shorten(name)}{hint} (accepted: {', '.join(_CALLS)})"
             )
-        if len(tree.args) != 1 or tree.keywords:
+        count, made = _CALLS[name]
+        if len(tree.args) != count or tree.keywords:
             given = "keywords" if tree.keywords else len(tree.args)
-            raise FoldError(f"{name} takes one argument, not {given}")
-        argument = self.read(tree.args[0], depth + 1)
-        return _CALLS[name](argument) if name in _CALLS else nodes.function(name, argument)
+            wanted = "one argument" if count == 1 else "two arguments"
+            raise FoldError(f"{name} takes {wanted}, not {given}")
+        return made(*(self.read(argument, depth + 1) for argument in tree.args))
 
     def _name(self, name: str) -> Node:
         if name == "t":

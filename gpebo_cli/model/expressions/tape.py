@@ -19,6 +19,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.model.expressions import jets
 from gpebo_cli.model.expressions.jets import Coefficient, Jet
+from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.program import Program, Recorder, finished
 from gpebo_cli.model.expressions.syntax import Expression, shorten
 
@@ -27,6 +28,7 @@ MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in par
 # Recording takes as long as evaluating four times without the kernel: where that is much, it may
 # never be gained again.
 _MOST_COMPILED = 1000
+_UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
 # Function, its place in the pair of jets computed together, and which pair.
 _PAIRS = {
@@ -35,6 +37,10 @@ _PAIRS = {
     "sinh": (np.sinh, 0, True),
     "cosh": (np.cosh, 1, True),
 }
+
+
+# Order, whether jumps are decided at other times, how many coefficients of how many signals.
+_Key = tuple[int, bool, tuple[int, int] | None]
 
 
 class Instruction(NamedTuple):
@@ -46,7 +52,10 @@ class Instruction(NamedTuple):
 
 
 class Switch(NamedTuple):
-    """The place of an argument of abs or sign, and (c, s) where that argument is c + s t."""
+    """The place of an argument of abs or sign, and (c, s) where that argument is c + s t.
+
+    Of min and max it is the difference of the two.
+    """
 
     argument: int
     affine: tuple[float, float] | None
@@ -71,19 +80,24 @@ class Tape:
     switches: tuple[Switch, ...]
     labels: tuple[Label, ...]  # those of the expressions first
 
-    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Array:
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
+    ) -> Array:
         """Taylor coefficients of all expressions, shape (order + 1, N, number of expressions).
 
         Args:
             t: times, shape (N,), seconds.
             order: highest coefficient wanted.
             inside: times, shape (N,), at which step, abs and sign are decided; by default ``t``.
+            signals: Taylor coefficients of the signals at t, (J + 1, N, number of signals), those
+                beyond J being zero; what depends on a signal is decided at t. None: inputs are the
+                functions of time that the tape has for them, and outputs are unknown.
 
         Raises:
             ConfigError: a value that is not finite; names the entry, its text and the time.
         """
         t = np.asarray(t, dtype=np.float64)
-        filled = self._in_a_row.taylor(t, order, inside)
+        filled = self._in_a_row.taylor(t, order, inside, signals)
         if filled is not None:
             return filled[0]
         result = np.zeros((order + 1, len(self.outputs), len(t)))
@@ -93,33 +107,40 @@ class Tape:
             here = slice(first, first + part)
             times = t[here]
             decided = times if inside is None else inside[here]
-            places = self._checked(times, order, decided)
+            jets_of_signals = _jets(None if signals is None else signals[:, here])
+            places = self._checked(times, order, decided, jets_of_signals)
             for column, place in enumerate(self.outputs):
                 for k, coefficient in enumerate(places[place][: order + 1]):
                     result[k, column, here] = coefficient
             # Arithmetic of plain floats (coefficients equal at all times) raises no flags.
             if not np.isfinite(result[:, :, here]).all():
-                self._refuse(times, order, decided)
+                self._refuse(times, order, decided, jets_of_signals)
         return np.moveaxis(result, 1, 2)
 
     @cached_property
     def jumps(self) -> bool:
-        """Whether there is any step, abs or sign."""
+        """Whether there is any step, abs, sign, min or max."""
         return bool(self.switches) or any(i.operation == "step" for i in self.instructions)
 
-    def program(self, order: int, apart: bool) -> Program | None:
+    def program(
+        self, order: int, apart: bool, signals: tuple[int, int] | None = None
+    ) -> Program | None:
         """What :meth:`taylor` does, for the compiled kernel; None where that is not worth it.
 
         Args:
             order: highest coefficient wanted.
             apart: whether the times at which jumps are decided are others than the times.
+            signals: how many coefficients of how many signals are given; None: no signals are.
         """
         if len(self.instructions) > _MOST_COMPILED:
             return None
-        recorder = Recorder()
+        recorder = Recorder(signals or (0, 0))
+        known = None if signals is None else recorder.signals
         try:
             with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
-                places = self._run(recorder.t, order, recorder.inside if apart else recorder.t)
+                places = self._run(
+                    recorder.t, order, recorder.inside if apart else recorder.t, known
+                )
         except FloatingPointError:
             return None  # to be refused at any time
         return finished(recorder, places, self.outputs, order)
@@ -135,33 +156,35 @@ class Tape:
         Raises:
             ConfigError: as for :meth:`taylor`.
         """
-        places = self._checked(t, 0, inside)
+        places = self._checked(t, 0, inside, None)
         result = np.empty((len(self.switches), len(t)))
         for row, switch in enumerate(self.switches):
             result[row] = places[switch.argument][0]
         return result
 
-    def _checked(self, t: Array, order: int, inside: Array) -> list[Jet]:
+    def _checked(self, t: Array, order: int, inside: Array, signals: list[Jet] | None) -> list[Jet]:
         """Run with every invalid operation refused, even one whose result is finite again."""
         try:
             with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
-                return self._run(t, order, inside)
+                return self._run(t, order, inside, signals)
         except FloatingPointError:
             # Only a second, slower run can tell whose fault it was and when; or that it was
             # nobody's: vectorised loops may raise flags for lanes that they do not return.
-            self._refuse(t, order, inside)
+            self._refuse(t, order, inside, signals)
             with np.errstate(all="ignore"):
-                return self._run(t, order, inside)
+                return self._run(t, order, inside, signals)
 
-    def _run(self, t: Any, order: int, inside: Any, stop: int | None = None) -> list[Jet]:
+    def _run(
+        self, t: Any, order: int, inside: Any, signals: Any, stop: int | None = None
+    ) -> list[Jet]:
         """Jets of all places before ``stop``, those that jump decided at ``inside``.
 
-        The times are arrays (N,), or symbols for them that record what is done.
+        The times and signals are arrays (N,), or symbols for them that record what is done.
         """
         deciding: list[Jet] | None = None
         if self.switches and inside is not t:
             last = max(switch.argument for switch in self.switches)
-            deciding = self._run(inside, 0, inside, last + 1)
+            deciding = self._run(inside, 0, inside, signals, last + 1)
         places: list[Jet] = []
         pairs: dict[tuple[int, bool], tuple[int, tuple[Jet, Jet]]] = {}
         for (operation, arguments, value), extra in zip(
@@ -193,22 +216,25 @@ class Tape:
                 jet = [t, 1.0]
             elif operation == "step":
                 jet = [(inside >= value).astype(np.float64)]
+            elif operation == "signal":
+                jet = places[arguments[0]] if signals is None else signals[int(value)]
             else:
-                sign = np.sign((places if deciding is None else deciding)[arguments[0]][0])
-                jet = [sign] if operation == "sign" else [sign * c for c in places[arguments[0]]]
+                decided = (places if deciding is None else deciding)[arguments[-1]][0]
+                jet = jets.switched(operation, decided, [places[a] for a in arguments], wanted)
             places.append(jet)
         return places
 
-    def _refuse(self, t: Array, order: int, inside: Array) -> None:
+    def _refuse(self, t: Array, order: int, inside: Array, signals: list[Jet] | None) -> None:
         """Raise the error for the first entry, and in it the innermost name, that is not finite."""
         for times in (t,) if inside is t else (t, inside):
             with np.errstate(all="ignore"):
-                places = self._run(times, order if times is t else 0, inside)
+                places = self._run(times, order if times is t else 0, inside, signals)
             # First index of a time at which a place, or something it is made of, is not finite.
             bad: list[float] = []
-            for (_, arguments, _), jet in zip(self.instructions, places, strict=True):
+            for (operation, arguments, _), jet in zip(self.instructions, places, strict=True):
                 own = [_first_not_finite(coefficient) for coefficient in jet]
-                bad.append(min([*own, *(bad[argument] for argument in arguments)]))
+                told = operation == "signal" and signals is not None
+                bad.append(min([*own, *(bad[argument] for argument in arguments if not told)]))
             for label in self.labels[: len(self.outputs)]:
                 if bad[label.place] < math.inf:
                     while inner := [k for k in label.uses if bad[self.labels[k].place] < math.inf]:
@@ -232,9 +258,15 @@ class Assembly:
     fixed: tuple[Array, ...]  # the matrices; what stands at the targets does not matter
 
     def taylor(
-        self, t: Array, order: int, inside: Array | None = None
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
     ) -> tuple[Array, ...] | None:
         """Taylor coefficients of the matrices at the times t (N,), by the compiled kernel.
+
+        Args:
+            t: times (N,).
+            order: highest coefficient wanted.
+            inside: where jumps are decided.
+            signals: as for :meth:`Tape.taylor`.
 
         Returns:
             shape (order + 1, N, ...) each, read-only where constant in time; None where there is
@@ -244,21 +276,30 @@ class Assembly:
         if kernels.compiled is None:
             return None
         apart = inside is not None and inside is not t and self.tape.jumps
-        key = order, apart
+        given = None if signals is None else (len(signals), signals.shape[2])
+        key = order, apart, given
         if key not in self._plans:
-            self._plans[key] = self._plan(order, apart)
+            self._plans[key] = self._plan(order, apart, given)
         plan = self._plans[key]
         if plan is None:
             return None
-        return kernels.compiled.jets(t, inside if apart else t, *plan)  # type: ignore[no-any-return]
+        if signals is None:
+            rows = np.empty((0, len(t)))
+        else:
+            rows = np.swapaxes(signals, 1, 2).reshape(-1, len(t)) if len(t) else signals[:, :, 0]
+        return kernels.compiled.jets(  # type: ignore[no-any-return]
+            t, inside if apart else t, rows, *plan
+        )
 
     @cached_property
-    def _plans(self) -> dict[tuple[int, bool], tuple[Array | IntArray, ...] | None]:
-        """What the kernel is given besides the times; by order, and whether jumps are apart."""
+    def _plans(self) -> dict[_Key, tuple[Array | IntArray, ...] | None]:
+        """What the kernel is given besides times and signals."""
         return {}
 
-    def _plan(self, order: int, apart: bool) -> tuple[Array | IntArray, ...] | None:
-        program = self.tape.program(order, apart)
+    def _plan(
+        self, order: int, apart: bool, signals: tuple[int, int] | None = None
+    ) -> tuple[Array | IntArray, ...] | None:
+        program = self.tape.program(order, apart, signals)
         if program is None:
             return None
         matrices = []
@@ -270,13 +311,22 @@ class Assembly:
         return *program, self.targets, *matrices
 
 
+def _jets(signals: Array | None) -> list[Jet] | None:
+    """Signals (J + 1, N, number) as one jet each."""
+    return None if signals is None else [list(signals[:, :, j]) for j in range(signals.shape[2])]
+
+
 def _first_not_finite(coefficient: Coefficient) -> float:
     flags = np.atleast_1d(~np.isfinite(coefficient))
     return float(np.argmax(flags)) if flags.any() else math.inf
 
 
-def record(expressions: Sequence[Expression]) -> Tape:
+def record(expressions: Sequence[Expression], inputs: Sequence[Expression] = ()) -> Tape:
     """Record expressions on one tape.
+
+    Args:
+        expressions: its outputs.
+        inputs: the first signals as functions of time, for when nobody says what they were.
 
     Raises:
         ConfigError: more than MAX_INSTRUCTIONS different operations.
@@ -288,16 +338,20 @@ def record(expressions: Sequence[Expression]) -> Tape:
         stack = [expression.node]
         while stack:
             node = stack[-1]
-            missing = [a for a in node.arguments if id(a) not in place_of]
+            children = node.arguments
+            if node.operation == "signal":
+                k = int(node.value)
+                children = (inputs[k].node if k < len(inputs) else _UNKNOWN,)
+            missing = [a for a in children if id(a) not in place_of]
             if missing:
                 stack.extend(missing)
                 continue
             stack.pop()
-            arguments = tuple(place_of[id(a)] for a in node.arguments)
+            arguments = tuple(place_of[id(a)] for a in children)
             instruction = Instruction(node.operation, arguments, node.value)
             place_of[id(node)] = instructions.setdefault(instruction, len(instructions))
-            if node.operation in ("abs", "sign"):
-                switches[arguments[0]] = Switch(arguments[0], node.arguments[0].affine)
+            if node.operation in ("abs", "sign", "min", "max"):
+                switches[arguments[-1]] = Switch(arguments[-1], children[-1].affine)
         if len(instructions) > MAX_INSTRUCTIONS:
             raise ConfigError(
                 f"{expression.where}: the expressions up to here need more than "
@@ -314,17 +368,24 @@ def record(expressions: Sequence[Expression]) -> Tape:
         extra=tuple(extra),
         outputs=tuple(place_of[id(expression.node)] for expression in expressions),
         switches=tuple(switches.values()),
-        labels=_labels(expressions, place_of),
+        labels=_labels(expressions, inputs, place_of),
     )
 
 
-def _labels(expressions: Sequence[Expression], place_of: dict[int, int]) -> tuple[Label, ...]:
+def _labels(
+    expressions: Sequence[Expression], inputs: Sequence[Expression], place_of: dict[int, int]
+) -> tuple[Label, ...]:
     """Labels of the expressions and of the names they use, as far as those are on the tape."""
     listed = list(expressions)
     index = {id(expression): k for k, expression in enumerate(listed)}
     uses: list[tuple[int, ...]] = []
     for expression in listed:  # grows as it is walked
-        kept = [used for used in expression.uses if id(used.node) in place_of]
+        used_here = [
+            inputs[int(used.node.value)]
+            if used.node.operation == "signal" and used.node.value < len(inputs) else used
+            for used in expression.uses
+        ]
+        kept = [used for used in used_here if id(used.node) in place_of]
         for used in kept:
             if id(used) not in index:
                 index[id(used)] = len(listed)
