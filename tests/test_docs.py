@@ -76,7 +76,7 @@ def test_the_first_hour(tmp_path):
     said = ""
     for language, body in re.findall(r"^```(sh|python)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         said += (shell if language == "sh" else python)(body, tmp_path)
-    for shown in ("did you mean k? (defined: k, Cap, t, pi)", "exit code 2", "exit code 1",
+    for shown in ("did you mean k? (defined: P, y, k, Cap, t, pi)", "exit code 2", "exit code 1",
                   "to do: every state needs an equation of its own"):
         assert shown in text
         assert shown in said
