@@ -18,6 +18,13 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ belo
     from gpebo_cli.api.calls import available, check, load_plant, run
     from gpebo_cli.api.result import Result
     from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
+    from gpebo_cli.importers import (
+        from_control,
+        from_file,
+        from_matrices,
+        from_mechanics,
+        from_netlist,
+    )
     from gpebo_cli.model.descriptor import DescriptorSystem
     from gpebo_cli.model.functions import Names, system_from_functions
     from gpebo_cli.observers import observe
@@ -38,6 +45,11 @@ __all__ = [
     "__version__",
     "available",
     "check",
+    "from_control",
+    "from_file",
+    "from_matrices",
+    "from_mechanics",
+    "from_netlist",
     "load_plant",
     "observe",
     "run",
@@ -49,6 +61,9 @@ _HOMES = {
     "api.calls": ("available", "check", "load_plant", "run"),
     "api.result": ("Result",),
     "errors": ("ConfigError", "GpeboError", "ModelError", "SolverError"),
+    "importers": (
+        "from_control", "from_file", "from_matrices", "from_mechanics", "from_netlist",
+    ),
     "observers": ("observe",),
     "settings": ("ObserverSettings", "SolverSettings", "TimeSettings"),
     "simulation.simulate": ("simulate",),

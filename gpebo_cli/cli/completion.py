@@ -168,7 +168,10 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
             *("--output", "--check", "--update", "--help"), "figures.formats=",
         ],
         "compare": ["--sort", "--reverse", "--csv", "--output", "--no-figures", "--help"],
-        "new": ["--config-dir", "--help", *(["plant", "estimator"] if not before else [])],
+        "new": [
+            "--config-dir", "--from", "--measure", "--unknown", "--help",
+            *(["plant", "estimator"] if not before else []),
+        ],
         "completion": [*SCRIPTS, "--help"],
     }
     if word.startswith("figures.formats="):

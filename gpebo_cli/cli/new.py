@@ -10,14 +10,19 @@ import sys
 from pathlib import Path
 
 from gpebo_cli.cli.locations import choices, conf_folder
-from gpebo_cli.cli.options import CONFIG_DIR, parse
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.cli.options import CONFIG_DIR, Options, parse
+from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.schema import nearest, shown
 
 _PACKAGE = {"{name}.py": "{kind}.py", "{kind}/{name}.yaml": "{kind}.yaml",
             "test_{name}.py": "test_{kind}.py", "pyproject.toml": "pyproject.toml"}
 KINDS = {"plant": {"plant/{name}.yaml": "plant.yaml"}, "estimator": _PACKAGE}
 """For each kind the files that are written, and the template of each."""
+FROM_FILE = {
+    "--from": "a netlist, a mechanical model or matrices",
+    "--measure": "what is measured, as v(out),y=i(L1)+i(V)",
+    "--unknown": "names of constant sources",
+}
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,79}")
 _WORDS = ("null", "true", "false", "yes", "no", "on", "off", "nan", "inf")  # mean more in YAML
@@ -44,9 +49,14 @@ def main(words: list[str]) -> int:
 
         sys.stdout.write(NEW_HELP)
         return 0
-    kind, name, folder = _parse(words)
+    kind, name, options = _parse(words)
+    folder = os.path.expanduser(options.config_dir or ".")
     paths = {Path(folder, path): text for path, text in files(kind, name, folder).items()}
     _check_name(kind, name, list(paths))
+    told = ""
+    if "--from" in options.values:
+        ((path, _),) = paths.items()
+        paths[path], told = _from_file(name, options)
 
     from gpebo_cli.results.files import make_folder, write_text
 
@@ -55,7 +65,7 @@ def main(words: list[str]) -> int:
         write_text(path, text)
         sys.stdout.write(f"{path}\n")
     said = _RUNS if len(paths) == 1 else _INSTALLED
-    sys.stdout.write(said.format(folder=shlex.quote(folder), kind=kind, name=name))
+    sys.stdout.write(told + said.format(folder=shlex.quote(folder), kind=kind, name=name))
     return 0
 
 
@@ -74,9 +84,29 @@ def files(kind: str, name: str, folder: str = ".") -> dict[str, str]:
     }
 
 
-def _parse(words: list[str]) -> tuple[str, str, str]:
-    """Kind, name and folder."""
-    options = parse("new", words, CONFIG_DIR)
+def _from_file(name: str, options: Options) -> tuple[str, str]:
+    """The text of a plant made from a file, and what there is to say of it."""
+    from gpebo_cli.importers import from_file
+    from gpebo_cli.model.plant import plant_from_mapping
+    from gpebo_cli.settings import SolverSettings, TimeSettings
+    from gpebo_cli.simulation.simulate import simulate
+
+    given = options.values
+    draft = from_file(given["--from"], name, measure=given.get("--measure"),
+                      unknown=given.get("--unknown"))
+    system = plant_from_mapping(draft.mapping())
+    said = [*draft.comments[1:]]
+    try:
+        index = simulate(system, TimeSettings(), SolverSettings()).structure.index
+        said.append(f"index {index} as computed")
+    except GpeboError as error:
+        said.append(f"it is written, but cannot be simulated yet: {error}")
+    return draft.to_yaml(), "".join(f"{line}\n" for line in said)
+
+
+def _parse(words: list[str]) -> tuple[str, str, Options]:
+    """Kind, name and options."""
+    options = parse("new", words, {**CONFIG_DIR, **FROM_FILE})
     given = options.words
     if not given or given[0] not in KINDS:
         what = f"gpebo new: {shown(given[0])} cannot be made" if given else "gpebo new needs a kind"
@@ -89,7 +119,12 @@ def _parse(words: list[str]) -> tuple[str, str, str]:
         raise ConfigError(
             f"gpebo new {given[0]} needs one name, as in gpebo new {given[0]} tank; got {got}"
         )
-    return given[0], given[1].removesuffix(".yaml"), os.path.expanduser(options.config_dir or ".")
+    if given[0] != "plant" and "--from" in options.values:
+        raise ConfigError(f"--from makes a plant; gpebo new {given[0]} has a template of its own")
+    for option in ("--measure", "--unknown"):
+        if option in options.values and "--from" not in options.values:
+            raise ConfigError(f"{option} is for a plant from a netlist: --from FILE {option} …")
+    return given[0], given[1].removesuffix(".yaml"), options
 
 
 def _check_name(kind: str, name: str, paths: list[Path]) -> None:

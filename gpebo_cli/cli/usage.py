@@ -100,13 +100,18 @@ examples:
 """
 
 NEW_HELP = """\
-usage: gpebo new {plant|estimator} NAME [--config-dir DIR]
+usage: gpebo new {plant|estimator} NAME [--config-dir DIR] [--from FILE …]
 
 Writes below DIR, by default the current folder; nothing that exists is overwritten.
 
   plant      DIR/plant/NAME.yaml: every key explained; it runs as it stands
   estimator  DIR/NAME.py, its settings DIR/estimator/NAME.yaml, its test DIR/test_NAME.py, and
              DIR/pyproject.toml, by which gpebo finds it once it is installed; the test passes
+
+With --from FILE a plant is made from a SPICE netlist (.cir .net .sp), a mechanical model (.yaml
+with M, D, K, G), or matrices (.mat, a folder of Matrix Market files, an OpenModelica linearisation
+in .py or .m). Of a netlist, --measure "v(out), y=i(L1)+i(V)" says what the outputs are, and
+--unknown I5,V3 which constant sources are unknown.
 
 examples:
   gpebo new plant tank

@@ -1,0 +1,105 @@
+"""Plants from where engineers have them: netlists, mechanics, matrices, models of python-control.
+
+Everything here makes a :class:`~gpebo_cli.importers.draft.PlantDraft`; ``to_yaml()`` is the text of
+a plant file as a person would write it, ``mapping()`` the same as data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.importers.circuit import circuit_from_netlist
+from gpebo_cli.importers.draft import PlantDraft
+from gpebo_cli.importers.matrices import from_control, from_matrices, read_matrices
+from gpebo_cli.importers.mechanics import from_mechanics
+
+__all__ = [
+    "PlantDraft", "from_control", "from_file", "from_matrices", "from_mechanics", "from_netlist",
+]
+
+NETLISTS = (".cir", ".net", ".sp", ".spice", ".ckt")
+"""Endings of SPICE netlists."""
+
+_MAX_TEXT = 5_000_000  # bytes of a netlist or a mechanical model
+
+
+def from_netlist(
+    netlist: str | PathLike[str], name: str = "circuit", *,
+    measure: str | Iterable[str] | None = None, unknown: str | Iterable[str] | None = None,
+) -> PlantDraft:
+    """A plant from a SPICE netlist by modified nodal analysis.
+
+    Args:
+        netlist: its text (more than one line) or its path.
+        name: of the plant.
+        measure: outputs, ``"v(out), y=i(L1)+i(V)"``; default: the voltages of ``.save``.
+        unknown: constant sources whose values are to be estimated, ``"I5,V3"``.
+
+    Returns:
+        The plant; its comments say what the topology says of the index.
+
+    Raises:
+        ConfigError: names the line, the element, or the quantity, and what would be accepted.
+    """
+    text, file = fspath(netlist), f"netlist {name}"
+    if "\n" not in text:
+        text, file = _text(Path(text)), text
+    return circuit_from_netlist(text, name, file, measure, unknown).draft
+
+
+def from_file(
+    path: str | PathLike[str], name: str, *, measure: str | None = None, unknown: str | None = None
+) -> PlantDraft:
+    """A plant from a file: a netlist, a mechanical model in YAML, or matrices.
+
+    Args:
+        path: ``.cir .net .sp .spice .ckt`` is a netlist; ``.yaml`` a mechanical model with M, D, K,
+            G; ``.mat``, ``.py``, ``.m`` and a folder of ``.mtx`` are matrices.
+        name: of the plant.
+        measure: outputs of a netlist.
+        unknown: unknown sources of a netlist.
+
+    Raises:
+        ConfigError: names the file, the place in it, and what would be accepted.
+    """
+    file = Path(path)
+    if file.suffix.lower() in NETLISTS:
+        return from_netlist(file, name, measure=measure, unknown=unknown)
+    for option, value in (("--measure", measure), ("--unknown", unknown)):
+        if value is not None:
+            endings = " ".join(NETLISTS)
+            raise ConfigError(f"{option} is for netlists ({endings}), and {path} is none")
+    if file.suffix.lower() in (".yaml", ".yml"):
+        return from_mechanics(_yaml(file), name, str(path))
+    found: dict[str, Any] = read_matrices(file)
+    matrices = {key: found.pop(key) for key in "EABCD" if key in found}
+    return from_matrices(matrices, name, reference=str(path), **found)
+
+
+def _text(path: Path) -> str:
+    try:
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such file")
+        if path.stat().st_size > _MAX_TEXT:
+            raise ConfigError(
+                f"{path} has {path.stat().st_size} bytes; at most {_MAX_TEXT} are read"
+            )
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path} is not UTF-8 text") from None
+
+
+def _yaml(path: Path) -> dict[str, object]:
+    import yaml
+
+    try:
+        content = yaml.safe_load(_text(path))
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected a mapping with M, D, K, G")
+    return content

@@ -1,0 +1,513 @@
+"""Modified nodal analysis: from a netlist to a descriptor system, and what its graph says of it.
+
+Unknowns are the node voltages and the currents of elements that are defined by their voltage.
+Charges and fluxes are conserved: i = (C v)' = C v' + C' v and v = (L i)' = L i' + L' i.
+"""
+
+from __future__ import annotations
+
+import keyword
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.importers.draft import PlantDraft
+from gpebo_cli.importers.netlist import GROUND, Element, Netlist, read_netlist, split_names
+from gpebo_cli.model.expressions import RESERVED
+from gpebo_cli.schema import nearest, shown
+
+_WITH_CURRENT = "LVEHT"  # kinds whose current is an unknown
+_QUANTITY = re.compile(r"([vi])\((\w+)(?:,(\w+))?\)", re.IGNORECASE)
+_TERM = re.compile(r"([+-]?)(?:([\d.eE]+(?:[eE][+-]?\d+)?)\*)?([vi]\([\w,]+\))", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Topology:
+    """What the graph of a circuit says of its index (Estévez Schwarz and Tischendorf, 2000)."""
+
+    loops: tuple[tuple[str, ...], ...]  # of capacitors and at least one voltage source each
+    cutsets: tuple[tuple[str, ...], ...]  # of inductors and current sources each
+    decides: bool  # False with controlled sources, couplings or transformers: a bound no more
+
+    @property
+    def index(self) -> int:
+        """2 where there is a loop or a cutset, else at most 1."""
+        return 2 if self.loops or self.cutsets else 1
+
+    def __str__(self) -> str:
+        found = [f"loop of capacitors and voltage sources: {', '.join(x)}" for x in self.loops]
+        found += [f"cutset of inductors and current sources: {', '.join(x)}" for x in self.cutsets]
+        why = "; ".join(found) or (
+            "no loop of capacitors with voltage sources, no cutset of inductors and current sources"
+        )
+        note = "" if self.decides else "; controlled sources and couplings may change it"
+        return f"index {self.index} by topology ({why}{note})"
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """A plant from a netlist, with what its topology says."""
+
+    draft: PlantDraft
+    topology: Topology
+
+
+def circuit_from_netlist(
+    text: str, name: str, file: str = "netlist", measure: str | Iterable[str] | None = None,
+    unknown: str | Iterable[str] | None = None,
+) -> Circuit:
+    """The descriptor system of a netlist.
+
+    Args:
+        text: the netlist.
+        name: of the plant.
+        file: for messages.
+        measure: outputs, each a sum of node voltages and currents of elements, with a name or
+            without: ``"v(out), y=i(L1)+2*i(V)"``.
+        unknown: constant sources whose values are unknown parameters, ``"I5,V3"``.
+
+    Raises:
+        ConfigError: names the line, the element, or the quantity, and what would be accepted.
+    """
+    netlist = read_netlist(text, file)
+    topology = examine(netlist, file)
+    measured = split_names(measure)
+    builder = _Builder(netlist, name, file, measured)
+    draft = builder.build()
+    for output in measured or [q for q in netlist.saved if q.startswith("v(")]:
+        builder.output(output)
+    draft.make_unknown(
+        [builder.source(word) for word in split_names(unknown)], builder.constants
+    )
+    draft.comments.append(str(topology))
+    return Circuit(draft, topology)
+
+
+def examine(netlist: Netlist, file: str) -> Topology:
+    """Loops and cutsets that raise the index; refuses circuits without a unique solution.
+
+    Raises:
+        ConfigError: a floating node, a loop of voltage sources, or a cutset of current sources.
+    """
+    branches = [e for e in netlist.elements if e.kind != "K"]
+    nodes = {node for e in branches for node in e.nodes}
+    if GROUND not in nodes:
+        raise ConfigError(f"{file}: no element is connected to ground, which is the node 0")
+    connected = _Joined(nodes)
+    for e in branches:
+        for pair in _branches_of(e):
+            connected.join(*pair)
+    floating = sorted(node for node in nodes if connected.root(node) != connected.root(GROUND))
+    if floating:
+        raise ConfigError(
+            f"{file}: no path leads from node {floating[0]} to ground; connect it, through a large "
+            "resistor for instance"
+        )
+    fixed = _Joined(nodes)  # by sources alone: their loops have no unique current
+    for e in branches:
+        if e.kind in "VEH":
+            a, b = e.nodes[:2]
+            if not fixed.join(a, b):
+                raise e.place.error(
+                    f"{e.name} closes a loop of voltage sources, or is shorted; its current would "
+                    "be anything"
+                )
+    carried = _Joined(nodes)
+    for e in branches:
+        if e.kind not in "IGF":
+            for pair in _branches_of(e):
+                carried.join(*pair)
+    for e in branches:
+        if e.kind in "IGF" and carried.root(e.nodes[0]) != carried.root(e.nodes[1]):
+            raise e.place.error(
+                f"{e.name} drives a current that can flow back through current sources only; its "
+                "voltage would be anything"
+            )
+    return Topology(
+        tuple(_loops(branches)), tuple(_cutsets(branches, nodes)),
+        all(e.kind in "RLCVIS" for e in netlist.elements),
+    )
+
+
+def _reserved(name: str) -> bool:
+    return name in RESERVED or keyword.iskeyword(name)
+
+
+def _branches_of(e: Element) -> list[tuple[str, str]]:
+    """Pairs of nodes between which an element carries a current."""
+    if e.kind == "T":
+        return [(e.nodes[0], e.nodes[1]), (e.nodes[2], e.nodes[3])]
+    return [(e.nodes[0], e.nodes[1])]
+
+
+class _Joined:
+    """Sets of nodes that are joined, a union–find."""
+
+    def __init__(self, nodes: Iterable[str]) -> None:
+        self._parent = {node: node for node in nodes}
+
+    def root(self, node: str) -> str:
+        while self._parent[node] != node:
+            self._parent[node] = self._parent[self._parent[node]]
+            node = self._parent[node]
+        return node
+
+    def join(self, a: str, b: str) -> bool:
+        """Join two nodes; whether they were apart."""
+        x, y = self.root(a), self.root(b)
+        self._parent[x] = y
+        return x != y
+
+
+def _loops(branches: Sequence[Element]) -> Iterable[tuple[str, ...]]:
+    """One loop of capacitors and sources for every voltage source that is in one."""
+    inside = [e for e in branches if e.kind in "CVEH"]
+    for source in inside:
+        if source.kind == "C":
+            continue
+        path = _path([e for e in inside if e is not source], *source.nodes[:2])
+        if path is not None:
+            yield (source.name, *path)
+
+
+def _path(branches: Sequence[Element], start: str, stop: str) -> list[str] | None:
+    """Names of elements on a shortest path, or None."""
+    near: dict[str, list[tuple[str, str]]] = {}
+    for e in branches:
+        a, b = e.nodes[:2]
+        near.setdefault(a, []).append((b, e.name))
+        near.setdefault(b, []).append((a, e.name))
+    reached: dict[str, list[str]] = {start: []}
+    front = [start]
+    while front:
+        following = []
+        for node in front:
+            for other, name in near.get(node, []):
+                if other not in reached:
+                    reached[other] = [*reached[node], name]
+                    following.append(other)
+        front = following
+    return reached.get(stop)
+
+
+def _cutsets(branches: Sequence[Element], nodes: set[str]) -> Iterable[tuple[str, ...]]:
+    """Inductors and current sources around each part that nothing else connects to ground."""
+    rest = _Joined(nodes)
+    for e in branches:
+        if e.kind not in "LIGF":
+            for pair in _branches_of(e):
+                rest.join(*pair)
+    parts = {rest.root(node) for node in nodes} - {rest.root(GROUND)}
+    crossing = [e for e in branches if e.kind in "LIGF"]
+    for part in sorted(parts):
+        sides = [[rest.root(node) == part for node in e.nodes[:2]] for e in crossing]
+        yield tuple(e.name for e, (a, b) in zip(crossing, sides, strict=True) if a != b)
+
+
+class _Builder:
+    """Stamps of the elements, row by row."""
+
+    def __init__(self, netlist: Netlist, name: str, file: str, measured: Sequence[str]) -> None:
+        self.netlist, self.file = netlist, file
+        self.draft = PlantDraft(name, title=netlist.title or f"circuit {name}", reference=file)
+        self.draft.comments.append(f"Modified nodal analysis of {file}.")
+        self.elements = {e.name.lower(): e for e in netlist.elements}
+        self.constants: dict[str, float] = {}  # of sources, by the input's name
+        self._taken: set[str] = set()
+        self._node: dict[str, str] = {}  # state of a node's voltage
+        self._row: dict[str, int] = {}  # of a node's balance of currents
+        self._current: dict[str, str] = {}  # state of an element's current, by lower-case name
+        self._wanted = {
+            match[2].lower()
+            for quantity in (*netlist.saved, *measured)
+            for match in _QUANTITY.finditer(quantity)
+            if match[1].lower() == "i"
+        }
+
+    def build(self) -> PlantDraft:
+        draft = self.draft
+        for key, value in self.netlist.parameters.items():
+            draft.parameters[self._claim(key, key)] = value
+        nodes = dict.fromkeys(n for e in self.netlist.elements for n in e.nodes if n != GROUND)
+        for node in nodes:
+            plain = node.isidentifier() and not _reserved(node)
+            label = self._claim(node if plain else f"v{node}", f"v_{node}")
+            self._node[node] = label
+            self._row[node] = draft.equation(f"currents at node {node}")
+            draft.states[label] = (self._initial(f"v({node})"), "V")
+        for e in self.netlist.elements:
+            wanted = e.name.lower() in self._wanted
+            if e.kind in _WITH_CURRENT or (e.kind in "RS" and wanted):
+                label = self._claim(f"i{e.name.lower()}", f"i_{e.name}")
+                self._current[e.name.lower()] = label
+                start = e.initial if e.kind == "L" and e.initial is not None else None
+                given = self._initial(f"i({e.name.lower()})")
+                draft.states[label] = (given if start is None else start, "A")
+        for e in self.netlist.elements:
+            getattr(self, f"_stamp_{e.kind}")(e)
+        self._start_of_capacitors()
+        return draft
+
+    def output(self, text: str) -> None:
+        """Add an output, ``v(a)``, ``v(a,b)``, ``i(R1)`` or a sum of such, perhaps with a name.
+
+        Raises:
+            ConfigError: no such node or element, or a text that is not such a sum.
+        """
+        label, equals, body = text.partition("=")
+        if not equals:
+            label, body = "", text
+        body = body.replace(" ", "")
+        terms = list(_TERM.finditer(body))
+        if not terms or "".join(match[0] for match in terms) != body:
+            raise ConfigError(
+                f"{self.file}: cannot measure {shown(text)}; write v(node), v(a,b), i(element) or "
+                "a sum such as y=i(L1)+2*v(out)"
+            )
+        row = len(self.draft.outputs)
+        parts: list[tuple[str, float]] = []
+        units = set()
+        for match in terms:
+            factor = float(match[2] or 1.0) * (-1.0 if match[1] == "-" else 1.0)
+            for column, sign in self._quantity(match[3]):
+                parts.append((column, factor * sign))
+            units.add("V" if match[3][0].lower() == "v" else "A")
+        name = label.strip() or ("y" if len(terms) > 1 else f"y_{parts[0][0]}")
+        self.draft.outputs[self._claim(name, f"{name}_")] = units.pop() if len(units) == 1 else ""
+        for column, factor in parts:
+            self.draft.add("C", row, column, factor)
+
+    def source(self, word: str) -> str:
+        """The input's name of an independent source."""
+        found = self.elements.get(word.lower())
+        return found.name if found is not None else word
+
+    def _quantity(self, text: str) -> list[tuple[str, float]]:
+        """States that make up a quantity, with their signs."""
+        match = _QUANTITY.fullmatch(text)
+        if match is None:
+            raise ConfigError(f"{self.file}: {shown(text)} is neither v(node) nor i(element)")
+        if match[1].lower() == "i":
+            name = match[2].lower()
+            if name not in self._current:
+                what = "no element" if name not in self.elements else "an element whose current "
+                raise ConfigError(
+                    f"{self.file}: i({match[2]}): there is {what}"
+                    + (
+                        f"{match[2]}" + nearest(name, self.elements)
+                        if name not in self.elements
+                        else "is not an unknown; measure that of a resistor, inductor or source"
+                    )
+                )
+            return [(self._current[name], 1.0)]
+        out = []
+        for node, sign in ((match[2], 1.0), (match[3] or GROUND, -1.0)):
+            low = node.lower()
+            if low in (GROUND, "gnd"):
+                continue
+            if low not in self._node:
+                raise ConfigError(
+                    f"{self.file}: there is no node {node}" + nearest(low, self._node)
+                )
+            out.append((self._node[low], sign))
+        return out
+
+    def _claim(self, name: str, otherwise: str) -> str:
+        """A name nobody has yet; names differ in more than case, for the reader's sake."""
+        for candidate in (name, otherwise, *(f"{otherwise}_{k}" for k in range(2, 1000))):
+            if candidate not in self._taken and not _reserved(candidate):
+                self._taken.add(candidate)
+                return candidate
+        raise ConfigError(f"{self.file}: no name is left for {name}")
+
+    def _initial(self, quantity: str) -> float:
+        return self.netlist.initial.get(quantity, 0.0)
+
+    def _value(self, e: Element) -> tuple[str, bool]:
+        """A parameter that stands for the element's value; whether it varies with time."""
+        if e.name not in self.draft.parameters:
+            self.draft.parameters[self._claim(e.name, f"{e.name}_")] = e.value
+        varies = isinstance(e.value, str) and self._varies(e.value)
+        return e.name, varies
+
+    def _varies(self, text: str) -> bool:
+        words = set(re.findall(r"[A-Za-z_]\w*", text))
+        if "t" in words:
+            return True
+        known = self.draft.parameters
+        return any(isinstance(known.get(w), str) and self._varies(str(known[w])) for w in words)
+
+    def _between(self, matrix: str, row: int | None, a: str, b: str, text: str) -> None:
+        """Add text · (v_a − v_b) to a row."""
+        if row is None:
+            return
+        for node, sign in ((a, ""), (b, "-")):
+            if node != GROUND:
+                self.draft.add(matrix, row, self._node[node], sign + text)
+
+    def _admittance(self, matrix: str, e: Element, text: str, sign: int = 1) -> None:
+        """A current text · (v_a − v_b) from node a to node b, in the balances of both."""
+        a, b = e.nodes[:2]
+        minus, plus = ("-", "") if sign > 0 else ("", "-")
+        for node, flow in ((a, plus), (b, minus)):
+            if node != GROUND:
+                for other, own in ((a, ""), (b, "-")):
+                    if other != GROUND:
+                        entry = "" if flow == own else "-"
+                        self.draft.add(matrix, self._row[node], self._node[other], entry + text)
+
+    def _branch(self, nodes: tuple[str, str], column: str, factor: str = "") -> None:
+        """A current that leaves its first node and enters its second."""
+        for node, sign in ((nodes[0], "-"), (nodes[1], "")):
+            if node != GROUND:
+                term = f"{sign}{factor}" if factor else (-1.0 if sign else 1.0)
+                self.draft.add("A", self._row[node], column, term)
+
+    def _stamp_R(self, e: Element) -> None:
+        name, _ = self._value(e)
+        column = self._current.get(e.name.lower())
+        if column is None:
+            self._admittance("A", e, f"1/{name}", sign=-1)
+            return
+        row = self._voltage_row(e, f"{e.name}: Ohm's law")
+        self.draft.add("A", row, column, f"-{name}")
+        self._branch((e.nodes[0], e.nodes[1]), column)
+
+    def _stamp_S(self, e: Element) -> None:
+        name, _ = self._value(e)
+        column = self._current.get(e.name.lower())
+        if column is None:
+            self._admittance("A", e, name, sign=-1)
+            return
+        row = self.draft.equation(f"{e.name}: current of the switch, a conductance")
+        self._between("A", row, e.nodes[0], e.nodes[1], name)
+        self.draft.add("A", row, column, -1.0)
+        self._branch((e.nodes[0], e.nodes[1]), column)
+
+    def _stamp_C(self, e: Element) -> None:
+        name, varies = self._value(e)
+        self._admittance("E", e, name)
+        if varies:
+            self._admittance("A", e, f"d({name})", sign=-1)
+
+    def _stamp_L(self, e: Element) -> None:
+        name, varies = self._value(e)
+        column = self._current[e.name.lower()]
+        row = self._voltage_row(e, f"{e.name}: voltage is the change of flux")
+        self._row[f"coil {e.name.lower()}"] = row
+        self.draft.add("E", row, column, name)
+        if varies:
+            self.draft.add("A", row, column, f"-d({name})")
+        self._branch((e.nodes[0], e.nodes[1]), column)
+
+    def _stamp_K(self, e: Element) -> None:
+        coils = [self.elements.get(name) for name in e.controls]
+        for name, coil in zip(e.controls, coils, strict=True):
+            if coil is None or coil.kind != "L":
+                raise e.place.error(f"{e.name} couples {name}, which is no inductor")
+        value, _ = self._value(e)
+        first, second = (coil for coil in coils if coil is not None)
+        for coil in (first, second):  # their equations stand before the coupling's terms
+            if f"coil {coil.name.lower()}" not in self._row:
+                raise e.place.error(f"{e.name} has to stand below {coil.name}")
+        mutual = self._claim(f"M_{e.name}", f"M_{e.name}_")
+        self.draft.parameters[mutual] = f"{value}*sqrt({first.name}*{second.name})"
+        varies = self._varies(str(self.draft.parameters[mutual]))
+        for own, other in ((first, second), (second, first)):
+            row = self._row[f"coil {own.name.lower()}"]
+            column = self._current[other.name.lower()]
+            self.draft.add("E", row, column, mutual)
+            if varies:
+                self.draft.add("A", row, column, f"-d({mutual})")
+
+    def _stamp_V(self, e: Element) -> None:
+        column = self._current[e.name.lower()]
+        row = self._voltage_row(e, f"{e.name}: voltage of the source")
+        self.draft.add("B", row, self._input(e, "V"), -1.0)
+        self._branch((e.nodes[0], e.nodes[1]), column)
+
+    def _stamp_I(self, e: Element) -> None:
+        name = self._input(e, "A")
+        for node, sign in ((e.nodes[0], -1.0), (e.nodes[1], 1.0)):
+            if node != GROUND:
+                self.draft.add("B", self._row[node], name, sign)
+
+    def _stamp_E(self, e: Element) -> None:
+        name, _ = self._value(e)
+        row = self._voltage_row(e, f"{e.name}: controlled voltage")
+        self._between("A", row, e.nodes[3], e.nodes[2], name)
+        self._branch((e.nodes[0], e.nodes[1]), self._current[e.name.lower()])
+
+    def _stamp_H(self, e: Element) -> None:
+        name, _ = self._value(e)
+        row = self._voltage_row(e, f"{e.name}: voltage controlled by a current")
+        self.draft.add("A", row, self._controlling(e), f"-{name}")
+        self._branch((e.nodes[0], e.nodes[1]), self._current[e.name.lower()])
+
+    def _stamp_G(self, e: Element) -> None:
+        name, _ = self._value(e)
+        for node, out in ((e.nodes[0], True), (e.nodes[1], False)):
+            if node != GROUND:
+                a, b = (e.nodes[3], e.nodes[2]) if out else (e.nodes[2], e.nodes[3])
+                self._between("A", self._row[node], a, b, name)
+
+    def _stamp_F(self, e: Element) -> None:
+        name, _ = self._value(e)
+        self._branch((e.nodes[0], e.nodes[1]), self._controlling(e), name)
+
+    def _stamp_T(self, e: Element) -> None:
+        name, _ = self._value(e)
+        column = self._current[e.name.lower()]
+        row = self._voltage_row(e, f"{e.name}: ideal transformer, v_1 = n v_2")
+        self._between("A", row, e.nodes[3], e.nodes[2], name)
+        self._branch((e.nodes[0], e.nodes[1]), column)
+        self._branch((e.nodes[3], e.nodes[2]), column, name)
+
+    def _voltage_row(self, e: Element, says: str) -> int:
+        """A row that begins with v_a − v_b."""
+        row = self.draft.equation(says)
+        for node, sign in ((e.nodes[0], 1.0), (e.nodes[1], -1.0)):
+            if node != GROUND:
+                self.draft.add("A", row, self._node[node], sign)
+        return row
+
+    def _input(self, e: Element, unit: str) -> str:
+        name = self._claim(e.name, f"{e.name}_source")
+        self.draft.inputs[name] = (e.value, unit)
+        if isinstance(e.value, float):
+            self.constants[name] = e.value
+        return name
+
+    def _controlling(self, e: Element) -> str:
+        column = self._current.get(e.controls[0])
+        if column is None:
+            raise e.place.error(
+                f"{e.name} is controlled by the current of {e.controls[0]}, which has to be a "
+                "voltage source or an inductor"
+            )
+        return column
+
+    def _start_of_capacitors(self) -> None:
+        """Node voltages from ``ic=`` of capacitors: those at ground first, then along chains."""
+        known: dict[str, float] = {GROUND: 0.0}
+        for node in self._node:
+            if f"v({node})" in self.netlist.initial:
+                known[node] = self.netlist.initial[f"v({node})"]
+        given = [e for e in self.netlist.elements if e.kind == "C" and e.initial is not None]
+        changed = True
+        while changed:
+            changed = False
+            for e in given:
+                a, b = e.nodes
+                assert e.initial is not None  # noqa: S101
+                if (a in known) != (b in known):
+                    if b in known:
+                        known[a] = known[b] + e.initial
+                    else:
+                        known[b] = known[a] - e.initial
+                    changed = True
+        for node, value in known.items():
+            if node != GROUND:
+                label = self._node[node]
+                self.draft.states[label] = (value, self.draft.states[label][1])

@@ -1,0 +1,204 @@
+"""A plant under construction: rows and columns by name, written as a person would write it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import yaml
+
+from gpebo_cli.errors import ConfigError
+
+Entry = float | str
+
+_WIDTH = 96  # of a written line, where it can be broken
+
+
+@dataclass
+class PlantDraft:
+    """Equations are added one by one, entries as sums of terms; :meth:`mapping` is the plant.
+
+    Attributes:
+        name: of the plant, and of its file.
+        title: one line for people.
+        reference: where it is from.
+        comments: lines at the top of the file.
+    """
+
+    name: str
+    title: str = ""
+    reference: str = ""
+    comments: list[str] = field(default_factory=list)
+    parameters: dict[str, Entry] = field(default_factory=dict)
+    states: dict[str, tuple[Entry, str]] = field(default_factory=dict)  # initial value, unit
+    inputs: dict[str, tuple[Entry, str]] = field(default_factory=dict)  # signal, unit
+    unknowns: dict[str, tuple[Entry, str]] = field(default_factory=dict)  # truth, unit
+    outputs: dict[str, str] = field(default_factory=dict)  # unit
+    rows: list[str] = field(default_factory=list)  # what each equation says
+    _terms: dict[str, dict[tuple[int, str], list[Entry]]] = field(
+        default_factory=lambda: {name: {} for name in "EABFCDH"}
+    )
+
+    def equation(self, says: str) -> int:
+        """A new row of E x' = A x + B u + F θ; its number."""
+        self.rows.append(says)
+        return len(self.rows) - 1
+
+    def add(self, matrix: str, row: int, column: str, term: Entry) -> None:
+        """Add a term to the entry of a matrix (E, A, B, F, C, D or H) in a row and a column."""
+        self._terms[matrix].setdefault((row, column), []).append(term)
+
+    def add_matrix(self, matrix: str, values: object, first: int = 0) -> None:
+        """Add all entries of a matrix that are not zero, its rows from ``first`` on."""
+        columns = list(self._columns(matrix))
+        for i, j, value in _nonzero(values):
+            self.add(matrix, first + i, columns[j], value)
+
+    def make_unknown(self, names: Iterable[str], numbers: Mapping[str, float]) -> None:
+        """Turn inputs into unknown parameters: their columns of B and D move to F and H.
+
+        Args:
+            names: of the inputs.
+            numbers: the constant value of every input that has one.
+
+        Raises:
+            ConfigError: no such input, or one that is not constant.
+        """
+        for name in names:
+            if name not in self.inputs:
+                raise ConfigError(
+                    f"plant {self.name}: {name} cannot be an unknown, it is no source; sources: "
+                    f"{', '.join(self.inputs) or 'none'}"
+                )
+            if name not in numbers:
+                raise ConfigError(
+                    f"plant {self.name}: {name} varies with time, and an unknown is a constant; "
+                    "give the source one number, or leave it an input"
+                )
+            self.unknowns[name] = (numbers[name], self.inputs.pop(name)[1])
+            for known, unknown in (("B", "F"), ("D", "H")):
+                for key in [key for key in self._terms[known] if key[1] == name]:
+                    self._terms[unknown][key] = self._terms[known].pop(key)
+
+    def mapping(self) -> dict[str, object]:
+        """The plant as the plain data of its file."""
+        text: dict[str, object] = {
+            "name": self.name,
+            "title": self.title or None,
+            "reference": self.reference or None,
+            "parameters": dict(self.parameters),
+            "states": list(self.states),
+            "inputs": {name: value for name, (value, _) in self.inputs.items()},
+            "unknowns": {name: value for name, (value, _) in self.unknowns.items()},
+            "outputs": list(self.outputs),
+            "E": self._grid("E"),
+            "A": self._grid("A"),
+        }
+        for matrix in "BFCDH":
+            wanted = bool(self._terms[matrix]) or (matrix in "BFC" and self._size(matrix))
+            if wanted:
+                text[matrix] = self._grid(matrix)
+        text["initial_state"] = {name: value for name, (value, _) in self.states.items()}
+        text["units"] = {
+            name: unit
+            for group in (self.states, self.inputs, self.unknowns)
+            for name, (_, unit) in group.items()
+            if unit
+        } | {name: unit for name, unit in self.outputs.items() if unit}
+        return {key: value for key, value in text.items() if value not in (None, {}, [])}
+
+    def to_yaml(self) -> str:
+        """The text of the plant's file, with a comment for every equation."""
+        plant = self.mapping()
+        lines = [f"# {line}".rstrip() for line in self.comments]
+        for key, value in plant.items():
+            if key in ("E", "A", "B", "F", "C", "D", "H"):
+                lines += ["", *self._matrix_lines(key, value)]
+            elif isinstance(value, dict) and key in ("parameters", "inputs", "unknowns"):
+                lines += ["", f"{key}:"]
+                lines += [f"  {_scalar(label)}: {_scalar(item)}" for label, item in value.items()]
+            else:
+                if key in ("states", "initial_state"):
+                    lines.append("")
+                lines += _flow(key, value)
+        return "\n".join([*lines, ""])
+
+    def _columns(self, matrix: str) -> Iterable[str]:
+        if matrix in "BD":
+            return self.inputs
+        return self.unknowns if matrix in "FH" else self.states
+
+    def _height(self, matrix: str) -> int:
+        return len(self.outputs) if matrix in "CDH" else len(self.rows)
+
+    def _size(self, matrix: str) -> int:
+        return self._height(matrix) * len(list(self._columns(matrix)))
+
+    def _grid(self, matrix: str) -> list[list[Entry]]:
+        terms, columns = self._terms[matrix], list(self._columns(matrix))
+        return [
+            [_sum(terms.get((row, column), [])) for column in columns]
+            for row in range(self._height(matrix))
+        ]
+
+    def _matrix_lines(self, matrix: str, grid: object) -> list[str]:
+        assert isinstance(grid, list)  # noqa: S101  made by _grid
+        notes = list(self.outputs) if matrix in "CDH" else self.rows
+        written = ["  - [" + ", ".join(map(_scalar, row)) + "]" for row in grid]
+        longest = max((len(line) for line in written), default=0)
+        if longest > _WIDTH:  # the comment stands above a row that fills the line
+            pairs = zip(written, notes, strict=True)
+            body = [line for row, note in pairs for line in (f"  # {note}", row)]
+        else:
+            body = [
+                f"{row:<{longest}}  # {note}" for row, note in zip(written, notes, strict=True)
+            ]
+        return [f"{matrix}:", *body]
+
+
+def _nonzero(values: object) -> Iterable[tuple[int, int, Entry]]:
+    """Row, column and value of what is not zero in a dense, sparse or nested matrix."""
+    if hasattr(values, "tocoo"):
+        sparse = values.tocoo()
+        order = np.lexsort((sparse.col, sparse.row))
+        for k in order.tolist():
+            if sparse.data[k] != 0:
+                yield int(sparse.row[k]), int(sparse.col[k]), float(sparse.data[k])
+        return
+    for i, row in enumerate(np.asarray(values, dtype=object)):
+        for j, value in enumerate(row):
+            if isinstance(value, str) or value != 0:
+                yield i, j, value if isinstance(value, str) else float(value)
+
+
+def _sum(terms: list[Entry]) -> Entry:
+    """The terms as one entry: numbers are added up, texts are joined by their signs."""
+    number = sum(term for term in terms if not isinstance(term, str))
+    text = [term for term in terms if isinstance(term, str)]
+    if not text:
+        return int(number) if number == int(number) and abs(number) < 1e15 else number
+    if number:
+        text.insert(0, repr(float(number)))
+    out = text[0]
+    for term in text[1:]:
+        out += f" - {term[1:]}" if term.startswith("-") else f" + {term}"
+    return out
+
+
+def _flow(key: str, value: object) -> list[str]:
+    """A key with a text, a list or a mapping, lists and mappings in brackets."""
+    if isinstance(value, list | dict):
+        return yaml.safe_dump(
+            {key: value}, default_flow_style=None, sort_keys=False, width=_WIDTH,
+            allow_unicode=True,
+        ).splitlines()
+    return [f"{key}: {_scalar(value)}"]
+
+
+def _scalar(value: object) -> str:
+    """One value as YAML writes it inside a list."""
+    if isinstance(value, float) and value == int(value) and abs(value) < 1e15:
+        value = int(value)
+    written = yaml.safe_dump([value], default_flow_style=True, width=10**9, allow_unicode=True)
+    return written.strip()[1:-1]

@@ -1,0 +1,248 @@
+"""Constant matrices as a plant: arrays, python-control, MATLAB, Matrix Market, Modelica.
+
+Files are data: ``.mat`` is read by SciPy, ``.mtx`` by SciPy, a Modelica linearisation is parsed
+as text; no code in them is run.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.importers.draft import PlantDraft
+from gpebo_cli.schema import shown
+
+MAX_BYTES = 200_000_000  # of a file of matrices
+MAX_STATES = 2_000
+
+_NAMES = "EABCD"
+
+
+def from_matrices(
+    matrices: Mapping[str, Any], name: str, *, states: Sequence[str] | None = None,
+    inputs: Mapping[str, float | str] | Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None, initial_state: Sequence[float] | None = None,
+    title: str = "", reference: str = "",
+) -> PlantDraft:
+    """E x' = A x + B u, y = C x + D u with constant matrices.
+
+    Args:
+        matrices: A (n, n), and E (n, n; default: identity), B (n, m), C (r, n), D (r, m), dense or
+            sparse.
+        name: of the plant.
+        states: n names; default x1, x2, …
+        inputs: m names with their signals, or names alone (their signals are 0); default u1, …
+        outputs: r names; default y1, …
+        initial_state: (n,); default zeros.
+        title: one line.
+        reference: where the matrices are from.
+
+    Raises:
+        ConfigError: A is missing, sizes that do not fit (says both), or entries that are not real.
+    """
+    present = [key for key in _NAMES if matrices.get(key) is not None]
+    given = {key: _real(key, matrices[key], name) for key in present}
+    if "A" not in given:
+        raise ConfigError(f"plant {name}: the matrix A is missing")
+    n = given["A"].shape[0]
+    if n > MAX_STATES:
+        raise ConfigError(f"plant {name}: A has {n} states; at most {MAX_STATES} are read")
+    m = given["B"].shape[1] if "B" in given else 0
+    r = given["C"].shape[0] if "C" in given else 0
+    sizes = {"E": (n, n), "A": (n, n), "B": (n, m), "C": (r, n), "D": (r, m)}
+    for key, matrix in given.items():
+        if matrix.shape != sizes[key]:
+            rows, columns = matrix.shape
+            raise ConfigError(
+                f"plant {name}: {key} is {rows} × {columns}; expected {sizes[key][0]} × "
+                f"{sizes[key][1]}"
+            )
+    draft = PlantDraft(name, title or f"matrices {name}", reference)
+    start = np.zeros(n) if initial_state is None else np.asarray(initial_state, dtype=float)
+    labels = _labels("states", states, "x", n, name)
+    if start.shape != (n,):
+        raise ConfigError(f"plant {name}: initial_state has {start.size} values for {n} states")
+    draft.states.update({s: (float(v), "") for s, v in zip(labels, start, strict=True)})
+    signals = inputs if isinstance(inputs, Mapping) else {}
+    columns = _labels("inputs", None if inputs is None else list(inputs), "u", m, name)
+    draft.inputs.update({u: (signals.get(u, 0.0), "") for u in columns})
+    draft.outputs.update(dict.fromkeys(_labels("outputs", outputs, "y", r, name), ""))
+    for i in range(n):
+        draft.equation(f"equation {i + 1}")
+    draft.add_matrix("E", given.get("E", np.eye(n)))
+    for key in "ABCD":
+        if key in given:
+            draft.add_matrix(key, given[key])
+    return draft
+
+
+def from_control(system: Any, name: str, **options: Any) -> PlantDraft:
+    """A state-space model of python-control or SciPy, or anything with A, B, C, D (and E).
+
+    Args:
+        system: with attributes ``A, B, C, D``, perhaps ``E``, ``dt`` and labels.
+        name: of the plant.
+        options: as in :func:`from_matrices`; labels of the model are kept.
+
+    Raises:
+        ConfigError: a discrete-time model, or one without A.
+    """
+    dt = getattr(system, "dt", None)
+    if dt not in (None, 0, 0.0):
+        raise ConfigError(
+            f"plant {name}: the model is in discrete time (dt = {dt}), and gpebo's plants are "
+            "differential equations; convert it to continuous time first"
+        )
+    if not hasattr(system, "A"):
+        kind = type(system).__name__
+        raise ConfigError(f"plant {name}: {kind} has no A; give a state-space model")
+    matrices = {key: getattr(system, key, None) for key in _NAMES}
+    kinds = (("states", "state_labels"), ("inputs", "input_labels"), ("outputs", "output_labels"))
+    for option, attribute in kinds:
+        labels = getattr(system, attribute, None)
+        if labels is not None and option not in options:
+            options[option] = [_identifier(str(label)) for label in labels]
+    return from_matrices(matrices, name, **options)
+
+
+def read_matrices(path: Path) -> dict[str, Any]:
+    """Matrices and names in a file or folder.
+
+    A ``.mat`` file with E, A, B, C, D; a folder of Matrix Market files whose names end in
+    ``.E.mtx``, ``_A.mtx`` or are ``B.mtx``; a linearisation by OpenModelica or Julia as Python
+    (``.py``) or MATLAB (``.m``) text with ``A = [...]``.
+
+    Raises:
+        ConfigError: nothing that can be read; names the file and what was expected.
+    """
+    if path.is_dir():
+        return _matrix_market(path)
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file")
+    if path.stat().st_size > MAX_BYTES:
+        raise ConfigError(
+            f"{path} has {path.stat().st_size} bytes; at most {MAX_BYTES} are read"
+        )
+    if path.suffix == ".mat":
+        return _matlab(path)
+    if path.suffix in (".py", ".m"):
+        return _modelica(path)
+    raise ConfigError(f"{path}: expected a .mat, .py or .m file, or a folder of .mtx files")
+
+
+def _matlab(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, variable_names=list(_NAMES))
+    except (ValueError, NotImplementedError, OSError, TypeError) as error:
+        raise ConfigError(
+            f"{path} cannot be read ({error}); save it with -v7 and the matrices E, A, B, C, D"
+        ) from None
+    found = {key: content[key] for key in _NAMES if key in content}
+    if "A" not in found:
+        raise ConfigError(f"{path} has no matrix A; expected A and, if there are any, E, B, C, D")
+    return found
+
+
+def _matrix_market(folder: Path) -> dict[str, Any]:
+    from scipy.io import mmread
+
+    found: dict[str, Any] = {}
+    for path in sorted(folder.glob("*.mtx")):
+        match = re.search(r"(?:^|[._-])([EABCD])\.mtx$", path.name)
+        if match is None:
+            continue
+        if match[1] in found:
+            raise ConfigError(f"{folder} has two files for {match[1]}; give a folder of one system")
+        if path.stat().st_size > MAX_BYTES:
+            raise ConfigError(f"{path} has more than {MAX_BYTES} bytes")
+        try:
+            found[match[1]] = mmread(path)
+        except ValueError as error:
+            raise ConfigError(f"{path} is no Matrix Market file ({error})") from None
+    if "A" not in found:
+        raise ConfigError(f"{folder} has no file A.mtx or NAME.A.mtx")
+    return found
+
+
+def _modelica(path: Path) -> dict[str, Any]:
+    """``A = [1, 2; 3, 4]`` of MATLAB text, or ``A = [[1, 2], [3, 4]]`` of Python text."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path} is not UTF-8 text") from None
+    found: dict[str, Any] = {}
+    assigned = r"^\s*([EABCD])\s*=\s*(?:np\.array\()?\s*(\[.*?\])\s*\)?\s*;?\s*$"
+    for match in re.finditer(assigned, text, re.MULTILINE | re.DOTALL):
+        found[match[1]] = _bracketed(match[2], f"{path}: {match[1]}")
+    names = (("states", "stateVars"), ("inputs", "inputVars"), ("outputs", "outputVars"),
+             ("initial_state", "x0"))
+    for key, word in names:
+        line = re.search(
+            rf"^\s*{word}\s*=\s*[\[{{](.*?)[\]}}]\s*;?\s*$", text, re.MULTILINE | re.DOTALL
+        )
+        if line is None:
+            continue
+        items = re.findall(r"[^,;\s'\"]+(?:\([^)]*\))?", line[1])
+        if key == "initial_state":
+            found[key] = [_float(item, f"{path}: {word}") for item in items]
+        else:
+            found[key] = [_identifier(item) for item in items]
+    if "A" not in found:
+        raise ConfigError(f"{path} has no line A = [...]; expected the text of a linear model")
+    return found
+
+
+def _bracketed(text: str, where: str) -> np.ndarray[Any, Any]:
+    try:
+        value = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        rows = [row for row in text.strip("[]").split(";") if row.strip()]
+        value = [
+            [_float(item, where) for item in row.replace(",", " ").split()] for row in rows
+        ]
+    try:
+        return np.atleast_2d(np.asarray(value, dtype=np.float64))
+    except (ValueError, TypeError):
+        raise ConfigError(f"{where} has rows of different lengths") from None
+
+
+def _float(text: str, where: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(f"{where}: {shown(text)} is not a number") from None
+
+
+def _identifier(text: str) -> str:
+    """A name that can stand in a plant: other characters become _."""
+    name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_")
+    return name if name and not name[0].isdigit() else f"x_{name}"
+
+
+def _labels(
+    kind: str, names: Sequence[str] | None, letter: str, count: int, plant: str
+) -> list[str]:
+    if names is None:
+        return [f"{letter}{i + 1}" for i in range(count)]
+    if len(names) != count:
+        raise ConfigError(f"plant {plant}: {len(names)} names of {kind} for {count} of them")
+    return list(names)
+
+
+def _real(key: str, value: Any, plant: str) -> Any:
+    """A matrix of finite real numbers, sparse ones as they are."""
+    matrix = value if hasattr(value, "tocoo") else np.atleast_2d(np.asarray(value))
+    data = matrix.tocoo().data if hasattr(matrix, "tocoo") else matrix
+    if not np.issubdtype(data.dtype, np.number) or (np.iscomplexobj(data) and data.imag.any()):
+        raise ConfigError(f"plant {plant}: {key} is not a matrix of real numbers")
+    if not np.isfinite(data).all():
+        raise ConfigError(f"plant {plant}: {key} has an entry that is not finite")
+    return matrix.real if np.iscomplexobj(data) else matrix

@@ -1,0 +1,594 @@
+"""SPICE netlists as data: lines of text to elements with nodes, values and places.
+
+What is read: R L C K V I E G F H, switches S with given instants, ideal transformers T with a
+ratio, subcircuits, ``.param``, ``.ic``, ``.save``, ``.probe``. Values are numbers with SPICE's
+suffixes, or expressions of ``time`` in braces, in the language of plant files. Nothing is
+executed and no other file is read. As in SPICE the first line is a title, names do not depend on
+case, and node 0 (or gnd) is ground.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.expressions import RESERVED
+from gpebo_cli.schema import nearest, shown
+
+GROUND = "0"
+MAX_LINES = 20_000
+MAX_ELEMENTS = 5_000  # with those of subcircuits
+MAX_DEPTH = 20  # of subcircuits in subcircuits
+
+NODES = {"R": 2, "L": 2, "C": 2, "V": 2, "I": 2, "E": 4, "G": 4, "F": 2, "H": 2, "S": 2, "T": 4}
+"""Kinds of elements with the number of their nodes; K couples two inductors and has none."""
+
+_NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)([a-zA-Z]*)")
+_SUFFIXES = {
+    "t": 1e12, "g": 1e9, "meg": 1e6, "x": 1e6, "k": 1e3, "mil": 25.4e-6, "m": 1e-3, "u": 1e-6,
+    "n": 1e-9, "p": 1e-12, "f": 1e-15,
+}
+_WORD = re.compile(r"[A-Za-z_]\w*")
+_IN_EXPRESSION = re.compile(
+    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?[A-Za-z]*)|(?P<word>[A-Za-z_]\w*)|(?P<rest>.)"
+)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where something stands in a file, for messages."""
+
+    file: str
+    line: int
+
+    def error(self, what: str) -> ConfigError:
+        """What is wrong there, as one line."""
+        return ConfigError(f"{self.file}, line {self.line}: {what}")
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element; ``value`` is a number or an expression in ``t`` and in parameters."""
+
+    kind: str
+    name: str  # as written; of a subcircuit's element the instances and the name, with _
+    nodes: tuple[str, ...]
+    value: float | str
+    place: Place
+    controls: tuple[str, ...] = ()  # names of the elements it is controlled by or couples
+    initial: float | None = None
+
+
+@dataclass(frozen=True)
+class Netlist:
+    """A circuit without its subcircuits: they are in place."""
+
+    title: str
+    elements: tuple[Element, ...]
+    parameters: Mapping[str, float | str]
+    initial: Mapping[str, float]  # by quantity, ``v(out)`` or ``i(l1)``
+    saved: tuple[str, ...]  # quantities, likewise
+
+
+@dataclass
+class _Block:
+    """Lines between .subckt and .ends, or those outside."""
+
+    name: str = ""
+    ports: tuple[str, ...] = ()
+    defaults: dict[str, str] = field(default_factory=dict)
+    lines: list[tuple[Place, str]] = field(default_factory=list)
+
+
+def read_netlist(text: str, file: str = "netlist") -> Netlist:
+    """Read a netlist.
+
+    Args:
+        text: of the file; its first line is the title.
+        file: its name, for messages.
+
+    Raises:
+        ConfigError: names the line, the element and what would be accepted.
+    """
+    title, lines = _logical_lines(text, file)
+    outside, blocks = _blocks(lines)
+    reader = _Reader(blocks)
+    reader.expand(outside, {}, {}, "", 0)
+    if not reader.elements:
+        raise ConfigError(f"{file}: there is no element in it (the first line is a title)")
+    return Netlist(
+        title, tuple(reader.elements.values()), reader.parameters, reader.initial,
+        tuple(reader.saved),
+    )
+
+
+def number(text: str) -> float | None:
+    """A number with a SPICE suffix (4.7k, 10uF, 1meg), or None."""
+    match = _NUMBER.fullmatch(text)
+    if match is None:
+        return None
+    tail = match[2].lower()
+    for suffix in ("meg", "mil"):
+        if tail.startswith(suffix):
+            return float(match[1]) * _SUFFIXES[suffix]
+    return float(match[1]) * (_SUFFIXES.get(tail[:1], 1.0) if tail else 1.0)
+
+
+def _logical_lines(text: str, file: str) -> tuple[str, list[tuple[Place, str]]]:
+    """The title, and lines without comments, with those that ``+`` continues."""
+    raw = text.splitlines()
+    if len(raw) > MAX_LINES:
+        raise ConfigError(f"{file} has {len(raw)} lines; at most {MAX_LINES} are read")
+    lines: list[tuple[Place, str]] = []
+    for k, line in enumerate(raw[1:], start=2):
+        content = re.split(r";|\$ |//", line)[0].strip()
+        if not content or content.startswith("*"):
+            continue
+        if content.startswith("+"):
+            if not lines:
+                raise Place(file, k).error("there is no line that + continues")
+            place, before = lines[-1]
+            lines[-1] = (place, f"{before} {content[1:]}")
+        else:
+            lines.append((Place(file, k), content))
+    return (raw[0].strip().lstrip("*").strip() if raw else ""), lines
+
+
+def _blocks(lines: list[tuple[Place, str]]) -> tuple[_Block, dict[str, _Block]]:
+    outside, blocks, current = _Block(), {}, None
+    for place, line in lines:
+        words = line.split()
+        head = words[0].lower()
+        if head == ".subckt":
+            if current is not None:
+                raise place.error(f".subckt inside .subckt {current.name}; close that with .ends")
+            if len(words) < 3:
+                raise place.error(".subckt needs a name and nodes, as in .subckt filter in out")
+            plain, options = _options(" ".join(words[2:]), place)
+            current = _Block(words[1], tuple(map(_node, plain)), options)
+            blocks[words[1].lower()] = current
+        elif head == ".ends":
+            if current is None:
+                raise place.error(".ends without .subckt")
+            current = None
+        elif head == ".end":
+            break
+        else:
+            (outside if current is None else current).lines.append((place, line))
+    if current is not None:
+        raise ConfigError(f"{lines[-1][0].file}: .subckt {current.name} has no .ends")
+    return outside, blocks
+
+
+def _node(word: str) -> str:
+    lower = word.lower()
+    return GROUND if lower in ("0", "gnd") else lower
+
+
+def _tokens(text: str, place: Place) -> list[str]:
+    """Words; what stands in braces, quotes or parentheses stays together, = is a word."""
+    words: list[str] = []
+    depth, current = 0, ""
+    quoted = False
+    for letter in text:
+        if letter == "'":
+            quoted = not quoted
+            current += "{" if quoted else "}"
+            continue
+        depth += (letter in "{(") - (letter in "})")
+        if depth == 0 and not quoted and (letter.isspace() or letter in ",="):
+            if current:
+                words.append(current)
+            current = ""
+            if letter == "=":
+                words.append("=")
+        else:
+            current += letter
+    if depth or quoted:
+        raise place.error("a brace, a quote or a parenthesis is not closed")
+    return [*words, current] if current else words
+
+
+def _options(text: str, place: Place) -> tuple[list[str], dict[str, str]]:
+    """Plain words, and ``key=value`` pairs by lower-case key."""
+    words, options = _tokens(text, place), {}
+    plain: list[str] = []
+    k = 0
+    while k < len(words):
+        if k + 2 < len(words) and words[k + 1] == "=":
+            key = words[k].lower()
+            value = words[k + 2]
+            k += 3
+            # on=1,3,5: more numbers belong to the key until the next key
+            while k < len(words) and number(words[k]) is not None and (
+                k + 1 == len(words) or words[k + 1] != "="
+            ):
+                value += f" {words[k]}"
+                k += 1
+            options[key] = value
+        elif words[k] == "=":
+            raise place.error("= needs a name before it and a value behind it")
+        else:
+            plain.append(words[k])
+            k += 1
+    return plain, options
+
+
+class _Reader:
+    """Collects elements while subcircuits are put in place."""
+
+    def __init__(self, blocks: Mapping[str, _Block]) -> None:
+        self.blocks = blocks
+        self.elements: dict[str, Element] = {}  # by lower-case name
+        self.parameters: dict[str, float | str] = {}
+        self.initial: dict[str, float] = {}
+        self.saved: list[str] = []
+
+    def expand(
+        self, block: _Block, nodes: Mapping[str, str], scope: Mapping[str, str], prefix: str,
+        depth: int,
+    ) -> None:
+        """Read the lines of a block.
+
+        Args:
+            block: its lines.
+            nodes: what its ports are called outside.
+            scope: parameters by lower-case name, with what they are called in the plant.
+            prefix: of names inside, ``x1_``.
+            depth: of nesting.
+        """
+        known = dict(scope)
+        lines = [(place, line, line.split()[0].lower()) for place, line in block.lines]
+        for place, line, head in lines:
+            if head in (".param", ".params"):
+                _, given = _options(line.split(None, 1)[1] if " " in line else "", place)
+                if not given:
+                    raise place.error(".param needs name=value")
+                for name, value in given.items():
+                    known[name] = self._parameter(prefix + name, value, known, place)
+        for place, line, head in lines:
+            if head.startswith(".param"):
+                continue
+            if head.startswith("."):
+                self._command(head, line, place, prefix, nodes)
+            elif head.startswith("x"):
+                self._instance(line, place, nodes, known, prefix, depth)
+            else:
+                self._element(line, place, nodes, known, prefix)
+
+    def _parameter(
+        self, name: str, value: str, scope: Mapping[str, str], place: Place
+    ) -> str:
+        taken = {key.lower() for key in self.parameters} | RESERVED
+        while name.lower() in taken:
+            name += "_"
+        self.parameters[name] = self.value(value, scope, place, name)
+        return name
+
+    def value(
+        self, text: str, scope: Mapping[str, str], place: Place, what: str
+    ) -> float | str:
+        """A number, or an expression translated into the language of plants."""
+        inner = text[1:-1] if text.startswith("{") and text.endswith("}") else text
+        plain = number(inner.strip())
+        if plain is not None:
+            return plain
+        out: list[str] = []
+        for match in _IN_EXPRESSION.finditer(inner.replace("^", "**")):
+            if match["number"]:
+                found = number(match["number"])
+                plain = match["number"][-1].isdigit() or match["number"][-1] == "."
+                out.append(match["number"] if plain or found is None else repr(found))
+            elif match["word"]:
+                word = match["word"].lower()
+                if word in ("time", "t"):
+                    out.append("t")
+                elif word in scope:
+                    out.append(scope[word])
+                elif word in RESERVED:
+                    out.append(word)
+                else:
+                    raise place.error(
+                        f"{what} uses {match['word']}, which is neither a parameter nor a function"
+                        + nearest(word, [*scope, *RESERVED])
+                    )
+            else:
+                out.append(match["rest"])
+        return "".join(out).strip()
+
+    def _command(
+        self, head: str, line: str, place: Place, prefix: str, nodes: Mapping[str, str]
+    ) -> None:
+        rest = line.split(None, 1)[1] if len(line.split(None, 1)) > 1 else ""
+        if head == ".ic":
+            _, given = _options(rest, place)
+            for quantity, value in given.items():
+                found = number(value)
+                if found is None:
+                    raise place.error(f".ic {quantity} = {shown(value)} is not a number")
+                self.initial[_inside(quantity, prefix, nodes)] = found
+        elif head in (".save", ".probe", ".print"):
+            for quantity in _tokens(rest, place):
+                if quantity.lower() not in ("tran", "all"):
+                    self.saved.append(_inside(quantity.lower(), prefix, nodes))
+        elif head in (".include", ".inc", ".lib"):
+            raise place.error(
+                f"{head} would read another file, and a netlist is read alone; put its lines here"
+            )
+        elif head in (".model", ".func"):
+            raise place.error(
+                f"{head} is not read: elements are linear, R L C K V I E G F H S T X, and "
+                "expressions stand in braces"
+            )
+        # Other commands ask for analyses, which gpebo's own settings describe.
+
+    def _instance(
+        self, line: str, place: Place, nodes: Mapping[str, str], scope: Mapping[str, str],
+        prefix: str, depth: int,
+    ) -> None:
+        plain, given = _options(line, place)
+        plain = [word for word in plain if word.lower() != "params:"]
+        if len(plain) < 2 or plain[-1].lower() not in self.blocks:
+            what = shown(plain[-1]) if len(plain) > 1 else "nothing"
+            raise place.error(
+                f"{plain[0]} ends with the name of a subcircuit, and {what} is none"
+                + (nearest(plain[-1].lower(), self.blocks) if len(plain) > 1 else "")
+            )
+        block = self.blocks[plain[-1].lower()]
+        if depth >= MAX_DEPTH:
+            raise place.error(f"subcircuits are nested more than {MAX_DEPTH} deep ({block.name})")
+        ends = plain[1:-1]
+        if len(ends) != len(block.ports):
+            raise place.error(
+                f"{plain[0]} has {len(ends)} nodes and the subcircuit {block.name} has "
+                f"{len(block.ports)}"
+            )
+        for key in given:
+            if key not in block.defaults:
+                raise place.error(
+                    f"{plain[0]}: {block.name} has no parameter {key}"
+                    + nearest(key, block.defaults)
+                )
+        inside = prefix + plain[0].lower() + "_"
+        ports = dict(zip(block.ports, (_outer(word, nodes, prefix) for word in ends), strict=True))
+        inner = dict(scope)
+        for key, default in block.defaults.items():
+            inner[key] = self._parameter(inside + key, given.get(key, default), scope, place)
+        self.expand(block, ports, inner, inside, depth + 1)
+
+    def _element(
+        self, line: str, place: Place, nodes: Mapping[str, str], scope: Mapping[str, str],
+        prefix: str,
+    ) -> None:
+        plain, options = _options(line, place)
+        name, kind = plain[0], plain[0][0].upper()
+        if kind == "K":
+            element = self._coupling(plain, scope, place, prefix)
+        elif kind not in NODES:
+            raise place.error(
+                f"{shown(name)}: elements are {', '.join([*NODES, 'K', 'X'])} by their first letter"
+            )
+        else:
+            count = NODES[kind]
+            ends, rest = plain[1 : 1 + count], plain[1 + count :]
+            if len(ends) < count:
+                raise place.error(f"{name} needs {count} nodes and has {len(ends)}")
+            where = tuple(_outer(word, nodes, prefix) for word in ends)
+            element = self._valued(kind, name, where, rest, options, scope, place, prefix)
+        full = prefix + name
+        if not _WORD.fullmatch(full):
+            raise place.error(f"{shown(name)} cannot be a name; use letters, digits and _")
+        if full.lower() in self.elements:
+            raise place.error(
+                f"{name} stands in line {self.elements[full.lower()].place.line} already"
+            )
+        if len(self.elements) == MAX_ELEMENTS:
+            raise place.error(f"there are more than {MAX_ELEMENTS} elements")
+        self.elements[full.lower()] = replace(element, name=full)
+
+    def _coupling(
+        self, plain: Sequence[str], scope: Mapping[str, str], place: Place, prefix: str
+    ) -> Element:
+        if len(plain) != 4:
+            raise place.error(f"{plain[0]} needs two inductors and a coefficient, as K1 L1 L2 0.9")
+        value = self.value(plain[3], scope, place, plain[0])
+        if isinstance(value, float) and not abs(value) <= 1.0:
+            raise place.error(f"{plain[0]}: a coupling is at most 1, got {value:g}")
+        coils = tuple(prefix + word.lower() for word in plain[1:3])
+        return Element("K", plain[0], (), value, place, coils)
+
+    def _valued(
+        self, kind: str, name: str, where: tuple[str, ...], rest: list[str],
+        options: dict[str, str], scope: Mapping[str, str], place: Place, prefix: str,
+    ) -> Element:
+        controls: tuple[str, ...] = ()
+        allowed = {"C": ("ic",), "L": ("ic",), "S": ("on", "off", "ron", "roff"), "T": ("n",)}
+        wrong = [key for key in options if key not in allowed.get(kind, ())]
+        if wrong and kind == "T":
+            raise place.error(f"{name}: T is an ideal transformer with n=RATIO; lines are not read")
+        if wrong and wrong[0] not in ("tc1", "tc2", "tc", "temp", "m"):
+            raise place.error(f"{name}: {wrong[0]}= is not read here")
+        if wrong:
+            raise place.error(f"{name}: {wrong[0]}= changes the value; write the value itself")
+        value: float | str
+        if kind in "VI":
+            value = self._source(rest, scope, place, name)
+        elif kind == "S":
+            value = self._switch(options, scope, place, name)
+        elif kind == "T":
+            if rest or "n" not in options:
+                raise place.error(f"{name} needs n=RATIO, as in T1 a 0 b 0 n=2")
+            value = self.value(options["n"], scope, place, name)
+        else:
+            if kind in "FH":
+                if not rest:
+                    raise place.error(f"{name} needs the voltage source whose current controls it")
+                controls, rest = (prefix + rest[0].lower(),), rest[1:]
+            if len(rest) != 1:
+                got = "none" if not rest else " ".join(rest)
+                raise place.error(f"{name} needs one value, a number or {{expression}}; got {got}")
+            value = self.value(rest[0], scope, place, name)
+        if kind in "RLCST" and isinstance(value, float) and value == 0.0:
+            raise place.error(f"{name} has the value 0")
+        initial = None
+        if "ic" in options:
+            initial = number(options["ic"])
+            if initial is None:
+                raise place.error(f"{name}: ic={options['ic']} is not a number")
+        return Element(kind, name, where, value, place, controls, initial)
+
+    def _switch(
+        self, options: Mapping[str, str], scope: Mapping[str, str], place: Place, name: str
+    ) -> str:
+        """The conductance of a switch that closes and opens at given instants."""
+        if "on" not in options and "off" not in options:
+            raise place.error(f"{name} needs its instants, as in S1 a b on=1,3 off=2 ron=1m")
+        instants: dict[str, list[float]] = {}
+        for key in ("on", "off"):
+            found = [number(word) for word in options.get(key, "").split()]
+            instants[key] = [time for time in found if time is not None]
+            if len(instants[key]) != len(found):
+                raise place.error(f"{name}: {key}={options[key]} has to be times in seconds")
+        events = sorted([(t, 1) for t in instants["on"]] + [(t, -1) for t in instants["off"]])
+        signs = [sign for _, sign in events]
+        if any(a == b for a, b in itertools.pairwise(signs)):
+            raise place.error(f"{name}: on and off have to take turns")
+        closed = "1" if signs[0] < 0 else "0"
+        for time, sign in events:
+            closed += f" {'+' if sign > 0 else '-'} step(t - {time!r})"
+        ron = self.value(options.get("ron", "1m"), scope, place, name)
+        roff = self.value(options.get("roff", "1g"), scope, place, name)
+        return f"1/({roff}) + (1/({ron}) - 1/({roff}))*({closed})"
+
+    def _source(
+        self, rest: list[str], scope: Mapping[str, str], place: Place, name: str
+    ) -> float | str:
+        words = list(rest)
+        if words and words[0].lower() == "dc":
+            words = words[1:]
+        for k, word in enumerate(words):
+            if word.lower() == "ac":  # of another analysis
+                words = words[:k]
+                break
+        text = " ".join(words)
+        shape = re.fullmatch(r"(?is)(?:\S+\s+)?(sin|pulse|pwl|exp)\s*\((.*)\)", text)
+        if shape is not None:
+            given = [number(word) for word in shape[2].replace(",", " ").split()]
+            if None in given:
+                raise place.error(f"{name}: {shape[1]}(…) takes numbers")
+            numbers = [value for value in given if value is not None]
+            try:
+                return _SHAPES[shape[1].lower()](numbers)
+            except ValueError as error:
+                raise place.error(f"{name}: {shape[1]}(…) {error}") from None
+        if not words:
+            return 0.0
+        if len(words) != 1:
+            raise place.error(
+                f"{name}: {shown(text)} is no source; write a number, {{expression}}, SIN(…), "
+                "PULSE(…), PWL(…) or EXP(…)"
+            )
+        return self.value(words[0], scope, place, name)
+
+
+def _outer(word: str, nodes: Mapping[str, str], prefix: str) -> str:
+    node = _node(word)
+    return node if node == GROUND else nodes.get(node, prefix + node)
+
+
+def _inside(quantity: str, prefix: str, nodes: Mapping[str, str]) -> str:
+    match = re.fullmatch(r"([vi])\((\w+)\)", quantity.replace(" ", ""))
+    if match is None:
+        return quantity
+    name = _outer(match[2], nodes, prefix) if match[1] == "v" else prefix + match[2]
+    return f"{match[1]}({name})"
+
+
+def _padded(numbers: Sequence[float], least: int, defaults: Sequence[float]) -> list[float]:
+    if len(numbers) < least:
+        raise ValueError(f"needs at least {least} numbers and has {len(numbers)}")
+    if len(numbers) > len(defaults):
+        raise ValueError(f"has {len(numbers)} numbers; at most {len(defaults)} are read")
+    return [*numbers, *defaults[len(numbers) :]]
+
+
+def _sin(numbers: Sequence[float]) -> str:
+    offset, amplitude, frequency, delay, damping, phase = _padded(numbers, 3, [0.0] * 6)
+    since = f"(t - {delay!r})" if delay else "t"
+    wave = f"sin(2*pi*{frequency!r}*{since}" + (f" + {phase!r}*pi/180)" if phase else ")")
+    if damping:
+        wave += f"*exp(-{damping!r}*{since})"
+    if delay:  # before it the source stands at its first value
+        first = f"sin({phase!r}*pi/180)" if phase else "0"
+        wave = f"({first} + ({wave} - {first})*step(t - {delay!r}))"
+    return f"{offset!r} + {amplitude!r}*{wave}"
+
+
+def _exp(numbers: Sequence[float]) -> str:
+    low, high, rise, tau1, fall, tau2 = _padded(numbers, 6, [0.0] * 6)
+    if not (tau1 > 0 and tau2 > 0):
+        raise ValueError("needs positive time constants")
+    return (
+        f"{low!r} + {high - low!r}*(1 - exp(-abs(t - {rise!r})/{tau1!r}))*step(t - {rise!r})"
+        f" + {low - high!r}*(1 - exp(-abs(t - {fall!r})/{tau2!r}))*step(t - {fall!r})"
+    )
+
+
+def _pwl(numbers: Sequence[float]) -> str:
+    if len(numbers) < 2 or len(numbers) % 2:
+        raise ValueError("needs pairs of a time and a value")
+    times, values = list(numbers[::2]), list(numbers[1::2])
+    if any(b < a for a, b in itertools.pairwise(times)):
+        raise ValueError("needs times that do not fall")
+    return _corners(times, values)
+
+
+def _pulse(numbers: Sequence[float]) -> str:
+    low, high, delay, rise, fall, width, period, count = _padded(numbers, 6, [0.0] * 8)
+    if period and not count:
+        raise ValueError(
+            "with a period needs the number of pulses as its eighth value; a plant has no end"
+        )
+    if count > 1_000:
+        raise ValueError(f"has {count:g} pulses; at most 1000 are read")
+    times, values = [0.0], [low]
+    for k in range(int(count) or 1):
+        start = delay + k * period
+        times += [start, start + rise, start + rise + width, start + rise + width + fall]
+        values += [low, high, high, low]
+    if any(b < a for a, b in itertools.pairwise(times)):
+        raise ValueError("has pulses that are longer than their period")
+    return _corners(times, values)
+
+
+def _corners(times: Sequence[float], values: Sequence[float]) -> str:
+    """A piecewise linear function as a sum of ramps and jumps, constant outside."""
+    terms, slope = [repr(values[0])], 0.0
+    for k in range(len(times)):
+        last = k == len(times) - 1
+        if not last and times[k + 1] == times[k]:
+            jump, new = values[k + 1] - values[k], 0.0
+        else:
+            jump = 0.0
+            new = 0.0 if last else (values[k + 1] - values[k]) / (times[k + 1] - times[k])
+        if new != slope:
+            terms.append(f"{new - slope!r}*(t - {times[k]!r})*step(t - {times[k]!r})")
+        if jump:
+            terms.append(f"{jump!r}*step(t - {times[k]!r})")
+        slope = new
+    return " + ".join(terms)
+
+
+_SHAPES = {"sin": _sin, "exp": _exp, "pwl": _pwl, "pulse": _pulse}
+
+
+def split_names(text: str | Iterable[str] | None) -> list[str]:
+    """Names from ``"a,b"`` or a list; nothing from None. Commas in parentheses do not divide."""
+    if text is None:
+        return []
+    if not isinstance(text, str):
+        return list(text)
+    return [part.strip() for part in re.split(r",(?![^(]*\))", text) if part.strip()]

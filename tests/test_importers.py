@@ -1,0 +1,345 @@
+"""Plants from netlists, mechanics and matrices, against other derivations of the same equations."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from examples import gpebo
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+from scipy.integrate import solve_ivp
+from scipy.io import mmwrite, savemat
+from scipy.linalg import expm
+
+from gpebo_cli import ConfigError, run
+from gpebo_cli.importers import from_control, from_file, from_matrices, from_mechanics, from_netlist
+from gpebo_cli.importers.circuit import circuit_from_netlist
+from gpebo_cli.importers.netlist import number, read_netlist
+
+PAPER = """electrical circuit of the paper
+C1 e1 0 {3+cos(time/3)} ic=0
+C2 e2 0 {2-cos(2*time)} ic=1
+L e2 0 {2-exp(-time)} ic=2
+R1 e2 e1 {4+2*sin(time)}
+R2 e1 0 {-(2+sin(time))}
+V 0 e1 {4*cos(2*time)*sin(time/5)}
+.save i(R1) i(R2)
+"""
+
+
+def plant_of(text, **options):
+    draft = from_netlist(text, "test", **options)
+    plant = draft.mapping()
+    assert yaml.safe_load(draft.to_yaml()) == plant  # the file says the same as the data
+    return plant
+
+
+def simulated(plant, horizon=10.0):
+    return run(plant, observer="none", time={"horizon": horizon})
+
+
+def test_the_papers_circuit():
+    plant = plant_of(PAPER, measure="y=i(L)+i(V)")
+    plant["observer_defaults"] = {"xi_a0": {"e1": 1, "e2": 0, "il": 0}}
+    ours, shipped = run(plant, estimator="drem"), run("circuit", estimator="drem")
+    assert ours.details.simulation.index == shipped.details.simulation.index == 2
+    assert circuit_from_netlist(PAPER, "c").topology.index == 2
+    for name in ("V", "y", "e1", "e2", "il", "ir1", "ir2", "iv"):
+        np.testing.assert_allclose(ours[name], shipped[name], rtol=0, atol=1e-15 * 10)
+    assert ours.parameters == pytest.approx(shipped.parameters, abs=1e-15)
+
+
+NETLISTS = {  # name: (netlist, what is measured, index)
+    "rc": ("rc\nV1 in 0 SIN(0 1 0.5)\nR1 in out 2\nC1 out 0 0.5 ic=0.3\n", "v(out)", 1),
+    "rlc": (
+        ("rlc\nV1 in 0 PWL(0 0 1 1 3 -1 5 0)\nR1 in a 1\nL1 a b 0.7 ic=0.2\nC1 b 0 0.4 ic=0\n"
+        "R2 b 0 5\n"), "v(b),i(L1)", 1,
+    ),
+    "coupled": (
+        "coils\nV1 in 0 SIN(0 1 0.3)\nR1 in a 1\nL1 a 0 1\nL2 b 0 2\nK1 L1 L2 0.8\nR2 b 0 3\n",
+        "v(b)", 1,
+    ),
+    "controlled voltage": (
+        ("e and g\nV1 in 0 SIN(0 1 0.2)\nR1 in a 1\nC1 a 0 1 ic=0\nE1 b 0 a 0 3\nR2 b c 2\n"
+        "C2 c 0 0.5 ic=0\nG1 d 0 c 0 0.7\nR3 d 0 2\nC3 d 0 1 ic=0\n"), "v(c),v(d)", 1,
+    ),
+    "controlled by current": (
+        ("f and h\nV1 in 0 SIN(0 1 0.2)\nR1 in a 1\nVs a b 0\nC1 b 0 1 ic=0\nF1 c 0 Vs 2\n"
+        "R2 c 0 1\nC2 c 0 1 ic=0\nH1 d 0 Vs 1.5\nR3 d e 1\nC3 e 0 1 ic=0\n"), "v(c),v(e)", 1,
+    ),
+    "subcircuits": (
+        ("sub\n.param rr=2\n.subckt filt in out r=1 c=1\nR1 in out {r*rr}\nC1 out 0 {c} ic=0\n"
+        ".ends\nV1 in 0 SIN(0 1 0.3)\nX1 in m filt r=0.5\nX2 m o filt c=0.3\n"), "v(o)", 1,
+    ),
+    "bridge": (
+        ("bridge\nI1 0 a SIN(0 1 0.25)\nR1 a b 1\nR2 a c 2\nC1 b 0 1 ic=0\nC2 c 0 500m ic=0\n"
+        "R3 b c 3\n"), "v(b),v(c)", 1,
+    ),
+    "pulse": (
+        "pulse\nV1 a 0 PULSE(0 2 1 0.5 0.25 2)\nR1 a b 1k\nC1 b 0 1m ic=0\n", "v(b)", 1,
+    ),
+    "damped sine": (
+        "sin\nV1 a 0 SIN(0.5 1 0.4 1 0.2)\nR1 a b 1\nC1 b 0 1 ic=0\n", "v(b)", 1,
+    ),
+    "exp": ("exp\nI1 0 b EXP(0 1 1 0.5 4 2)\nR1 b 0 1\nC1 b 0 1 ic=0\n", "v(b)", 0),
+    "cv loop": (
+        "cv\nV1 a 0 SIN(0 1 0.3)\nC1 a b 1 ic=0\nC2 b 0 2 ic=0\nR1 b 0 1\n", "v(b),i(V1)", 2,
+    ),
+    "li cutset": (
+        "li\nI1 0 a SIN(0 1 0.3)\nL1 a b 1\nR1 b 0 2\nC1 b 0 1 ic=0\n", "v(b),v(a)", 2,
+    ),
+    "two coils in a row": (
+        "ll\nV1 in 0 SIN(0 1 0.3)\nR1 in a 1\nL1 a b 1\nL2 b c 2\nR2 c 0 1\n", "v(b),i(L1)", 2,
+    ),
+}
+
+
+@pytest.mark.skipif(shutil.which("ngspice") is None, reason="ngspice is not installed")
+@pytest.mark.parametrize("name", NETLISTS)
+def test_against_ngspice(name, tmp_path):
+    text, measure, index = NETLISTS[name]
+    result = simulated(plant_of(text, measure=measure))
+    assert result.details.simulation.index == index
+    out = tmp_path / "out.txt"
+    (tmp_path / "a.cir").write_text(
+        f"{text}.options reltol=1e-9 abstol=1e-15 vntol=1e-12 chgtol=1e-18 method=gear maxord=6\n"
+        f".control\ntran 1m 10 0 1m uic\nset wr_singlescale\noption numdgt=12\n"
+        f"wrdata {out} {measure.replace(',', ' ')}\nquit\n.endc\n.end\n"
+    )
+    subprocess.run(["ngspice", "-b", "a.cir"], cwd=tmp_path, check=True, capture_output=True)
+    theirs = np.loadtxt(out)
+    late = result["t"] > 0.05  # the first steps of ngspice are of low order
+    for k, output in enumerate(from_netlist(text, measure=measure).outputs, start=1):
+        expected = np.interp(result["t"], theirs[:, 0], theirs[:, k])
+        size = np.abs(expected).max()
+        assert np.abs(result[output] - expected)[late].max() < 2e-4 * size, output
+
+
+@pytest.mark.parametrize("cells", [3, 20])
+def test_a_ladder_of_coils_and_capacitors(cells):
+    """Against the matrix exponential of its state equations, with currents first."""
+    lines, nodes = ["ladder", "I1 0 n0 1"], [f"n{k}" for k in range(cells + 1)]
+    lines += [f"C{k} {node} 0 {1 + 0.1 * k:g} ic=0" for k, node in enumerate(nodes)]
+    lines += [f"L{k} n{k} m{k} {0.5 + 0.05 * k:g}" for k in range(cells)]
+    lines += [f"R{k} m{k} n{k + 1} {1 + 0.2 * k:g}" for k in range(cells)]
+    result = simulated(plant_of("\n".join(lines) + "\n", measure=f"v(n{cells})"), 5.0)
+    C, L = 1 + 0.1 * np.arange(cells + 1), 0.5 + 0.05 * np.arange(cells)
+    R, D = 1 + 0.2 * np.arange(cells), np.eye(cells, cells + 1) - np.eye(cells, cells + 1, 1)
+    A = np.block([
+        [-np.diag(R / L), D / L[:, None]], [-(D.T / C[:, None]), np.zeros((cells + 1, cells + 1))]
+    ])
+    b = np.zeros(2 * cells + 1)
+    b[cells] = 1 / C[0]
+    augmented = np.zeros((len(b) + 1, len(b) + 1))
+    augmented[:-1, :-1], augmented[:-1, -1] = A, b
+    expected = expm(5.0 * augmented)[-2, -1]
+    assert result[f"y_n{cells}"][-1] == pytest.approx(expected, rel=1e-10)
+
+
+@given(st.lists(
+    st.tuples(st.sampled_from("RRRLCCVI"), st.integers(0, 4), st.integers(0, 4)),
+    min_size=2, max_size=9,
+))
+@settings(max_examples=60, deadline=None)
+def test_the_index_is_what_topology_says(branches):
+    """Passive elements and independent sources: Estévez Schwarz and Tischendorf's theorem."""
+    lines = ["random"]
+    lines += [
+        f"{kind}{k} {a} {b} {1 + 0.3 * k:g}" for k, (kind, a, b) in enumerate(branches) if a != b
+    ]
+    try:
+        circuit = circuit_from_netlist("\n".join(lines) + "\n", "random")
+    except ConfigError:
+        return
+    index = simulated(circuit.draft.mapping(), 1.0).details.simulation.index
+    assert index == 2 if circuit.topology.index == 2 else index <= 1
+
+
+def test_a_switch_at_given_instants():
+    text = "switch\nV1 a 0 1\nS1 a b on=1 off=3 ron=1 roff=1meg\nC1 b 0 1 ic=0\nR1 b 0 1g\n"
+    result = simulated(plant_of(text, measure="v(b)"), 5.0)
+    t, v = result["t"], result["y_b"]
+    assert np.abs(v[t < 1]).max() < 2e-6
+    closed = (t > 1) & (t < 3)
+    np.testing.assert_allclose(v[closed], 1 - np.exp(-(t[closed] - 1)), atol=2e-6)
+    np.testing.assert_allclose(v[t > 3], 1 - np.exp(-2.0), atol=2e-6)
+
+
+def test_an_ideal_transformer():
+    text = "t\nV1 a 0 2\nT1 a 0 b 0 n=4\nR1 b 0 1\nC1 c 0 1\nR2 b c 1\n"
+    result = simulated(plant_of(text, measure="v(b),i(T1)"), 40.0)
+    assert result["y_b"][-1] == pytest.approx(0.5)
+    assert result["y_it1"][-1] == pytest.approx(0.125)  # 0.5 A through R1, divided by the ratio
+
+
+def test_an_unknown_source_is_estimated():
+    text = "leak\nV1 a 0 SIN(0 1 0.5)\nR1 a b 1k\nC1 b 0 1m ic=0.2\nI5 b 0 2u\n"
+    result = run(plant_of(text, measure="v(b)", unknown="I5"), estimator="ls_drem")
+    assert result.estimates["I5"][0, -1] == pytest.approx(2e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize(("text", "value"), [
+    ("4.7k", 4700.0), ("10uF", 1e-5), ("1meg", 1e6), ("1MEG", 1e6), ("2m", 2e-3), ("1e-3", 1e-3),
+    ("5V", 5.0), ("3mil", 76.2e-6), (".5n", 5e-10),
+])
+def test_suffixes(text, value):
+    assert number(text) == pytest.approx(value, rel=1e-15)
+
+
+def test_what_continues_and_what_is_a_comment():
+    netlist = read_netlist("title\n* no\nR1 a 0\n+ 5 ; ohms\nC1 a 0 1 $ farad\n.end\nR1 a 0 2\n")
+    assert [(e.name, e.value) for e in netlist.elements] == [("R1", 5.0), ("C1", 1.0)]
+
+
+@pytest.mark.parametrize(("lines", "message"), [
+    ("R1 a b 1\nC1 a b 1", "no element is connected to ground"),
+    ("R1 a 0 1\nR2 b c 1", "no path leads from node b to ground"),
+    ("V1 a 0 1\nV2 a 0 2", "line 3: V2 closes a loop of voltage sources"),
+    ("I1 0 a 1\nI2 a 0 1\nR1 b 0 1", "line 2: I1 drives a current"),
+    ("R1 a 0 0", "line 2: R1 has the value 0"),
+    ("R1 a 0", "R1 needs one value"),
+    ("R1 a 0 {foo*2}", "R1 uses foo, which is neither a parameter nor a function"),
+    ("R1 a 0 1\nR1 a 0 2", "line 3: R1 stands in line 2 already"),
+    ("D1 a 0 mod", "elements are R, L, C"),
+    ("X1 a 0 filter", "ends with the name of a subcircuit, and 'filter' is none"),
+    ("T1 a 0 b 0 z0=50 td=1n", "T is an ideal transformer with n=RATIO"),
+    (".include /etc/passwd\nR1 a 0 1", "would read another file"),
+    ("V1 a 0 PULSE(0 1 0 1n 1n 1u 2u)\nR1 a 0 1", "needs the number of pulses"),
+    ("K1 L1 L2 0.5\nL1 a 0 1\nL2 b 0 1", "K1 has to stand below L1"),
+    ("L1 a 0 1\nL2 b 0 1\nK1 L1 L2 1.5", "a coupling is at most 1"),
+    ("R1 a 0 {1", "is not closed"),
+    (".subckt s a\nR1 a 0 1\nX1 a s\n.ends\nX1 b s\nR2 b 0 1", "nested more than 20 deep"),
+])
+def test_mistakes_in_netlists(lines, message):
+    with pytest.raises(ConfigError) as error:
+        from_netlist(f"title\n{lines}\n", "bad")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("measure", "unknown", "message"), [
+    ("v(q)", None, "there is no node q"), ("i(C1)", None, "whose current"),
+    ("sqrt(2)", None, "cannot measure"), (None, "R1", "it is no source"),
+    (None, "V1", "varies with time"),
+])
+def test_mistakes_in_what_is_asked(measure, unknown, message):
+    text = "t\nV1 a 0 SIN(0 1 1)\nR1 a b 1\nC1 b 0 1\n"
+    with pytest.raises(ConfigError, match=message.replace("(", r"\(")):
+        from_netlist(text, measure=measure, unknown=unknown)
+
+
+SLIDER_CRANK = {  # linearised about a slow turn: two positions on a line that a rod connects
+    "M": [[2.0, 0.0], [0.0, 1.0]], "D": [[0.3, 0], [0, 0.1]], "K": [[4, 0], [0, "1 + 0.5*sin(t)"]],
+    "G": [[1, -1]], "inputs": {"force": "sin(t)"}, "B": [[1], [0]], "unknowns": {"load": -0.5},
+    "F": [[0], [1]], "measure": ["q1"],
+    "initial_positions": [0.2, 0.2], "initial_velocities": {"q1": 0.1, "q2": 0.1},
+}
+
+
+def test_mechanics_of_index_3():
+    """Both masses move as one; the force in the rod is what is left of a balance."""
+    result = simulated(from_mechanics(SLIDER_CRANK, "rod").mapping())
+    assert result.details.simulation.index == 3
+
+    def slope(t, z):
+        force = np.sin(t) - 0.5 - 0.4 * z[1] - (5 + 0.5 * np.sin(t)) * z[0]
+        return [z[1], force / 3]
+
+    t = result["t"]
+    z = solve_ivp(slope, (0, t[-1]), [0.2, 0.1], "DOP853", t, rtol=1e-12, atol=1e-14).y
+    np.testing.assert_allclose(result["q1"], z[0], atol=1e-9)
+    np.testing.assert_allclose(result["v_q2"], z[1], atol=1e-9)
+    acceleration = np.array(slope(t, z)[1])
+    rod = 2 * acceleration + 0.3 * z[1] + 4 * z[0] - np.sin(t)
+    np.testing.assert_allclose(result["lambda1"], rod, atol=1e-8)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"M": None}, "M is missing"), ({"K": [[1, 0]]}, "K has 1 rows; expected 2"),
+    ({"G": [[1, 2, 3]]}, "G[0] has 3 entries; expected 2"), ({"stiffness": 1}, "unknown key"),
+    ({"measure": ["q3"]}, "did you mean"), ({"M": [[1, True], [0, 1]]}, "M[0][1]"),
+    ({"positions": ["a"]}, "positions has 1 names and M has 2 rows"),
+])
+def test_mistakes_in_mechanics(change, message):
+    with pytest.raises(ConfigError) as error:
+        from_mechanics({**SLIDER_CRANK, **change}, "rod", "rod.yaml")
+    assert message in str(error.value)
+
+
+A = np.array([[0.0, 1.0], [-2.0, -0.3]])
+B, C = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+
+
+def test_a_state_space_model():
+    system = SimpleNamespace(
+        A=A, B=B, C=C, D=np.zeros((1, 1)), dt=0, state_labels=["x[0]", "x[1]"],
+        input_labels=["u"], output_labels=["y"],
+    )
+    plant = from_control(system, "oscillator", initial_state=[1, 0]).mapping()
+    assert plant["states"] == ["x_0", "x_1"]
+    np.testing.assert_allclose(simulated(plant)["x_0"][-1], (expm(10 * A) @ [1, 0])[0], atol=1e-11)
+    system.dt = 0.1
+    with pytest.raises(ConfigError, match="discrete time"):
+        from_control(system, "oscillator")
+
+
+def test_files_of_matrices(tmp_path):
+    E = sparse.diags([1.0, 2.0])
+    savemat(tmp_path / "a.mat", {"E": E, "A": A, "B": B, "C": C})
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name, matrix in (("E", E), ("A", A), ("B", B), ("C", C)):
+        mmwrite(folder / f"plant.{name}.mtx", sparse.coo_matrix(matrix))
+    expected = from_matrices({"E": E.toarray(), "A": A, "B": B, "C": C}, "p").mapping()
+    for path in (tmp_path / "a.mat", folder):
+        assert {**from_file(path, "p").mapping(), "reference": None} == {
+            **expected, "reference": None
+        }
+    (tmp_path / "m.m").write_text(
+        "x0 = [1, 0];\nA = [0, 1; -2, -0.3];\nB = [0; 1];\nC = [1, 0];\n"
+        "stateVars  = {'mass.s','mass.v'};\ninputVars  = {'force'};\noutputVars = {'s'};\n"
+    )
+    (tmp_path / "m.py").write_text(
+        "x0 = [1, 0]\nA = [[0, 1],\n     [-2, -0.3]]\nB = [[0], [1]]\nC = [[1, 0]]\n"
+        "stateVars = ['mass.s', 'mass.v']\ninputVars = ['force']\noutputVars = ['s']\n"
+    )
+    made = [from_file(tmp_path / f"m.{ending}", "p").mapping() for ending in ("m", "py")]
+    for plant in made:
+        plant.pop("reference")
+    assert made[0] == made[1]
+    assert made[0]["states"] == ["mass_s", "mass_v"]
+    assert made[0]["initial_state"] == {"mass_s": 1.0, "mass_v": 0.0}
+    assert made[0]["A"] == [[0, 1], [-2, -0.3]]
+
+
+@pytest.mark.parametrize(("matrices", "message"), [
+    ({"B": B}, "the matrix A is missing"),
+    ({"A": A, "B": np.ones((3, 1))}, "B is 3 × 1; expected 2 × 1"),
+    ({"A": [[np.nan]]}, "not finite"), ({"A": [[1j]]}, "real numbers"),
+])
+def test_mistakes_in_matrices(matrices, message):
+    with pytest.raises(ConfigError, match=message):
+        from_matrices(matrices, "p")
+
+
+def test_from_a_file_on_the_command_line(tmp_path):
+    (tmp_path / "paper.cir").write_text(PAPER)
+    words = ("new", "plant", "mine", "--from", "paper.cir", "--measure", "y=i(L)+i(V)")
+    done = gpebo(*words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "index 2 by topology (loop of capacitors and voltage sources: V, C1)" in done.stdout
+    assert "index 2 as computed" in done.stdout
+    done = gpebo("check", "--config-dir", ".", "plant=mine", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = gpebo(*words[:2], "other", "--measure", "v(a)", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--measure is for a plant from a netlist" in done.stderr
+    done = gpebo(*words[:2], "other", "--from", "nothing.cir", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (2, "gpebo: error: nothing.cir: no such file\n")
+    assert not (tmp_path / "plant" / "other.yaml").exists()
