@@ -134,12 +134,12 @@ def step_figure(path: Path) -> None:
         noise=NoiseSettings(name="gaussian", outputs=0.01),
     )
     system = plant("descriptor", **recipe["plant"])
-    [(_, panels)] = describe(run_experiment(settings, system), ["parameters"])
+    [panels] = describe(run_experiment(settings, system), ["parameters"]).values()
     renewed = replace(
         settings, estimator={"name": "least_squares", "beta": 0.0},
         observer=ObserverSettings(remedy="reset", reset_times=[10.0], reset_keep=0.0),
     )
-    [(_, again)] = describe(run_experiment(renewed, system), ["parameters"])
+    [again] = describe(run_experiment(renewed, system), ["parameters"]).values()
     style = line(len(panels[0].curves) + 1)  # the next one looks like the truth
     both = [
         replace(panel, curves=(

@@ -111,9 +111,14 @@ class ExcitationSettings:
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """What is drawn and how much is written."""
+    """What is drawn, how it looks and how much is written."""
 
     figures: bool | list[str] = True  # True: all, False: none, or names of figures
+    formats: list[Literal["png", "pdf", "svg"]] = field(default_factory=lambda: ["png"])
+    width: Literal["column", "page"] | float = "column"  # of a two-column journal, or inches
+    dpi: int = 200
+    style: str | None = None  # one that comes with matplotlib; None: ours
+    error: Literal["log", "linear"] = "log"  # |error| on a logarithmic axis, or with its sign
     max_rows: int = 100_000  # of estimates.csv; many cases keep fewer samples each
 
 

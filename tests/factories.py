@@ -51,6 +51,7 @@ def make_system(units: Mapping[str, str] = UNITS) -> DescriptorSystem:
         title="circuit with time-varying elements",
         reference="arXiv:2407.14373",
         units=dict(units),
+        labels={"il": "i_L"},
     )
 
 

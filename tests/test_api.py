@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -185,8 +187,23 @@ def test_figures(circuit):
     assert figure._repr_png_().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match=r"did you mean gram\?"):
         circuit.plot("grm")
-    with pytest.raises(ConfigError, match="has nothing for 'gains'"):
+    with pytest.raises(ConfigError, match="has nothing for gains; it has signals, regressor"):
         circuit.plot("gains")
+
+
+def test_a_panel_on_axes_of_ones_own(circuit):
+    figure, axes = plt.subplots()
+    assert circuit.plot("state_error_a", ax=axes) is axes
+    assert axes.get_yscale() == "log"
+    _, other = plt.subplots()
+    circuit.plot("error of e2", ax=other)
+    np.testing.assert_array_equal(
+        other.get_lines()[0].get_ydata(), np.abs(circuit.errors["e2"][0])
+    )
+    figure.savefig(io.BytesIO())
+    plt.close("all")
+    with pytest.raises(ConfigError, match="no figure 'e7'"):
+        circuit.plot("e7", ax=axes)
 
 
 def test_without_an_observer_there_are_signals_only(tmp_path):
@@ -310,6 +327,7 @@ RIDGE = """\
 from dataclasses import dataclass
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from gpebo_cli.findings import Requirement

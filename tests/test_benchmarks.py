@@ -206,4 +206,4 @@ def test_the_peer_of_the_cold_run_draws_the_same_figures(tmp_path, monkeypatch):
         plain_figures, "draw", lambda path, panels, **_: drawn.update({path.stem: len(panels)})
     )
     plain_figures.main(tmp_path, tmp_path)
-    assert drawn == {name: len(panels) for name, panels in describe(result)}
+    assert drawn == {name: len(panels) for name, panels in describe(result).items()}

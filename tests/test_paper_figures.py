@@ -187,7 +187,7 @@ def test_the_page_says_whose_the_settings_are(written: Path) -> None:
 
 
 def test_a_table_has_what_the_picture_has() -> None:
-    for name, panels in describe(make_result(thin=7, samples=301)):
+    for name, panels in describe(make_result(thin=7, samples=301)).items():
         text = csv_text(blocks(panels)).splitlines()
         header, *rows = csv.reader(text)
         table = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])

@@ -12,7 +12,7 @@ from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.functions import system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
-from gpebo_cli.results.figures import parameters
+from gpebo_cli.results.figures import describe, parameters
 from gpebo_cli.settings import ObserverSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -142,11 +142,13 @@ def test_forgetting_follows_a_step_and_remembering_does_not(name):
     assert np.array_equal(panels[0].curves[-1].y, truth)
 
 
-def test_a_constant_unknown_has_no_figure_of_its_own():
+def test_a_constant_unknown_is_drawn_with_e0_where_it_is_asked_for():
     settings = Settings(
         plant={}, estimator={"name": "least_squares"}, time=TimeSettings(horizon=2.0)
     )
-    assert parameters(run_experiment(settings, shipped("descriptor"))) == []
+    result = run_experiment(settings, shipped("descriptor"))
+    assert [panel.name for panel in parameters(result)] == list(result.estimation.names)
+    assert "parameters" not in describe(result)
 
 
 def test_a_function_of_the_wrong_shape_is_refused():

@@ -24,9 +24,11 @@ from gpebo_cli.results import figures
 from gpebo_cli.results.figures import truth_at
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.frames import frame
+from gpebo_cli.results.style import draw_on
 from gpebo_cli.schema import nearest, shown
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
@@ -217,26 +219,32 @@ class Result:
     @property
     def figures(self) -> list[str]:
         """Names of the figures that :meth:`plot` can draw of this run."""
-        return [name for name, _ in figures.describe(self.details, figures.FIGURES)]
+        return list(figures.describe(self.details, figures.FIGURES))
 
-    def plot(self, figure: str | None = None) -> Figure:
+    def plot(self, figure: str | None = None, *, ax: Axes | None = None) -> Figure | Axes:
         """A figure of the run, as ``gpebo run`` draws it; a notebook shows it.
 
         Args:
-            figure: one of :attr:`figures`; by default the states and their estimates.
+            figure: one of :attr:`figures`; by default the states and their estimates. With ``ax``
+                also the name of one of its panels, as in ``error of e1``.
+            ax: axes of a figure of yours to draw one panel on: the one named, or the first.
+
+        Returns:
+            The figure, or ``ax``.
 
         Raises:
             ConfigError: no figure has that name, or this run has nothing for it.
         """
-        has = self.figures
+        found = figures.describe(self.details, figures.FIGURES)
         if figure is None:
-            figure = next(n for n in ("estimates_a", "estimates", "states") if n in has)
-        drawn = dict(figures.draw(self.details, [figure]))
-        if figure not in drawn:
-            raise ConfigError(
-                f"figures: this run has nothing for {shown(figure)}; it has {', '.join(has)}"
-            )
-        return drawn[figure]
+            figure = next(n for n in ("estimates_a", "estimates", "states") if n in found)
+        if ax is None:
+            return dict(figures.draw(self.details, [figure]))[figure]
+        panels = {panel.name: panel for of_one in found.values() for panel in of_one}
+        if figure not in panels:
+            panels[figure] = figures.describe(self.details, [figure], strict=True)[figure][0]
+        draw_on(ax, panels[figure])
+        return ax
 
     def save(
         self, folder: str | os.PathLike[str], figures: bool | Sequence[str] = True

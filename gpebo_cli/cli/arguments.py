@@ -132,7 +132,8 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
             if key in _SWEEP_WORDS:
                 sweep[key] = text
             else:
-                overrides.append(word)
+                # `figures` says which ones; how they look stands beside how much is written.
+                overrides.append(re.sub(r"^(\+*)figures\.(?=\w+=)", r"\1output.", word))
             continue
         given, equals, value = word.partition("=")
         flag = _SWITCHES.get(given) or _WITH_VALUE.get(given) or _LONG.get(given)

@@ -43,6 +43,7 @@ _FOLDER = "estimator"  # an observer that estimates by itself: its name again, f
 # Accepted ranges, ends included. What a type cannot say; beyond them nothing sensible happens.
 _RANGES = {
     "time.samples": (2, 10_000_000),
+    "output.dpi": (30, 1200),
     "solver.tol": (1e-15, 0.1),
     "solver.stages": (2, 16),
     "solver.max_elements": (1, math.inf),
@@ -54,6 +55,7 @@ _RANGES = {
     "observer.reset_keep": (0, 1),
     "noise.seeds": (1, 1_000_000),
 }
+_INCHES = (1.5, 40.0)  # how wide a figure may be
 _OPEN = ("start", "horizon")  # of time: null where the data, or a default, decides
 _POSITIVE = (
     "time.horizon", "observer.sample_time", "excitation.rho", "excitation.window",
@@ -155,7 +157,16 @@ def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:
             )
         figures = words[figures]
     chosen = convert(figures, bool | list[str], "figures")
-    return read(OutputSettings, {**section, "figures": chosen}, "output")
+    built = read(OutputSettings, {**section, "figures": chosen}, "output")
+    low, high = _INCHES
+    if isinstance(built.width, float) and not low <= built.width <= high:
+        raise ConfigError(
+            f"figures.width: expected column, page or {low:g} to {high:g} inches, got "
+            f"{built.width:g}"
+        )
+    if not built.formats:
+        raise ConfigError("figures.formats: expected some of png, pdf and svg, got an empty list")
+    return built
 
 
 def _check_ranges(built: Settings) -> None:

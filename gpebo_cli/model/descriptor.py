@@ -110,6 +110,7 @@ class DescriptorSystem:
     reference: str = ""
     source: str = ""  # the file it came from, for messages
     units: dict[str, str] = field(default_factory=dict)  # by state, input, output or unknown
+    labels: dict[str, str] = field(default_factory=dict)  # mathtext, by those and by parameters
     observer_defaults: dict[str, object] = field(default_factory=dict)
 
     @property

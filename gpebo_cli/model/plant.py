@@ -49,6 +49,7 @@ KEYS = (
     "H",
     "initial_state",
     "units",
+    "labels",
     "observer_defaults",
 )
 """Keys of a plant file; name, states, E, A and initial_state are required."""
@@ -59,6 +60,7 @@ _OF_INPUTS = {"an input": "", "an output": "; y = C x + D u + H θ would contain
 _OF_TIME = dict.fromkeys(("an input", "an output"), ": its derivative would be needed")
 
 _PLANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,79}")  # it becomes part of a folder's name
+_LONGEST_LABEL = 80
 _YAML_BOOLEAN = "YAML reads on, off, yes and no as booleans"
 
 
@@ -257,7 +259,8 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
         title=_line(plant, "title", mapping.get("title")),
         reference=_line(plant, "reference", mapping.get("reference")),
         source=source,
-        units=_units(plant, mapping.get("units"), tuple(elsewhere)),
+        units=_texts(plant, "units", mapping, tuple(elsewhere)),
+        labels=_labels(plant, mapping, (*elsewhere, *(f"e0_{state}" for state in states))),
         observer_defaults=dict(_mapping(plant, "observer_defaults", mapping)),
     )
 
@@ -534,13 +537,27 @@ def _initial_values(plant: str, value: object, states: tuple[str, ...]) -> dict[
     return dict(zip(states, values, strict=True))
 
 
-def _units(plant: str, value: object, names: Sequence[str]) -> dict[str, str]:
-    units: dict[str, str] = {}
-    for label, unit in _mapping(plant, "units", {"units": value}).items():
+def _texts(
+    plant: str, key: str, mapping: Mapping[str, object], names: Sequence[str]
+) -> dict[str, str]:
+    texts: dict[str, str] = {}
+    for label, text in _mapping(plant, key, mapping).items():
         if label not in names:
             raise ConfigError(
-                f"{plant}: units has {_show(label)}, which is no state, input, output or "
+                f"{plant}: {key} has {_show(label)}, which is no state, input, output or "
                 f"unknown{nearest(str(label), names)}"
             )
-        units[label] = _line(plant, f"units.{label}", unit)
-    return units
+        texts[label] = _line(plant, f"{key}.{label}", text)
+    return texts
+
+
+def _labels(plant: str, mapping: Mapping[str, object], names: Sequence[str]) -> dict[str, str]:
+    """Names as figures have them, in the mathematics of TeX without dollars."""
+    labels = _texts(plant, "labels", mapping, names)
+    for name, text in labels.items():
+        if not 0 < len(text) <= _LONGEST_LABEL or "$" in text:
+            raise ConfigError(
+                f"{plant}: labels.{name}: expected 1 to {_LONGEST_LABEL} characters of TeX's "
+                f"mathematics without $, as in i_L or \\theta_{{1}}, not {_show(text)}"
+            )
+    return labels

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from importlib import import_module, util
 from typing import TYPE_CHECKING, Any
 
-from gpebo_cli.results.style import DPI, TEXT, WIDTH, our_rc
+from gpebo_cli.results.style import TEXT, WIDTH, new_figure, our_rc
+from gpebo_cli.results.symbols import typeset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,15 +66,11 @@ def netlist() -> str:
 
 def circuit() -> Figure:
     """Draw the circuit, one column wide."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     # Untyped, and an extra: nothing else needs it.
     schemdraw: Any = import_module("schemdraw")
     elements: Any = import_module("schemdraw.elements")
     with our_rc():
-        figure = Figure(figsize=(WIDTH, WIDTH * (_HIGH - _LOW) / _ACROSS), dpi=DPI)
-        FigureCanvasAgg(figure)
+        figure = new_figure(WIDTH, WIDTH * (_HIGH - _LOW) / _ACROSS)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set_axis_off()
         drawing = schemdraw.Drawing(canvas=axes)
@@ -128,16 +125,17 @@ def _texts() -> Iterator[tuple[str, _Point, str]]:
     """Names of elements, currents and nodes, where they stand and how they are aligned."""
     for branch in BRANCHES:
         (x0, y0), (x1, y1) = _ends(branch)
-        name = branch.element[0] + branch.element[1:].translate(str.maketrans("12", "₁₂"))
+        name = typeset(branch.element, {})
         if x0 == x1:
             gap = 0.66 if branch.element == "V" else 0.55
             yield name, (x0 - gap, (y0 + y1) / 2), "right"
         else:
             yield name, ((x0 + x1) / 2, y0 - 0.62), "center"
         if branch.current:
-            yield branch.current, _arrow(branch)[2], "left" if x0 == x1 else "center"
-    yield "e1", (_AT["C1"], _TOP + 0.45), "center"
-    yield "e2", (_AT["C2"], _TOP + 0.45), "center"
+            current = rf"$i_{{{branch.element}}}$"
+            yield current, _arrow(branch)[2], "left" if x0 == x1 else "center"
+    yield "$e_1$", (_AT["C1"], _TOP + 0.45), "center"
+    yield "$e_2$", (_AT["C2"], _TOP + 0.45), "center"
 
 
 def _add_wires(drawing: Any, elements: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -13,7 +14,8 @@ import numpy as np
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.finished import METRICS, Case, read_errors
-from gpebo_cli.results.style import Axis, Curve, Panel, compose, line, number_text, symbol
+from gpebo_cli.results.style import Axis, Curve, Panel, compose, line
+from gpebo_cli.results.symbols import number_text, symbol
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -179,9 +181,7 @@ def _heat_map(
     x: Array, y: Array, values: Array, columns: tuple[str, str, str], label: str
 ) -> Figure:
     """One cell per case, all of the same size: gains are spaced by factors, as a rule."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LogNorm, Normalize
-    from matplotlib.figure import Figure
 
     across, up, metric = columns
     finite = values[np.isfinite(values)]
@@ -189,9 +189,9 @@ def _heat_map(
     log = low > 0 and high > 10 * low
     norm = LogNorm(low, high) if log else Normalize(low, high)
     with style.our_rc():
-        figure = Figure(figsize=(style.WIDTH, 2.6), dpi=style.DPI)
-        FigureCanvasAgg(figure)
-        axes = figure.add_axes((0.19, 0.17, 0.60, 0.71))
+        figure = style.new_figure(style.WIDTH, 2.6)
+        figure.set_layout_engine("constrained")
+        axes = figure.subplots()
         axes.set_facecolor("#DDDDDD")  # no value: never reached, or no such case
         image = axes.imshow(
             np.ma.masked_invalid(values), origin="lower", aspect="auto", norm=norm, cmap="cividis",
@@ -201,13 +201,13 @@ def _heat_map(
             places = np.unique(np.linspace(0, len(numbers) - 1, min(len(numbers), 5)).astype(int))
             axis.set_ticks(places, [number_text(float(numbers[p])) for p in places])
             axis.set_label_text(symbol(name))
-        bar = figure.colorbar(image, cax=figure.add_axes((0.82, 0.17, 0.04, 0.71)))
+        bar = figure.colorbar(image, ax=axes, pad=0.02)
         ends = np.geomspace(low, high, 4) if log else np.linspace(low, high, 4)
         bar.set_ticks([])
         bar.ax.yaxis.set_ticks(ends, [f"{value:.2g}" for value in ends])
         bar.ax.yaxis.minorticks_off()
         title = _METRIC_LABELS[metric] + (f"; {label}" if label else "")
-        figure.text(0.02, 0.97, style.shorten(title, style.WIDTH), va="top")
+        axes.set_title("\n".join(textwrap.wrap(title, 48)), fontsize=style.TEXT, loc="left")
     return figure
 
 

@@ -19,16 +19,8 @@ from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.names import FIGURE_NAMES
-from gpebo_cli.results.style import (
-    Axis,
-    Curve,
-    Panel,
-    compose,
-    line,
-    number_text,
-    symbol,
-    with_unit,
-)
+from gpebo_cli.results.style import Axis, Curve, Panel, compose, line
+from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
 from gpebo_cli.schema import nearest, shown
 
 if TYPE_CHECKING:
@@ -45,15 +37,15 @@ def states(result: RunResult) -> list[Panel]:
     """Fig. 3: the true states over time, one panel per unit."""
     known, names = _known(result), result.system.states
     shown = result.signals.states[:, known]
-    return _by_unit(result, "states", [names[i] for i in known], result.signals.t, shown)
+    return _by_unit(result, "states", [names[i] for i in known], shown)
 
 
 def signals(result: RunResult) -> list[Panel]:
     """Inputs and outputs over time: all an observer gets to see, beside the truth if it differs."""
     s, system = result.signals, result.system
     return [
-        *_by_unit(result, "inputs", system.inputs, s.t, s.inputs, s.measured_inputs),
-        *_by_unit(result, "outputs", system.outputs, s.t, s.outputs, s.measured_outputs),
+        *_by_unit(result, "inputs", system.inputs, s.inputs, s.measured_inputs),
+        *_by_unit(result, "outputs", system.outputs, s.outputs, s.measured_outputs),
     ]
 
 
@@ -62,71 +54,64 @@ def regressor(result: RunResult) -> list[Panel]:
     regression = result.regression
     if regression is None or not regression.parameters:
         return []
-    psi = regression.psi
+    psi, labels = regression.psi, result.system.labels
     rows = [row for row in range(psi.shape[1]) if np.any(psi[:, row])] or [0]
-    return [
+    panels = [
         Panel(
-            label="regressor ψ" if len(rows) == 1 else f"ψ, row {row + 1}",
-            curves=tuple(
-                Curve(regression.t, psi[:, row, column], f"ψ {name}", line(column))
+            "regressor ψ" if len(rows) == 1 else f"ψ, row {row + 1}",
+            tuple(
+                Curve(regression.t, psi[:, row, column], f"ψ {name}", line(column),
+                      f"for {typeset(name, labels)}")
                 for column, name in enumerate(regression.parameters)
             ),
-            legend=row == rows[0],
+            text=r"regressor $\psi$" if len(rows) == 1 else rf"$\psi$, row {row + 1}",
         )
         for row in rows
         if row < psi.shape[1]
     ]
+    return _with_legend(panels)
 
 
 def estimates(result: RunResult) -> list[Panel]:
     """All states and their estimates, where the parameters do not tell x_a from x_b."""
     differential, other = _split(result)
-    return [] if differential else _estimates(result, other)
+    return [] if differential else _state_estimates(result, other)
 
 
 def estimates_a(result: RunResult) -> list[Panel]:
     """Fig. 4: the differential states x_a and their estimates."""
-    return _estimates(result, _split(result)[0])
+    return _state_estimates(result, _split(result)[0])
 
 
 def estimates_b(result: RunResult) -> list[Panel]:
     """Fig. 5: the other states x_b and their estimates."""
     differential, other = _split(result)
-    return _estimates(result, other) if differential else []
+    return _state_estimates(result, other) if differential else []
 
 
 def parameters(result: RunResult) -> list[Panel]:
-    """Estimates of the parameters over time, with the truth dashed, where the truth varies.
+    """Estimates of the parameters over time, with the truth where it is known.
 
-    The components of e₀ are left out: where θ varies they are what makes up for it, of any size.
+    Where θ varies the components of e₀ are left out: they are what makes up for it, of any size.
     """
     estimation = result.estimation
-    if estimation is None or not result.system.theta_varies:
+    if estimation is None:
         return []
-    shown = _shown_cases(estimation)
-    labels = _case_labels(result, estimation, shown)
+    varies = result.system.theta_varies
+    truth = estimation.true_parameters
     panels = []
-    for i, name in enumerate(result.system.unknowns):
-        truth = estimation.true_parameters[:, i]
-        curves = [
-            Curve(estimation.t, estimation.parameters[case, :, i], label, line(k))
-            for k, (case, label) in enumerate(zip(shown, labels, strict=True))
-        ]
-        curves.append(Curve(estimation.t, truth, "true", style.VARYING))
+    for i, name in enumerate(estimation.names):
+        if varies and name not in result.system.unknowns:
+            continue
+        curve = Curve(estimation.t, truth[:, i], "true", style.VARYING if varies else style.TRUTH)
         panels.append(
-            Panel(
-                with_unit(name, _parameter_unit(result, name)),
-                tuple(curves),
-                limits=_estimate_limits(truth, estimation.parameters[shown, :, i]),
-                legend=i == 0,
-                note=_note(estimation, shown) if i == 0 else "",
-            )
+            _estimate(result, name, estimation.parameters[:, :, i], curve, behind=not varies)
         )
-    return panels
+    return _with_legend(panels, _note(estimation))
 
 
 def parameter_error(result: RunResult) -> list[Panel]:
-    """Fig. 6: error of every parameter (for the circuit, the initial conditions), logarithmic.
+    """Fig. 6: error of every parameter (for the circuit, the initial conditions).
 
     Where θ varies, of the unknowns only, as in ``parameters``.
     """
@@ -134,20 +119,15 @@ def parameter_error(result: RunResult) -> list[Panel]:
     if estimation is None:
         return []
     truth = estimation.true_parameters
-    known = np.flatnonzero(~np.isnan(truth).any(axis=0))
     size = np.nan_to_num(np.max(np.abs(truth), axis=0))
     largest = float(np.max(size, initial=0.0))  # the measure of one that is zero
-    curves = [
-        (
-            name,
-            _parameter_unit(result, name),
-            estimation.parameters[:, :, i] - truth[:, i],
-            float(size[i]) or largest,
-        )
+    panels = [
+        _error(result, name, estimation.parameters[:, :, i] - truth[:, i], size[i] or largest)
         for i, name in enumerate(estimation.names)
-        if i in known and (not result.system.theta_varies or name in result.system.unknowns)
+        if not np.isnan(truth[:, i]).any()
+        and (not result.system.theta_varies or name in result.system.unknowns)
     ]
-    return _errors(result, estimation, curves)
+    return _with_legend(panels, _note(estimation))
 
 
 def state_error(result: RunResult) -> list[Panel]:
@@ -157,12 +137,12 @@ def state_error(result: RunResult) -> list[Panel]:
 
 
 def state_error_a(result: RunResult) -> list[Panel]:
-    """Fig. 7: error of the differential states x_a, logarithmic."""
+    """Fig. 7: error of the differential states x_a."""
     return _state_errors(result, _split(result)[0])
 
 
 def state_error_b(result: RunResult) -> list[Panel]:
-    """Fig. 8: error of the other states x_b, logarithmic."""
+    """Fig. 8: error of the other states x_b."""
     differential, other = _split(result)
     return _state_errors(result, other) if differential else []
 
@@ -173,20 +153,22 @@ def gram(result: RunResult) -> list[Panel]:
     if excitation is None or excitation.gram_eigenvalues.shape[1] == 0:
         return []
     t, eigenvalues = excitation.t, excitation.gram_eigenvalues
-    ends = t[[0, -1]]
     curves = [
-        Curve(t, eigenvalues[:, i], f"λ{style.subscript(i + 1)}", line(i))
+        Curve(t, eigenvalues[:, i], f"λ{subscript(i + 1)}", line(i), rf"$\lambda_{{{i + 1}}}$")
         for i in range(eigenvalues.shape[1])
     ]
-    level = f"ρ = {number_text(excitation.rho)}"
-    curves.append(Curve(ends, np.full(2, excitation.rho), level, style.LIMIT))
+    level = number_text(excitation.rho)
+    curves.append(
+        Curve(t[[0, -1]], np.full(2, excitation.rho), f"ρ = {level}", style.LIMIT,
+              rf"$\rho$ = {level}")
+    )
     reached = None
     if excitation.t_c is not None:
         reached = (excitation.t_c, f"t_c = {number_text(excitation.t_c)} s")
     size = float(np.nanmax(eigenvalues, initial=0.0))
-    return [
-        Panel("eigenvalues of G", tuple(curves), log=True, size=size, vertical=reached, legend=True)
-    ]
+    panel = Panel("eigenvalues of G", tuple(curves), text="eigenvalues of $G$", log=True,
+                  size=size, vertical=reached)
+    return _with_legend([panel])
 
 
 def delta(result: RunResult) -> list[Panel]:
@@ -195,15 +177,13 @@ def delta(result: RunResult) -> list[Panel]:
     if estimation is None or estimation.delta is None:
         return []
     values = np.abs(estimation.delta)
-    shown = _shown_cases(estimation) if len(values) > 1 else [0]
-    labels = _case_labels(result, estimation, shown) if len(values) > 1 else [""]
-    curves = tuple(
-        Curve(estimation.t, values[case], label, line(i))
-        for i, (case, label) in enumerate(zip(shown, labels, strict=True))
-    )
     size = float(np.max(values[np.isfinite(values)], initial=0.0))
-    note = _note(estimation, shown) if len(values) > 1 else ""
-    return [Panel("|Δ|", curves, log=True, size=size, legend=len(shown) > 1, note=note)]
+    if len(values) > 1:
+        curves = _per_case(result, values)
+        panel = Panel("|Δ|", curves, text=r"$|\Delta|$", log=True, size=size)
+        return _with_legend([panel], _note(estimation))
+    curve = Curve(estimation.t, values[0], "", line(0))
+    return [Panel("|Δ|", (curve,), text=r"$|\Delta|$", log=True, size=size)]
 
 
 def gains(result: RunResult) -> list[Panel]:
@@ -212,27 +192,25 @@ def gains(result: RunResult) -> list[Panel]:
     gain = _varying_gain(estimation) if estimation is not None else None
     if estimation is None or metrics is None or gain is None:
         return []
+    if np.isnan(metrics.final_error_parameters).all() and not _known(result):
+        return []
     values = np.array([case[gain] for case in estimation.cases])
     order = np.argsort(values, kind="stable")
     axis = Axis(gain, f"gain {symbol(gain)}", log=True)
 
-    def over_gain(parameters: Array, states: Array) -> tuple[Curve, ...]:
-        pairs = (("parameters", parameters), ("states", states))
+    def over_gain(kind: str) -> tuple[Curve, ...]:
         return tuple(
-            Curve(values[order], column[order], label, replace(line(k), dots=True))
-            for k, (label, column) in enumerate(pairs)
+            Curve(values[order], getattr(metrics, f"{kind}_{of}")[order], of,
+                  replace(line(k), dots=True))
+            for k, of in enumerate(("parameters", "states"))
         )
 
-    if np.isnan(metrics.final_error_parameters).all() and not _known(result):
-        return []
-    final = over_gain(metrics.final_error_parameters, metrics.final_error_states)
-    seconds = over_gain(metrics.seconds_to_1pct_parameters, metrics.seconds_to_1pct_states)
     size = max(_parameter_size(result), _state_size(result))
     # Seconds on a linear axis: they seldom span a decade, and a decade is all one could label.
-    return [
-        Panel("final error", final, log=True, size=size, axis=axis, legend=True),
-        Panel("time to 1 % (s)", seconds, axis=axis),
-    ]
+    return _with_legend([
+        Panel("final error", over_gain("final_error"), log=True, size=size, axis=axis),
+        Panel("time to 1 %", over_gain("seconds_to_1pct"), "s", axis=axis),
+    ])
 
 
 def error_norms(result: RunResult) -> list[Panel]:
@@ -240,10 +218,10 @@ def error_norms(result: RunResult) -> list[Panel]:
     estimation = result.estimation
     if estimation is None or len(estimation.cases) < MIN_GAINS:
         return []
-    shown = _shown_cases(estimation)
-    labels = _case_labels(result, estimation, shown)
-    named = [(label, result, case) for label, case in zip(labels, shown, strict=True)]
-    return _norm_panels(named, _note(estimation, shown))
+    chosen = _shown_cases(estimation)
+    labels = _case_labels(result, estimation, chosen)
+    named = [(label, result, case) for label, case in zip(labels, chosen, strict=True)]
+    return _norm_panels(named, _note(estimation))
 
 
 def overlay(results: Mapping[str, RunResult]) -> list[Panel]:
@@ -269,33 +247,54 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def describe(
-    result: RunResult, names: Iterable[str] | None = None
-) -> Iterator[tuple[str, list[Panel]]]:
+    result: RunResult, names: Iterable[str] | None = None, *, strict: bool = False
+) -> dict[str, list[Panel]]:
     """Panels of the figures called ``names``; those the run has nothing for are left out.
 
-    With ``None``, all; ``signals``, which the paper does not have, only if there was no observer or
-    it saw something else than the truth.
+    With ``None``, all but what says little: ``signals``, which the paper does not have, is there if
+    there was no observer or it saw something else than the truth; ``parameters`` if θ varies or
+    the signals are a recording.
+
+    Args:
+        result: the run.
+        names: of figures.
+        strict: whether a figure that the run has nothing for is refused.
 
     Raises:
-        ConfigError: a name is unknown; at once, not at the first figure.
+        ConfigError: a name is unknown, or is refused.
     """
     if names is None:
         noisy = result.signals.measured_outputs is not None
-        plain = result.estimation is None or noisy
-        names = [name for name in FIGURES if name != "signals" or plain]
+        said = {"signals": result.estimation is None or noisy,
+                "parameters": result.system.theta_varies or result.recording is not None}
+        names = [name for name in FIGURES if said.get(name, True)]
     wanted = list(dict.fromkeys(names))
     check_names(wanted)
-    described = ((name, FIGURES[name](result)) for name in wanted)
-    return ((name, panels) for name, panels in described if panels)
+    found = {name: FIGURES[name](result) for name in wanted}
+    empty = [name for name, panels in found.items() if not panels]
+    if strict and empty:
+        has = [name for name, function in FIGURES.items() if function(result)]
+        raise ConfigError(
+            f"figures: this run has nothing for {', '.join(empty)}; it has {', '.join(has)}"
+        )
+    return {name: panels for name, panels in found.items() if panels}
 
 
 def draw(result: RunResult, names: Iterable[str] | None = None) -> Iterator[tuple[str, Figure]]:
-    """Draw what :func:`describe` gives, one figure at a time.
+    """Draw figures, one at a time, as ``settings.output`` wants them to look.
 
     Raises:
-        ConfigError: a name is unknown; at once, not at the first figure.
+        ConfigError: a name is unknown, or the run has nothing for it; at once, not at the first
+            figure.
     """
-    return ((name, compose(panels)) for name, panels in describe(result, names))
+    described = describe(result, names, strict=names is not None)
+    look = result.settings.output
+    return ((name, compose(panels, look)) for name, panels in described.items())
+
+
+def _with_legend(panels: list[Panel], note: str = "") -> list[Panel]:
+    """The same with a legend above the first one, which is that of all."""
+    return [replace(panel, legend=True, note=note) for panel in panels[:1]] + panels[1:]
 
 
 def _split(result: RunResult) -> tuple[list[int], list[int]]:
@@ -309,32 +308,37 @@ def _split(result: RunResult) -> tuple[list[int], list[int]]:
     return differential, [i for i in range(len(names)) if i not in differential]
 
 
-def _parameter_unit(result: RunResult, parameter: str) -> str:
+def _unit(result: RunResult, name: str) -> str:
     units = result.system.units
-    return units.get(parameter) or units.get(parameter.removeprefix(_INITIAL), "")
+    return units.get(name) or units.get(name.removeprefix(_INITIAL), "")
 
 
 def _by_unit(
-    result: RunResult, kind: str, names: Sequence[str], t: Array, values: Array,
+    result: RunResult, kind: str, names: Sequence[str], values: Array,
     measured: Array | None = None,
 ) -> list[Panel]:
     """One panel per unit, in the order in which the units appear; what was measured behind."""
+    t, labels = result.signals.t, result.system.labels
     units = [result.system.units.get(name, "") for name in names]
     panels = []
     for unit in dict.fromkeys(units):
         members = [i for i, other in enumerate(units) if other == unit]
-        label = names[members[0]] if len(members) == 1 else kind
-        curves = tuple(Curve(t, values[:, i], names[i], line(k)) for k, i in enumerate(members))
-        if measured is not None:
-            curves = (
-                *(
-                    Curve(t, measured[:, i], f"{names[i]} measured", style.MEASURED)
-                    for i in members
-                    if np.any(measured[:, i] != values[:, i])
-                ),
-                *curves,
-            )
-        panels.append(Panel(with_unit(label, unit), curves, legend=len(curves) > 1))
+        behind = members if measured is not None else []
+        curves = (
+            *(
+                Curve(t, measured[:, i], f"{names[i]} measured", style.MEASURED,
+                      f"{typeset(names[i], labels)} measured")
+                for i in behind
+                if measured is not None and np.any(measured[:, i] != values[:, i])
+            ),
+            *(
+                Curve(t, values[:, i], names[i], line(k), typeset(names[i], labels))
+                for k, i in enumerate(members)
+            ),
+        )
+        name = names[members[0]] if len(members) == 1 else kind
+        text = typeset(name, labels) if len(members) == 1 else kind
+        panels.append(Panel(name, curves, unit, text, legend=len(curves) > 1))
     return panels
 
 
@@ -360,6 +364,11 @@ def _shown_cases(estimation: EstimationResult) -> list[int]:
     if count <= MAX_CASES:
         return list(range(count))
     return [int(case) for case in np.linspace(0, count - 1, MAX_CASES).round()]
+
+
+def _note(estimation: EstimationResult) -> str:
+    count = len(estimation.cases)
+    return f"{MAX_CASES} of {count} cases:" if count > MAX_CASES else ""
 
 
 def _seen(result: RunResult, members: Iterable[int]) -> list[int]:
@@ -400,7 +409,6 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]], note: str) -> list
     """Norms of the errors of parameters and of states: a curve per label, run and case."""
     of_parameters: list[Curve] = []
     of_states: list[Curve] = []
-    sizes = [0.0, 0.0]
     for k, (label, result, case) in enumerate(named):
         estimation = result.estimation
         if estimation is None:
@@ -412,18 +420,14 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]], note: str) -> list
         for curves, errors in ((of_parameters, parameters), (of_states, states)):
             if errors.shape[1]:
                 curves.append(Curve(estimation.t, np.linalg.norm(errors, axis=1), label, line(k)))
-        sizes = [max(sizes[0], _parameter_size(result)), max(sizes[1], _state_size(result))]
+    sizes = [max((size(r) for _, r, _ in named), default=0.0)
+             for size in (_parameter_size, _state_size)]
+    log = all(result.settings.output.error == "log" for _, result, _ in named)
     panels = [
-        Panel("‖parameter error‖", tuple(of_parameters), log=True, size=sizes[0]),
-        Panel("‖state error‖", tuple(of_states), log=True, size=sizes[1]),
+        Panel("‖parameter error‖", tuple(of_parameters), log=log, size=sizes[0]),
+        Panel("‖state error‖", tuple(of_states), log=log, size=sizes[1]),
     ]
-    panels = [panel for panel in panels if panel.curves]
-    return [replace(panel, legend=True, note=note) for panel in panels[:1]] + panels[1:]
-
-
-def _note(estimation: EstimationResult, shown: Sequence[int]) -> str:
-    count = len(estimation.cases)
-    return f"{len(shown)} of {count} cases:" if len(shown) < count else ""
+    return _with_legend([panel for panel in panels if panel.curves], note)
 
 
 def _case_labels(
@@ -442,49 +446,58 @@ def _case_labels(
     ]
 
 
-def _estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
+def _per_case(result: RunResult, values: Array) -> tuple[Curve, ...]:
+    """A curve for each case that is shown, of values (G, M) at the times of the estimates."""
     estimation = result.estimation
-    members = _seen(result, members)
-    if estimation is None or not members:
-        return []
-    signals, system = result.signals, result.system
-    known = _known(result)
-    shown = _shown_cases(estimation)
-    labels = _case_labels(result, estimation, shown)
-    panels = []
-    for i in members:
-        truth = signals.states[:, i]
-        name = system.states[i]
-        curves = [Curve(signals.t, truth, "true", style.TRUTH)] if i in known else []
-        curves += [
-            Curve(estimation.t, estimation.states[case, :, i], label, line(k))
-            for k, (case, label) in enumerate(zip(shown, labels, strict=True))
-        ]
-        deviation = _deviation(estimation, name)
-        if deviation is not None:
-            middle = estimation.states[0, :, i]
-            curves += [
-                Curve(estimation.t, middle + 2 * deviation, "± 2σ", style.SPREAD),
-                Curve(estimation.t, middle - 2 * deviation, "", style.SPREAD),
-            ]
-        panels.append(
-            Panel(
-                with_unit(name, system.units.get(name, "")),
-                tuple(curves),
-                limits=(
-                    _estimate_limits(truth, estimation.states[shown, :, i]) if i in known else None
-                ),
-                legend=i == members[0],
-                note=_note(estimation, shown) if i == members[0] else "",
-            )
-        )
-    return panels
+    if estimation is None:
+        return ()
+    chosen = _shown_cases(estimation)
+    labels = _case_labels(result, estimation, chosen)
+    return tuple(
+        Curve(estimation.t, values[case], label, line(k))
+        for k, (case, label) in enumerate(zip(chosen, labels, strict=True))
+    )
 
 
 def _deviation(estimation: EstimationResult, name: str) -> Array | None:
     """The standard deviation (M,) that an estimator with one case states of an estimate."""
     stated = estimation.checks.get(f"{name}_std")
     return stated[0] if stated is not None and len(stated) == 1 else None
+
+
+def _estimate(
+    result: RunResult, name: str, values: Array, truth: Curve, *, behind: bool = True
+) -> Panel:
+    """Estimates (G, M) of ``name`` with their ± 2σ, and the truth if it is known."""
+    estimation = result.estimation
+    assert estimation is not None  # noqa: S101  the callers looked
+    curves = _per_case(result, values)
+    deviation = _deviation(estimation, name)
+    if deviation is not None:
+        low, high = values[0] - 2 * deviation, values[0] + 2 * deviation
+        curves = (
+            *curves,
+            Curve(estimation.t, high, "± 2σ", style.SPREAD, r"$\pm\,2\sigma$", down_to=low),
+            Curve(estimation.t, low, "", style.SPREAD),
+        )
+    known = bool(np.isfinite(truth.y).any())
+    if known:
+        curves = (truth, *curves) if behind else (*curves, truth)
+    limits = _estimate_limits(truth.y, values[_shown_cases(estimation)]) if known else None
+    return Panel(name, curves, _unit(result, name), typeset(name, result.system.labels),
+                 limits=limits)
+
+
+def _state_estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
+    estimation, signals = result.estimation, result.signals
+    if estimation is None:
+        return []
+    panels = [
+        _estimate(result, result.system.states[i], estimation.states[:, :, i],
+                  Curve(signals.t, signals.states[:, i], "true", style.TRUTH))
+        for i in _seen(result, members)
+    ]
+    return _with_legend(panels, _note(estimation))
 
 
 def _estimate_limits(truth: Array, guesses: Array) -> tuple[float, float]:
@@ -499,48 +512,34 @@ def _estimate_limits(truth: Array, guesses: Array) -> tuple[float, float]:
 
 def _state_errors(result: RunResult, members: Sequence[int]) -> list[Panel]:
     estimation, known = result.estimation, _known(result)
-    members = [i for i in _seen(result, members) if i in known]
-    if estimation is None or not members:
+    if estimation is None:
         return []
     truth = truth_at(result, estimation.t)
-    names, units = result.system.states, result.system.units
-    curves = [
-        (
-            names[i],
-            units.get(names[i], ""),
-            estimation.states[:, :, i] - truth[:, i],
-            float(np.max(np.abs(truth[:, i]), initial=0.0)),
-        )
-        for i in members
+    panels = [
+        _error(result, result.system.states[i], estimation.states[:, :, i] - truth[:, i],
+               float(np.max(np.abs(truth[:, i]), initial=0.0)))
+        for i in _seen(result, members)
+        if i in known
     ]
-    return _errors(result, estimation, curves)
+    return _with_legend(panels, _note(estimation))
 
 
-def _errors(
-    result: RunResult,
-    estimation: EstimationResult,
-    quantities: Sequence[tuple[str, str, Array, float]],
-) -> list[Panel]:
-    """One logarithmic panel per quantity: its name, unit, error (G, M) and size."""
-    shown = _shown_cases(estimation)
-    labels = _case_labels(result, estimation, shown)
-    panels = []
-    for number, (name, unit, error, size) in enumerate(quantities):
-        curves = [
-            Curve(estimation.t, np.abs(error[case]), label, line(k))
-            for k, (case, label) in enumerate(zip(shown, labels, strict=True))
-        ]
-        deviation = _deviation(estimation, name)
-        if deviation is not None:
-            curves.append(Curve(estimation.t, 2 * deviation, "2σ", style.SPREAD))
-        panels.append(
-            Panel(
-                with_unit(f"error of {name}", unit),
-                tuple(curves),
-                log=True,
-                size=size,
-                legend=number == 0,
-                note=_note(estimation, shown) if number == 0 else "",
-            )
-        )
-    return panels
+def _error(result: RunResult, name: str, error: Array, size: float) -> Panel:
+    """The error (G, M) of an estimate with its 2σ; ``size`` is that of the truth.
+
+    It is the absolute value on a logarithmic axis, or has its sign on a linear one.
+    """
+    estimation = result.estimation
+    assert estimation is not None  # noqa: S101  the callers looked
+    signed = result.settings.output.error == "linear"
+    curves = _per_case(result, error if signed else np.abs(error))
+    deviation = _deviation(estimation, name)
+    if deviation is not None:
+        up, down = 2 * deviation, -2 * deviation if signed else None
+        label, text = ("± 2σ", r"$\pm\,2\sigma$") if signed else ("2σ", r"$2\sigma$")
+        curves = (*curves, Curve(estimation.t, up, label, style.SPREAD, text, down_to=down))
+        if down is not None:
+            curves = (*curves, Curve(estimation.t, down, "", style.SPREAD))
+    labels = result.system.labels
+    return Panel(f"error of {name}", curves, _unit(result, name),
+                 error_of(name, labels, signed=signed), log=not signed, size=size)

@@ -8,6 +8,7 @@ from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.results import tables
 from gpebo_cli.results.figures import FIGURES, draw
 from gpebo_cli.results.files import make_folder, remove_files, write_text
+from gpebo_cli.results.names import FORMATS
 from gpebo_cli.results.provenance import Provenance, provenance
 from gpebo_cli.results.style import save
 from gpebo_cli.results.summary import summary_text
@@ -33,7 +34,8 @@ def write_run(
         made_by: versions and commit; by default those of this process.
 
     Raises:
-        ConfigError: a figure asked for does not exist; nothing has been written then.
+        ConfigError: a figure asked for does not exist, or the run has nothing for it; nothing has
+            been written then.
         GpeboError: a file cannot be written; the message names it.
     """
     wanted = result.settings.output.figures
@@ -56,11 +58,12 @@ def write_run(
         tables.write_noise(folder / NOISE_TABLE, estimation, result.noise)
     for name, figure in figures:
         make_folder(folder / "figures")
-        save(figure, folder / "figures" / f"{name}.png")
+        for suffix in result.settings.output.formats:
+            save(figure, folder / "figures" / f"{name}.{suffix}")
     write_text(folder / "summary.json", summary_text(result, made_by or provenance()))
 
 
 def _remove_earlier(folder: Path) -> None:
     """Remove what an earlier run left, by name: a folder may hold files that are not ours."""
     remove_files(folder / name for name in ("summary.json", *TABLES, NOISE_TABLE))
-    remove_files(folder / "figures" / f"{name}.png" for name in FIGURES)
+    remove_files(folder / "figures" / f"{name}.{s}" for name in FIGURES for s in FORMATS)

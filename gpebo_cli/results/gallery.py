@@ -36,7 +36,7 @@ def figures_of(recipe: Recipe) -> dict[str, list[Panel]]:
     """Panels of all figures of a recipe, in the order in which they are shown."""
     study = STUDIES.get(recipe.name, Study())
     if "" in recipe.runs:
-        return dict(describe(recipe.runs[""], study.figures))
+        return describe(recipe.runs[""], study.figures)
     return {"estimators": panels} if (panels := overlay(recipe.runs)) else {}
 
 

@@ -9,7 +9,7 @@ from html import escape
 
 from gpebo_cli.results.names import FORMATS
 from gpebo_cli.results.provenance import Provenance
-from gpebo_cli.results.style import number_text, symbol
+from gpebo_cli.results.symbols import number_text, symbol
 
 _STYLE = """
 :root { color-scheme: light; }

@@ -1,56 +1,50 @@
-"""How figures look: one column of a two-column paper, legible without colour.
+"""How figures look: a column or a page of a journal, legible without colour.
 
-A figure is described by :class:`Panel` and :class:`Curve` and laid out by :func:`compose`, in
-inches: matplotlib's own layout engines draw every text once more to measure it, which makes a
-figure take half as long again. For the same reason ticks are computed here and labelled in Unicode,
-without mathtext. matplotlib is imported by the first figure, not before.
+A figure is described by :class:`Panel` and :class:`Curve`, which are its data as well, and drawn by
+:func:`compose`. matplotlib is imported by the first figure, not before, and never by way of pyplot.
 """
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results.files import write_file
+from gpebo_cli.results.symbols import escaped, number_text, power_of_ten, with_unit
+from gpebo_cli.schema import nearest, shown
+from gpebo_cli.settings import OutputSettings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
-WIDTH = 3.5  # inches, one column
-DPI = 200
+WIDTHS = {"column": 3.5, "page": 7.16}  # inches, of a two-column journal
+WIDTH, DPI = WIDTHS["column"], 200
 TEXT = 8.0  # points; the labels of ticks are one point smaller
-PANEL_HEIGHT = 1.05  # inches, of one among several
-SINGLE_HEIGHT = 1.9  # inches, of a panel that is alone
+PANEL_HEIGHT, SINGLE_HEIGHT = 1.15, 2.0  # inches: one among several, one alone
 MAX_PANELS = 8
 
 ROUNDING = 1e-16  # relative to the size of a signal, errors below this say nothing
 _HUGE = 1e300  # an estimate that diverges further leaves the axis; the axis itself stays finite
-
-_RIGHT, _BOTTOM, _EDGE, _GAP = 0.10, 0.38, 0.07, 0.11  # inches
-_LABEL = 0.13  # inches from the left edge to the middle of the names of vertical axes
-_LEFT = 0.52  # inches, enough for tick labels of four characters; more make it wider
-_LEGEND_ROW = 0.145  # inches
-_CHARACTER = 0.62 * TEXT / 72  # inches; mean advance of DejaVu Sans is 0.58 em
-_HANDLE = 3.0 * TEXT / 72  # inches; handle and its padding in a legend
-_COLUMN_GAP = 1.2 * TEXT / 72  # inches
+_PAD, _GAP = 0.05, 0.11  # inches: at the edges of a figure, and between panels
 
 # Whatever a user's matplotlibrc says, the figures of a run are the same.
 RC: dict[str, Any] = {
     "text.usetex": False,
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
+    "mathtext.fontset": "dejavusans",
     "font.size": TEXT,
     "axes.labelsize": TEXT,
     "axes.linewidth": 0.6,
@@ -59,6 +53,8 @@ RC: dict[str, Any] = {
     "figure.facecolor": "white",
     "axes.labelpad": 2.0,
     "axes.grid": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
     "xtick.labelsize": TEXT - 1,
     "ytick.labelsize": TEXT - 1,
     "xtick.major.width": 0.6,
@@ -69,26 +65,57 @@ RC: dict[str, Any] = {
     "ytick.major.pad": 2.0,
     "legend.fontsize": TEXT,
     "legend.title_fontsize": TEXT,
+    "legend.frameon": False,
+    "legend.borderpad": 0.0,
+    "legend.borderaxespad": 0.2,
+    "legend.labelspacing": 0.25,
+    "legend.handlelength": 2.4,
+    "legend.handletextpad": 0.5,
+    "legend.columnspacing": 1.2,
+    "lines.dash_capstyle": "butt",
+    "lines.solid_capstyle": "butt",
     "path.simplify": True,
     "path.simplify_threshold": 0.111,
     "agg.path.chunksize": 20000,
-    "pdf.fonttype": 42,  # journals refuse matplotlib's default, Type 3
-    "svg.hashsalt": "gpebo",  # ids within the file are the same every time
 }
+# These hold in every style: journals refuse Type 3 fonts, and the ids in an SVG file do not vary.
+_ALWAYS: dict[str, Any] = {"text.usetex": False, "pdf.fonttype": 42, "svg.hashsalt": "gpebo"}
 
 
 @contextmanager
-def our_rc() -> Iterator[None]:
-    """Set :data:`RC` for a while; ``matplotlib.rc_context`` copies all 300 entries, deeply."""
+def our_rc(style: str | None = None) -> Iterator[None]:
+    """Set :data:`RC`, or a style of matplotlib's, for a while.
+
+    ``matplotlib.rc_context`` would copy and check all 300 settings for every figure.
+    """
     import matplotlib as mpl
 
     settings: Any = mpl.rcParams  # its keys are typed as literals
-    theirs = {key: settings[key] for key in RC}
+    ours = {**(RC if style is None else _style(style)), **_ALWAYS}
+    theirs = {key: settings[key] for key in ours}
     try:
-        settings.update(RC)
+        settings.update(ours)
         yield
     finally:
         settings.update(theirs)
+
+
+def _style(name: str) -> dict[str, Any]:
+    """A style that comes with matplotlib; a path or an address is none.
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    from matplotlib import rcParamsDefault, style
+
+    if name not in style.library:
+        known = sorted(style.available)
+        raise ConfigError(
+            f"figures.style: matplotlib has no style {shown(name)}; known: {', '.join(known)}"
+            + nearest(name, known)
+        )
+    changed: dict[str, Any] = {**style.library[name]}  # type: ignore[dict-item]
+    return {**{key: rcParamsDefault[key] for key in RC}, **changed}  # type: ignore[index]
 
 
 @dataclass(frozen=True)
@@ -99,6 +126,13 @@ class Line:
     dashes: tuple[float, ...] = ()
     width: float = 1.1
     dots: bool = False  # a dot at every point: for few points, with gaps between them perhaps
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """What a matplotlib line is made with."""
+        dashes: Any = (0, self.dashes) if self.dashes else "-"
+        dots = {"marker": "o", "markersize": 2.4} if self.dots else {}
+        return {"color": self.color, "linestyle": dashes, "linewidth": self.width, **dots}
 
 
 # Okabe & Ito (2008) without their yellow, too light for a line. No two dashes are alike, so that
@@ -134,8 +168,10 @@ class Curve:
 
     x: Array
     y: Array
-    label: str
+    label: str  # in tables
     style: Line
+    text: str = ""  # in the legend; default: the label
+    down_to: Array | None = None  # (N,) the other edge of a band
 
 
 @dataclass(frozen=True)
@@ -146,21 +182,24 @@ class Axis:
     label: str
     unit: str = ""
     log: bool = False
+    text: str = ""  # in the figure; default: the label
 
 
-TIME = Axis("t", "time t", "s")
+TIME = Axis("t", "time t", "s", text="time $t$")
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes: ``curves``, the vertical axis called ``label``.
+    """One pair of axes with its ``curves``.
 
     On a ``log`` axis, values that are not positive are left out, and the axis ends at rounding,
     1e-16 of ``size``. ``limits`` bounds a linear axis (default: the range of the curves).
     """
 
-    label: str
+    name: str  # of the vertical axis, in tables
     curves: tuple[Curve, ...]
+    unit: str = ""
+    text: str = ""  # the name in the figure; default: as in tables
     log: bool = False
     size: float = 0.0  # of the signal whose error this is; 0: not known
     limits: tuple[float, float] | None = None
@@ -168,6 +207,11 @@ class Panel:
     vertical: tuple[float, str] | None = None  # a time worth marking, and its legend entry
     legend: bool = False
     note: str = ""  # above the legend
+
+    @property
+    def label(self) -> str:
+        """Name and unit, as tables have them."""
+        return with_unit(self.name, self.unit)
 
 
 def drawn(panel: Panel, curve: Curve) -> Array:
@@ -178,103 +222,180 @@ def drawn(panel: Panel, curve: Curve) -> Array:
     return np.where(keep, curve.y, np.nan)
 
 
-def with_unit(name: str, unit: str) -> str:
-    """Name of an axis: ``e1 (V)``, or the bare name where no unit is known."""
-    return f"{name} ({unit})" if unit else name
+def compose(panels: Sequence[Panel], look: OutputSettings | None = None) -> Figure:
+    """Draw ``panels`` below each other over one axis, each below its own legend, if any.
 
+    At most :data:`MAX_PANELS` are drawn; a line at the bottom says how many were left out.
 
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_SUBSCRIPT = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
-_GREEK = {
-    "alpha": "α",
-    "beta": "β",
-    "gamma": "γ",
-    "delta": "δ",
-    "lambda": "λ",
-    "mu": "μ",
-    "rho": "ρ",
-}
+    Args:
+        panels: the horizontal axis is the first one's.
+        look: width, resolution and style; by default a column at 200 dpi in our own.
 
-
-def power_of_ten(exponent: int) -> str:
-    """``10⁻³`` in Unicode."""
-    return "10" + str(exponent).translate(_SUPERSCRIPT)
-
-
-def number_text(value: float) -> str:
-    """A few digits, in powers of ten where that is shorter: ``0.5``, ``10¹⁰``, ``2.5·10⁻⁷``."""
-    if not math.isfinite(value) or value == 0.0 or 1e-3 <= abs(value) < 1e4:
-        return f"{value:.4g}".replace("-", "−")
-    mantissa, exponent = f"{value:.2e}".split("e")
-    mantissa = mantissa.rstrip("0").rstrip(".").replace("-", "−")
-    power = power_of_ten(int(exponent))
-    return {"1": power, "−1": f"−{power}"}.get(mantissa, f"{mantissa}·{power}")
-
-
-def subscript(number: int) -> str:
-    """``₁₂`` for 12."""
-    return str(number).translate(_SUBSCRIPT)
-
-
-def symbol(gain: str) -> str:
-    """Symbol of a gain as a paper prints it: ``gamma`` is γ, ``gamma_2`` is γ₂, ``f0`` is f₀."""
-    word = gain.rstrip("0123456789").rstrip("_")
-    digits = gain[len(word) :].lstrip("_").translate(_SUBSCRIPT)
-    if word in _GREEK:
-        return _GREEK[word] + digits
-    return word + digits if len(word) == 1 else gain
-
-
-def linear_ticks(low: float, high: float, most: int) -> tuple[Array, int]:
-    """Multiples of 1, 2 or 5 times a power of ten within [low, high], at most ``most`` of them.
-
-    Returns:
-        The ticks (K,) and the number of decimals that tell them apart.
+    Raises:
+        ConfigError: matplotlib has no such style.
     """
-    span = high - low
-    decade = math.floor(math.log10(span / most))
-    for factor in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0):
-        step = factor * 10.0**decade
-        first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-        if last - first < most:
-            break
-    ticks = np.arange(first, last + 1, dtype=np.float64) * step
-    return ticks, max(0, -math.floor(math.log10(step) + 1e-9))
+    look = look or OutputSettings()
+    shown = panels[:MAX_PANELS]
+    width = WIDTHS[look.width] if isinstance(look.width, str) else look.width
+    tall = SINGLE_HEIGHT if len(shown) == 1 else PANEL_HEIGHT
+    with our_rc(look.style):
+        figure = new_figure(width, 1.5 * tall * len(shown), look.dpi)
+        rows = [figure.add_axes((0.2, 0.2, 0.7, 1 / 1.5 / len(shown))) for _ in shown]
+        for axes, panel in zip(rows, shown, strict=True):
+            _fill(axes, panel, tall)
+            _set_across(axes, shown)
+        for axes in rows[:-1]:
+            _only_mark_ticks(axes)
+        _arrange(figure, rows, shown, tall)
+        if len(panels) > len(shown):
+            note = f"{len(shown)} of {len(panels)} shown"
+            figure.text(_PAD / width, 0.0, note, size=TEXT - 1, va="bottom")
+    return figure
 
 
-def log_ticks(low: int, high: int, most: int) -> list[int]:
-    """Exponents of the decades to label within [low, high], at most ``most`` and evenly spaced."""
-    step = max(1, math.ceil((high - low + 1) / most))
-    return [exponent for exponent in range(low, high + 1) if exponent % step == 0]
+def draw_on(axes: Axes, panel: Panel) -> None:
+    """Draw one panel on axes of somebody else's figure, in the settings that hold there."""
+    _fill(axes, panel, axes.bbox.height / axes.figure.dpi)
+    _set_across(axes, [panel])
+    if panel.legend:
+        _set_legend(axes, panel, axes.bbox.width)
 
 
-@dataclass(frozen=True)
-class _Scale:
-    """Limits and ticks of an axis, and the power of ten its labels leave out."""
-
-    low: float
-    high: float
-    ticks: Sequence[float]
-    labels: Sequence[str]
-    exponent: int = 0
+def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
+    """An empty figure, in inches."""
+    figure_class, canvas_class = _classes()
+    figure = figure_class(figsize=(width, height), dpi=dpi)
+    canvas_class(figure)
+    return figure
 
 
-def _scale(low: float, high: float, most: int) -> _Scale:
-    """Limits as given, at most ``most`` ticks, labels short even for large and small values."""
-    exponent = math.floor(math.log10(max(abs(low), abs(high))))
-    if -3 < exponent < 4:
-        exponent = 0
-    unit = 10.0**exponent
-    ticks, decimals = linear_ticks(low / unit, high / unit, most)
-    labels = [f"{tick:.{decimals}f}".replace("-", "−") for tick in ticks + 0.0]  # no "−0"
-    return _Scale(low, high, (ticks * unit).tolist(), labels, exponent)
+def _arrange(figure: Figure, rows: Sequence[Axes], panels: Sequence[Panel], tall: float) -> None:
+    """Put panels of the height ``tall`` below each other, as wide as names and ticks allow.
+
+    matplotlib's layout engines would fit the panels to the figure, not the figure to them, and
+    measure every text four times, which takes longer than drawing.
+    """
+    dpi, width = figure.dpi, figure.get_figwidth()
+    names: list[Any] = [axes.yaxis.get_tightbbox() for axes in rows]
+    left = _PAD + max(a.bbox.x0 - box.x0 for a, box in zip(rows, names, strict=True)) / dpi
+    across: Any = rows[-1].xaxis.get_tightbbox()
+    right = _PAD + max(0.0, across.x1 - rows[-1].bbox.x1) / dpi
+    inner = width - left - right
+    heads = [
+        _set_legend(axes, panel, inner * dpi) / dpi if panel.legend else 0.0
+        for axes, panel in zip(rows, panels, strict=True)
+    ]
+    bottom = _PAD + (rows[-1].bbox.y0 - across.y0) / dpi
+    height = _PAD + sum(heads) + len(rows) * (tall + _GAP) - _GAP + bottom
+    figure.set_size_inches(width, height)
+    thick = max(axes.yaxis.label.get_window_extent().width for axes in rows) / dpi
+    top = height - _PAD
+    for axes, head in zip(rows, heads, strict=True):
+        top -= head + tall
+        axes.set_position((left / width, top / height, inner / width, tall / height))
+        axes.yaxis.set_label_coords((_PAD + thick - left) / inner, 0.5)
+        top -= _GAP
 
 
-def _linear_scale(panel: Panel, most: int) -> _Scale:
+@cache
+def _classes() -> tuple[type[Figure], Any]:
+    """matplotlib's figure and canvas with what they lack, without pyplot.
+
+    The figure shows itself in a notebook. The canvases share a parser of formulas and thereby its
+    memory: most of a run's figures have the same names on them, and each takes milliseconds.
+    """
+    from matplotlib import figure
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    first: dict[str, Any] = {}
+
+    class Drawing(figure.Figure):
+        def _repr_png_(self) -> bytes:
+            return file_content(self, "png")
+
+    class Canvas(FigureCanvasAgg):
+        def get_renderer(self) -> Any:
+            renderer: Any = super().get_renderer()  # type: ignore[no-untyped-call]
+            renderer.mathtext_parser = first.setdefault("parser", renderer.mathtext_parser)
+            return renderer
+
+    return Drawing, Canvas
+
+
+def file_content(figure: Figure, suffix: str) -> bytes:
+    """``figure`` as a PNG, PDF or SVG file, which does not record when it was written."""
+    buffer = BytesIO()
+    date = {"pdf": "CreationDate", "svg": "Date"}.get(suffix)
+    # Level 1: flat drawings gain nothing from more, and level 6 takes twice the time.
+    more: Any = {"metadata": {date: None}} if date else {"pil_kwargs": {"compress_level": 1}}
+    with our_rc():
+        # The default, "figure", would replace what a style has set.
+        figure.savefig(buffer, format=suffix, dpi="figure", facecolor="auto", **more)
+    return buffer.getvalue()
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write ``figure`` in the format of the path's suffix, complete or not at all.
+
+    Raises:
+        GpeboError: the file cannot be written.
+    """
+    write_file(path, [file_content(figure, path.suffix[1:])])
+
+
+def _fill(axes: Axes, panel: Panel, height: float) -> None:
+    """Draw a panel that is ``height`` inches high, all but its legend and what panels share."""
+    if panel.log:
+        axes.set_yscale("log")
+    axes.set_ylim(*(_log_limits(panel) if panel.log else _limits(panel)))
+    for curve in panel.curves:
+        axes.plot(curve.x, drawn(panel, curve), label=curve.text or escaped(curve.label) or "_",
+                  **curve.style.keywords)
+        if curve.down_to is not None:
+            axes.fill_between(curve.x, curve.down_to, curve.y, color=curve.style.color,
+                              alpha=0.15, linewidth=0.0)
+    if all(np.isnan(drawn(panel, curve)).all() for curve in panel.curves):
+        finite = any(np.isfinite(curve.y).any() for curve in panel.curves)
+        said = "zero throughout" if finite else "no finite values"
+        axes.text(0.5, 0.5, said, transform=axes.transAxes, ha="center", va="center")
+    if panel.vertical is not None:
+        time, label = panel.vertical
+        axes.axvline(time, label=label.replace("t_c", "$t_c$"), **INSTANT.keywords)
+    power = _set_ticks(axes.yaxis, 5, log=panel.log)
+    unit = " ".join(filter(None, (power, escaped(panel.unit))))
+    _set_name(axes, panel.text or escaped(panel.name), unit, height)
+
+
+def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
+    """Scale, limits, ticks and name of the horizontal axis."""
+    axis = panels[0].axis
+    ends = [curve.x[[0, -1]] for panel in panels for curve in panel.curves if curve.x.size]
+    values = np.concatenate(ends or [np.ones(1)])
+    low, high = float(values.min()), float(values.max())
+    if not high > low:
+        high = low * 10.0 if axis.log else low + 1.0
+    if axis.log:
+        axes.set_xscale("log")
+        margin = (high / low) ** 0.02
+        axes.set_xlim(low / margin, high * margin)
+    else:
+        axes.set_xlim(low, high)
+    power = _set_ticks(axes.xaxis, 7, log=axis.log)
+    if axis.log and np.ceil(np.log10(low)) + 1 > np.floor(np.log10(high) + 1e-9):
+        # There are less than two whole decades to label: the ends are.
+        axes.set_xticks([low, high], [number_text(low), number_text(high)])
+    unit = " ".join(filter(None, (power, escaped(axis.unit))))
+    axes.set_xlabel(with_unit(axis.text or escaped(axis.label), unit))
+
+
+def _limits(panel: Panel) -> tuple[float, float]:
+    """Ends of a linear axis: finite and apart, whatever the values."""
     if panel.limits is not None:
         low, high = panel.limits
     else:
-        values = np.concatenate([c.y[np.isfinite(c.y)] for c in panel.curves] or [np.zeros(0)])
+        bands = [curve.down_to for curve in panel.curves if curve.down_to is not None]
+        values = np.concatenate([*(c.y for c in panel.curves), *bands, np.zeros(0)])
+        values = values[np.isfinite(values)]
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     low, high = max(low, -_HUGE), min(high, _HUGE)
     size = max(abs(low), abs(high))
@@ -283,292 +404,89 @@ def _linear_scale(panel: Panel, most: int) -> _Scale:
     elif high - low <= 1e-9 * size:  # constant: show it on an axis of its own size
         low, high = low - 0.5 * size, high + 0.5 * size
     margin = 0.06 * (high - low)
-    return _scale(low - margin, high + margin, most)
+    return low - margin, high + margin
 
 
-def _log_scale(panel: Panel, most: int) -> _Scale:
-    values = np.concatenate([c.y[np.isfinite(c.y) & (c.y > 0)] for c in panel.curves])
-    floor = ROUNDING * panel.size
+def _log_limits(panel: Panel) -> tuple[float, float]:
+    """Ends of a logarithmic axis: whole decades, and a little more so that no curve is cut."""
+    values = np.concatenate([*(c.y for c in panel.curves), np.zeros(0)])
+    values = values[np.isfinite(values) & (values > 0)]
     low, high = (float(values.min()), float(values.max())) if values.size else (0.1, 1.0)
     high = min(max(high, 1.0 / _HUGE), _HUGE)
-    low = min(max(low, floor, 1.0 / _HUGE), high)
+    low = min(max(low, ROUNDING * panel.size, 1.0 / _HUGE), high)
     first = math.floor(math.log10(low) + 1e-9)
     last = max(math.ceil(math.log10(high) - 1e-9), first + 1)
-    exponents = log_ticks(first, last, most)
-    ticks = [10.0**exponent for exponent in exponents]
-    labels = [power_of_ten(exponent) for exponent in exponents]
-    # A little more than whole decades, so that a curve at the very top is not half cut off.
     room = min(1.0, (last - first) * 0.04)
-    return _Scale(10.0 ** (first - room), 10.0 ** (last + room), ticks, labels)
+    return 10.0 ** (first - room), 10.0 ** (last + room)
 
 
-def _horizontal_scale(panels: Sequence[Panel], width: float) -> _Scale:
-    """As many ticks, up to seven, as their labels leave room for."""
-    ends = [curve.x[[0, -1]] for panel in panels for curve in panel.curves if curve.x.size]
-    values = np.concatenate(ends or [np.ones(1)])
-    start, stop = float(values.min()), float(values.max())
-    log = panels[0].axis.log
-    if not stop > start:
-        stop = start * 10.0 if log else start + 1.0
-    for most in range(7, 1, -1):
-        scale = _decades(start, stop, most) if log else _scale(start, stop, most)
-        room = width / max(len(scale.labels), 1)
-        if max(map(_length, scale.labels), default=0) * _CHARACTER <= 0.8 * room:
-            break
-    return scale
+def _set_ticks(axis: Any, most: int, *, log: bool) -> str:
+    """At most ``most`` + 1 ticks; the power of ten that their labels leave out."""
+    from matplotlib.ticker import MaxNLocator
+
+    ends = axis.get_view_interval()
+    if log:
+        first, last = math.ceil(math.log10(ends[0])), math.floor(math.log10(ends[1]))
+        step = -(-(last - first + 1) // most)
+        exponents = [k for k in range(first, last + 1) if k % step == 0]
+        # A text with superscripts: setting a formula takes twenty times as long.
+        axis.set_ticks([10.0**k for k in exponents], [power_of_ten(k) for k in exponents])
+        axis.set_ticks([], minor=True)
+        return ""
+    ticks = MaxNLocator(most, steps=[1, 2, 5, 10]).tick_values(*ends)
+    ticks = ticks[(ticks >= ends[0]) & (ticks <= ends[1])]
+    exponent = math.floor(math.log10(np.abs(ends).max()))
+    if -3 < exponent < 4:
+        exponent = 0
+    unit = 10.0**exponent
+    apart = float(np.diff(ticks).min(initial=np.inf) / unit)
+    decimals = max(0, -math.floor(math.log10(apart) + 1e-9)) if math.isfinite(apart) else 1
+    labels = [f"{tick / unit + 0.0:.{decimals}f}".replace("-", "−") for tick in ticks]
+    axis.set_ticks(ticks, labels)
+    return power_of_ten(exponent) if exponent else ""
 
 
-def _decades(low: float, high: float, most: int) -> _Scale:
-    """Limits just beyond the values; powers of ten, or the ends if there are not two of them."""
-    first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
-    exponents = log_ticks(first, last, most) if last > first else []
-    few = len(exponents) < 2
-    ticks = [low, high] if few else [10.0**exponent for exponent in exponents]
-    labels = [number_text(tick) for tick in ticks] if few else [*map(power_of_ten, exponents)]
-    margin = (high / low) ** 0.02
-    return _Scale(low / margin, high * margin, ticks, labels)
-
-
-def _legend_entries(panel: Panel, width: float) -> list[tuple[str, Line]]:
-    entries = [(curve.label, curve.style) for curve in panel.curves if curve.label]
-    if panel.vertical is not None:
-        entries.append((panel.vertical[1], INSTANT))
-    return [(shorten(label, width - _HANDLE), style) for label, style in entries]
-
-
-def _length(text: str) -> float:
-    """Length of ``text`` in characters of mean width; superscripts are narrower."""
-    narrow = sum(text.count(letter) for letter in "⁻⁰¹²³⁴⁵⁶⁷⁸⁹₀₁₂₃₄₅₆₇₈₉.,· ")
-    return len(text) - 0.4 * narrow
-
-
-def legend_columns(labels: Sequence[str], width: float) -> int:
-    """Most columns in which a legend is no wider than ``width`` inches, but one at least.
-
-    matplotlib fills column after column, the first ones with one entry more.
-    """
-    for columns in range(len(labels), 1, -1):
-        short, longer = divmod(len(labels), columns)
-        ends = [short * k + min(k, longer) for k in range(columns + 1)]
-        widths = [
-            max(map(_length, labels[start:end])) * _CHARACTER + _HANDLE
-            for start, end in pairwise(ends)
-        ]
-        if sum(widths) + _COLUMN_GAP * (columns - 1) <= width:
-            return columns
-    return 1
-
-
-def shorten(text: str, width: float) -> str:
-    """Leave out the middle of ``text`` if it is wider than ``width`` inches."""
-    room = max(5, int(width / _CHARACTER))
-    if _length(text) <= width / _CHARACTER or len(text) <= room:
-        return text
-    tail = room // 2
-    return f"{text[: room - tail - 1]}…{text[-tail:]}"
-
-
-@dataclass(frozen=True)
-class _Name:
-    """Where the name of a vertical axis goes: beside it or, too long for that, above it."""
-
-    beside: str
-    size: float = TEXT  # of what is beside, in points
-    above: str = ""
-
-
-def _place_name(label: str, exponent: int, panel_height: float) -> _Name:
-    head, bracket, tail = label.rpartition(" (")
-    unit = bracket.strip() + tail if bracket else ""
-    if exponent:
-        power = power_of_ten(exponent)
-        unit = f"({power} {unit[1:]}" if unit else f"({power})"
-    name = head if bracket else label
-    whole = f"{name} {unit}".strip()
-    fits = TEXT * (panel_height + _GAP / 2) / (_length(whole) * _CHARACTER)
-    if fits >= TEXT - 1:
-        return _Name(whole, min(TEXT, fits))
-    return _Name(unit or "value", TEXT, shorten(name, WIDTH - 2 * _EDGE))
-
-
-def compose(panels: Sequence[Panel]) -> Figure:
-    """Draw ``panels`` below each other over one axis, each below its own legend, if any.
-
-    The horizontal axis is the first panel's. At most :data:`MAX_PANELS` are drawn; a line at the
-    bottom says how many were left out.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    shown = panels[:MAX_PANELS]
-    panel_height = SINGLE_HEIGHT if len(shown) == 1 else PANEL_HEIGHT
-    most = 6 if len(shown) == 1 else 5
-    scales = [_log_scale(p, most) if p.log else _linear_scale(p, most) for p in shown]
-    longest = max(_length(label) for scale in scales for label in scale.labels or [""])
-    left = _LEFT + max(0.0, longest - 4.0) * _CHARACTER
-    inner = WIDTH - left - _RIGHT
-    legends = [_legend_entries(p, inner) if p.legend else [] for p in shown]
-    columns = [legend_columns([label for label, _ in e], inner) if e else 0 for e in legends]
-    names = [
-        _place_name(p.label, scale.exponent, panel_height)
-        for p, scale in zip(shown, scales, strict=True)
-    ]
-    headers = [  # inches above each panel
-        _LEGEND_ROW * ((math.ceil(len(e) / c) if c else 0) + bool(p.note) + bool(name.above))
-        for p, e, c, name in zip(shown, legends, columns, names, strict=True)
-    ]
-    height = _EDGE + sum(headers) + len(shown) * (panel_height + _GAP) - _GAP + _BOTTOM
-    across, axis = _horizontal_scale(shown, inner), shown[0].axis
-    power = f"{power_of_ten(across.exponent)} " if across.exponent else ""
-
-    with our_rc():
-        figure = _figure_class()(figsize=(WIDTH, height), dpi=DPI)
-        FigureCanvasAgg(figure)
-        top = height - _EDGE
-        for number, (panel, scale, name) in enumerate(zip(shown, scales, names, strict=True)):
-            if name.above:
-                figure.text(_EDGE / WIDTH, top / height, name.above, va="top")
-            top -= headers[number]
-            last = number == len(shown) - 1
-            box = (
-                left / WIDTH,
-                (top - panel_height) / height,
-                inner / WIDTH,
-                panel_height / height,
-            )
-            axes = figure.add_axes(box)
-            _set_scales(axes, across, scale, log=(axis.log, panel.log))
-            _draw_curves(axes, panel)
-            if last:
-                axes.set_xticks(across.ticks, across.labels)
-            else:
-                _mark_ticks(axes, across.ticks)
-            axes.set_yticks(scale.ticks, scale.labels)
-            axes.set_ylabel(name.beside, fontsize=name.size, va="center")
-            axes.yaxis.set_label_coords((_LABEL - left) / inner, 0.5)
-            if last:
-                axes.set_xlabel(with_unit(axis.label, f"{power}{axis.unit}".strip()))
-                axes.xaxis.set_label_coords(0.5, -0.21 / panel_height)
-            if legends[number]:
-                _draw_legend(axes, legends[number], columns[number], panel.note, panel_height)
-            top -= panel_height + _GAP
-        if len(panels) > len(shown):
-            note = f"{len(shown)} of {len(panels)} shown"
-            figure.text(0.02, 0.03 / height, note, size=TEXT - 1, va="bottom")
-    return figure
-
-
-@cache
-def _figure_class() -> type[Figure]:
-    """matplotlib's figure, which in addition shows itself in a notebook, without pyplot."""
-    from matplotlib import figure
-
-    class Drawing(figure.Figure):
-        """A figure with its picture."""
-
-        def _repr_png_(self) -> bytes:
-            stream = BytesIO()
-            with our_rc():
-                self.savefig(stream, format="png", pil_kwargs={"optimize": True})
-            return stream.getvalue()
-
-    return Drawing
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write ``figure`` in the format of the path's suffix, complete or not at all.
-
-    A PNG has ``WIDTH * DPI`` pixels across. No format records when it was written.
-
-    Args:
-        figure: what :func:`compose` returned.
-        path: ends with one of :data:`gpebo_cli.results.names.FORMATS`.
-
-    Raises:
-        GpeboError: the file cannot be written.
-    """
-    buffer = BytesIO()
-    with our_rc():
-        if path.suffix == ".png":
-            from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-            # Level 1: flat drawings gain nothing from more, and level 6 takes twice the time.
-            FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
-            buffer, pil_kwargs={"compress_level": 1}
-        )
-        else:
-            date = {".pdf": "CreationDate", ".svg": "Date"}[path.suffix]
-            figure.savefig(buffer, format=path.suffix[1:], metadata={date: None})
-    write_file(path, [buffer.getvalue()])
-
-
-def _artist(x: Array, y: Array, style: Line) -> Line2D:
-    from matplotlib.lines import Line2D
-
-    dashes = (0, style.dashes) if style.dashes else "-"
-    cap = {"dash_capstyle": "butt", "solid_capstyle": "butt", "solid_joinstyle": "round"}
-    artist = Line2D(x, y, color=style.color, linestyle=dashes, linewidth=style.width, **cap)  # type: ignore[arg-type]
-    if style.dots:
-        artist.set(marker="o", markersize=2.4)
-    return artist
-
-
-def _set_scales(axes: Axes, across: _Scale, up: _Scale, log: tuple[bool, bool]) -> None:
-    from matplotlib.ticker import NullLocator
-
-    if log[0]:
-        axes.set_xscale("log")
-        axes.xaxis.set_minor_locator(NullLocator())
-    if log[1]:
-        axes.set_yscale("log")
-        axes.yaxis.set_minor_locator(NullLocator())
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlim(across.low, across.high)
-    axes.set_ylim(up.low, up.high)
-
-
-def _draw_curves(axes: Axes, panel: Panel) -> None:
-    visible = False
-    for curve in panel.curves:
-        values = drawn(panel, curve)
-        visible = visible or not np.isnan(values).all()
-        axes.add_line(_artist(curve.x, values, curve.style))
-    if not visible:
-        finite = any(np.isfinite(curve.y).any() for curve in panel.curves)
-        said = "zero throughout" if finite else "no finite values"
-        axes.text(0.5, 0.5, said, transform=axes.transAxes, ha="center", va="center")
-    if panel.vertical is not None:
-        mark = INSTANT
-        axes.axvline(panel.vertical[0], color=mark.color, linewidth=mark.width)
-
-
-def _mark_ticks(axes: Axes, ticks: Sequence[float]) -> None:
-    """Mark ``ticks`` on a horizontal axis without labels: one artist instead of five per tick."""
-    marks = _artist(np.asarray(ticks), np.zeros(len(ticks)), Line(RC["axes.edgecolor"]))
-    # Marker 3 is matplotlib's TICKDOWN.
-    marks.set(linestyle="none", marker=3, markersize=RC["xtick.major.size"])
-    marks.set(markeredgewidth=RC["xtick.major.width"], clip_on=False)
-    marks.set_transform(axes.get_xaxis_transform())
-    axes.add_artist(marks)
+def _only_mark_ticks(axes: Axes) -> None:
+    """Leave of the horizontal axis its ticks: one artist in place of five for each of them."""
+    ticks = axes.get_xticks()
     axes.set_xticks([])
-
-
-def _draw_legend(
-    axes: Axes, entries: Sequence[tuple[str, Line]], columns: int, note: str, panel_height: float
-) -> None:
-    nothing = np.zeros(0)
-    axes.legend(
-        handles=[_artist(nothing, nothing, style) for _, style in entries],
-        labels=[label for label, _ in entries],
-        title=note or None,
-        alignment="left",
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0 + 0.025 / panel_height),
-        ncols=columns,
-        frameon=False,
-        borderpad=0.0,
-        borderaxespad=0.0,
-        labelspacing=0.25,
-        handlelength=2.4,
-        handletextpad=0.5,
-        columnspacing=1.2,
+    axes.set_xlabel("")
+    axes.plot(
+        ticks, np.zeros(len(ticks)), linestyle="none", marker=3, clip_on=False,  # 3: tick down
+        markersize=RC["xtick.major.size"], markeredgewidth=RC["xtick.major.width"],
+        color=axes.spines["bottom"].get_edgecolor(), transform=axes.get_xaxis_transform(),
     )
+
+
+def _set_name(axes: Axes, name: str, unit: str, height: float) -> None:
+    """Name the vertical axis, on several lines or in smaller letters if it is a long one."""
+    broken = "\n".join(textwrap.wrap(name.replace("_", "_ "), 22)).replace("_ ", "_")
+    for text in (with_unit(name, unit), f"{name}\n({unit})", f"{broken}\n({unit})"):
+        axes.set_ylabel(text.removesuffix("\n()"))
+        if len(text) < 12:
+            return
+        length = axes.yaxis.label.get_window_extent().height / axes.figure.dpi
+        if length <= height:
+            return
+    axes.yaxis.label.set_fontsize(TEXT * height / length)
+
+
+def _set_legend(axes: Axes, panel: Panel, room: float) -> float:
+    """Put the legend above the panel, in as many columns as ``room`` has; its height in pixels."""
+    handles, labels = axes.get_legend_handles_labels()
+    if not handles:
+        return 0.0
+    for columns in range(min(len(handles), 6), 0, -1):
+        legend = axes.legend(
+            handles, labels, title=panel.note or None, alignment="left",
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+        )
+        if legend.get_window_extent().width <= room:
+            break
+    else:
+        share = room / legend.get_window_extent().width
+        for text in legend.get_texts():
+            whole = text.get_text().replace(" = ", "\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}")
+            text.set_text(textwrap.fill(whole, int(0.9 * share * len(whole)),
+                                        break_long_words=False, break_on_hyphens=False))
+    return float(legend.get_window_extent().height) + 2.0

@@ -1,0 +1,102 @@
+"""Names and numbers as people write them: in plain Unicode for tables, as mathtext for figures."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUBSCRIPT = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+_LETTERS = {
+    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ", "eta": "η",
+    "theta": "θ", "iota": "ι", "kappa": "κ", "lambda": "λ", "mu": "μ", "nu": "ν", "xi": "ξ",
+    "pi": "π", "rho": "ρ", "sigma": "σ", "tau": "τ", "upsilon": "υ", "phi": "φ", "chi": "χ",
+    "psi": "ψ", "omega": "ω", "Gamma": "Γ", "Delta": "Δ", "Theta": "Θ", "Lambda": "Λ", "Xi": "Ξ",
+    "Pi": "Π", "Sigma": "Σ", "Phi": "Φ", "Psi": "Ψ", "Omega": "Ω",
+}
+_WORD = re.compile(r"([A-Za-z]+)(\d*)")
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Name of an axis: ``e1 (V)``, or the bare name where no unit is known."""
+    return f"{name} ({unit})" if unit else name
+
+
+def power_of_ten(exponent: int) -> str:
+    """``10⁻³`` in Unicode."""
+    return "10" + str(exponent).translate(_SUPERSCRIPT)
+
+
+def number_text(value: float) -> str:
+    """A few digits, in powers of ten where that is shorter: ``0.5``, ``10¹⁰``, ``2.5·10⁻⁷``."""
+    if not math.isfinite(value) or value == 0.0 or 1e-3 <= abs(value) < 1e4:
+        return f"{value:.4g}".replace("-", "−")
+    mantissa, exponent = f"{value:.2e}".split("e")
+    mantissa = mantissa.rstrip("0").rstrip(".").replace("-", "−")
+    power = power_of_ten(int(exponent))
+    return {"1": power, "−1": f"−{power}"}.get(mantissa, f"{mantissa}·{power}")
+
+
+def subscript(number: int) -> str:
+    """``₁₂`` for 12."""
+    return str(number).translate(_SUBSCRIPT)
+
+
+def symbol(gain: str) -> str:
+    """Symbol of a gain as a paper prints it: ``gamma`` is γ, ``gamma_2`` is γ₂, ``f0`` is f₀."""
+    word = gain.rstrip("0123456789").rstrip("_")
+    digits = gain[len(word) :].lstrip("_").translate(_SUBSCRIPT)
+    if word in _LETTERS:
+        return _LETTERS[word] + digits
+    return word + digits if len(word) == 1 else gain
+
+
+def math_of(name: str, labels: Mapping[str, str]) -> str:
+    r"""A name as mathtext without its dollars; empty where it is a phrase and no symbol.
+
+    Args:
+        name: of a signal or a parameter: ``x1`` becomes ``x_{1}``, ``theta`` becomes ``\theta``,
+            ``e0_il`` becomes ``e_{0,i_L}`` if that is the label of ``il``.
+        labels: what the plant's author writes instead, by name.
+    """
+    if name in labels:
+        return labels[name]
+    head, *rest = name.split("_")
+    match = _WORD.fullmatch(head)
+    if match is None or len(name) > 12 or not all(rest):
+        return ""
+    letters, digits = match.groups()
+    below = [*([digits] if digits else []), *(_below(part, labels) for part in rest)]
+    if letters in _LETTERS:
+        letters = f"\\{letters}"
+    elif len(letters) > 1:
+        letters = f"\\mathrm{{{letters}}}"
+    return f"{letters}_{{{','.join(below)}}}" if below else letters
+
+
+def _below(part: str, labels: Mapping[str, str]) -> str:
+    return math_of(part, labels) or f"\\mathrm{{{part}}}"
+
+
+def typeset(name: str, labels: Mapping[str, str]) -> str:
+    """A name for a figure: in math where :func:`math_of` knows it as a symbol."""
+    math = math_of(name, labels)
+    return f"${math}$" if math else escaped(name)
+
+
+def error_of(name: str, labels: Mapping[str, str], *, signed: bool) -> str:
+    """``|x̂ − x|``, or ``x̂ − x`` if ``signed``, for a figure."""
+    math = math_of(name, labels)
+    if not math:
+        return f"error of {escaped(name)}"
+    # The hat stands on the letter, and not on its index.
+    letter, mark, index = re.fullmatch(r"(.*?)(?:([_^])(.*))?", math, re.DOTALL).groups("")  # type: ignore[union-attr]
+    hat = f"\\widehat{{{letter}}}" if letter.startswith("\\mathrm") else f"\\hat{{{letter}}}"
+    difference = f"{hat}{mark}{index} - {math}"
+    return f"${difference}$" if signed else f"$|{difference}|$"
+
+
+def escaped(text: str) -> str:
+    """Text that matplotlib does not take for math."""
+    return text.replace("$", r"\$")
