@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from gpebo_cli.cli.locations import conf_folder
+from gpebo_cli.configs.locations import conf_folder
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.model.descriptor import Array, DescriptorSystem

@@ -297,7 +297,7 @@ def test_wrong_usage_is_a_config_error_on_one_line(words, expected):
         ("name: mine\nname: other\n", "the key name stands twice"),
         ("name: [\n", "not valid YAML"),
         ("- 1\n", "expected a mapping"),
-        (MINE + "title: ${oc.env:HOME}\n", "is not allowed in a plant"),
+        (MINE + "title: ${oc.env:HOME}\n", "${…} is not allowed"),
         (MINE.replace("-1", "-z"), "the name 'z' is not defined"),
     ],
 )

@@ -237,7 +237,8 @@ def test_a_failed_run_is_exit_code_1(tmp_path):
     (tmp_path / "taken").touch()
     done = gpebo("run", "hydra.run.dir=taken", *FAST, cwd=tmp_path)
     assert done.returncode == 1
-    assert done.stderr == "gpebo: error: taken: File exists\n"
+    assert done.stderr.startswith("gpebo: error: cannot create the folder ")
+    assert done.stderr.endswith("taken: File exists\n")
 
 
 def test_a_traceback_when_it_is_asked_for(tmp_path):
@@ -468,70 +469,7 @@ def test_an_interrupted_sweep_keeps_what_is_done(tmp_path):
         assert next(csv.DictReader(stream))["status"] == "done"
 
 
-# Files of strangers ---------------------------------------------------------------------------
-
-BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
-    f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n"
-    for a, b in zip("abcdefgh", "bcdefghi", strict=True)
-)
-
-HOSTILE = [
-    ("plant/x.yaml", BOMB, "entries, aliases expanded"),
-    ("plant/x.yaml", "a: &a [*a]\n", "*a contains itself"),
-    ("plant/x.yaml", "a: " + "[" * 100_000, "levels deep"),
-    ("plant/x.yaml", "#" * 2_000_001, "bytes; at most"),
-    ("plant/x.yaml", MINE.replace("mine", "${oc.env:HOME}"), "${…} is not allowed"),
-    ("plant/x.yaml", MINE.replace("[[-1]]", "[['${oc.env:HOME}']]"), "${…} is not allowed"),
-    ("plant/x.yaml", MINE.replace("name: mine", "name: ../../mine"), "part of a folder's name"),
-    ("plant/x.yaml", MINE.replace("name: mine\n", ""), "name is missing"),
-    ("plant/x.yaml", "# @package hydra.callbacks\n" + MINE, "`# @package` is not allowed"),
-    ("plant/x.yaml", MINE + "defaults: [_self_]\n", "has no defaults list"),
-    ("plant/x.yaml", MINE + "x: {_target_: os.system}\n", "`_target_` is not allowed"),
-    ("plant/x.yaml", "!!python/object/apply:os.system ['touch pwned']", "not valid YAML"),
-    ("plant/x.yaml", "name: [", "not valid YAML"),
-    ("experiment/x.yaml", "# @package hydra.job_logging\na: 1\n", "only `# @package _global_`"),
-    (
-        "experiment/x.yaml",
-        "# @package _global_\nhydra: {job_logging: {handlers: {a: {(): os.system}}}}\n",
-        "hydra.job_logging is not allowed",
-    ),
-    (
-        "experiment/x.yaml",
-        "# @package _global_\ndefaults: [{/plant@hydra.callbacks: circuit}]\n",
-        "a defaults list may choose",
-    ),
-    (
-        "experiment/x.yaml",
-        "# @package _global_\nplant: {title: '${oc.env:HOME}'}\n",
-        "${…} is not allowed",
-    ),
-]
-
-
-@pytest.mark.parametrize(("path", "text", "expected"), HOSTILE)
-def test_hostile_files_get_one_line_quickly(tmp_path, path, text, expected):
-    target = tmp_path / "evil" / path
-    target.parent.mkdir(parents=True)
-    target.write_text(text)
-    group = target.parent.name
-    done = gpebo("run", "--config-dir", "evil", f"{group}=x", *FAST, cwd=tmp_path)  # or a time-out
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert expected in done.stderr
-    assert not (tmp_path / "pwned").exists()
-
-
-def test_a_launcher_from_the_folder_cannot_be_chosen_by_it(tmp_path):
-    folder = tmp_path / "evil"
-    (folder / "experiment").mkdir(parents=True)
-    (folder / "hydra" / "launcher").mkdir(parents=True)
-    (folder / "hydra" / "launcher" / "mine.yaml").write_text("_target_: os.system\n")
-    (folder / "experiment" / "x.yaml").write_text(
-        "# @package _global_\ndefaults: [{override /hydra/launcher: mine}]\n"
-    )
-    done = gpebo("run", "--config-dir", folder, "experiment=x", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "a defaults list may choose" in done.stderr
+# Files of one's own ---------------------------------------------------------------------------
 
 
 def test_half_written_neighbours_do_no_harm(tmp_path, mine):

@@ -17,7 +17,7 @@ from examples import ROOT, environment
 
 from gpebo_cli.cli.app import COMMANDS
 from gpebo_cli.cli.completion import SCRIPTS, candidates
-from gpebo_cli.cli.locations import GROUPS
+from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.results.figures import FIGURES
 from gpebo_cli.results.names import FIGURE_NAMES, METRICS

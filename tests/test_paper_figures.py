@@ -17,8 +17,9 @@ import yaml
 from factories import make_result
 from PIL import Image
 
-from gpebo_cli.cli import configuration, figures
-from gpebo_cli.cli.locations import choices, conf_folder
+from gpebo_cli.cli import figures
+from gpebo_cli.configs import configuration
+from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results import circuit, gallery
 from gpebo_cli.results.figures import describe, overlay

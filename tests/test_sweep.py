@@ -450,4 +450,4 @@ def test_a_folder_from_a_stranger_cannot_bring_launchers(tmp_path):
     evil.write_text("# @package hydra.launcher\n_target_: os.abort\n")
     done = gpebo("run", "-m", "--config-dir", ".", "launcher=evil", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "cannot bring launchers" in done.stderr
+    assert "there is no such launcher; known: basic" in done.stderr

@@ -9,8 +9,8 @@ from typing import Any, cast
 
 from gpebo_cli.api.choice import choose, plain, primary
 from gpebo_cli.api.result import Result
-from gpebo_cli.cli import configuration
-from gpebo_cli.cli.locations import DATA_GROUPS, GROUPS, choices, conf_folder
+from gpebo_cli.configs import configuration
+from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import Estimator, settings_of
 from gpebo_cli.experiment import assumptions

@@ -1,30 +1,26 @@
 """From what a caller gives to the configuration of one run, with the files' own defaults.
 
-``conf/gpebo.yaml`` and the files of its groups are read here as Hydra reads them for the command
-line, so that a default is written in one place.
+``conf/gpebo.yaml`` and the files of its groups are read as for the command line, so that a default
+is written in one place.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gpebo_cli.cli import configuration
-from gpebo_cli.cli.guard import check_file
-from gpebo_cli.cli.locations import choices, conf_folder
+from gpebo_cli.configs import files
+from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.schema import nearest, shown
-
-PRIMARY = "gpebo.yaml"
 
 
 def primary() -> dict[str, Any]:
     """The primary configuration, ``conf/gpebo.yaml``."""
-    return configuration.load(os.path.join(conf_folder(), PRIMARY))
+    return files.shipped(PRIMARY)
 
 
 def default(group: str) -> str:
@@ -57,7 +53,10 @@ def choose(
     if given is None:
         given = default(group)
     if group == "plant" and (path := _as_path(given)) is not None:
-        return _load(path, group, os.path.dirname(os.path.abspath(path)))
+        path = os.path.expanduser(path)
+        if not os.path.exists(path):
+            raise ConfigError(f"{path}: there is no such file")
+        return files.load_path(path, group), _shortest(path)
     if not isinstance(given, str):
         wanted = "a name, a path, a mapping or a DescriptorSystem" if group == "plant" else (
             "a name or a mapping"
@@ -94,27 +93,19 @@ def _named(
         mine = os.path.abspath(os.path.expanduser(os.fspath(config_dir)))
         if not os.path.isdir(mine):
             raise ConfigError(f"config_dir {config_dir}: there is no such folder")
-        folders.append(mine)
-    known = {folder: choices(folder, group) for folder in folders}
-    found = [folder for folder in folders if name in known[folder]]
-    if len(found) > 1:
-        mine = os.path.join(found[1], group, f"{name}.yaml")
-        raise ConfigError(
-            f"{mine} has the name of one that comes with gpebo and would be ignored; rename it"
-        )
-    if not found:
-        names = sorted(known_name for folder in folders for known_name in known[folder])
-        text = f"{group}={name}: there is no such {group}; known: {', '.join(names)}"
-        hint = nearest(name, names)
-        if not hint and config_dir is None:
-            hint = f" (yours: config_dir=DIR with DIR/{group}/{name}.yaml)"
-        raise ConfigError(text + hint)
-    return _load(os.path.join(found[0], group, f"{name}.yaml"), group, found[0])
+        folders.insert(0, mine)  # first, so that a file with a name of ours is noticed
+    inside = f"{group}/{name}"
+    for folder in folders:
+        if files.is_file(folder, inside):
+            path = os.path.join(folder, f"{inside}.yaml")
+            return files.load(folder, inside), _shortest(path)
+    names = sorted(known for folder in folders for known in choices(folder, group))
+    text = f"{group}={name}: there is no such {group}; known: {', '.join(names)}"
+    hint = nearest(name, names)
+    if not hint and config_dir is None:
+        hint = f" (yours: config_dir=DIR with DIR/{group}/{name}.yaml)"
+    raise ConfigError(text + hint)
 
 
-def _load(path: str, group: str, folder: str) -> tuple[dict[str, Any], str]:
-    path = os.path.expanduser(path)
-    if not Path(path).exists():
-        raise ConfigError(f"{path}: there is no such file")
-    check_file(path, group, folder)
-    return configuration.load(path), min(path, os.path.relpath(path), key=len)
+def _shortest(path: str) -> str:
+    return min(path, os.path.relpath(path), key=len)

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpebo_cli import estimators
-from gpebo_cli.api.choice import primary
-from gpebo_cli.cli import configuration
-from gpebo_cli.cli.report import case_rows, run_lines
+from gpebo_cli.configs import configuration
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.experiment.result import RunResult
@@ -24,6 +22,7 @@ from gpebo_cli.results import figures
 from gpebo_cli.results.figures import truth_at
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.frames import frame
+from gpebo_cli.results.report import case_rows, run_lines
 from gpebo_cli.results.style import draw_on
 from gpebo_cli.schema import nearest, shown
 
@@ -270,9 +269,7 @@ class Result:
         name = str(self.config["estimator"]["name"])
         repeats = bool(self.config["plant"]) and name in estimators.names()
         head = configuration.REPEATS if repeats else _NOT_REPEATED
-        text = configuration.config_text(
-            {**self.config, "figures": word}, configuration.patterns(primary()), head
-        )
+        text = configuration.config_text({**self.config, "figures": word}, head)
         write_run(details, Path(folder), text)
         return Path(folder)
 

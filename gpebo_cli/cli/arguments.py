@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
-from gpebo_cli.cli.locations import GROUPS, choices, conf_folder
+from gpebo_cli.configs.locations import GROUPS, PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.schema import nearest, shown
 
@@ -36,6 +36,7 @@ _LONG = {long: long for long in (*_SWITCHES.values(), *_WITH_VALUE.values())}
 OPTIONS = tuple(_LONG)
 """Long names of all options of ``gpebo run``."""
 
+_ONE_OF = ("--run", "--multirun", "--cfg", "--info", "--shell-completion", "--hydra-help")
 VALUES = {
     "--cfg": ("job", "hydra", "all"),
     "--info": ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
@@ -53,9 +54,6 @@ _SWEEPER = "gpebo"
 _SWEEP_WORDS = ("resume", "fail_fast")  # of a sweep, not of the configuration
 _KEYS = (*GROUPS, "launcher", "time", "excitation", "figures", "output", *_SWEEP_WORDS)
 
-PRIMARY = "gpebo"
-"""The primary configuration, conf/gpebo.yaml; another name than a run's own config.yaml."""
-
 
 @dataclass(frozen=True)
 class Arguments:
@@ -65,7 +63,7 @@ class Arguments:
     switches: frozenset[str] = frozenset()  # long names
     config_dir: str | None = None  # absolute
     config_name: str = PRIMARY
-    options: tuple[str, ...] = ()  # of Hydra, as it reads them
+    options: Mapping[str, str] = field(default_factory=dict)  # of those with a value
     resume: str | None = None  # absolute folder of a sweep to go on with
     fail_fast: str = ""  # as given; empty: not given
     dry_run: bool = False
@@ -81,11 +79,8 @@ class Arguments:
 
     @property
     def for_hydra(self) -> list[str]:
-        """The words for Hydra's parser: overrides first, then every flag."""
-        folder = [] if self.config_dir is None else ["--config-dir", self.config_dir]
-        name = [] if self.config_name == PRIMARY else ["--config-name", self.config_name]
-        words = [*self.overrides, *self._sweeper, *sorted(self.switches), *self.options]
-        return [*words, *folder, *name]
+        """The overrides that Hydra composes."""
+        return [*self.overrides, *self._sweeper]
 
     @property
     def _sweeper(self) -> list[str]:
@@ -98,10 +93,6 @@ class Arguments:
         if self.dry_run:
             words.append("hydra.sweeper.dry_run=true")
         return words
-
-    def with_override(self, override: str) -> Arguments:
-        """The same with one more override, which wins."""
-        return replace(self, overrides=(*self.overrides, override))
 
     @property
     def folders(self) -> list[str]:
@@ -159,20 +150,28 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
     config_dir = _config_dir(values.pop("--config-dir", None))
     config_name = _config_name(values.pop("--config-name", None), config_dir)
     overrides = _with_data(overrides, config_name)
-    options = tuple(item for pair in values.items() for item in pair)
-    dry_run = "--dry-run" in switches
-    switches.discard("--dry-run")
     multirun = "--multirun" in switches
+    _check_questions(switches, values)
     return Arguments(
         tuple(_override(word, multirun=multirun) for word in overrides),
         frozenset(switches),
         config_dir,
         config_name,
-        options,
+        values,
         _resume(sweep.get("resume")),
         _fail_fast(sweep.get("fail_fast")),
-        dry_run,
+        "--dry-run" in switches,
     )
+
+
+def _check_questions(switches: Collection[str], values: Mapping[str, str]) -> None:
+    """Hydra answers one question at a time."""
+    asked = [flag for flag in _ONE_OF if flag in switches or flag in values]
+    if len(asked) > 1:
+        raise ConfigError(f"only one of {', '.join(asked)} at a time")
+    for flag in ("--resolve", "--package"):
+        if (flag in switches or flag in values) and "--cfg" not in values:
+            raise ConfigError(f"{flag} is for what --cfg prints; add --cfg job")
 
 
 def _with_data(overrides: list[str], config_name: str) -> list[str]:

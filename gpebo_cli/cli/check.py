@@ -8,12 +8,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gpebo_cli.cli import arguments as command_line
-from gpebo_cli.cli.arguments import Arguments
 from gpebo_cli.errors import ConfigError
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
     from gpebo_cli.findings import Assumption
 
 _WIDTH = 100
@@ -66,50 +63,22 @@ def main(words: list[str]) -> int:
     word = "-m" if "--multirun" in arguments.switches else arguments.of_a_sweep
     if word:
         raise ConfigError(f"gpebo check looks at one configuration; leave out {word}")
-    if arguments.config_dir is not None:
-        from gpebo_cli.cli.guard import check_folder
+    from gpebo_cli.cli import composition
 
-        check_folder(arguments.config_dir, arguments.config_name)
-    check = _Check(arguments)
-    from gpebo_cli.cli.run import call_hydra
-
-    # Hydra makes the folder of a job before it runs it; a check writes nothing.
-    # A recipe of a sweep is checked as far as it goes without the sweep.
-    once = arguments.with_override("hydra.run.dir=.").with_override("hydra.mode=RUN")
-    call_hydra(once, check)
-    return check.finish(as_json=as_json)
-
-
-class _Check:
-    """Called back by Hydra; keeps what was found, or what went wrong."""
-
-    def __init__(self, arguments: Arguments) -> None:
-        self._arguments = arguments
-        self._error: Exception | None = None
-        self._title = ""
-        self._found: Sequence[Assumption] = ()
-
-    def __call__(self, cfg: DictConfig) -> None:
+    with composition.session(arguments) as hydra:
+        if composition.show(hydra, arguments):
+            return 0
+        # A recipe of a sweep is checked as far as it goes without the sweep.
+        config, _ = composition.compose(hydra, arguments)
         from gpebo_cli.cli.job import read_job
 
-        try:
-            settings, system, _ = read_job(cfg, self._arguments, draw=False)
-            from gpebo_cli.experiment.assumptions import check
+        job = read_job(config, arguments, draw=False)
+        from gpebo_cli.experiment.assumptions import check
 
-            self._title = f"plant {system.name}, observer {settings.observer.name}"
-            self._found = check(settings, system)
-        except Exception as error:  # noqa: BLE001  raised again by finish()
-            self._error = error
-
-    def finish(self, *, as_json: bool) -> int:
-        """Print what was found, or raise what went wrong."""
-        if self._error is not None:
-            raise self._error
-        if not self._found:  # --cfg and the like: no job was run
-            return 0
-        failed = [a for a in self._found if not a.holds]
-        sys.stdout.write(_json(self._found) if as_json else _table(self._title, self._found))
-        return 1 if failed else 0
+        found = check(job.settings, job.system)
+    title = f"plant {job.system.name}, observer {job.settings.observer.name}"
+    sys.stdout.write(_json(found) if as_json else _table(title, found))
+    return 0 if all(a.holds for a in found) else 1
 
 
 def _json(found: Sequence[Assumption]) -> str:

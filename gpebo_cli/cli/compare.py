@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpebo_cli.cli.options import parse
-from gpebo_cli.cli.report import columns
 from gpebo_cli.cli.sweep_folder import PLAN, job_folder, read_plan, read_records
 from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.results.report import columns
 from gpebo_cli.schema import nearest
 
 if TYPE_CHECKING:

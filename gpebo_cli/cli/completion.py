@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 
 from gpebo_cli.cli.arguments import OPTIONS, VALUES
 from gpebo_cli.cli.listing import KINDS, described
-from gpebo_cli.cli.locations import DATA_GROUPS, GROUPS, choices, conf_folder
+from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.results.names import FIGURE_NAMES, FORMATS, METRICS
 from gpebo_cli.schema import nearest, shown

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpebo_cli.cli.locations import choices, conf_folder
 from gpebo_cli.cli.options import Options, parse, unknown
+from gpebo_cli.configs import configuration
+from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.schema import nearest, shown
 
 if TYPE_CHECKING:
+    from hydra.core.config_loader import ConfigLoader
     from omegaconf import DictConfig
 
     from gpebo_cli.experiment.result import RunResult
@@ -135,20 +137,16 @@ def run_recipes(names: list[str]) -> Iterator[Recipe]:
         ConfigError: a recipe is wrong.
         GpeboError: one of its runs failed; it is named.
     """
-    from hydra import initialize_config_dir
     from omegaconf import OmegaConf
 
     from gpebo_cli.cli.arguments import Arguments
-    from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS, explain
+    from gpebo_cli.cli.composition import session
     from gpebo_cli.results.gallery import Recipe
 
     for name in names:
         runs: dict[str, RunResult] = {}
-        try:
-            with initialize_config_dir(conf_folder(), version_base="1.3"):
-                jobs = list(_jobs(name))
-        except LIBRARY_ERRORS as error:
-            raise ConfigError(f"experiment {name}: {explain(error, Arguments())}") from error
+        with session(Arguments()) as hydra:
+            jobs = list(_jobs(name, hydra.config_loader))
         for label, cfg in jobs:
             try:
                 runs[label] = _run_job(cfg)
@@ -159,17 +157,16 @@ def run_recipes(names: list[str]) -> Iterator[Recipe]:
         yield Recipe(name, runs=runs, **words)
 
 
-def _jobs(name: str) -> Iterator[tuple[str, DictConfig]]:
+def _jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConfig]]:
     """Configurations of a recipe: one, or those of its ``hydra.sweeper.params`` by their values."""
-    from hydra import compose
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.types import RunMode
 
     overrides = [f"experiment={name}"]
-    first = compose("gpebo", overrides, return_hydra_config=True)
+    first = loader.load_configuration(PRIMARY, overrides, RunMode.RUN)
     swept: Mapping[str, Any] = first.hydra.sweeper.get("params") or {}
     if first.hydra.mode != RunMode.MULTIRUN or not swept:
-        yield "", compose("gpebo", overrides)
+        yield "", first
         return
     parser = OverridesParser.create()
     values = []
@@ -180,15 +177,16 @@ def _jobs(name: str) -> Iterator[tuple[str, DictConfig]]:
         )
     for chosen in itertools.product(*values):
         pairs = zip(swept, chosen, strict=True)
-        yield ", ".join(chosen), compose("gpebo", [*overrides, *(f"{k}={v}" for k, v in pairs)])
+        words = [*overrides, *(f"{k}={v}" for k, v in pairs)]
+        yield ", ".join(chosen), loader.load_configuration(PRIMARY, words, RunMode.RUN)
 
 
 def _run_job(cfg: DictConfig) -> RunResult:
-    from gpebo_cli.cli import composed, configuration
-    from gpebo_cli.cli.report import Progress
+    from gpebo_cli.cli import composition
+    from gpebo_cli.cli.progress import Progress
     from gpebo_cli.experiment.pipeline import run_experiment
     from gpebo_cli.model.plant import plant_from_mapping
 
-    settings = configuration.settings(composed.plain(cfg), draw=False)
+    settings = configuration.settings(composition.plain(cfg), draw=False)
     with Progress() as progress:
         return run_experiment(settings, plant_from_mapping(settings.plant), progress)

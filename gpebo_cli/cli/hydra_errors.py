@@ -1,21 +1,20 @@
-"""What Hydra, OmegaConf and PyYAML raise, as one line with the nearest name."""
+"""What Hydra and OmegaConf raise, as one line with the nearest name."""
 
 from __future__ import annotations
 
 import os
 import re
 
-import yaml
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from gpebo_cli.cli.arguments import Arguments
-from gpebo_cli.cli.configuration import yaml_problem
-from gpebo_cli.cli.locations import GROUPS, choices
+from gpebo_cli.configs.files import is_group
+from gpebo_cli.configs.locations import GROUPS, choices
 from gpebo_cli.schema import nearest, shown
 
-LIBRARY_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError)
+LIBRARY_ERRORS = (HydraException, OmegaConfBaseException)
 """What composing a configuration can raise because of what a user wrote."""
 
 _QUOTED = re.compile(r"^Could not (?:override|append to config)[^']*'([^']+)'")
@@ -30,8 +29,6 @@ _LONGEST = 400
 
 def explain(error: BaseException, arguments: Arguments) -> str:
     """One sentence for an error of :data:`LIBRARY_ERRORS`: what was given, what is accepted."""
-    if isinstance(error, yaml.YAMLError):
-        return _one_line(yaml_problem(error))
     if isinstance(error, MissingConfigException):
         return _missing(error, arguments)
     if isinstance(error, OverrideParseException):
@@ -61,7 +58,8 @@ def _missing(error: MissingConfigException, arguments: Arguments) -> str:
         return _a_path((error.missing_cfg_file or "").partition("/"))
     if group == "hydra/launcher" and name in _EXTRAS:
         return f"{group}={name} is not installed; pip install 'gpebo[{_EXTRAS[name]}]'"
-    known = sorted({found for folder in arguments.folders for found in choices(folder, group)})
+    folders = [folder for folder in arguments.folders if is_group(folder, group)]
+    known = sorted({found for folder in folders for found in choices(folder, group)})
     known = known or sorted(error.options or ())
     match = _MISSING_IN.search(str(error))
     chooser = match[1] if match else arguments.config_name

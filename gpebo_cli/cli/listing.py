@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import sys
 
-from gpebo_cli.cli.locations import choices, conf_folder
 from gpebo_cli.cli.options import CONFIG_DIR, parse
+from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError
 
 KINDS = {

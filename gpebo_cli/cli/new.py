@@ -9,8 +9,8 @@ import shlex
 import sys
 from pathlib import Path
 
-from gpebo_cli.cli.locations import choices, conf_folder
 from gpebo_cli.cli.options import CONFIG_DIR, Options, parse
+from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.schema import nearest, shown
 

@@ -16,14 +16,13 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobStatus
 from omegaconf import DictConfig, OmegaConf
 
 from gpebo_cli.cli import interrupts
 from gpebo_cli.cli.arguments import Arguments, quoted
 from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS
-from gpebo_cli.cli.job import output_folder, run_job
-from gpebo_cli.cli.locations import GROUPS
-from gpebo_cli.cli.report import case_rows, columns
+from gpebo_cli.cli.job import read_job, run_job
 from gpebo_cli.cli.sweep_folder import (
     STOP,
     TABLE,
@@ -38,8 +37,10 @@ from gpebo_cli.cli.sweep_folder import (
 )
 from gpebo_cli.cli.sweep_progress import Bar
 from gpebo_cli.cli.workers import Watch, end_children
+from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results.files import make_folder, write_text
+from gpebo_cli.results.report import case_rows, columns
 from gpebo_cli.schema import shown
 
 if TYPE_CHECKING:
@@ -66,17 +67,18 @@ def run_sweep_job(cfg: DictConfig, arguments: Arguments) -> None:
 
     A job that fails is recorded and the next one runs; Hydra itself would stop at the first.
     """
-    folder = Path(output_folder())
+    hydra = HydraConfig.get()
+    folder = Path(hydra.runtime.output_dir)
     stop = folder.parent / STOP
     if stop.exists():
         return
-    hydra = HydraConfig.get()
     start = perf_counter()
     cases: list[dict[str, float | None]] = []
     error = ""
     interrupts.check()
     try:
-        rows = case_rows(run_job(cfg, arguments, str(folder), draw=False, quiet=True))
+        job = read_job(cfg, arguments, draw=False)
+        rows = case_rows(run_job(job, str(folder), quiet=True))
         cases = [{k: v if math.isfinite(v) else None for k, v in row.items()} for row in rows]
     except GpeboError as raised:
         error = str(raised)
@@ -203,10 +205,9 @@ def _launch(
         except Exception as error:  # noqa: BLE001  a worker died, a cluster is out of reach
             return f"{type(error).__name__}: {error}"
         for number, job in zip(numbers, returned, strict=False):
-            try:
-                _ = job.return_value  # raises what the job raised, a full disk for instance
-            except Exception as error:  # noqa: BLE001
-                errors[number] = " ".join(f"{type(error).__name__}: {error}".split())
+            if job.status == JobStatus.FAILED:  # a full disk for instance
+                raised = job._return_value  # noqa: SLF001  asked for in public, Hydra prints it
+                errors[number] = " ".join(f"{type(raised).__name__}: {raised}".split())
         if orders.fail_fast and (folder / STOP).exists():
             break
     return ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gpebo_cli.cli.locations import GROUPS, choices, conf_folder
+from gpebo_cli.configs.locations import GROUPS, choices, conf_folder
 
 HELP = """\
 gpebo: adaptive state observers for linear time-varying descriptor systems

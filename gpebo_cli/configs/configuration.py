@@ -1,15 +1,13 @@
-"""From plain data to :class:`Settings`, and to the ``config.yaml`` of a run. Knows no Hydra."""
+"""From plain data to :class:`Settings`, and to the ``config.yaml`` of a run."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-import yaml
-
+from gpebo_cli.configs.text import dump
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.schema import convert, nearest, read, shown
 from gpebo_cli.settings import (
@@ -23,7 +21,7 @@ from gpebo_cli.settings import (
     TimeSettings,
 )
 
-_KEYS = (
+KEYS = (
     "plant",
     "data",
     "observer",
@@ -37,6 +35,8 @@ _KEYS = (
     "title",
     "reference",
 )
+"""Keys of a configuration, from which everything about a run follows."""
+
 _DESCRIPTIVE = ("title", "reference")  # of files in the groups; for people
 _FOLDER = "estimator"  # an observer that estimates by itself: its name again, for its folders
 
@@ -67,17 +67,17 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
     """The settings of one run.
 
     Args:
-        config: plain data, as :func:`gpebo_cli.cli.composed.plain` returns it.
+        config: plain data, of the keys in :data:`KEYS`.
         draw: whether ``figures: null`` means all figures or none.
 
     Raises:
         ConfigError: an unknown key, a wrong type, or a value out of range.
     """
     for key in config:
-        if key not in _KEYS:
+        if key not in KEYS:
             raise ConfigError(
-                f"{key}: no such key; the configuration has {', '.join(_KEYS)}"
-                + nearest(str(key), _KEYS)
+                f"{key}: no such key; the configuration has {', '.join(KEYS)}"
+                + nearest(str(key), KEYS)
             )
     data = read(DataSettings, _group(config, "data"), "data")
     built = Settings(
@@ -112,6 +112,9 @@ def _group(config: Mapping[str, Any], name: str) -> dict[str, Any]:
         return {}
     if not isinstance(section, Mapping):
         raise ConfigError(f"{name}: expected a mapping of keys to values, got {shown(section)}")
+    for key in _DESCRIPTIVE:
+        if isinstance(section.get(key), Mapping | list):
+            raise ConfigError(f"{name}.{key}: expected text, got {shown(section[key])}")
     return {str(k): v for k, v in section.items() if k not in _DESCRIPTIVE}
 
 
@@ -186,107 +189,10 @@ def _value(built: Settings, name: str) -> Any:
     return getattr(getattr(built, group), key)
 
 
-@dataclass(frozen=True)
-class RunPatterns:
-    """Where a run and a sweep are written, before ``${now:…}`` and names are filled in."""
-
-    run: str
-    sweep: str
-    subdir: str
-
-
-def patterns(primary: Mapping[str, Any]) -> RunPatterns:
-    """The patterns in the ``hydra`` section of a primary configuration."""
-    run, sweep = primary["hydra"]["run"], primary["hydra"]["sweep"]
-    return RunPatterns(str(run["dir"]), str(sweep["dir"]), str(sweep["subdir"]))
-
-
 REPEATS = "Repeats the run: gpebo run --config-dir <this folder> --config-name config"
 """What the first line of a ``config.yaml`` says."""
 
 
-def config_text(config: Mapping[str, Any], patterns: RunPatterns, head: str = REPEATS) -> str:
+def config_text(config: Mapping[str, Any], head: str = REPEATS) -> str:
     """The ``config.yaml`` of a run: complete, and good to repeat it into a new folder."""
-    hydra = {
-        "output_subdir": None,
-        "job": {"chdir": False},
-        "run": {"dir": patterns.run},
-        "sweep": {"dir": patterns.sweep, "subdir": patterns.subdir},
-    }
-    defaults: list[Any] = [
-        "_self_",
-        {"override hydra/job_logging": "none"},
-        {"override hydra/hydra_logging": "none"},
-    ]
-    return f"# {head}\n" + yaml.dump(
-        {"defaults": defaults, **config, "hydra": hydra},
-        Dumper=_Dumper,
-        allow_unicode=True,
-        default_flow_style=None,  # rows of a matrix on one line each
-        sort_keys=False,
-        width=100,
-    )
-
-
-def load(path: str) -> dict[str, Any]:
-    """The mapping in a YAML file, read as Hydra's loader reads it.
-
-    Raises:
-        ConfigError: the file cannot be read, is not YAML, has a key twice, or is no mapping.
-    """
-    try:
-        with open(path, encoding="utf-8") as stream:
-            content = yaml.load(stream, Loader=_Loader)  # noqa: S506  a SafeLoader
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not text in UTF-8") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(yaml_problem(error)) from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path}: expected a mapping of keys to values, got {shown(content)}")
-    return content
-
-
-def yaml_problem(error: yaml.YAMLError) -> str:
-    """File, line and problem of an error of PyYAML's, in one sentence."""
-    mark = getattr(error, "problem_mark", None)
-    problem = getattr(error, "problem", None) or str(error)
-    where = "" if mark is None else f"{mark.name}, line {mark.line + 1}: "
-    return f"{where}not valid YAML: {problem}"
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads 1e9 as a number and refuses a key that stands twice, as OmegaConf's loader does."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
-        """Refuse what YAML would silently overwrite."""
-        seen = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key.value} stands twice", key.start_mark
-                )
-            seen.add(key.value if isinstance(key.value, str) else None)
-        return super().construct_mapping(node, deep=deep)
-
-
-class _Dumper(yaml.SafeDumper):
-    """Quotes text that OmegaConf would read as a number, and repeats what occurs twice."""
-
-    def ignore_aliases(self, data: object) -> bool:  # noqa: ARG002
-        """A matrix that stands in two places is written twice; there is nothing to follow."""
-        return True
-
-
-# As in omegaconf's loader; PyYAML alone takes 1e9, without a point, for text.
-_Dumper.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.[\d_]+)(e[-+]?\d+)?$|[-+]?\.?(inf|nan)$", re.IGNORECASE),
-    list("-+0123456789.inIN"),
-)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(\d[\d_]*\.?\d*|\.\d+)e[-+]?\d+$", re.IGNORECASE),
-    list("-+0123456789."),
-)
+    return f"# {head}\n{dump(config)}"

@@ -9,6 +9,9 @@ GROUPS = ("plant", "data", "observer", "estimator", "solver", "noise", "experime
 DATA_GROUPS = ("plant", "data", "observer", "estimator", "solver", "noise")
 """Groups whose files are values only; an experiment may choose from groups and set anything."""
 
+PRIMARY = "gpebo"
+"""The primary configuration, conf/gpebo.yaml; another name than a run's own config.yaml."""
+
 
 def conf_folder() -> str:
     """The folder of configuration files: inside the installed package, else the checkout's.

@@ -1,51 +1,15 @@
-"""What a person sees of a run: progress on a terminal, a table, the last line."""
+"""What a person sees of a run: a table, what moved, the last line."""
 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
-from threading import Timer
-from time import monotonic
-from typing import TYPE_CHECKING, Self
-
-from gpebo_cli.cli import interrupts
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import NoiseStatistics, RunResult
 
-_DELAY = 1.0  # seconds: what is quicker than this needs no progress
 _SHOWN_CASES = 12
-
-
-class Progress:
-    """Stages of a run on stderr, if that is a terminal and the run takes more than a second."""
-
-    def __init__(self, *, quiet: bool = False) -> None:
-        self._terminal = sys.stderr.isatty() and not quiet
-        self._stage = ""
-        self._start = monotonic()
-        self._timer = Timer(_DELAY, self._show)
-        self._timer.daemon = True
-
-    def __enter__(self) -> Self:
-        if self._terminal:
-            self._timer.start()  # says something even if the first stage takes for ever
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._timer.cancel()
-
-    def __call__(self, stage: str) -> None:
-        """A stage begins, unless Ctrl-C was pressed in the last one."""
-        interrupts.check()
-        self._stage = stage
-        if self._terminal and monotonic() - self._start > _DELAY:
-            self._show()
-
-    def _show(self) -> None:
-        sys.stderr.write(f"{monotonic() - self._start:6.1f} s  {self._stage}\n")
-        sys.stderr.flush()
 
 
 def case_rows(result: RunResult) -> list[dict[str, float]]:
@@ -136,10 +100,3 @@ def run_lines(result: RunResult, folder: str = "") -> list[str]:
     if moved:
         lines.append(f"consistent initial state: {moved}")
     return [*lines, *([folder] if folder else []), result.verdict]
-
-
-def print_run(result: RunResult, folder: str) -> None:
-    """Table, folder and verdict to stdout, the verdict last; warnings to stderr."""
-    sys.stdout.write("".join(f"{line}\n" for line in run_lines(result, folder)))
-    sys.stdout.flush()  # before what follows on stderr
-    sys.stderr.write("".join(f"gpebo: warning: {line}\n" for line in result.warnings))

@@ -1,0 +1,229 @@
+"""From the words of the command line to one configuration, by Hydra, and to Hydra's own answers.
+
+Hydra never opens a file of gpebo's or of a ``--config-dir``: it is handed plain data that
+:mod:`gpebo_cli.configs.files` has read and checked. What it composes is checked once more before
+anything in it is used.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, cast
+
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
+from hydra._internal.hydra import Hydra
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult, ConfigSource
+from hydra.types import RunMode
+from hydra.version import setbase
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gpebo_cli.cli.arguments import Arguments
+from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS, explain
+from gpebo_cli.configs import files
+from gpebo_cli.configs.locations import choices, conf_folder
+from gpebo_cli.errors import ConfigError
+
+_INSTANTIATED = ("hydra.launcher._target_", "hydra.sweeper._target_")
+_PLUGINS = ("hydra_plugins.", "hydra._internal.core_plugins.")
+
+
+class GpeboSource(ConfigSource):
+    """The files of a folder as Hydra's search path has them."""
+
+    @staticmethod
+    def scheme() -> str:
+        """What stands before ``://``."""
+        return "gpebo"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """The content of a file, and where in the configuration it belongs."""
+        content = OmegaConf.create(files.load(self.path, config_path))
+        header: dict[str, str | None] = {"package": files.package(config_path)}
+        return ConfigResult(self.provider, self.full_path(), content, header)
+
+    def is_group(self, config_path: str) -> bool:
+        """Whether there are files of a group."""
+        return files.is_group(self.path, config_path)
+
+    def is_config(self, config_path: str) -> bool:
+        """Whether there is a file."""
+        return files.is_file(self.path, config_path)
+
+    def available(self) -> bool:
+        """Whether there is the folder."""
+        return True  # its name has been checked
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        """Names of a group's files, for ``glob(…)``."""
+        if results_filter == ObjectType.GROUP or not self.is_group(config_path):
+            return []
+        return choices(self.path, config_path)
+
+
+class Loader(ConfigLoaderImpl):
+    """Hydra's, from our sources alone; a configuration that could run code is an error."""
+
+    def __init__(self, config_dir: str | None = None) -> None:
+        setbase("1.3")
+        Plugins.instance()  # knows Hydra's own sources
+        SourcesRegistry.instance().register(GpeboSource)
+        path = ConfigSearchPathImpl()
+        path.append("hydra", "pkg://hydra.conf")
+        if config_dir is not None:  # first, so that a file with a name of ours is noticed
+            path.append("command-line", f"gpebo://{config_dir}")
+        path.append("main", f"gpebo://{conf_folder()}")
+        path.append("schema", "structured://")
+        super().__init__(path)
+
+    def load_configuration(self, *args: Any, **kwargs: Any) -> DictConfig:
+        """As Hydra's.
+
+        Raises:
+            ConfigError: something in it names code to run, or a folder to search.
+        """
+        config = super().load_configuration(*args, **kwargs)
+        plain = OmegaConf.to_container(config, resolve=False)
+        refuse_code(cast("dict[str, Any]", plain))
+        return config
+
+
+def refuse_code(config: Mapping[str, Any]) -> None:
+    """The second line: whatever the files were, only Hydra's and our own plugins are called.
+
+    Raises:
+        ConfigError: a callback, or a name of something to call.
+    """
+    hydra = config["hydra"]
+    for key in ("callbacks", "searchpath"):
+        if hydra.get(key):
+            raise ConfigError(f"hydra.{key}: not allowed; files of yours are found by --config-dir")
+    for where, value in _targets(config, ""):
+        if where not in _INSTANTIATED or not str(value).startswith(_PLUGINS):
+            raise ConfigError(f"{where}: `_target_` is not allowed; a configuration is data")
+
+
+def _targets(value: object, where: str) -> Iterator[tuple[str, object]]:
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            inside = f"{where}.{key}" if where else str(key)
+            if key == "_target_":
+                yield inside, inner
+            yield from _targets(inner, inside)
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        for position, inner in enumerate(value):
+            yield from _targets(inner, f"{where}[{position}]")
+
+
+@contextmanager
+def session(arguments: Arguments) -> Iterator[Hydra]:
+    """Hydra, for one command; its errors as ours.
+
+    Raises:
+        ConfigError: the command line or a file is wrong.
+    """
+    before = os.environ.get("HYDRA_FULL_ERROR", "")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # without it Hydra prints its errors and exits with 1
+    logging.raiseExceptions = False  # a reader that has seen enough is no news
+    hydra = Hydra("gpebo", Loader(arguments.config_dir))
+    GlobalHydra.instance().clear()
+    GlobalHydra.instance().initialize(hydra)
+    try:
+        yield hydra
+    except LIBRARY_ERRORS as error:
+        raise ConfigError(explain(error, arguments)) from error
+    except RecursionError as error:
+        raise ConfigError("a file chooses itself, by way of its defaults list") from error
+    finally:
+        os.environ["HYDRA_FULL_ERROR"] = before
+        GlobalHydra.instance().clear()
+
+
+def compose(hydra: Hydra, arguments: Arguments) -> tuple[DictConfig, bool]:
+    """The configuration, and whether it is of a sweep: a recipe may say so, too.
+
+    Raises:
+        ConfigError: it would run code.
+    """
+    words = arguments.for_hydra
+    config = hydra.config_loader.load_configuration(
+        arguments.config_name, words, RunMode.MULTIRUN, validate_sweep_overrides=False
+    )
+    swept = "--multirun" in arguments.switches or config.hydra.mode == RunMode.MULTIRUN
+    mode = RunMode.MULTIRUN if swept else RunMode.RUN
+    loader = cast("Loader", hydra.config_loader)
+    loader.validate_sweep_overrides_legal(
+        OverridesParser.create().parse_overrides(words), mode, from_shell=True
+    )
+    config.hydra.mode = mode
+    config.hydra.overrides.hydra.append(f"hydra.mode={mode.name}")  # for the jobs of a sweep
+    HydraConfig.instance().set_config(config)
+    return config, swept
+
+
+def show(hydra: Hydra, arguments: Arguments) -> bool:
+    """Answer ``--cfg``, ``--info`` and the like; whether there was such a question."""
+    name, words = arguments.config_name, list(arguments.for_hydra)
+    options = arguments.options
+    if "--hydra-help" in arguments.switches:
+        program = [f"{os.path.basename(sys.argv[0])} run", *words]
+        sys.argv = program  # the parser is called after it
+        parser = get_args_parser()
+        hydra.hydra_help(name, parser, parser.parse_args(words))
+    elif "--shell-completion" in arguments.switches:
+        hydra.shell_completion(name, words)
+    elif "--cfg" in options:
+        package, resolve = options.get("--package"), "--resolve" in arguments.switches
+        hydra.show_cfg(name, words, options["--cfg"], package, resolve)
+    elif "--info" in options:
+        hydra.show_info(options["--info"], name, words)
+    else:
+        return False
+    return True
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """The configuration without Hydra's section as plain data, interpolations resolved.
+
+    In the plant there are none: it is text that may come from a stranger, and an interpolation in
+    it could read environment variables or other parts of the configuration.
+
+    Raises:
+        ConfigError: an interpolation in the plant, or a value that is still missing (``???``).
+    """
+    config = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    plant = config.get("plant")
+    if not isinstance(plant, DictConfig):
+        raise ConfigError("plant.name is missing; choose a file with plant=NAME")
+    _refuse_interpolations(OmegaConf.to_container(plant, resolve=False), "plant")
+    try:
+        missing = sorted(OmegaConf.missing_keys(config))
+        if missing:
+            raise ConfigError(f"{missing[0]} has no value yet (???); give it one")
+        return cast("dict[str, Any]", OmegaConf.to_container(config, resolve=True))
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{error.full_key or 'configuration'}: {error.msg}") from error
+
+
+def _refuse_interpolations(value: object, where: str) -> None:
+    if isinstance(value, str) and "${" in value:
+        raise ConfigError(f"{where}: ${{…}} is not allowed in a plant; write the value")
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            _refuse_interpolations(key, where)
+            _refuse_interpolations(inner, f"{where}.{key}")
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        for position, inner in enumerate(value):
+            _refuse_interpolations(inner, f"{where}[{position}]")

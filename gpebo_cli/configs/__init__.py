@@ -1,0 +1,1 @@
+"""Configuration files: where they are, how they are read, what they may say. Knows no Hydra."""

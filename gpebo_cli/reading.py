@@ -1,0 +1,44 @@
+"""Files that others wrote are opened here: only regular ones, of a bounded size."""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import BinaryIO
+
+from gpebo_cli.errors import ConfigError
+
+
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a regular file for reading: a device has no end, and a pipe may never begin.
+
+    Raises:
+        ConfigError: the file cannot be opened, or is a folder, a pipe, a socket or a device.
+    """
+    try:
+        # Without O_NONBLOCK, opening a pipe waits until somebody writes to it.
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{path} cannot be read: {reason}") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise ConfigError(f"{path} is not a regular file")
+    return os.fdopen(descriptor, "rb")
+
+
+def read_text(path: str | os.PathLike[str], limit: int) -> str:
+    """The text of a regular file of at most ``limit`` bytes in UTF-8.
+
+    Raises:
+        ConfigError: it is no such file.
+    """
+    with open_regular(path) as stream:
+        content = stream.read(limit + 1)
+        size = os.fstat(stream.fileno()).st_size
+    if len(content) > limit:
+        raise ConfigError(f"{path} has {size} bytes; at most {limit} are read")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not text in UTF-8 (byte {error.start})") from error

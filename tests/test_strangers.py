@@ -1,0 +1,317 @@
+"""Files from strangers: whatever they say, no code runs, nothing is written elsewhere, one line.
+
+Every attack is made in each kind of file that gpebo reads from a ``--config-dir``, and tried on the
+command line and from Python. A file that an attack would make is called ``MARKER``.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from hydra.core.hydra_config import HydraConfig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from gpebo_cli import GpeboError, run
+from gpebo_cli.configs.configuration import KEYS
+from gpebo_cli.configs.text import parse
+from gpebo_cli.errors import ConfigError
+from tests.inprocess import gpebo
+
+PLANT = """\
+name: mine
+states: [x]
+outputs: [y]
+E: [[1]]
+A: [[-1]]
+C: [[1]]
+initial_state: {x: 1}
+"""
+RECIPE = "time: {horizon: 0.1, samples: 3}\nfigures: none\n"
+SHORT = ["observer=none", "figures=none", "time.horizon=0.1", "time.samples=3"]
+
+CALL = "{_target_: os.mkdir, _args_: [MARKER]}"
+PAYLOADS = {
+    "callback": "hydra: {callbacks: {x: CALL}}",
+    "launcher": "hydra: {launcher: CALL}",
+    "sweeper": "hydra: {sweeper: CALL}",
+    "sweep": "hydra: {mode: MULTIRUN, sweeper: {params: {+hydra.callbacks.x: 'CALL'}}}",
+    "sweep of hydra": "hydra: {mode: MULTIRUN, sweeper: {params: {hydra.sweep.dir: MARKER}}}",
+    "logging": "hydra: {job_logging: {version: 1, formatters: {a: {(): os.mkdir, path: MARKER}}}}",
+    "environment": "hydra: {job: {env_set: {OWNED: 'yes'}}}",
+    "folder": "hydra: {run: {dir: MARKER}}",
+    "chdir": "hydra: {job: {chdir: true}}",
+    "search path": "hydra: {searchpath: ['file://FOLDER/docs']}",
+    "dotted": "hydra.callbacks.x._target_: os.mkdir",
+    "another case": "Hydra: {callbacks: {x: CALL}}",
+    "value": "title: CALL",
+    "deep": "time: {horizon: CALL}",
+    "interpolation": "title: '${oc.env:SECRET}'",
+    "escaped interpolation": 'title: "\\x24{oc.env:SECRET}"',
+    "key": "'${oc.env:SECRET}': 1",
+    "defaults": "defaults: [{/docs@_global_.hydra.callbacks.x: extra}]",
+    "defaults of hydra": "defaults: [{override /hydra/launcher: mine}]",
+    "defaults elsewhere": "defaults: [{/plant@hydra.callbacks: circuit}]",
+    "defaults of docs": "defaults: [/docs/extra]",
+    "defaults above": "defaults: [{/experiment: ../docs/extra}]",
+    "defaults of itself": "defaults: [{/experiment: x}]",
+}
+FORMS = {
+    "plain": "P",
+    "global": "# @package _global_\nP",
+    "elsewhere": "# @package hydra.callbacks\nP",
+    "directive": "%YAML 1.3\n---\n# @package _global_\nP",
+    "directive 1.1": "# @package _global_\n%YAML 1.1\n---\nP",
+    "tag directive": "%TAG ! tag:yaml.org,2002:python/\n---\nP",
+    "line separator": "# a\u2028# @package _global_\nP",
+    "next line": "# a\x85# @package _global_\nP",
+    "byte order mark": "\ufeff# @package _global_\nP",
+    "merge": "# @package _global_\n<<: {P}",
+    "merges": "# @package _global_\n<<: [{P}, {a: 1}]",
+    "merged anchor": "# @package _global_\ntitle: &a {P}\n<<: *a",
+    "quoted merge": "# @package _global_\n'<<': {P}",
+    "tagged merge": "# @package _global_\n!!merge <<: {P}",
+    "tag": "# @package _global_\n!!map\nP",
+    "second document": "# @package _global_\ntitle: a\n---\nP",
+    "twice": "# @package _global_\nhydra: {mode: RUN}\ndefaults: [_self_]\ntitle: a\nP",
+}
+KINDS = {
+    "plant": ("plant/x.yaml", PLANT, ["plant=x", *SHORT]),
+    "estimator": ("estimator/x.yaml", "name: drem\n", ["estimator=x", *SHORT]),
+    "experiment": ("experiment/x.yaml", RECIPE, ["experiment=x", *SHORT]),
+    "primary": ("x.yaml", RECIPE + "observer: {name: none}\n", ["--config-name", "x"]),
+}
+
+
+@pytest.fixture(autouse=True)
+def secret(monkeypatch):
+    monkeypatch.setenv("SECRET", "5ecret")
+
+
+def prepared(tmp_path, path, text):
+    """A folder with a stranger's file in it, and bait around it."""
+    folder, marker = tmp_path / "evil", tmp_path / "marker"
+    filled = text.replace("CALL", CALL).replace("MARKER", str(marker))
+    bait = CALL.replace("MARKER", str(marker))
+    for name in ("docs/extra.yaml", "hydra/launcher/mine.yaml", "hydra/callbacks/x.yaml",
+                 "launcher/mine.yaml"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(bait)
+    (folder / path).parent.mkdir(parents=True, exist_ok=True)
+    (folder / path).write_bytes(filled.replace("FOLDER", str(folder)).encode())
+    return folder, marker
+
+
+def assert_harmless(done, tmp_path, marker):
+    assert not marker.exists()
+    assert not (tmp_path / "docs").exists()
+    assert "5ecret" not in done.out + done.err
+    assert "OWNED" not in os.environ
+    if done.code:
+        assert (done.code, done.err.count("\n")) == (2, 1), done.err
+        assert done.err.startswith("gpebo: error: ")
+        assert "internal" not in done.err
+        assert not (tmp_path / "outputs").exists()
+        return
+    config = HydraConfig.instance().cfg
+    assert set(config) <= {*KEYS, "hydra"}
+    hydra = OmegaConf.to_container(config.hydra, resolve=False)
+    assert not hydra["callbacks"]
+    assert not hydra["job"]["env_set"]
+    assert hydra["run"]["dir"].startswith("outputs/runs/${now:")
+    assert [path.name for path in tmp_path.iterdir() if path.name != "evil"] == ["outputs"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("form", FORMS)
+def test_no_syntax_hides_a_key(tmp_path, kind, form):
+    """Every syntax around the worst key, and around a value that would be replaced."""
+    path, body, words = KINDS[kind]
+    for payload in ("callback", "interpolation"):
+        text = FORMS[form].replace("P", PAYLOADS[payload])
+        # A header stands first, so what is hidden stands before the rest.
+        folder, marker = prepared(tmp_path / payload, path, f"{text}\n{body}")
+        done = gpebo("run", "--config-dir", folder, *words, cwd=folder.parent)
+        assert done.code == 2
+        assert_harmless(done, folder.parent, marker)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("payload", PAYLOADS)
+def test_nothing_of_hydra_can_be_reached(tmp_path, kind, payload):
+    path, body, words = KINDS[kind]
+    folder, marker = prepared(tmp_path, path, f"{body}{PAYLOADS[payload]}\n")
+    done = gpebo("run", "--config-dir", folder, *words, cwd=tmp_path)
+    assert done.code == 2
+    assert_harmless(done, tmp_path, marker)
+
+
+@pytest.mark.parametrize("payload", PAYLOADS)
+@pytest.mark.parametrize("group", ["plant", "estimator"])
+def test_nor_from_python(tmp_path, payload, group):
+    path, body, _ = KINDS[group]
+    folder, marker = prepared(tmp_path, path, f"{body}{PAYLOADS[payload]}\n")
+    time = {"horizon": 0.1, "samples": 3}
+    for name in ("x", folder / path) if group == "plant" else ("x",):
+        with pytest.raises(GpeboError) as caught:
+            run(**{"plant": "circuit", group: name}, time=time, config_dir=folder)
+        assert "\n" not in str(caught.value)
+        assert not marker.exists()
+
+
+def test_a_recipe_may_sweep_and_nothing_else(tmp_path):
+    recipe = RECIPE + "hydra: {mode: MULTIRUN, sweeper: {params: {time.horizon: '0.1,0.2'}}}\n"
+    folder, marker = prepared(tmp_path, "experiment/x.yaml", recipe)
+    done = gpebo("run", "--config-dir", folder, "experiment=x", "observer=none", cwd=tmp_path)
+    assert (done.code, done.err) == (0, "")
+    assert "2 jobs, 2 done" in done.out
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("override", [
+    f"+hydra.callbacks.x={CALL}", "hydra.launcher._target_=os.mkdir",
+    "+plant.parameters={_target_: os.mkdir}", "hydra.searchpath=[file:///tmp]",
+])
+def test_the_second_line_holds_without_the_first(tmp_path, override):
+    """What is composed is checked, too, whoever wrote it."""
+    override = override.replace("MARKER", str(tmp_path / "marker"))
+    done = gpebo("run", override, *SHORT, cwd=tmp_path)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "not allowed" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+# Names and places ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("group", "text"), [
+    ("plant", PLANT.replace("mine", "../../marker")),
+    ("plant", PLANT.replace("mine", "a/../../../marker")),
+    ("estimator", "name: ../../../marker\n"),
+    ("observer", "name: kalman_bucy\nestimator: x/../../../../marker\n"),
+    ("observer", "name: gpebo\nestimator: x/../../../../marker\n"),
+])
+def test_a_name_cannot_lead_elsewhere(tmp_path, group, text):
+    """Names of plants and estimators are parts of a folder's name."""
+    folder, marker = prepared(tmp_path, f"{group}/x.yaml", text)
+    done = gpebo("run", "--config-dir", folder, f"{group}=x", "figures=none", cwd=tmp_path)
+    assert done.code == 2
+    assert_harmless(done, tmp_path, marker)
+
+
+@pytest.mark.parametrize("choice", ["../x", "../../x", "lab/../../x", "/etc/x", "lab", "x/", "."])
+def test_a_choice_cannot_lead_elsewhere(tmp_path, choice):
+    folder, _ = prepared(tmp_path, "plant/lab/y.yaml", PLANT)
+    for place in (tmp_path / "x.yaml", folder / "x.yaml"):
+        place.write_text(PLANT)
+    done = gpebo("run", "--config-dir", folder, f"plant={choice}", *SHORT, cwd=tmp_path)
+    assert (done.code, done.err.count("\n")) == (2, 1), done.err
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_links_lead_nowhere_but_inside(tmp_path):
+    folder, marker = prepared(tmp_path, "plant/mine.yaml", PLANT)
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "x.yaml").write_text(PLANT)
+    (folder / "plant" / "file.yaml").symlink_to(outside / "x.yaml")
+    (folder / "plant" / "lab").symlink_to(outside)
+    (folder / "plant" / "inside.yaml").symlink_to("mine.yaml")
+    (folder / "plant" / "round.yaml").symlink_to("round.yaml")
+    (folder / "plant" / "zero.yaml").symlink_to("/dev/zero")
+    (folder / "plant" / "folder.yaml").mkdir()
+    os.mkfifo(folder / "plant" / "pipe.yaml")
+    for name in ("file", "lab/x", "round", "zero", "folder", "pipe"):
+        done = gpebo("run", "--config-dir", folder, f"plant={name}", *SHORT, cwd=tmp_path)
+        assert (done.code, done.err.count("\n")) == (2, 1), done.err
+        with pytest.raises(GpeboError):
+            run(folder / "plant" / f"{name}.yaml" if name in ("pipe", "zero") else name,
+                config_dir=folder)
+    assert gpebo(
+        "run", "--config-dir", folder, "plant=inside", *SHORT, "hydra.run.dir=out", cwd=tmp_path
+    ).code == 0
+    assert not marker.exists()
+
+
+BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n"
+    for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(("text", "expected"), [
+    (BOMB, "entries, aliases expanded"),
+    ("a: &a [*a]\n", "*a contains itself"),
+    ("a: *b\n", "stands for nothing"),
+    ("a: " + "[" * 100_000, "levels deep"),
+    ("#" * 2_000_001, "bytes; at most"),
+    (PLANT.replace("name: mine\n", ""), "name is missing"),
+    (PLANT + "name: other\n", "the key name stands twice"),
+    (PLANT + "1: 2\n", "a key must be text"),
+    (PLANT + "[1, 2]: 2\n", "a key must be text"),
+    (PLANT + "title: !!binary aGFsbG8=\n", "a file is plain data"),
+    (PLANT + "n: 0x_\n", "a number that cannot be read"),
+    (PLANT + f"n: {'9' * 5000}\n", "a number that cannot be read"),
+    ("name: [", "not valid YAML"),
+    ("name: a\0b\n", "not valid YAML"),
+    ("- 1\n", "expected a mapping"),
+    ("", "expected a mapping"),
+])
+def test_a_file_that_is_no_data_is_one_line(tmp_path, text, expected):
+    folder, _ = prepared(tmp_path, "plant/x.yaml", text)
+    done = gpebo("run", "--config-dir", folder, "plant=x", *SHORT, cwd=tmp_path)
+    assert (done.code, done.err.count("\n")) == (2, 1), done.err
+    assert expected in done.err
+
+
+def test_text_that_is_no_text_is_one_line(tmp_path):
+    folder, _ = prepared(tmp_path, "plant/x.yaml", PLANT)
+    (folder / "plant" / "x.yaml").write_bytes(PLANT.encode() + b"title: \xff\n")
+    done = gpebo("run", "--config-dir", folder, "plant=x", *SHORT, cwd=tmp_path)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "not text in UTF-8" in done.err
+
+
+# Any text ------------------------------------------------------------------------------------
+
+PIECES = st.sampled_from([
+    "%YAML 1.3\n", "%YAML 1.1\n", "%TAG ! !x\n", "---\n", "...\n", "# @package _global_\n",
+    "# @package hydra\n", "\u2028", "\x85", "\r", "\x0b", "\x0c", "\ufeff", "\t", " ", "\n", "  ",
+    "hydra: ", "Hydra: ", "callbacks: ", "defaults: ", "_target_: os.mkdir", "title: ", "time: ",
+    "<<: ", "'<<': ", "? ", ": ", "- ", "{", "}", "[", "]", ", ", "&a ", "*a", "*b ", "!!map ",
+    "!x ", "!!python/name:os.system ", "${oc.env:SECRET}", "'", '"', "\\x24{now:}", "|\n  ",
+    ">-\n ", "null", "1e9", "0x_", "mode: MULTIRUN", "experiment: x", "a: ", "a",
+    "plant: circuit", "#",
+])
+TEXTS = st.lists(PIECES, max_size=14).map("".join)
+
+
+def only_data(value):
+    if isinstance(value, dict):
+        assert "<<" not in value
+        return all(isinstance(key, str) and only_data(inner) for key, inner in value.items())
+    if isinstance(value, list):
+        return all(map(only_data, value))
+    return value is None or (type(value) in (bool, int, float, str) and "${" not in str(value))
+
+
+@given(TEXTS)
+@settings(max_examples=500, deadline=None)
+def test_any_text_is_data_or_one_line(text):
+    problem = ""
+    try:
+        assert only_data(parse(text, "x.yaml"))
+    except ConfigError as error:
+        problem = str(error)
+    assert len(problem.splitlines()) <= 1
+
+
+@given(st.sampled_from(sorted(KINDS)), TEXTS)
+@settings(max_examples=60, deadline=None)
+def test_any_file_is_composed_within_the_schema_or_one_line(tmp_path_factory, kind, text):
+    path, body, words = KINDS[kind]
+    tmp_path = tmp_path_factory.mktemp("any")
+    folder, marker = prepared(tmp_path, path, f"{text}\n{body}")
+    assert_harmless(gpebo("run", "--config-dir", folder, *words, cwd=tmp_path), tmp_path, marker)
