@@ -111,4 +111,4 @@ def test_settling_time_counts_the_last_excursion():
 
 def test_time_rms():
     t = np.linspace(0, 2 * np.pi, 20_001)
-    assert time_rms(t, np.sin(t)[None])[0] == pytest.approx(np.sqrt(0.5), rel=1e-6)
+    assert time_rms(t, np.sin(t)[None] ** 2)[0] == pytest.approx(np.sqrt(0.5), rel=1e-6)

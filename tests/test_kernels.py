@@ -1,36 +1,190 @@
-"""The compiled kernels against the NumPy that they stand for: linalg, and what all share."""
+"""Both twins of every kernel: the same numbers, and the compiled one really answers."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from importlib import import_module
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from kernel_paths import COMPILED, by_both, needs_kernels
 
 from gpebo_cli import kernels
-from gpebo_cli.numerics.linalg import affine_scan
+from gpebo_cli.numerics.linalg import affine_scan, spectral_norm
 
-pytestmark = needs_kernels
+needs_kernels = pytest.mark.skipif(
+    kernels.kind() == "numpy" and os.environ.get("GPEBO_KERNELS") != "compiled",
+    reason="the kernels are not compiled",
+)
+Case = Callable[[np.random.Generator], tuple[Any, ...]]
+
+
+def _mixed(rng, count=37, p=3, c=2):
+    extended = rng.normal(size=(count, p, p + c))
+    extended[: count // 4] *= 1e-40  # squares of determinants would underflow
+    extended[count // 2 :] *= 1e40
+    return (extended,)
+
+
+def _law(rng, cases=11, gains=1, p=3):
+    steps, times = 30, 40
+    return (
+        rng.exponential(size=steps), *rng.normal(size=(3, steps, p)),
+        rng.integers(0, steps, times), rng.exponential(size=times), rng.uniform(size=times),
+        rng.normal(size=(1, p)), 10 ** rng.uniform(-8, 4, size=(cases, gains)),
+    )
+
+
+def _errors(rng, cases=11, times=70, p=3, n=4, constant=False):
+    of_time = 1 if constant else times
+    truth, x = rng.normal(size=(of_time, p)), rng.normal(size=(of_time, n))
+    truth[:, 1] = np.nan  # has no weight
+    return (
+        rng.normal(size=(cases, times, p)), truth, np.array([2.0, 0.0, 1.0]),
+        rng.normal(size=(of_time, n)), rng.normal(size=(of_time, n, p)), x,
+        rng.uniform(0.5, 2.0, size=n),
+    )
+
+
+def _symmetric(rng, p=4, more=1):
+    A = rng.normal(size=(9, p, p + more)) * 10.0 ** rng.integers(-200, 200, size=(9, 1, 1))
+    A[..., :p] += np.swapaxes(A[..., :p], 1, 2)
+    A[0], A[1] = 0.0, np.eye(p, p + more)
+    return (A,)
+
+
+CASES: list[tuple[str, str, Case]] = [
+    ("laws", "mixed", _mixed),
+    ("laws", "mixed", lambda rng: _mixed(rng, 8, 1, 1)),
+    ("laws", "mixed", lambda rng: _mixed(rng, 1, 6, 1)),
+    ("laws", "stepped_law", _law),
+    ("laws", "stepped_law", lambda rng: _law(rng, 1)),
+    ("laws", "stepped_law", lambda rng: _law(rng, 17, 3)),
+    ("laws", "squared_errors", _errors),
+    ("laws", "squared_errors", lambda rng: _errors(rng, 1, 5, constant=True)),
+    ("spectra", "eigenvalues", _symmetric),
+    ("spectra", "eigenvalues", lambda rng: _symmetric(rng, 1, 0)),
+    ("spectra", "eigenvalues", lambda rng: _symmetric(rng, 8, 0)),
+]
+NAMES = [f"{subject}-{name}-{i}" for i, (subject, name, _) in enumerate(CASES)]
+
+
+def both(subject: str, name: str, arguments: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+    """What the twins return, as tuples; the compiled one must not have left it to NumPy."""
+    found = []
+    for kind in ("numpy", "compiled"):
+        module = import_module(f"gpebo_cli.kernels.{subject}_{kind}")
+        with pytest.MonkeyPatch.context() as patch:
+            if kind == "compiled":
+                refuse = SimpleNamespace()  # without the NumPy twin
+                patch.setattr(module, f"{subject}_numpy", refuse, raising=False)
+            answer = getattr(module, name)(*arguments)
+        found.append(answer if isinstance(answer, tuple) else (answer,))
+    return found
+
+
+@needs_kernels
+@pytest.mark.parametrize(("subject", "name", "case"), CASES, ids=NAMES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_twins_agree(subject, name, case, seed):
+    arguments = case(np.random.default_rng(seed))
+    for one, other in zip(*both(subject, name, arguments), strict=True):
+        expected, found = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
+        assert expected.shape == found.shape
+        size = np.abs(expected).max(axis=-1, keepdims=True, initial=0.0)
+        # Relative to a vector's largest component; where both are not finite they are the same.
+        same = np.abs(found - expected) <= 1e-9 * size
+        assert (same | (expected == found) | (np.isnan(expected) & np.isnan(found))).all()
+
+
+@needs_kernels
+@pytest.mark.parametrize(("subject", "name", "case"), CASES, ids=NAMES)
+def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
+    compiled = getattr(import_module("gpebo_cli.kernels._compiled"), name)
+    arguments = case(np.random.default_rng(0))
+    for place, value in enumerate(arguments):
+        if isinstance(value, np.ndarray):
+            for wrong in (value.astype(complex), value[None], value.tolist()):
+                with pytest.raises(TypeError, match=f"argument {place} must be"):
+                    compiled(*arguments[:place], wrong, *arguments[place + 1 :])
+    with pytest.raises(TypeError, match="too few"):
+        compiled(*arguments[:-1])
+    with pytest.raises(TypeError, match="expected"):
+        compiled(*arguments, 1.0)
+
+
+@needs_kernels
+@pytest.mark.parametrize(("name", "case", "place", "cut"), [
+    ("stepped_law", _law, 1, np.s_[:-1]),
+    ("stepped_law", _law, 2, np.s_[:, :-1]),
+    ("stepped_law", _law, 5, np.s_[:-1]),
+    ("stepped_law", _law, 7, np.s_[:, :-1]),
+    ("stepped_law", lambda rng: _law(rng, 4, 3), 8, np.s_[:, :-1]),
+    ("squared_errors", _errors, 1, np.s_[:-1]),
+    ("squared_errors", _errors, 2, np.s_[:-1]),
+    ("squared_errors", _errors, 4, np.s_[:, :, :-1]),
+    ("squared_errors", _errors, 5, np.s_[:, :-1]),
+    ("mixed", _mixed, 0, np.s_[:, :, :2]),
+    ("eigenvalues", _symmetric, 0, np.s_[:, :, :3]),
+])  # fmt: skip
+def test_arrays_that_do_not_fit_each_other_are_refused(name, case, place, cut):
+    """What would lead out of an array is never read."""
+    arguments = case(np.random.default_rng(0))
+    wrong = (*arguments[:place], arguments[place][cut], *arguments[place + 1 :])
+    with pytest.raises(ValueError, match=r"expected|will not do"):
+        getattr(import_module("gpebo_cli.kernels._compiled"), name)(*wrong)
+
+
+@needs_kernels
+def test_where_the_compiled_kernel_declines_numpy_answers():
+    A = np.eye(3)[None].repeat(2, axis=0)
+    A[1, 0, 0] = np.inf
+    one, other = both_kinds_answer("spectra", "eigenvalues", A)
+    np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
+    large = np.eye(20)[None]
+    one, other = both_kinds_answer("spectra", "eigenvalues", large)
+    np.testing.assert_array_equal(one, other)
+
+
+def both_kinds_answer(subject: str, name: str, *arguments: Any) -> tuple[Any, Any]:
+    """What the twins return where the compiled one may ask the other."""
+    one, other = (
+        getattr(import_module(f"gpebo_cli.kernels.{subject}_{kind}"), name)
+        for kind in ("numpy", "compiled")
+    )
+    return one(*arguments), other(*arguments)
 
 
 def test_kernels_are_there_where_they_were_asked_for():
-    assert kernels.compiled is not None
+    assert kernels.kind() == os.environ.get("GPEBO_KERNELS", kernels.kind())
 
 
-@given(st.integers(0, 40), st.integers(1, 4), st.booleans(), st.integers(0, 2**32 - 1))
-def test_affine_scan(steps, lanes, shared, seed):
-    rng = np.random.default_rng(seed)
-    factor = rng.uniform(0, 1, (steps, 1 if shared else lanes))
-    shift, start = rng.normal(size=(steps, lanes)), rng.normal(size=lanes)
-    one, other = by_both(lambda: affine_scan(factor, shift, start))
-    np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+def test_decays_are_accurate_to_the_last_digits():
+    gains = 10.0 ** np.arange(-12.0, 4.0)[:, None]
+    zero, one = np.zeros((1, 1)), np.ones((1, 1))
+    eta = kernels.laws.stepped_law(
+        np.ones(1), zero, one, zero, np.zeros(1, dtype=np.intp), np.ones(1), np.ones(1), zero,
+        gains,
+    )[:, 0, 0]
+    mean = np.array([1 - x / 2 + x**2 / 6 if x < 1e-4 else -np.expm1(-x) / x for x in gains[:, 0]])
+    np.testing.assert_allclose(eta, 1.0 - mean, rtol=1e-9, atol=2e-16)
 
 
-def test_a_kernel_refuses_arrays_that_do_not_fit():
-    with pytest.raises(TypeError, match="argument 0 must be an array of float64 with 2 axes"):
-        COMPILED.affine_scan(np.zeros(3), np.zeros((3, 1)), np.zeros(1))
-    with pytest.raises(ValueError, match="steps of factor and shift: 2 and 3"):
-        COMPILED.affine_scan(np.zeros((2, 1)), np.zeros((3, 1)), np.zeros(1))
-    with pytest.raises(TypeError, match="2 arguments, expected 3"):
-        COMPILED.affine_scan(np.zeros((2, 1)), np.zeros((3, 1)))
+def test_the_norm_of_numbers_whose_squares_vanish_or_overflow():
+    rng = np.random.default_rng(150)
+    for exponent in (-310.0, -161.93154924180968, -150.0, 0.0, 160.0):
+        A = rng.normal(size=(29, 5, 7)) * 10.0**exponent
+        with np.errstate(over="ignore"):
+            expected = 10.0**exponent * np.linalg.norm(A / 10.0**exponent, 2, axis=(1, 2)).max()
+        assert spectral_norm(A, 7) == pytest.approx(expected, rel=1e-10)
+    assert spectral_norm(np.zeros((3, 2, 2)), 2) == 0.0
+
+
+@pytest.mark.parametrize("lanes", [1, 3, 3000])
+def test_affine_scan(lanes):
+    rng = np.random.default_rng(lanes)
+    factor, shift = rng.uniform(0, 1, (40, lanes)), rng.normal(size=(40, lanes))
+    z = affine_scan(factor, shift, np.ones(lanes))
+    np.testing.assert_allclose(z[1:], factor * z[:-1] + shift, rtol=1e-12, atol=1e-12)

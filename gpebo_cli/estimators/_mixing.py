@@ -7,7 +7,7 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import SMALL, determinant_and_adjugate_action
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
 
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not
@@ -28,7 +28,7 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
         return delta, Y.reshape(len(t), -1)
 
     def determinant(t: Array) -> Array:
-        return determinants(extended(t)[..., :p])
+        return np.asarray(np.linalg.det(extended(t)[..., :p]))
 
     delta, quotient = mixed_points(extended.values)
     return scalar_path(extended.mesh, signals, delta, quotient, t, determinant, floor)
@@ -36,41 +36,20 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
 
 def mixed_points(extended: Array) -> tuple[Array, Array]:
     """Δ (K, s + 1) and η̄ = 𝐘/Δ, usable everywhere, (K, s + 1, p c) of [Ω | 𝒴] (.., p, p + c)."""
-    p = extended.shape[-2]
-    if kernels.compiled is not None and p <= SMALL:
-        delta, quotient = kernels.compiled.mixed_points(extended, SINGULAR)
-        return delta, quotient
-    delta, quotient, usable = determinant_and_quotient(extended[..., :p], extended[..., p:])
-    return delta, filled(quotient.reshape(*delta.shape, -1), usable)
+    points = extended.shape[:-2]
+    delta, quotient, usable = determinant_and_quotient(
+        extended.reshape(-1, *extended.shape[-2:])
+    )
+    return delta.reshape(points), filled(quotient.reshape(*points, -1), usable.reshape(points))
 
 
-def determinants(omega: Array) -> Array:
-    """det Ω (N,) of Ω (N, p, p)."""
-    if kernels.compiled is not None and omega.shape[-1] <= SMALL:
-        delta: Array = kernels.compiled.determinants(omega)
-        return delta
-    return np.asarray(np.linalg.det(omega))
-
-
-def determinant_and_quotient(omega: Array, rhs: Array) -> tuple[Array, Array, BoolArray]:
-    """Δ = det Ω, η̄ = 𝐘/Δ, and where η̄ is more than rounding; Ω (..., p, p), 𝒴 (..., p, c).
+def determinant_and_quotient(extended: Array) -> tuple[Array, Array, BoolArray]:
+    """Δ = det Ω, η̄ = 𝐘/Δ, and where η̄ is more than rounding, of [Ω | 𝒴] (N, p, p + c).
 
     𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
     """
-    delta = np.asarray(np.linalg.det(omega), dtype=np.float64)
-    usable = delta != 0.0  # by elimination, an exact zero is a pivot that is zero
-    quotient, p = np.zeros_like(rhs), omega.shape[-1]
-    if usable.any():
-        # Ω⁻¹ beside Ω⁻¹𝒴: ‖Ω‖ ‖Ω⁻¹‖ is at most p times the condition number.
-        square = omega[usable]
-        unit = np.broadcast_to(np.eye(p), square.shape)
-        both = np.concatenate([unit, rhs[usable]], axis=-1)
-        solved = np.linalg.solve(square, both)
-        quotient[usable] = solved[..., p:]
-        with np.errstate(over="ignore", invalid="ignore"):  # where Ω is 1e-160, that is singular
-            inverse = np.linalg.norm(solved[..., :p], axis=(-2, -1))
-            condition = np.linalg.norm(square, axis=(-2, -1)) * inverse
-        usable[usable] = condition * SINGULAR < 1.0  # False for nan, too
+    delta, quotient, condition = kernels.laws.mixed(extended)
+    usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
     return delta, quotient, usable
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli.estimators._information import Spectrum
-from gpebo_cli.estimators._scalar import mean_decay
+from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
 from gpebo_cli.regression.estimator import SampledEstimates

@@ -83,9 +83,6 @@ def law_variation(energy: Array, quotient: Array, gain: float) -> tuple[float, f
     Returns:
         the largest variation, and the largest |η̄| of the last element.
     """
-    if kernels.compiled is not None:
-        variation, last = kernels.compiled.law_variation(energy, quotient, gain).tolist()
-        return variation, last
     length = np.maximum(np.diff(energy, axis=1), 0.0)
     weight = np.minimum(1.0, gain * length)
     change = np.abs(np.diff(quotient, axis=1))
@@ -96,59 +93,43 @@ def law_variation(energy: Array, quotient: Array, gain: float) -> tuple[float, f
 
 
 def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:
-    """η̄ constant: η̂ = η̄ + e^{−γI} (η̂(0) − η̄), (g, M, p); arguments as in :func:`scalar_law`."""
-    final = path.quotient[-1, -1]
-    if kernels.compiled is not None:
-        eta: Array = kernels.compiled.constant_law(
-            path.energy_at_t, final, np.atleast_2d(start), gains
-        )
-        return eta
-    decay = np.exp(-gains[:, None, :] * path.energy_at_t[:, None])  # (g, M, p or 1)
-    distance = start - final if start.ndim == 1 else (start - final)[:, None]
-    return np.asarray(final + decay * distance)
+    """η̄ constant: η̂ = η̄ + e^{−γI} (η̂(0) − η̄), (g, M, p); arguments as in :func:`scalar_law`.
+
+    That is one step of the law with η̄ linear in I, over which nothing changes.
+    """
+    final = path.quotient[-1, -1:]
+    whole = path.energy.ravel()[-1:]
+    zero, count = np.zeros_like(final), len(path.t)
+    return kernels.laws.stepped_law(
+        whole, final, zero, zero, np.zeros(count, dtype=np.intp), path.energy_at_t,
+        np.zeros(count), np.atleast_2d(start), gains,
+    )
 
 
 def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     """η̄ linear in I between neighbouring points: what little it varies is second order.
 
-    A step x = γ δI of the distance ε = η̂ − η̄, which stays accurate after convergence, is
-    ε₊ = e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄). Arguments and result, (g, M, p), are
-    :func:`scalar_law`'s.
+    Arguments and result, (g, M, p), are :func:`scalar_law`'s.
     """
-    if kernels.compiled is not None:
-        estimates: Array = kernels.compiled.linear_law(
-            path.energy, path.quotient, path.mesh.edges, path.mesh.rule.points, path.t,
-            path.mesh.sampler(path.t).element, path.energy_at_t, np.atleast_2d(start), gains,
-        )
-        return estimates
-    length = np.maximum(np.diff(path.energy, axis=1), 0.0)
-    change = np.diff(path.quotient, axis=1)
-    s, p = change.shape[1:]
-    x = gains * length.reshape(-1, 1, 1)  # (N, g, p or 1)
-    following = np.concatenate([path.quotient[1:, 0], path.quotient[-1:, -1]])
-    jump = np.zeros_like(change)  # of η̄ between elements; η̂ is continuous
-    jump[:, -1] = following - path.quotient[:, -1]
-    left = path.quotient[:, :-1].reshape(-1, 1, p)
-    change = change.reshape(-1, 1, p)
-    shift = -mean_decay(x) * change - jump.reshape(-1, 1, p)
-    distance = affine_scan(np.exp(-x), shift, start - left[0])[:-1]  # at each left end
+    energy, quotient = path.energy, path.quotient
+    s, p = energy.shape[1] - 1, quotient.shape[2]
+    length = np.maximum(np.diff(energy, axis=1), 0.0)
+    jump = np.zeros((len(energy), s, p))  # of η̄ between elements; η̂ is continuous
+    jump[:-1, -1] = quotient[1:, 0] - quotient[:-1, -1]
 
-    sampler = path.mesh.sampler(path.t)
-    element = sampler.element
+    element = path.mesh.sampler(path.t).element
     local = (path.t - path.mesh.edges[element]) / path.mesh.steps[element]
     index = np.clip(np.searchsorted(path.mesh.rule.points, local, side="right") - 1, 0, s - 1)
-    n = element * s + index
     step = length[element, index]
-    partial = np.clip(path.energy_at_t - path.energy[element, index], 0.0, step)
-    share = np.divide(partial, step, out=np.zeros_like(partial), where=step > 0)[:, None, None]
-    x = gains * partial[:, None, None]
-    eta = left[n] + np.exp(-x) * distance[n] + share * (1.0 - mean_decay(x)) * change[n]
-    return np.ascontiguousarray(np.swapaxes(eta, 0, 1))
-
-
-def mean_decay(x: Array) -> Array:
-    """(1 − e^{−x})/x and its limit 1, of each entry of x (...,)."""
-    return np.divide(-np.expm1(-x), x, out=np.ones_like(x), where=x > 0.0)
+    partial = np.clip(path.energy_at_t - energy[element, index], 0.0, step)
+    # At the next point itself there is nothing to go from there.
+    there = (partial == step) & (index < s - 1)
+    index, partial = index + there, np.where(there, 0.0, partial)
+    share = np.divide(partial, step, out=np.zeros_like(partial), where=partial > 0)
+    return kernels.laws.stepped_law(
+        length.ravel(), quotient[:, :-1].reshape(-1, p), np.diff(quotient, axis=1).reshape(-1, p),
+        jump.reshape(-1, p), element * s + index, partial, share, np.atleast_2d(start), gains,
+    )
 
 
 def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
@@ -221,8 +202,5 @@ def scalar_path(
 
 def integral_of_square(mesh: Mesh, delta: Array) -> Array:
     """I = ∫Δ² of Δ (K, s + 1) at the points of its mesh, (K, s + 1); it never falls."""
-    if kernels.compiled is not None:
-        energy: Array = kernels.compiled.energy(delta, mesh.steps, mesh.rule.integration)
-        return energy
     integral = Trajectory(mesh, delta**2).integral().values.ravel()
     return np.asarray(np.maximum.accumulate(integral).reshape(delta.shape))

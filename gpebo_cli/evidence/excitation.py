@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, Requirement
+from gpebo_cli.kernels import spectra
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import SMALL_SPECTRUM, largest
+from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
@@ -24,7 +24,6 @@ from gpebo_cli.settings import ExcitationSettings
 RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
-_APART = 1e-8  # eigenvalues nearer than this leave the direction to whoever computes it
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -66,7 +65,7 @@ def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings)
     t_c = _first_time(gram, rho)
     return Excitation(
         t=t,
-        gram_eigenvalues=np.maximum(_sampled_eigenvalues(gram, t), 0.0),
+        gram_eigenvalues=np.maximum(spectra.eigenvalues(gram(t)), 0.0),
         pe_level=segment_level(regression, t, window),
         window=window,
         is_ie=t_c is not None,
@@ -85,38 +84,8 @@ def _weakest(matrix: Array) -> tuple[list[float], list[float]]:
 
     Further columns are not looked at.
     """
-    p = len(matrix)
-    if kernels.compiled is not None and p <= SMALL_SPECTRUM:
-        found: tuple[Array, Array] | None = kernels.compiled.eigenvector(matrix)
-        if found is not None:  # else not all is finite
-            values, vector = found[0].tolist(), found[1].tolist()
-            if p == 1 or values[1] - values[0] > _APART * abs(values[-1]):
-                return values, vector
-    of_all, vectors = np.linalg.eigh(matrix[:, :p])
+    of_all, vectors = np.linalg.eigh(matrix[:, : len(matrix)])
     return of_all.tolist(), vectors[:, 0].tolist()
-
-
-def eigenvalues(matrices: Array) -> Array:
-    """Of symmetric matrices (N, p, p), ascending (N, p); further columns are not looked at."""
-    p = matrices.shape[1]
-    if kernels.compiled is not None and p <= SMALL_SPECTRUM:
-        found: Array | None = kernels.compiled.eigenvalues(matrices)
-        if found is not None:  # else not all is finite
-            return found
-    return np.asarray(np.linalg.eigvalsh(matrices[..., :p]), dtype=np.float64)
-
-
-def _sampled_eigenvalues(gram: Trajectory, t: Array) -> Array:
-    """Of G at the times t (N,), (N, p), from [G | h] (p, p + c)."""
-    p = gram.values.shape[2]
-    if kernels.compiled is not None and p <= SMALL_SPECTRUM:
-        sampler = gram.mesh.sampler(t)
-        found: Array | None = kernels.compiled.sampled_eigenvalues(
-            gram.values, sampler.element, sampler.weights
-        )
-        if found is not None:
-            return found
-    return eigenvalues(Trajectory(gram.mesh, gram.values[..., :p])(t))
 
 
 def _first_time(gram: Trajectory, rho: float) -> float | None:
@@ -131,19 +100,12 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
     mesh, p = gram.mesh, gram.values.shape[2]
     if rho <= 0:
         return None
-    if kernels.compiled is not None and 0 < p <= SMALL_SPECTRUM:
-        found: float | None = kernels.compiled.first_time(
-            gram.values, mesh.edges, mesh.rule.points, mesh.rule.barycentric, _AROUND, float(rho),
-            _ROUNDS, _SAME_TIME,
-        )
-        if found is not None:  # else not all is finite
-            return found if found > -np.inf else None
-    reached = np.flatnonzero(eigenvalues(gram.values[:, -1])[:, 0] >= rho)
+    reached = np.flatnonzero(spectra.eigenvalues(gram.values[:, -1])[:, 0] >= rho)
     if len(reached) == 0:
         return None
     k = int(reached[0])
     points = mesh.points[k]
-    level = eigenvalues(gram.values[k])[:, 0] - rho
+    level = spectra.eigenvalues(gram.values[k])[:, 0] - rho
     element = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1, :, :, :p])
     for _ in range(_ROUNDS):
         j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
@@ -153,7 +115,7 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
         share = level[j - 1] / (level[j - 1] - level[j])
         guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
         points = np.unique(np.clip(guess + (high - low) * _AROUND, low, high))
-        level = eigenvalues(element(points))[:, 0] - rho
+        level = spectra.eigenvalues(element(points))[:, 0] - rho
         level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
     return high
 
@@ -182,7 +144,7 @@ def segment_level(regression: LinearRegression, t: Array, window: float) -> Arra
         here = np.flatnonzero(b > a)
         gram[here] += between(segment.outer, a[here], b[here])
         before = segment
-    level[whole] = np.maximum(eigenvalues(gram)[:, 0], 0.0)
+    level[whole] = np.maximum(spectra.eigenvalues(gram)[:, 0], 0.0)
     return level
 
 
@@ -207,7 +169,7 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     to_there = mesh.sampler(t)
     to_there = Sampler(to_there.element[whole], to_there.weights[whole])
     sums = _window_sums(outer, from_there, to_there, outer.values.shape[2])
-    level[whole] = np.maximum(eigenvalues(sums)[:, 0], 0.0)
+    level[whole] = np.maximum(spectra.eigenvalues(sums)[:, 0], 0.0)
     return level
 
 
@@ -224,12 +186,6 @@ def between(signal: Trajectory, a: Array, b: Array) -> Array:
 def _window_sums(signal: Trajectory, start: Sampler, stop: Sampler, columns: int) -> Array:
     """:func:`between` of the first columns, with the times where these samplers look."""
     mesh = signal.mesh
-    if kernels.compiled is not None:
-        sums: Array = kernels.compiled.window_sums(
-            signal.values, mesh.steps, mesh.rule.integration, columns,
-            start.element, start.weights, stop.element, stop.weights,
-        )
-        return sums
     within = Trajectory(mesh, signal.values[..., :columns]).local_integral().values
     totals = within[:, -1]
     head = start(within)  # from the left end of a's element to a
@@ -256,7 +212,7 @@ def sampled_window_level(regression: SampledRegression, window: float) -> Array:
     first = np.searchsorted(t, t[whole] - window + slack, side="right")
     pairs = np.stack([first, whole + 1], axis=1).ravel()
     sums = np.add.reduceat(steps, pairs, axis=0)[::2]
-    level[whole] = np.maximum(eigenvalues(sums)[:, 0], 0.0)
+    level[whole] = np.maximum(spectra.eigenvalues(sums)[:, 0], 0.0)
     return level
 
 

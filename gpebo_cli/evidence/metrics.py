@@ -32,17 +32,30 @@ def measure(t: Array, parameter_error: Array, state_error: Array) -> Metrics:
 
     Over what the observer sees and what is known of the truth; NaN where that is nothing.
     """
-    out = np.full((5, len(parameter_error)), np.nan)
     known = ~np.isnan(parameter_error[0, -1])
-    if known.any() or not known.size:
-        norm = np.linalg.norm(parameter_error[..., known], axis=2)
-        out[0] = settling_time(t, norm)
-        out[2] = np.abs(parameter_error[:, -1, known]).max(axis=1, initial=0.0)
-    known = ~np.isnan(state_error[0, -1])
-    if known.any():
-        norm = np.linalg.norm(state_error[..., known], axis=2)
-        out[1], out[4] = settling_time(t, norm), time_rms(t, norm)
-        out[3] = np.abs(state_error[:, -1, known]).max(axis=1)
+    seen = ~np.isnan(state_error[0, -1])
+    parameters, states = parameter_error[..., known], state_error[..., seen]
+    return measure_squares(
+        t, (parameters**2).sum(axis=2) if known.any() or not known.size else None,
+        parameters[:, -1], (states**2).sum(axis=2) if seen.any() else None, states[:, -1],
+    )
+
+
+def measure_squares(
+    t: Array, of_parameters: Array | None, last_parameters: Array, of_states: Array | None,
+    last_states: Array,
+) -> Metrics:
+    """Metrics from squared norms (G, M) and from errors at the end, (G, p) and (G, n).
+
+    NaN where the norms are None.
+    """
+    out = np.full((5, len(last_parameters)), np.nan)
+    if of_parameters is not None:
+        out[0] = settling_time(t, of_parameters, SETTLED**2)
+        out[2] = np.abs(last_parameters).max(axis=1, initial=0.0)
+    if of_states is not None:
+        out[1], out[4] = settling_time(t, of_states, SETTLED**2), time_rms(t, of_states)
+        out[3] = np.abs(last_states).max(axis=1)
     return Metrics(*out)
 
 
@@ -75,6 +88,8 @@ def settling_time(t: Array, error: Array, fraction: float = SETTLED) -> Array:
     return out
 
 
-def time_rms(t: Array, error: Array) -> Array:
-    """Root mean square over time (trapezoidal) of error norms (g, M), shape (g,)."""
-    return np.asarray(np.sqrt(np.trapezoid(error**2, t, axis=1) / (t[-1] - t[0])))
+def time_rms(t: Array, squares: Array) -> Array:
+    """Root mean square over time (trapezoidal) of norms whose squares are (g, M), shape (g,)."""
+    steps = np.diff(t)
+    weights = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+    return np.asarray(np.sqrt(squares @ (weights / (t[-1] - t[0]))))

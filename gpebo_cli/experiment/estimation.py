@@ -11,7 +11,7 @@ import numpy as np
 from gpebo_cli import estimators, kernels
 from gpebo_cli.errors import SolverError
 from gpebo_cli.evidence.excitation import WINDOWS, Excitation, assess, sampled_window_level
-from gpebo_cli.evidence.metrics import SETTLED, Metrics, measure
+from gpebo_cli.evidence.metrics import Metrics, measure, measure_squares
 from gpebo_cli.experiment.assumptions import Observed, warnings
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.experiment.online import Online, joined
@@ -19,7 +19,6 @@ from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, 
 from gpebo_cli.experiment.seeds import over_seeds
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import SMALL
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Observation, StateMap, observe
 from gpebo_cli.observers.observation import AffineStateMap
@@ -188,10 +187,8 @@ def _evaluation(
     state_map: StateMap, grid: Array, truth: Array, x: Array, judged: slice, chosen: IntArray
 ) -> _Evaluation:
     """How a batch of cases is measured on the grid (M,) against η (M, p) and x (M, n)."""
-    large = max(truth.shape[1], x.shape[1]) > SMALL
-    if kernels.compiled is None or large or not isinstance(state_map, AffineStateMap):
-        reconstruct = state_map.at(grid)
-
+    reconstruct = state_map.at(grid)
+    if not isinstance(state_map, AffineStateMap):
         def evaluate(eta: Array) -> tuple[Array, Array, Array]:
             x_hat = reconstruct(eta)
             metrics = measure(grid, (eta - truth)[..., judged], x_hat - x)
@@ -199,17 +196,27 @@ def _evaluation(
 
         return evaluate
 
-    measured, columns = kernels.compiled.measured, np.arange(truth.shape[1])[judged]
     sampler = state_map.offset.mesh.sampler(grid)
     offset, gain = sampler(state_map.offset.values), sampler(state_map.gain.values)
+    in_eta = np.zeros(truth.shape[1], dtype=bool)
+    in_eta[judged] = True
 
     def evaluate_affine(eta: Array) -> tuple[Array, Array, Array]:
-        """The same in one pass over the estimates: x̂ is formed where it is needed."""
-        found: tuple[Array, Array, Array] = measured(
-            grid, np.asarray(eta, dtype=np.float64), truth, columns, offset, gain, x, chosen,
-            SETTLED,
+        """The same, with x̂ only where it is needed: on the grid its errors are numbers."""
+        eta = np.asarray(eta, dtype=np.float64)
+        of_eta = eta[:, -1] - truth[-1]
+        of_x = offset[-1] + eta[:, -1] @ gain[-1].T - x[-1]
+        seen, known = in_eta & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
+        squares = kernels.laws.squared_errors(
+            eta, truth, seen.astype(float), offset, gain, x, known.astype(float)
         )
-        return found
+        judges = seen.any() or not in_eta.any()
+        metrics = measure_squares(
+            grid, squares[0] if judges else None, of_eta[:, seen],
+            squares[1] if known.any() else None, of_x[:, known],
+        )
+        x_hat = offset[chosen] + np.matmul(gain[chosen], eta[:, chosen, :, None])[..., 0]
+        return np.array(list(vars(metrics).values())), eta[:, chosen], x_hat
 
     return evaluate_affine
 

@@ -1,30 +1,41 @@
-"""Inner loops in C, for systems so small that NumPy's calls cost more than what is in them.
+"""The inner loops: arrays in, arrays out, each of them in NumPy and in C.
 
-Every kernel stands for lines of NumPy beside which it is called: those define what it computes,
-are what runs where nothing could be compiled, and what the tests hold it against. A kernel takes
-and returns arrays, decides nothing and raises nothing but TypeError and ValueError for arrays
-that do not fit.
+For systems so small that NumPy's calls cost more than what is in them, C is many times faster.
+Each subject is two modules with the same functions: ``laws_numpy`` says what is computed,
+``laws_compiled`` computes it in C, or leaves it to NumPy where sizes or numbers are not for C.
+Which of the two is bound here as ``laws`` is decided once, when this package is imported. What is
+computed when, and what follows from it, is decided by the callers.
 
-``GPEBO_KERNELS=numpy`` in the environment runs without them.
+``GPEBO_KERNELS=numpy`` in the environment chooses NumPy, ``compiled`` insists on C.
 """
 
 from __future__ import annotations
 
 import os
 from importlib import import_module
+from importlib.util import find_spec
 from types import ModuleType
+from typing import TYPE_CHECKING
 
-_CHOICE = "GPEBO_KERNELS"
+_ASKED = os.environ.get("GPEBO_KERNELS")
+_COMPILED = _ASKED != "numpy" and find_spec(f"{__name__}._compiled") is not None
+if _ASKED == "compiled" and not _COMPILED:
+    raise ImportError("GPEBO_KERNELS=compiled, but nothing was compiled when gpebo was installed")
 
-compiled: ModuleType | None = None
-"""The kernels, or None: look it up at every call, tests switch it off."""
-if os.environ.get(_CHOICE, "compiled") != "numpy":
-    try:
-        compiled = import_module("gpebo_cli.kernels._compiled")
-    except ImportError:  # nothing was compiled when the package was built
-        compiled = None
+SUBJECTS = ("laws", "spectra")
+compiled: ModuleType | None = import_module(f"{__name__}._compiled") if _COMPILED else None
 
 
 def kind() -> str:
     """What does the inner loops of this process: ``compiled`` or ``numpy``."""
-    return "numpy" if compiled is None else "compiled"
+    return "compiled" if _COMPILED else "numpy"
+
+
+if TYPE_CHECKING:
+    from gpebo_cli.kernels import laws_numpy as laws
+    from gpebo_cli.kernels import spectra_numpy as spectra
+
+    __all__ = ["SUBJECTS", "kind", "laws", "spectra"]
+else:
+    for _subject in SUBJECTS:
+        globals()[_subject] = import_module(f"{__name__}.{_subject}_{kind()}")

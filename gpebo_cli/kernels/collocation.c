@@ -246,8 +246,8 @@ static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize
         longest = q.h[k] > longest ? q.h[k] : longest;
     const int constant = q.A.step == 0 && q.E.step == 0 && q.T.step == 0;
     const npy_intp sides = n + columns * (constant ? K : 1);
-    q.together = scratch(&call, (n + 1) * m + s * n * columns + d * d + s * s + columns);
-    double *W = q.together ? scratch(&call, m * row_length(m, sides)) : NULL;
+    q.together = old_scratch(&call, (n + 1) * m + s * n * columns + d * d + s * s + columns);
+    double *W = q.together ? old_scratch(&call, m * row_length(m, sides)) : NULL;
     int *members = W ? integers(&call, 2 * K) : NULL;
     PyArrayObject *particular = members ? fresh(&call, 4, (npy_intp[]){K, s, n, columns}) : NULL;
     if (particular == NULL)
@@ -550,7 +550,7 @@ static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t 
             !same("columns of amplification", size(amplified, 1), n + 1))
             return failed(&call);
     }
-    double found[3], *work = scratch(&call, (size_t)(C * (K + 14)));
+    double found[3], *work = old_scratch(&call, (size_t)(C * (K + 14)));
     if (work == NULL)
         return failed(&call);
     const Ending ending = {

@@ -75,7 +75,7 @@ PyArrayObject *fresh_indices(Call *call, npy_intp length)
     return keep(call, PyArray_SimpleNew(1, &length, NPY_INTP));
 }
 
-double *scratch(Call *call, size_t numbers)
+double *old_scratch(Call *call, size_t numbers)
 {
     npy_intp length = numbers ? (npy_intp)numbers : 1;
     PyArrayObject *memory = fresh(call, 1, &length);
@@ -139,4 +139,54 @@ int same(const char *what, npy_intp one, npy_intp other)
         return 1;
     PyErr_Format(PyExc_ValueError, "%s: %zd and %zd", what, (Py_ssize_t)one, (Py_ssize_t)other);
     return 0;
+}
+
+int solve_in_place(double *A, double *B, npy_intp n, npy_intp columns)
+{
+    int sign = 1;
+    for (npy_intp k = 0; k < n; k++) {
+        npy_intp best = k;
+        for (npy_intp i = k + 1; i < n; i++)
+            if (fabs(A[i * n + k]) > fabs(A[best * n + k]))
+                best = i;
+        if (A[best * n + k] == 0.0)
+            return 0;
+        if (best != k) {
+            sign = -sign;
+            for (npy_intp j = k; j < n; j++) {
+                const double kept = A[k * n + j];
+                A[k * n + j] = A[best * n + j];
+                A[best * n + j] = kept;
+            }
+            for (npy_intp j = 0; j < columns; j++) {
+                const double kept = B[k * columns + j];
+                B[k * columns + j] = B[best * columns + j];
+                B[best * columns + j] = kept;
+            }
+        }
+        const double *restrict pivot = A + k * n, *restrict known = B + k * columns;
+        for (npy_intp i = k + 1; i < n; i++) {
+            double *restrict row = A + i * n, *restrict right = B + i * columns;
+            if (row[k] == 0.0)
+                continue;
+            const double factor = row[k] / pivot[k];
+            for (npy_intp j = k + 1; j < n; j++)
+                row[j] -= factor * pivot[j];
+            for (npy_intp j = 0; j < columns; j++)
+                right[j] -= factor * known[j];
+        }
+    }
+    for (npy_intp k = n - 1; k >= 0; k--) {
+        double *restrict solved = B + k * columns;
+        for (npy_intp i = k + 1; i < n; i++) {
+            const double a = A[k * n + i];
+            const double *restrict later = B + i * columns;
+            for (npy_intp j = 0; j < columns; j++)
+                solved[j] -= a * later[j];
+        }
+        const double pivot = A[k * n + k];
+        for (npy_intp j = 0; j < columns; j++)
+            solved[j] /= pivot;
+    }
+    return sign;
 }

@@ -56,7 +56,7 @@ PyArrayObject *zeros(Call *call, int axes, const npy_intp *shape);
 PyArrayObject *fresh_indices(Call *call, npy_intp length);
 
 /* Memory that lives as long as the call; NULL with an exception. */
-double *scratch(Call *call, size_t numbers);
+double *old_scratch(Call *call, size_t numbers);
 int *integers(Call *call, size_t numbers);
 
 /* Ends a call without a result, with None for one, or with a number. */

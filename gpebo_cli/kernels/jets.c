@@ -297,7 +297,7 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
     block = block < 32 ? 32 : block > 512 ? 512 : block;
     block = block > times ? times : block;
     Rows rows = {
-        {NULL, NULL}, NULL, times, known, scratch(&call, (used - known) * block), block,
+        {NULL, NULL}, NULL, times, known, old_scratch(&call, (used - known) * block), block,
         data(constants)};
     if (rows.memory == NULL)
         return failed(&call);
@@ -437,7 +437,7 @@ EVERY_WIDTH static void mark_moved(npy_int64 *restrict moved, const double *rest
 /* Memory for as many marks, all 0; NULL with an exception. */
 static npy_int64 *marks(Call *call, npy_intp count)
 {
-    npy_int64 *made = (npy_int64 *)scratch(call, count);
+    npy_int64 *made = (npy_int64 *)old_scratch(call, count);
     if (made != NULL)
         memset(made, 0, count * sizeof *made);
     return made;
@@ -492,7 +492,7 @@ static PyObject *missed_between(PyObject *module, PyObject *const *given, Py_ssi
     if (between == NULL)
         return failed(&call);
     const npy_intp points = size(between, 0), looks = size(between, 1);
-    double *memory = NULL, *expected = scratch(&call, looks);
+    double *memory = NULL, *expected = old_scratch(&call, looks);
     npy_intp elements = 0, length = 0;
     for (npy_intp pair = 0; expected != NULL && pair < pairs; pair++) {
         PyArrayObject *nodal = values_of(&call, 1 + 2 * pair);
@@ -503,7 +503,7 @@ static PyObject *missed_between(PyObject *module, PyObject *const *given, Py_ssi
             elements = points ? size(nodal, 1) / points : 0;
             length = elements * (points + looks);
             out = zeros(&call, 2, (npy_intp[]){pairs, elements});
-            memory = out ? scratch(&call, REMEMBERED * length) : NULL;
+            memory = out ? old_scratch(&call, REMEMBERED * length) : NULL;
         }
         const npy_intp entries = entries_of(nodal);
         if (memory == NULL || !same("nodes", size(nodal, 1), elements * points) ||
@@ -569,7 +569,7 @@ static PyObject *known_kinds(PyObject *module, PyObject *const *given, Py_ssize_
         all += entries[m];
         most_kinds += size(values[m], 0);
     }
-    double *one = scratch(&call, times);
+    double *one = old_scratch(&call, times);
     npy_int64 *moves = one ? marks(&call, all) : NULL;
     int *away = moves ? integers(&call, all) : NULL;
     int *counts = away ? integers(&call, most_kinds) : NULL;
@@ -743,12 +743,12 @@ static PyObject *joined(PyObject *module, PyObject *const *given, Py_ssize_t cou
             return failed(&call);
         }
     const npy_intp length = s.elements * s.points;
-    s.values = scratch(&call, s.columns * length);
-    s.scale = s.values ? scratch(&call, s.columns * s.elements) : NULL;
+    s.values = old_scratch(&call, s.columns * length);
+    s.scale = s.values ? old_scratch(&call, s.columns * s.elements) : NULL;
     s.skipped = s.scale ? integers(&call, s.columns) : NULL;
     int *stays = s.skipped ? integers(&call, s.elements + 1) : NULL;
-    double *largest = stays ? scratch(&call, s.elements) : NULL;
-    double *sampled = largest ? scratch(&call, s.points) : NULL;
+    double *largest = stays ? old_scratch(&call, s.elements) : NULL;
+    double *sampled = largest ? old_scratch(&call, s.points) : NULL;
     if (sampled == NULL)
         return failed(&call);
     for (npy_intp j = 0; j < s.columns; j++)
@@ -773,7 +773,7 @@ static PyObject *joined(PyObject *module, PyObject *const *given, Py_ssize_t cou
                 outside("counts of elements", together);
             return failed(&call);
         }
-        double *replaced = scratch(&call, together * s.points);
+        double *replaced = old_scratch(&call, together * s.points);
         if (replaced == NULL)
             return failed(&call);
         found = 0;

@@ -69,7 +69,7 @@ static PyObject *tails(PyObject *module, PyObject *const *given, Py_ssize_t coun
         most = size(kind, 2) > most ? size(kind, 2) : most;
     }
     PyArrayObject *tail = fresh(&call, 1, &K);
-    double *work = tail ? scratch(&call, (size_t)((K + 1 + used) * most + K * used)) : NULL;
+    double *work = tail ? old_scratch(&call, (size_t)((K + 1 + used) * most + K * used)) : NULL;
     if (work == NULL)
         return failed(&call);
     double *worst = work + (K + 1 + used) * most;
@@ -315,7 +315,7 @@ static PyObject *integral(PyObject *module, PyObject *const *given, Py_ssize_t c
         !same("columns of R", size(R, 1), s))
         return failed(&call);
     PyArrayObject *integrals = fresh(&call, 3, PyArray_DIMS(values));
-    double *total = integrals ? scratch(&call, c) : NULL;
+    double *total = integrals ? old_scratch(&call, c) : NULL;
     if (total == NULL)
         return failed(&call);
     for (npy_intp b = 0; b < c; b++)
@@ -346,8 +346,8 @@ static PyObject *low_pass(PyObject *module, PyObject *const *given, Py_ssize_t c
         !same("columns of the start", size(start, 0), c))
         return failed(&call);
     PyArrayObject *filtered = fresh(&call, 3, PyArray_DIMS(values));
-    double *W = filtered ? scratch(&call, s * row_length(s, 1 + c)) : NULL;
-    double *state = W ? scratch(&call, c + s) : NULL;
+    double *W = filtered ? old_scratch(&call, s * row_length(s, 1 + c)) : NULL;
+    double *state = W ? old_scratch(&call, c + s) : NULL;
     int *columns = state ? integers(&call, 2 * c) : NULL;
     if (columns == NULL)
         return failed(&call);

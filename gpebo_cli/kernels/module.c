@@ -2,6 +2,8 @@
 #define GPEBO_MODULE
 #include "common.h"
 
+int add_all_kernels(PyObject *module);
+
 static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT, "_compiled", "Inner loops in C.", -1, NULL, NULL, NULL, NULL, NULL,
 };
@@ -13,14 +15,18 @@ PyMODINIT_FUNC PyInit__compiled(void)
     if (module == NULL)
         return NULL;
     PyMethodDef *subjects[] = {
-        linear_kernels,    jets_kernels,       mesh_kernels,
+        jets_kernels,       mesh_kernels,
         structure_kernels, reduction_kernels,  collocation_kernels,
-        observer_kernels,  excitation_kernels, estimation_kernels,
+        observer_kernels,  
     };
     for (size_t i = 0; i < sizeof(subjects) / sizeof(subjects[0]); i++)
         if (PyModule_AddFunctions(module, subjects[i]) < 0) {
             Py_DECREF(module);
             return NULL;
         }
+    if (add_all_kernels(module) < 0) {
+        Py_DECREF(module);
+        return NULL;
+    }
     return module;
 }

@@ -218,63 +218,6 @@ static double largest_in(const double *restrict from, npy_intp numbers)
     return largest_of(&so_far);
 }
 
-/* (N, n, m) -> max over N of |entry|, (n, m). */
-static PyObject *entry_sizes(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 1))
-        return NULL;
-    PyArrayObject *matrices = doubles(&call, 0, 3);
-    if (matrices == NULL)
-        return failed(&call);
-    const npy_intp n = size(matrices, 1), m = size(matrices, 2);
-    PyArrayObject *out = zeros(&call, 2, (npy_intp[]){n, m});
-    double *restrict sum = out == NULL ? NULL : scratch(&call, n * m);
-    if (sum == NULL)
-        return failed(&call);
-    memset(sum, 0, n * m * sizeof(double));
-    double *restrict most = data(out);
-    const double *restrict one = data(matrices);
-    for (npy_intp k = 0; k < size(matrices, 0); k++, one += n * m)
-        for (npy_intp i = 0; i < n * m; i++) {
-            const double entry = fabs(one[i]);
-            most[i] = entry > most[i] ? entry : most[i];
-            sum[i] += entry;
-        }
-    for (npy_intp i = 0; i < n * m; i++)
-        if (sum[i] != sum[i])
-            most[i] = NAN;
-    return results(&call, 1, out);
-}
-
-/* (…, columns), first -> max |entry| of the columns from `first` on, 0 if there are none. */
-static PyObject *largest_entry(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    Stack values;
-    npy_intp first;
-    if (!begin(&call, given, count, 2))
-        return NULL;
-    const int axes = PyArray_Check(given[0]) ? PyArray_NDIM((PyArrayObject *)given[0]) : 0;
-    if (!stack(&call, 0, axes > 1 ? axes - 1 : 1, &values) || !count_of(&call, 1, &first))
-        return failed(&call);
-    const npy_intp columns = last(&values, 1), all = values.times * values.numbers;
-    if (first == 0 || all == 0)
-        return one_number(&call, largest_in(values.at, all));
-    double most = 0.0;
-    for (npy_intp i = 0; i < all; i += columns)
-        for (npy_intp j = first; j < columns; j++) {
-            const double entry = fabs(values.at[i + j]);
-            if (entry != entry)
-                return one_number(&call, NAN);
-            if (entry > most)
-                most = entry;
-        }
-    return one_number(&call, most);
-}
-
 /* What `in_frame` works with at LANES times. */
 typedef struct {
     Lane *E, *A, *B, *F, *C;          /* (n, n), (n, n), (n, m), (n, q), (r, n) */
@@ -358,7 +301,7 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
     npy_intp total = 0;
     for (size_t i = 0; i < sizeof(lengths) / sizeof(lengths[0]); i++)
         total += lengths[i];
-    double *memory = signals == NULL ? NULL : scratch(&call, total * LANES);
+    double *memory = signals == NULL ? NULL : old_scratch(&call, total * LANES);
     if (memory == NULL)
         return failed(&call);
     Frame f;
@@ -511,63 +454,6 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
                    dynamics, unknowns, signals);
 }
 
-/* from_unknowns (N or 1, k, q), from_signals (N or 1, k, m + r), g_signals (N or 1, rows, m + r),
-   u (N, m), y (N, r), columns -> f (N, k, columns) = [from_signals [u; y] | from_unknowns | 0] and
-   g_y (N, rows) = g_signals [u; y]. */
-static PyObject *driven(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    Stack unknowns, from, g, u, y;
-    npy_intp columns;
-    if (!begin(&call, given, count, 6) || !stack(&call, 0, 2, &unknowns) ||
-        !stack(&call, 1, 2, &from) || !stack(&call, 2, 2, &g) || !stack(&call, 3, 1, &u) ||
-        !stack(&call, 4, 1, &y) || !count_of(&call, 5, &columns))
-        return failed(&call);
-    const npy_intp N = u.times, m = u.numbers, r = y.numbers, k = last(&from, 2);
-    const npy_intp q = last(&unknowns, 1), rows = last(&g, 2);
-    if (!same("times of u and y", N, y.times) || !same("signals", last(&from, 1), m + r) ||
-        !same("signals in g_y", last(&g, 1), m + r) ||
-        !same("coordinates", last(&unknowns, 2), k) ||
-        !lasting("times of from_unknowns", &unknowns, N) ||
-        !lasting("times of from_signals", &from, N) || !lasting("times of g_signals", &g, N))
-        return failed(&call);
-    if (columns < 1 + q) {
-        PyErr_SetString(PyExc_ValueError, "too few columns");
-        return failed(&call);
-    }
-    PyArrayObject *f = zeros(&call, 3, (npy_intp[]){N, k, columns});
-    PyArrayObject *g_y = f == NULL ? NULL : fresh(&call, 2, (npy_intp[]){N, rows});
-    if (g_y == NULL)
-        return failed(&call);
-    double *forcing = data(f), *seen = data(g_y);
-    for (npy_intp t = 0; t < N; t++, forcing += k * columns, seen += rows) {
-        const double *a = u.at + t * m, *b = y.at + t * r;
-        const double *matrix = from.at + (from.times == 1 ? 0 : t) * from.numbers;
-        const double *theta = unknowns.at + (unknowns.times == 1 ? 0 : t) * unknowns.numbers;
-        for (npy_intp i = 0; i < k; i++, matrix += m + r) {
-            double sum = 0.0;
-            for (npy_intp j = 0; j < m; j++)
-                sum += matrix[j] * a[j];
-            for (npy_intp j = 0; j < r; j++)
-                sum += matrix[m + j] * b[j];
-            forcing[i * columns] = sum;
-            for (npy_intp j = 0; j < q; j++)
-                forcing[i * columns + 1 + j] = theta[i * q + j];
-        }
-        matrix = g.at + (g.times == 1 ? 0 : t) * g.numbers;
-        for (npy_intp i = 0; i < rows; i++, matrix += m + r) {
-            double sum = 0.0;
-            for (npy_intp j = 0; j < m; j++)
-                sum += matrix[j] * a[j];
-            for (npy_intp j = 0; j < r; j++)
-                sum += matrix[m + j] * b[j];
-            seen[i] = sum;
-        }
-    }
-    return results(&call, 2, f, g_y);
-}
-
 /* z (N, k, 1 + p), q, basis (n, k), 𝒜B (N or 1, rows, k), g_y (N, rows), G (N or 1, rows, q),
    Q1 (N or 1, rows, b), H (N or 1, n, b) -> Y (N, rows), psi (N, rows, p), offset (N, n), gain
    (N, n, p), sizes (2,) of the terms of Y and of psi before they cancel. */
@@ -605,7 +491,7 @@ static PyObject *regression_signals(PyObject *module, PyObject *const *given, Py
     PyArrayObject *sizes = zeros(&call, 1, (npy_intp[]){2});
     const npy_intp total = z.numbers + A.numbers + g.numbers + G.numbers + Q1.numbers + H.numbers +
                            (rows + b + n) * columns;
-    double *memory = sizes == NULL ? NULL : scratch(&call, total * LANES);
+    double *memory = sizes == NULL ? NULL : old_scratch(&call, total * LANES);
     if (memory == NULL)
         return failed(&call);
     Lane *signed_z = (Lane *)memory, *left = signed_z + z.numbers, *known = left + A.numbers;
@@ -685,26 +571,6 @@ static void add_products(double *square, npy_intp a, double *right, npy_intp b, 
         }
 }
 
-/* psi (N, rows, p), Y (N, rows) -> ψᵀψ (N, p, p) and ψᵀY (N, p). */
-static PyObject *products(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 2))
-        return NULL;
-    PyArrayObject *psi = doubles(&call, 0, 3), *Y = psi == NULL ? NULL : doubles(&call, 1, 2);
-    if (Y == NULL || !same("times of psi and Y", size(psi, 0), size(Y, 0)) ||
-        !same("rows of psi and Y", size(psi, 1), size(Y, 1)))
-        return failed(&call);
-    const npy_intp N = size(psi, 0), rows = size(psi, 1), p = size(psi, 2);
-    PyArrayObject *square = fresh(&call, 3, (npy_intp[]){N, p, p});
-    PyArrayObject *right = square == NULL ? NULL : fresh(&call, 2, (npy_intp[]){N, p});
-    if (right == NULL)
-        return failed(&call);
-    add_products(data(square), p, data(right), 1, data(psi), data(Y), N, rows, p, 1);
-    return results(&call, 2, square, right);
-}
-
 /* psi (K, s + 1, rows, p), Y (K, s + 1, rows, c) -> [ψᵀψ | ψᵀY] (K, s + 1, p, p + c). */
 static PyObject *outer_products(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
@@ -725,101 +591,6 @@ static PyObject *outer_products(PyObject *module, PyObject *const *given, Py_ssi
     return results(&call, 1, out);
 }
 
-/* psi (N, rows, p), Y (N, rows) -> the largest entry of each row of them, (rows,) both. */
-static PyObject *residual_sizes(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 2))
-        return NULL;
-    PyArrayObject *psi = doubles(&call, 0, 3), *Y = psi == NULL ? NULL : doubles(&call, 1, 2);
-    if (Y == NULL || !same("times of psi and Y", size(psi, 0), size(Y, 0)) ||
-        !same("rows of psi and Y", size(psi, 1), size(Y, 1)))
-        return failed(&call);
-    const npy_intp N = size(psi, 0), rows = size(psi, 1), p = size(psi, 2);
-    PyArrayObject *in_psi = zeros(&call, 1, &rows);
-    PyArrayObject *in_Y = in_psi == NULL ? NULL : zeros(&call, 1, &rows);
-    if (in_Y == NULL)
-        return failed(&call);
-    const double *one = data(psi), *other = data(Y);
-    for (npy_intp t = 0; t < N; t++)
-        for (npy_intp i = 0; i < rows; i++, other++) {
-            double most = data(in_psi)[i];
-            for (npy_intp j = 0; j < p; j++, one++)
-                most = larger(most, fabs(*one));
-            data(in_psi)[i] = most;
-            data(in_Y)[i] = larger(data(in_Y)[i], fabs(*other));
-        }
-    return results(&call, 2, in_psi, in_Y);
-}
-
-/* out (M, n) = offset (M, n) + gain (M, p, n)ᵀ eta (M, p), with n known to the compiler. */
-#define MAPPED(n)                                                                                  \
-    case n:                                                                                        \
-        for (npy_intp t = 0; t < M; t++, eta += p, out += n) {                                     \
-            double sum[n];                                                                         \
-            memcpy(sum, offset + t * n, sizeof(sum));                                              \
-            for (npy_intp k = 0; k < p; k++)                                                       \
-                for (int i = 0; i < n; i++)                                                        \
-                    sum[i] += eta[k] * gain[(t * p + k) * n + i];                                  \
-            memcpy(out, sum, sizeof(sum));                                                         \
-        }                                                                                          \
-        break
-
-static void mapped(double *restrict out, const double *restrict offset, const double *restrict gain,
-                   const double *restrict eta, npy_intp M, npy_intp n, npy_intp p)
-{
-    switch (n) {
-        MAPPED(1);
-        MAPPED(2);
-        MAPPED(3);
-        MAPPED(4);
-        MAPPED(5);
-        MAPPED(6);
-        MAPPED(7);
-        MAPPED(8);
-    default:
-        for (npy_intp t = 0; t < M; t++, eta += p, out += n) {
-            memcpy(out, offset + t * n, n * sizeof(double));
-            for (npy_intp k = 0; k < p; k++)
-                for (npy_intp i = 0; i < n; i++)
-                    out[i] += eta[k] * gain[(t * p + k) * n + i];
-        }
-    }
-}
-
-/* offset (M, n), gain (M, n, p), eta (g, M, p) -> offset + gain eta, (g, M, n). */
-static PyObject *affine_map(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 3))
-        return NULL;
-    PyArrayObject *offset = doubles(&call, 0, 2);
-    PyArrayObject *gain = offset == NULL ? NULL : doubles(&call, 1, 3);
-    PyArrayObject *eta = gain == NULL ? NULL : doubles(&call, 2, 3);
-    if (eta == NULL || !same("times of offset and gain", size(offset, 0), size(gain, 0)) ||
-        !same("states of offset and gain", size(offset, 1), size(gain, 1)) ||
-        !same("times of gain and eta", size(gain, 0), size(eta, 1)) ||
-        !same("parameters of gain and eta", size(gain, 2), size(eta, 2)))
-        return failed(&call);
-    const npy_intp M = size(gain, 0), n = size(gain, 1), p = size(gain, 2), g = size(eta, 0);
-    PyArrayObject *out = fresh(&call, 3, (npy_intp[]){g, M, n});
-    double *turned = out == NULL ? NULL : scratch(&call, M * n * p);
-    if (turned == NULL)
-        return failed(&call);
-    for (npy_intp t = 0; t < M; t++)
-        for (npy_intp i = 0; i < n; i++)
-            for (npy_intp k = 0; k < p; k++)
-                turned[(t * p + k) * n + i] = data(gain)[(t * n + i) * p + k];
-    for (npy_intp i = 0; i < g; i++)
-        mapped(data(out) + i * M * n, data(offset), turned, data(eta) + i * M * p, M, n, p);
-    return results(&call, 1, out);
-}
-
 PyMethodDef observer_kernels[] = {
-    KERNEL(entry_sizes),    KERNEL(largest_entry),      KERNEL(in_frame),
-    KERNEL(driven),         KERNEL(regression_signals), KERNEL(products),
-    KERNEL(outer_products), KERNEL(residual_sizes),     KERNEL(affine_map),
-    {NULL, NULL, 0, NULL},
+    KERNEL(in_frame), KERNEL(regression_signals), KERNEL(outer_products), {NULL, NULL, 0, NULL},
 };

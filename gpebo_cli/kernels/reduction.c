@@ -202,7 +202,7 @@ static int elimination(Call *call, Py_ssize_t place, const Model *m, Elimination
     el->Z1 = data(Z1);
     PyArrayObject *where = fresh_indices(call, 4 * size);
     const npy_intp a = el->a, widest = r > n ? r : n;
-    double *memory = where ? scratch(call, LANES * (4 * n * size + size * size + 2 * a * r +
+    double *memory = where ? old_scratch(call, LANES * (4 * n * size + size * size + 2 * a * r +
                                                     size * n + 2 * n * n + n) +
                                                2 * widest * widest * (LANES + 1))
                            : NULL;
@@ -342,7 +342,7 @@ static PyObject *all_levels(PyObject *module, PyObject *const *given, Py_ssize_t
     PyArrayObject *smallest = known ? fresh(&call, 2, (npy_intp[]){times, 3}) : NULL;
     PyArrayObject *dynamics = smallest ? fresh(&call, 3, (npy_intp[]){times, d, d}) : NULL;
     int *closer = dynamics ? integers(&call, times) : NULL;
-    double *inverse = closer ? scratch(&call, LANES * (r * r + 2 * n * n)) : NULL;
+    double *inverse = closer ? old_scratch(&call, LANES * (r * r + 2 * n * n)) : NULL;
     if (inverse == NULL)
         return failed(&call);
     double *AT = inverse + r * r * LANES, *of_z = AT + n * n * LANES;
@@ -446,7 +446,7 @@ static int forcing(Call *call, const Model *m, Forcing *f)
         if (all[i]->times != f->times && !same("times of inputs", all[i]->times, 1))
             return 0;
     const npy_intp n = m->n, width = f->inputs + f->unknowns;
-    double *memory = scratch(call, LANES * (m->mu + 1) * (n * width + width + n));
+    double *memory = old_scratch(call, LANES * (m->mu + 1) * (n * width + width + n));
     if (memory == NULL)
         return 0;
     f->of_B = memory;
@@ -645,7 +645,7 @@ static PyObject *reduced(PyObject *module, PyObject *const *given, Py_ssize_t co
         return failed(&call);
     }
     double *buffer = make(&call, n, d, times, times, &out)
-                         ? scratch(&call, LANES * (n * n + 2 * n + a * (n + 1)) + 3 * n)
+                         ? old_scratch(&call, LANES * (n * n + 2 * n + a * (n + 1)) + 3 * n)
                          : NULL;
     if (buffer == NULL)
         return failed(&call);
@@ -743,7 +743,7 @@ static PyObject *reduced_constant(PyObject *module, PyObject *const *given, Py_s
     }
     const double *Z1 = data(first_basis), *Z2 = data(second_basis);
     double *e = make(&call, n, d, times, 1, &out)
-                    ? scratch(&call, 2 * n * size_of_M + 2 * n * n + a * n + a + 2 * LANES * n)
+                    ? old_scratch(&call, 2 * n * size_of_M + 2 * n * n + a * n + a + 2 * LANES * n)
                     : NULL;
     if (e == NULL)
         return failed(&call);

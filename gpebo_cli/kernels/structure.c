@@ -92,7 +92,7 @@ static void derivative_array(const Model *m, const double *e, const double *a, d
 int prepare(Call *call, const Model *m, Look *look)
 {
     const npy_intp n = m->n, size = m->size, many = size * size;
-    double *memory = scratch(call, 2 * n * size + 4 * many + size + size * size + 3 * n * n);
+    double *memory = old_scratch(call, 2 * n * size + 4 * many + size + size * size + 3 * n * n);
     PyArrayObject *order = memory ? fresh_indices(call, size) : NULL;
     if (order == NULL)
         return 0;
@@ -328,7 +328,7 @@ static PyObject *start(PyObject *module, PyObject *const *given, Py_ssize_t coun
     PyArrayObject *Z1 = columns ? zeros(&call, 2, (npy_intp[]){n, d}) : NULL;
     PyArrayObject *Z2 = Z1 ? zeros(&call, 2, (npy_intp[]){size, a}) : NULL;
     PyArrayObject *dynamics = Z2 ? fresh(&call, 3, (npy_intp[]){1, d, d}) : NULL;
-    double *whole = dynamics ? scratch(&call, 2 * n * n) : NULL;
+    double *whole = dynamics ? old_scratch(&call, 2 * n * n) : NULL;
     if (whole == NULL)
         return failed(&call);
     memcpy(data(smallest), look.smallest, sizeof(look.smallest));
@@ -375,7 +375,7 @@ static PyObject *balance(PyObject *module, PyObject *const *given, Py_ssize_t co
         return failed(&call);
     PyArrayObject *rows = fresh(&call, 1, &n), *columns = rows ? fresh(&call, 1, &n) : NULL;
     PyArrayObject *time = columns ? fresh(&call, 1, (npy_intp[]){1}) : NULL;
-    double *most = time ? scratch(&call, 2 * n * n) : NULL;
+    double *most = time ? old_scratch(&call, 2 * n * n) : NULL;
     if (most == NULL)
         return failed(&call);
     double *row = data(rows), *column = data(columns), tau = 1.0;
@@ -448,7 +448,7 @@ static PyObject *dips(PyObject *module, PyObject *const *given, Py_ssize_t count
         return failed(&call);
     const npy_intp times = size(values, 0);
     PyArrayObject *steady = fresh(&call, 1, (npy_intp[]){1});
-    double *all = steady ? scratch(&call, 3 * times) : NULL;
+    double *all = steady ? old_scratch(&call, 3 * times) : NULL;
     if (all == NULL)
         return failed(&call);
     double is_steady = 1.0;
@@ -514,7 +514,7 @@ static PyObject *consistent(PyObject *module, PyObject *const *given, Py_ssize_t
     PyArrayObject *known = zeros(&call, 1, (npy_intp[]){1});
     PyArrayObject *x = known ? zeros(&call, 1, &n) : NULL;
     PyArrayObject *order_of = x ? fresh_indices(&call, n) : NULL;
-    double *W = order_of ? scratch(&call, 4 * n * n + 4 * n) : NULL;
+    double *W = order_of ? old_scratch(&call, 4 * n * n + 4 * n) : NULL;
     if (W == NULL)
         return failed(&call);
     double *mirrors = W + n * n, *kernel = mirrors + n * n, *image = kernel + n * n;

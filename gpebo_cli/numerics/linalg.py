@@ -7,17 +7,10 @@ singular value: a one-column product of size 1e-17 has rank 0, not 1.
 from __future__ import annotations
 
 from contextlib import suppress
-from math import prod
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, BoolArray
-
-# Rows of matrices, up to which LAPACK's calls cost more than what they compute: by elimination, and
-# where singular values are wanted.
-SMALL, _SMALL_SPECTRUM = 16, 8
-SMALL_SPECTRUM = 16  # the same for eigenvalues of symmetric matrices
 
 
 def transpose(a: Array) -> Array:
@@ -63,8 +56,7 @@ def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Ar
     """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p) or (..., p, c), singular Ω too.
 
     With Ω = U Σ Vᵀ, adj(Ω) = det(U) det(V) V diag(∏_{j≠i} σ_j) Uᵀ. The usual det(Ω)·inv(Ω) is
-    rejected: it is undefined at the start, where every extension begins at Ω = 0. The kernel does
-    it by elimination with the smallest pivot last, by which nothing is divided.
+    rejected: it is undefined at the start, where every extension begins at Ω = 0.
 
     Returns:
         det(Ω) of shape (...,), adj(Ω) b of the shape of b, and the reciprocal condition number
@@ -77,13 +69,6 @@ def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Ar
         (0.0, [0.0, 0.0])
     """
     p = omega.shape[-1]
-    if kernels.compiled is not None and 0 < p <= _SMALL_SPECTRUM:
-        shape, c = omega.shape[:-2], 1 if rhs.ndim < omega.ndim else rhs.shape[-1]
-        count = prod(shape)
-        delta, action, condition = kernels.compiled.adjugate_action(
-            omega.reshape(count, p, p), rhs.reshape(count, p, c)
-        )
-        return delta.reshape(shape), action.reshape(rhs.shape), condition.reshape(shape)
     u, sigma, vt = np.linalg.svd(omega)
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     # Products of all singular values but one, by prefix and suffix products: no division.
@@ -105,7 +90,7 @@ _SCAN_LIMIT = 1 << 11  # above this many parallel recurrences a plain loop over 
 def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
     """All z_k of z_{k+1} = a_k z_k + b_k along axis 0.
 
-    In NumPy, for few recurrences a parallel prefix scan: it composes neighbouring affine maps in
+    For few recurrences a parallel prefix scan: it composes neighbouring affine maps in
     log2(K) vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the
     recurrence. For many, the recurrence itself, each step vectorised over all of them.
 
@@ -118,14 +103,6 @@ def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
         z_0 … z_K, shape (K + 1, ...).
     """
     shape = np.broadcast_shapes(factor.shape, shift.shape)
-    if kernels.compiled is not None:
-        lanes = (shape[0], int(np.prod(shape[1:])))
-        z: Array = kernels.compiled.affine_scan(
-            np.broadcast_to(factor, shape).reshape(lanes),
-            np.broadcast_to(shift, shape).reshape(lanes),
-            np.broadcast_to(np.asarray(start, dtype=np.float64), shape[1:]).reshape(lanes[1]),
-        )
-        return z.reshape(shape[0] + 1, *shape[1:])
     out = np.empty((shape[0] + 1, *shape[1:]))
     out[0] = start
     if np.prod(shape[1:], dtype=np.int64) > _SCAN_LIMIT:
@@ -151,10 +128,19 @@ def largest(extended: Array) -> float:
 
 
 def spectral_norm(matrices: Array, columns: int) -> float:
-    """‖·‖₂ of the first columns of matrices (..., a, b), the largest of all."""
-    if kernels.compiled is not None and min(matrices.shape[-2], columns) <= SMALL_SPECTRUM:
-        found: float | None = kernels.compiled.spectral_norm(matrices, columns)
-        if found is not None:  # else not all is finite
-            return found
-    norms = np.linalg.norm(matrices[..., :columns], 2, axis=(-2, -1))
-    return float(norms.max(initial=0.0))
+    """‖·‖₂ of the first columns of matrices (..., a, b), the largest of all.
+
+    Singular values are computed only of matrices whose Frobenius norm leaves room for a larger one
+    than that of the matrix with the largest Frobenius norm.
+    """
+    flat = matrices[..., :columns].reshape(-1, matrices.shape[-2], columns)
+    size = float(np.abs(flat).max(initial=0.0))
+    if size == 0.0 or not np.isfinite(size):
+        return size
+    flat = flat / size  # squares neither overflow nor vanish
+    frobenius = np.sqrt(np.einsum("nij,nij->n", flat, flat))
+    norm = float(np.linalg.norm(flat[np.argmax(frobenius)], 2))
+    rest = flat[frobenius > norm * (1.0 + 1e-12)]
+    if len(rest) > 1:
+        norm = max(norm, float(np.linalg.norm(rest, 2, axis=(1, 2)).max()))
+    return norm * size

@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import spectral_norm
@@ -60,9 +59,6 @@ class AffineStateMap:
         offset, gain = sampler(self.offset.values), sampler(self.gain.values)
 
         def reconstruct(eta: Array) -> Array:
-            if kernels.compiled is not None and eta.ndim == gain.ndim:
-                states: Array = kernels.compiled.affine_map(offset, gain, eta)
-                return states
             return np.asarray(offset + np.matmul(gain, eta[..., None])[..., 0])
 
         return reconstruct
@@ -131,9 +127,6 @@ def log_norm(Phi: Array) -> float:
 
 def largest_entry(values: Array, first: int = 0) -> float:
     """Size of the largest entry of values (…, columns), in the columns from ``first`` on."""
-    if kernels.compiled is not None:
-        size: float = kernels.compiled.largest_entry(values, first)
-        return size
     return float(np.abs(values[..., first:]).max(initial=0.0))
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, LinearSolution, solve
@@ -178,11 +177,6 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
 
 def _driven(o: ObserverMatrices, u: Array, y: Array, columns: int) -> tuple[Array, Array]:
     """[b_0 | D_0 | 0], shape (N, k, columns), and g_y (N, e + r), of u (N, m) and y (N, r)."""
-    if kernels.compiled is not None:
-        driven: tuple[Array, Array] = kernels.compiled.driven(
-            o.from_unknowns, o.from_signals, o.g_signals, u, y, columns
-        )
-        return driven
     signals = np.concatenate([u, y], axis=1)[:, :, None]
     f = np.zeros((len(u), o.dynamics.shape[1], columns))
     f[:, :, :1] = o.from_signals @ signals

@@ -11,7 +11,7 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import SMALL_SPECTRUM, joined, orthonormal_complement, transpose
+from gpebo_cli.numerics.linalg import joined, orthonormal_complement, transpose
 from gpebo_cli.observers.reduced.split import (
     TINY,
     Frame,
@@ -294,10 +294,6 @@ def weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
         injectivity: (N,) and
         elimination: H (N or 1, n, n_b), as in ``ObserverMatrices``.
     """
-    if kernels.compiled is not None and 0 < elimination.shape[2] <= SMALL_SPECTRUM:
-        found: Array | None = kernels.compiled.weakest(injectivity, elimination)
-        if found is not None:  # else not all is finite
-            return float(found[0]), int(found[1])
     if not np.isfinite(injectivity).all():
         return float(np.inf), 0
     H = elimination if len(elimination) > 1 else np.repeat(elimination, len(injectivity), axis=0)

@@ -56,17 +56,11 @@ class Assembled:
 
     def _row_sizes(self) -> tuple[Array, Array]:
         """Largest entry of each row of ψ and of Y over the times, (e + r,) both."""
-        if kernels.compiled is not None:
-            sizes: tuple[Array, Array] = kernels.compiled.residual_sizes(self.psi, self.Y)
-            return sizes
         return np.abs(self.psi).max(axis=(0, 2), initial=0.0), np.abs(self.Y).max(axis=0)
 
 
 def _products(psi: Array, Y: Array) -> tuple[Array, Array]:
     """ψᵀψ (N, p, p) and ψᵀY (N, p) of ψ (N, rows, p) and Y (N, rows)."""
-    if kernels.compiled is not None and psi.shape[2] <= _SMALL:
-        products: tuple[Array, Array] = kernels.compiled.products(psi, Y)
-        return products
     both = outer_products(psi, Y)
     return both[..., :-1], both[..., -1]
 

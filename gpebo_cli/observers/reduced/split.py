@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import orthonormal_complement, transpose
@@ -49,9 +48,6 @@ class Frame:
 
 def entry_sizes(E: Array) -> Array:
     """Largest size of each entry of E (N, n, n) over the times, (n, n)."""
-    if kernels.compiled is not None:
-        sizes: Array = kernels.compiled.entry_sizes(E)
-        return sizes
     return np.asarray(np.abs(E).max(axis=0))
 
 

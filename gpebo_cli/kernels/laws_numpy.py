@@ -1,0 +1,83 @@
+"""Mixing, the scalar law of DREM for many gains, and how far estimates are from the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpebo_cli.kernels.arrays import Array, IntArray
+
+
+def mixed(extended: Array) -> tuple[Array, Array, Array]:
+    """Δ = det Ω (N,), Ω⁻¹𝒴 (N, p, c) and ‖Ω‖‖Ω⁻¹‖ (N,) of [Ω | 𝒴] (N, p, p + c).
+
+    Where Δ = 0 the second one is not finite.
+    """
+    p = extended.shape[1]
+    omega = extended[:, :, :p]
+    delta = np.linalg.det(omega)
+    solved = np.full((*extended.shape[:2], extended.shape[2]), np.nan)
+    regular = delta != 0.0  # by elimination, an exact zero is a pivot that is zero
+    unit = np.broadcast_to(np.eye(p), (int(np.count_nonzero(regular)), p, p))
+    both = np.concatenate([unit, extended[regular, :, p:]], axis=2)
+    solved[regular] = np.linalg.solve(omega[regular], both)
+    with np.errstate(over="ignore", invalid="ignore"):  # where Ω is 1e-160, that is singular
+        inverse = np.linalg.norm(solved[:, :, :p], axis=(1, 2))
+        condition = np.linalg.norm(omega, axis=(1, 2)) * inverse
+    return delta, solved[:, :, p:], condition
+
+
+def stepped_law(
+    length: Array, left: Array, change: Array, jump: Array, step: IntArray, partial: Array,
+    share: Array, start: Array, gains: Array,
+) -> Array:
+    """η̂ (g, M, p) where η̄ is linear in I over each step, and η̂ is continuous where η̄ jumps.
+
+    A step x = γ δI of the distance ε = η̂ − η̄, which stays accurate after convergence, is
+    ε₊ = e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄).
+
+    Args:
+        length: of the steps in I, δI ≥ 0, shape (S,).
+        left: η̄ at their left ends (S, p).
+        change: of η̄ over each (S, p).
+        jump: of η̄ at the end of each (S, p).
+        step: in which each time lies (M,).
+        partial: how far I is from its left end there (M,).
+        share: of the step that is (M,).
+        start: η̂ at the start (1 or g, p).
+        gains: γ (g, 1 or p).
+    """
+    count, p = left.shape
+    distance = np.empty((count, len(gains), p))
+    distance[0] = start - left[0]
+    for k in range(count - 1):
+        x = gains * length[k]
+        distance[k + 1] = np.exp(-x) * distance[k] - mean_decay(x) * change[k] - jump[k]
+    x = gains * partial[:, None, None]
+    eta = np.exp(-x) * distance[step]
+    eta += left[step, None] + (1.0 - mean_decay(x)) * (share[:, None] * change[step])[:, None]
+    return np.ascontiguousarray(np.swapaxes(eta, 0, 1))
+
+
+def mean_decay(x: Array) -> Array:
+    """(1 − e^{−x})/x and its limit 1, of each entry of x (...,)."""
+    return np.divide(-np.expm1(-x), x, out=np.ones_like(x), where=x > 0.0)
+
+
+def squared_errors(
+    eta: Array, truth: Array, in_eta: Array, offset: Array, gain: Array, x: Array, in_x: Array
+) -> tuple[Array, Array]:
+    """Weighted squares of η̂ − η and of x̂ − x, x̂ = offset + gain η̂, both (g, M).
+
+    Args:
+        eta: η̂ (g, M, p).
+        truth: η (M or 1, p).
+        in_eta: weights of its components (p,); with the weight 0 a component may be NaN.
+        offset: of x̂, (M or 1, n).
+        gain: of x̂, (M or 1, n, p).
+        x: the true states (M or 1, n).
+        in_x: their weights (n,).
+    """
+    some, seen = in_eta != 0.0, in_x != 0.0
+    of_eta = np.einsum("gmj,j->gm", (eta - truth)[..., some] ** 2, in_eta[some])
+    error = np.matmul(gain[:, seen], eta[..., None])[..., 0] + (offset - x)[:, seen]
+    return of_eta, np.einsum("gmi,i->gm", error**2, in_x[seen])
