@@ -22,7 +22,7 @@ from gpebo_cli.observers.canonical import (
 )
 from gpebo_cli.results.files import make_folder
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line, save
-from gpebo_cli.settings import ObserverSettings, Settings, TimeSettings
+from gpebo_cli.settings import Settings, TimeSettings
 
 IMAGES = Path(__file__).parent / "img"
 HORIZON = 20.0
@@ -81,19 +81,19 @@ def sampled_orders(path: Path) -> None:
     plant = plant_from_mapping(yaml.safe_load(text))
     time = TimeSettings(0.0, HORIZON, 20_001)
 
-    def estimates(observer: ObserverSettings) -> tuple[Array, Array]:
+    def estimates(observer: dict[str, object]) -> tuple[Array, Array]:
         settings = Settings({}, {"name": "ls_drem"}, time=time, observer=observer)
         estimation = run_experiment(settings, plant).estimation
         assert estimation is not None  # noqa: S101  an observer was asked for
         return estimation.t, estimation.states[0]
 
-    t, continuous = estimates(ObserverSettings())
+    t, continuous = estimates({"name": "gpebo"})
     steps = np.array([0.2, 0.1, 0.05, 0.02, 0.01, 0.005])
     curves = []
     for k, hold in enumerate(("zoh", "linear")):
         errors = []
         for step in steps:
-            at, sampled = estimates(ObserverSettings(sample_time=float(step), hold=hold))
+            at, sampled = estimates({"name": "gpebo", "sample_time": float(step), "hold": hold})
             same = np.searchsorted(t, at - 1e-9)
             errors.append(np.abs(sampled - continuous[same]).max())
         curves.append(Curve(steps, np.array(errors), hold, replace(line(k), dots=True)))
@@ -113,7 +113,7 @@ def unbounded(path: Path) -> None:
                 plant={},
                 estimator={"name": "least_squares", "f0": 1e-8},
                 time=TimeSettings(horizon=40.0),
-                observer=ObserverSettings(remedy=remedy),
+                observer={"name": "gpebo", "remedy": remedy},
             ),
             system,
         )

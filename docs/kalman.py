@@ -21,7 +21,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results.files import write_text
 from gpebo_cli.results.style import Curve, Panel, compose, line, save
-from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings
+from gpebo_cli.settings import NoiseSettings, Settings
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "howto" / "kalman.md"
@@ -35,7 +35,7 @@ class Method:
     """A column of the table."""
 
     label: str
-    observer: ObserverSettings
+    observer: dict[str, Any]
     estimator: dict[str, Any]
 
 
@@ -45,11 +45,11 @@ def methods(process: float) -> tuple[Method, ...]:
     Least squares starts from the variance the filter starts from, α = 1/V apart; the filter with
     V as the only noise is then the same estimate in other coordinates.
     """
-    kalman = ObserverSettings(name="kalman_bucy")
-    driven = ObserverSettings(name="kalman_bucy", process=process)
+    kalman = {"name": "kalman_bucy"}
+    driven = {"name": "kalman_bucy", "process": process}
     return (
-        Method("gpebo, least_squares", ObserverSettings(), {"name": "least_squares", "f0": 1e-6}),
-        Method("gpebo, ls_drem", ObserverSettings(), {"name": "ls_drem", "gamma": 10}),
+        Method("gpebo, least_squares", {"name": "gpebo"}, {"name": "least_squares", "f0": 1e-6}),
+        Method("gpebo, ls_drem", {"name": "gpebo"}, {"name": "ls_drem", "gamma": 10}),
         Method("kalman_bucy", kalman, {"name": "drem"}),
         Method(f"kalman_bucy, process {process:g}", driven, {"name": "drem"}),
     )

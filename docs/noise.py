@@ -17,7 +17,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results.figures import describe
 from gpebo_cli.results.files import make_folder, write_text
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line, save
-from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings, TimeSettings
+from gpebo_cli.settings import NoiseSettings, Settings, TimeSettings
 
 HERE = Path(__file__).parent
 PAGE = HERE / "howto" / "noise.md"
@@ -137,7 +137,7 @@ def step_figure(path: Path) -> None:
     [panels] = describe(run_experiment(settings, system), ["parameters"]).values()
     renewed = replace(
         settings, estimator={"name": "least_squares", "beta": 0.0},
-        observer=ObserverSettings(remedy="reset", reset_times=[10.0], reset_keep=0.0),
+        observer={"name": "gpebo", "remedy": "reset", "reset_times": [10.0], "reset_keep": 0.0},
     )
     [again] = describe(run_experiment(renewed, system), ["parameters"]).values()
     style = line(len(panels[0].curves) + 1)  # the next one looks like the truth

@@ -27,17 +27,17 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ belo
     )
     from gpebo_cli.model.descriptor import DescriptorSystem
     from gpebo_cli.model.functions import Names, system_from_functions
-    from gpebo_cli.observers import observe
-    from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
+    from gpebo_cli.observers import Measurements, observe
+    from gpebo_cli.settings import SolverSettings, TimeSettings
     from gpebo_cli.simulation.simulate import simulate
 
 __all__ = [
     "ConfigError",
     "DescriptorSystem",
     "GpeboError",
+    "Measurements",
     "ModelError",
     "Names",
-    "ObserverSettings",
     "Result",
     "SolverError",
     "SolverSettings",
@@ -64,8 +64,8 @@ _HOMES = {
     "importers": (
         "from_control", "from_file", "from_matrices", "from_mechanics", "from_netlist",
     ),
-    "observers": ("observe",),
-    "settings": ("ObserverSettings", "SolverSettings", "TimeSettings"),
+    "observers": ("Measurements", "observe"),
+    "settings": ("SolverSettings", "TimeSettings"),
     "simulation.simulate": ("simulate",),
     "model.descriptor": ("DescriptorSystem",),
     "model.functions": ("Names", "system_from_functions"),

@@ -1,8 +1,11 @@
 """From a plain mapping to a frozen dataclass: every key known, every value of its type.
 
 The dataclass is the schema. A field is found by its name, or by ``metadata["key"]`` where the
-name is a word of Python's (``lambda``). Numbers may come as text: YAML 1.1 reads ``1e-9`` as a
-string, and refusing it would help nobody.
+name is a word of Python's (``lambda``). ``metadata["range"]`` is the accepted range of a number,
+ends included, and ``metadata["positive"]`` asks for more than zero. A field whose value is one of
+several objects has ``metadata["one_of"]``, dataclasses by name: the key says which, and their
+settings are keys beside it. Numbers may come as text: YAML 1.1 reads ``1e-9`` as a string, and
+refusing it would help nobody.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import math
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import lru_cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -67,20 +70,67 @@ def read(cls: type[T], mapping: object, where: str) -> T:
     if not is_dataclass(cls):
         raise TypeError(f"{cls!r} is not a dataclass")
     hints = _hints(cls)
-    by_key = {field.metadata.get("key", field.name): field for field in fields(cls)}
+    by_key, known = _by_key(cls), keys(cls)
     for key in mapping:
-        if key not in by_key:
+        if key not in known:
             raise ConfigError(
-                f"{where}.{key}: no such key; {where} has {', '.join(by_key)}"
-                + nearest(str(key), by_key)
+                f"{where}.{key}: no such key; {where} has {', '.join(known)}"
+                + nearest(str(key), known)
             )
     values: dict[str, Any] = {}
     for key, field in by_key.items():
-        if key in mapping:
-            values[field.name] = convert(mapping[key], hints[field.name], f"{where}.{key}")
+        if "one_of" in field.metadata:
+            values[field.name] = _chosen(field, key, mapping, where)
+        elif key in mapping:
+            value = convert(mapping[key], hints[field.name], f"{where}.{key}")
+            _check_range(value, field, f"{where}.{key}")
+            values[field.name] = value
         elif field.default is MISSING and field.default_factory is MISSING:
             raise ConfigError(f"{where}.{key} is missing; it has no default")
     return cls(**values)
+
+
+def keys(cls: type) -> list[str]:
+    """The keys that :func:`read` knows for a dataclass, those of what it chooses from included."""
+    found: dict[str, None] = {}
+    for key, field in _by_key(cls).items():
+        found[key] = None
+        for option in field.metadata.get("one_of", {}).values():
+            found |= dict.fromkeys(keys(option))
+    return list(found)
+
+
+def _by_key(cls: Any) -> dict[str, Field[Any]]:
+    return {field.metadata.get("key", field.name): field for field in fields(cls)}
+
+
+def _chosen(field: Field[Any], key: str, mapping: Mapping[Any, Any], where: str) -> Any:
+    """The one of several objects that ``mapping[key]`` names, with its own keys as its settings."""
+    options = field.metadata["one_of"]
+    default = next(name for name, option in options.items() if isinstance(field.default, option))
+    chosen = convert(mapping.get(key, default), Literal[tuple(options)], f"{where}.{key}")
+    own = keys(options[chosen])
+    for name, option in options.items():
+        for other, its in _by_key(option).items():
+            make = its.default_factory
+            usual = its.default if make is MISSING else make()
+            if other not in own and mapping.get(other, usual) != usual:
+                raise ConfigError(
+                    f"{where}.{other} is of {where}.{key}={name}, but the {key} is {chosen}"
+                )
+    return read(options[chosen], {k: mapping[k] for k in own if k in mapping}, where)
+
+
+def _check_range(value: Any, field: Field[Any], where: str) -> None:
+    if value is None:
+        return
+    if "range" in field.metadata:
+        low, high = field.metadata["range"]
+        if not low <= value <= high:
+            upto = f"to {high:g}" if math.isfinite(high) else "or more"
+            raise ConfigError(f"{where}: expected {low:g} {upto}, got {value:g}")
+    if field.metadata.get("positive") and value <= 0:
+        raise ConfigError(f"{where}: expected a positive number, got {value:g}")
 
 
 @lru_cache(maxsize=64)

@@ -2,7 +2,7 @@
 
 These are the only description of a run below the command layer: no Hydra, no files. The reader
 in ``reading.py`` builds them from a plain mapping and refuses keys that are not fields here.
-The plant and the estimator are described by their own modules, found by name.
+The plant, the observer and the estimator are described by their own modules, found by name.
 """
 
 from __future__ import annotations
@@ -43,45 +43,6 @@ class SolverSettings:
     max_elements: int = 200_000
     max_strangeness_index: int = 6
     rank_tol: float = 1e-10  # singular values below rank_tol * (size of the factors) are zero
-
-
-@dataclass(frozen=True)
-class ObserverSettings:
-    """Which observer, and what it is free to choose."""
-
-    name: Literal["gpebo", "canonical", "kalman_bucy", "none"] = "gpebo"
-    # Where the dynamic extension starts: by state name, or a list of n_a numbers; None: what the
-    # plant proposes, else zero.
-    xi_a0: Mapping[str, float] | list[float] | None = None
-    # gpebo: the whole residual, or its last r rows as the paper has it.
-    regression: Literal["projected", "paper"] = "projected"
-    # gpebo: what is done about a Φ that grows (docs/howto/unstable.md).
-    remedy: Literal["none", "reset", "output_injection", "current_coordinates"] = "none"
-    # of output_injection: n rows, as many columns as outputs, numbers or expressions of t; None:
-    # from a Riccati equation.
-    injection: list[list[float | str]] | None = None
-    # of reset: at intervals, and at these times; neither: where Φ has grown a hundredfold.
-    reset_interval: float | None = None  # seconds
-    reset_times: list[float] = field(default_factory=list)  # seconds
-    reset_keep: float = 1.0  # share of what is known that counts after a reset; 0: learn anew
-    # canonical: the output that Proposition 4 rests on (None: the first that fits), its gain
-    # (diagonal, remark4, or two expressions of t) and the start of its state.
-    output: str | None = None
-    L_w: str | list[str] = "diagonal"
-    r0: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    # How much each output counts, by order or name (absent: 1); only ratios matter. None: equally.
-    weights: Mapping[str, float] | list[float] | None = None
-    # kalman_bucy, of what is estimated, the unknowns and w_<state>: variance at the start, and
-    # intensity of the white noise that drives it (one number, a list, or by name; absent: the
-    # default of P0, no noise).
-    P0: float | list[float] | Mapping[str, float] = 10.0
-    process: float | list[float] | Mapping[str, float] = 0.0
-    # Where the noise leaves measurements exact: standard deviation of the noise assumed instead,
-    # relative to each one's own size, at the noise's sample time.
-    regularisation: float = 1e-3
-    # Between samples of an observer in discrete time (None: continuous), and what it assumes there.
-    sample_time: float | None = None  # seconds
-    hold: Literal["zoh", "linear"] = "zoh"
 
 
 @dataclass(frozen=True)
@@ -130,7 +91,7 @@ class Settings:
     estimator: Mapping[str, object]
     time: TimeSettings = field(default_factory=TimeSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
-    observer: ObserverSettings = field(default_factory=ObserverSettings)
+    observer: Mapping[str, object] = field(default_factory=lambda: {"name": "gpebo"})
     excitation: ExcitationSettings = field(default_factory=ExcitationSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
     noise: NoiseSettings = field(default_factory=NoiseSettings)

@@ -18,7 +18,7 @@ from gpebo_cli.experiment.result import (
 )
 from gpebo_cli.findings import Assumption, Direction, Requirement
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
-from gpebo_cli.settings import ObserverSettings, OutputSettings, Settings
+from gpebo_cli.settings import OutputSettings, Settings
 
 STATES = ("e1", "e2", "il", "ir1", "ir2", "iv")
 UNITS = {"e1": "V", "e2": "V", "il": "A", "ir1": "A", "ir2": "A", "iv": "A", "V": "V", "y": "A"}
@@ -151,7 +151,7 @@ def without_observer(result: RunResult) -> RunResult:
     """The same run with ``observer=none``."""
     return replace(
         result,
-        settings=replace(result.settings, observer=ObserverSettings(name="none")),
+        settings=replace(result.settings, observer={"name": "none"}),
         regression=None,
         excitation=None,
         estimation=None,

@@ -8,6 +8,7 @@ from typing import Any
 
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.observers import Measurements
 
 DATA = Path(__file__).parent / "data"
 CONF = Path(__file__).parent.parent / "conf"
@@ -40,3 +41,8 @@ def problem(path: Path) -> tuple[dict[str, Any], DescriptorSystem]:
         "initial_state": data["x0"],
     }
     return data, plant_from_mapping(mapping, path.name)
+
+
+def seen(signals):
+    """What an observer gets to see of a simulation."""
+    return Measurements(signals.inputs, signals.outputs)

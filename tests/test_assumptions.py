@@ -14,13 +14,13 @@ from plants import shipped
 
 from gpebo_cli.experiment.assumptions import check
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.settings import ObserverSettings, Settings
+from gpebo_cli.settings import Settings
 
 ROOT = Path(__file__).parent.parent
 
 
 def found(system, **observer):
-    settings = Settings(plant={}, estimator={}, observer=ObserverSettings(**observer))
+    settings = Settings(plant={}, estimator={}, observer={"name": "gpebo", **observer})
     return {a.name: a for a in check(settings, system)}
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import reference, shipped
+from plants import reference, seen, shipped
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.canonical import unknown_input_matrices
-from gpebo_cli.settings import ObserverSettings, Settings, SolverSettings, TimeSettings
+from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
@@ -20,7 +20,7 @@ def run(system, estimator=None, samples=2001, **observer):
     settings = Settings(
         plant={},
         estimator=estimator or {"name": "ls_drem", "gamma": 100.0, "f0": 1e-6},
-        observer=ObserverSettings(name="canonical", **observer),
+        observer={"name": "canonical", **observer},
         time=TimeSettings(samples=samples),
     )
     return run_experiment(settings, system)
@@ -92,9 +92,7 @@ def test_all_suitable_outputs_are_stacked():
         C=[[1, 0, 0, 0, 0], [0.5, 0, "c1", "c2", 0], [0, "cos(t)", 0, 0, 0]],
     )
     signals = simulate(system, TimeSettings(), SOLVER).signals
-    observation = observe(
-        system, signals.inputs, signals.outputs, ObserverSettings(name="canonical"), SOLVER
-    )
+    observation = observe(system, seen(signals), SOLVER, name="canonical")
     assert observation.regression.psi.values.shape[2] == 2
     assert observation.regression.parameters == ("e0_za1", "e0_za2")
 

@@ -19,9 +19,9 @@ from gpebo_cli.cli.app import COMMANDS
 from gpebo_cli.cli.completion import SCRIPTS, candidates
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.results.figures import FIGURES
 from gpebo_cli.results.names import FIGURE_NAMES, METRICS
-from gpebo_cli.settings import ObserverSettings
 
 
 def names(*words):
@@ -107,7 +107,7 @@ def test_what_cannot_be_completed_is_nothing():
 def test_names_that_are_written_twice_agree():
     assert tuple(FIGURES) == FIGURE_NAMES
     assert tuple(field.name for field in fields(Metrics)) == METRICS
-    regressions = get_args(get_type_hints(ObserverSettings)["regression"])
+    regressions = get_args(get_type_hints(Gpebo)["regression"])
     offered = set(names("run", "observer.regression="))
     assert offered == {f"observer.regression={name}" for name in regressions}
 

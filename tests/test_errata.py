@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plants import CONF, shipped
+from plants import CONF, seen, shipped
 from regressions import ETA, fading, regression
 
 from gpebo_cli import estimators
@@ -21,7 +21,7 @@ from gpebo_cli.observers.canonical import (
     unknown_input_matrices,
 )
 from gpebo_cli.observers.reduced.matrices import observer_matrices
-from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
+from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
@@ -30,7 +30,7 @@ T = np.linspace(0.0, 20.0, 401)
 
 def observation(system, **settings):
     signals = simulate(system, TimeSettings(), SOLVER).signals
-    return observe(system, signals.inputs, signals.outputs, ObserverSettings(**settings), SOLVER)
+    return observe(system, seen(signals), SOLVER, **settings)
 
 
 def test_circuit_regressor_is_identically_zero_as_printed():
@@ -213,10 +213,7 @@ def test_proposition_3_regressor_is_a_transposed_product():
     """y_k − C_k ξ_a = −C_k Φ_a θ_a; the printed −C_k Φ_a with C_k a column has no meaning."""
     system = shipped("canonical")
     result = simulate(system, TimeSettings(), SOLVER)
-    found = observe(
-        system, result.signals.inputs, result.signals.outputs,
-        ObserverSettings(name="canonical"), SOLVER,
-    )
+    found = observe(system, seen(result.signals), SOLVER, name="canonical")
     eta = found.truth(T, np.broadcast_to(system.theta, (len(T), system.q)), result.signals.states)
     regression = found.regression
     np.testing.assert_allclose(regression.Y(T), regression.psi(T) @ eta[0], atol=1e-10)

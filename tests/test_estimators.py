@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import reference, shipped
+from plants import reference, seen, shipped
 from regressions import ETA, adjugate, fading, integrate, regression, three
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._extension import kreisselmeier, lion
 from gpebo_cli.observers import observe
-from gpebo_cli.settings import ObserverSettings, SolverSettings, TimeSettings
+from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 T = np.linspace(0, 10, 101)
@@ -214,9 +214,7 @@ def test_mixed_regression_holds(make):
 def test_ls_drem_delta_is_the_reference_one():
     system = shipped("circuit")
     signals = simulate(system, TimeSettings(), SolverSettings()).signals
-    observation = observe(
-        system, signals.inputs, signals.outputs, ObserverSettings(), SolverSettings()
-    )
+    observation = observe(system, seen(signals), SolverSettings())
     rows = reference("circuit")["at"]
     t = np.array([row["t"] for row in rows])
     found = estimate("ls_drem", observation.regression, t, alpha=1, f0=1).delta(t)[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import reference, shipped
+from plants import reference, seen, shipped
 from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec
 
@@ -13,7 +13,6 @@ from gpebo_cli.evidence.metrics import settling_time, time_rms
 from gpebo_cli.observers import observe
 from gpebo_cli.settings import (
     ExcitationSettings,
-    ObserverSettings,
     SolverSettings,
     TimeSettings,
 )
@@ -34,9 +33,7 @@ def outer(regression):
 def test_eigenvalues_of_the_circuit_match_the_reference():
     system = shipped("circuit")
     signals = simulate(system, TimeSettings(), SolverSettings()).signals
-    regression = observe(
-        system, signals.inputs, signals.outputs, ObserverSettings(), SolverSettings()
-    ).regression
+    regression = observe(system, seen(signals), SolverSettings()).regression
     rows = reference("circuit")["at"]
     t = np.array([row["t"] for row in rows])
     found = assess(regression, t, ExcitationSettings())

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plants import shipped
+from plants import seen, shipped
 from test_cli import FAST, folders, gpebo
 from test_observer import ROTATING
 
@@ -22,12 +22,11 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers import SignalNoise, observe
-from gpebo_cli.observers.kalman_bucy import noise_model, reduced_system
+from gpebo_cli.observers._riccati import run_filter
+from gpebo_cli.observers.kalman_bucy import filter_model, noise_model
 from gpebo_cli.observers.reduced.matrices import observer_matrices
-from gpebo_cli.observers.riccati import run_filter
 from gpebo_cli.settings import (
     NoiseSettings,
-    ObserverSettings,
     Settings,
     SolverSettings,
     TimeSettings,
@@ -43,7 +42,7 @@ def run(system: DescriptorSystem, horizon: float = 20.0, **more: Any) -> RunResu
         Settings(
             plant={}, estimator=more.pop("estimator", {"name": "drem"}), noise=noise,
             time=TimeSettings(horizon=horizon, samples=401),
-            observer=ObserverSettings(**{"name": "kalman_bucy", **more}),
+            observer={"name": "kalman_bucy", **more},
         ),
         system,
     )
@@ -55,7 +54,7 @@ def assumption(result: RunResult, name: str):
 
 def in_basis(system: DescriptorSystem, t: Array, inside: Array, u: Array, y: Array, like=None):
     o = observer_matrices(system, t, inside, 1e-10, like)
-    return reduced_system(o, u, y), o.split.basis, o
+    return filter_model(o, u, y), o.split.basis, o
 
 
 @pytest.mark.parametrize("name", ["circuit", "descriptor", "rotating"])
@@ -209,7 +208,7 @@ def test_window_is_exciting_but_not_uniformly_observable():
     # Yet the filter knows the state: what it learnt in three seconds it does not forget.
     assert result.metrics.final_error_states[0] < 1e-6
     settings = replace(
-        result.settings, observer=ObserverSettings(name="kalman_bucy"), estimator={"name": "drem"}
+        result.settings, observer={"name": "kalman_bucy"}, estimator={"name": "drem"}
     )
     failed = [a.name for a in check(settings, result.system) if not a.holds]
     assert failed == ["uniform observability"]
@@ -238,10 +237,7 @@ def test_settings_that_do_not_fit(settings, message):
     system = shipped("descriptor")
     signals = simulate(system, TimeSettings(horizon=1.0), SOLVER).signals
     with pytest.raises(ConfigError, match=message.replace(".", r"\.")):
-        observe(
-            system, signals.inputs, signals.outputs,
-            ObserverSettings(name="kalman_bucy", **settings), SOLVER,
-        )
+        observe(system, seen(signals), SOLVER, name="kalman_bucy", **settings)
 
 
 def test_command_line(tmp_path):

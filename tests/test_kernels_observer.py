@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_paths import by_both, needs_kernels
+from plants import seen
 
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
@@ -17,7 +18,6 @@ from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced import matrices
 from gpebo_cli.observers.reduced.regression import regression_signals
 from gpebo_cli.settings import (
-    ObserverSettings,
     SolverSettings,
     TimeSettings,
 )
@@ -221,8 +221,6 @@ def test_a_plant_without_inputs_is_observed():
         "A": [["-1 - t/9", 1], [1, 1]], "C": [[0, 1]], "outputs": ["y"], "initial_state": [1, -1],
     })
     signals = simulate(system, TimeSettings(horizon=3.0), SolverSettings()).signals
-    one, other = by_both(lambda: observe(
-        system, signals.inputs, signals.outputs, ObserverSettings(), SolverSettings()
-    ))
+    one, other = by_both(lambda: observe(system, seen(signals), SolverSettings()))
     close(one.regression.psi.values, other.regression.psi.values)
     close(one.regression.Y.values, other.regression.Y.values)

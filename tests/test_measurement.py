@@ -24,11 +24,10 @@ from gpebo_cli.experiment.noise import (
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers import observe
+from gpebo_cli.observers import Measurements, observe
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import (
     NoiseSettings,
-    ObserverSettings,
     Settings,
     SolverSettings,
     TimeSettings,
@@ -192,9 +191,7 @@ def test_the_regression_of_noisy_signals(shape):
     system = shipped("descriptor")
     noise = {"outputs": 0.3, "inputs": 0.2, "sample_time": 0.1, "shape": shape, "seed": 5}
     _, measured = seen(system, **noise)
-    regression = observe(
-        system, measured.inputs, measured.outputs, ObserverSettings(), SOLVER
-    ).regression
+    regression = observe(system, Measurements(measured.inputs, measured.outputs), SOLVER).regression
 
     def blocks(t):
         c = system.coefficients.taylor(np.array([t]), 0)

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.schema import nearest, read
-from gpebo_cli.settings import ObserverSettings, OutputSettings, SolverSettings, TimeSettings
+from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,12 @@ def test_an_unknown_key_is_answered_with_the_nearest():
 
 def test_a_wrong_choice_names_what_is_accepted():
     with pytest.raises(ConfigError, match=r"projected or paper, got 'papre'; did you mean"):
-        read(ObserverSettings, {"regression": "papre"}, "observer")
+        read(Gpebo, {"regression": "papre"}, "observer")
 
 
 @pytest.mark.parametrize("value", [None, [1.0, 0.0], {"e1": 1.0}])
 def test_unions_take_each_of_their_types(value):
-    assert read(ObserverSettings, {"xi_a0": value}, "observer").xi_a0 == value
+    assert read(Gpebo, {"xi_a0": value}, "observer").xi_a0 == value
 
 
 def test_a_union_that_fits_nothing_names_all_its_types():

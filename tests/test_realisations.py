@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plants import shipped
+from plants import seen, shipped
 from regressions import ETA, regression, three
 from test_cli import folders, gpebo
 
@@ -21,7 +21,6 @@ from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.settings import (
     NoiseSettings,
-    ObserverSettings,
     Settings,
     SolverSettings,
     TimeSettings,
@@ -52,7 +51,8 @@ def two_outputs(**more):
 def settings(system, estimator, horizon=4.0, weights=None, **noise):
     return Settings(
         plant={}, estimator=estimator, time=TimeSettings(horizon=horizon, samples=11),
-        observer=ObserverSettings(weights=weights), noise=NoiseSettings(name="gaussian", **noise),
+        observer={"name": "gpebo", "weights": weights},
+        noise=NoiseSettings(name="gaussian", **noise),
     )
 
 
@@ -161,8 +161,7 @@ def test_equal_weights_change_nothing():
     system = two_outputs()
     signals = simulate(system, TimeSettings(horizon=2.0), SolverSettings()).signals
     plain, equal = (
-        observe(system, signals.inputs, signals.outputs, ObserverSettings(weights=w),
-                SolverSettings()).regression
+        observe(system, seen(signals), SolverSettings(), weights=w).regression
         for w in (None, {"y1": 0.1, "y2": 0.1})
     )
     assert plain.Y.values.tobytes() == equal.Y.values.tobytes()
@@ -194,10 +193,7 @@ def test_weighted_elimination_is_weighted_least_squares():
     assert residual @ residual == pytest.approx(left @ W @ left, rel=1e-12)
     # The observer's equation stays true: w' = A_0 w + b_0 + D_0 θ for any elimination.
     signals = simulate(system, TimeSettings(horizon=3.0), SolverSettings()).signals
-    observation = observe(
-        system, signals.inputs, signals.outputs, ObserverSettings(weights=[1, 0.3, 0.05]),
-        SolverSettings(),
-    )
+    observation = observe(system, seen(signals), SolverSettings(), weights=[1, 0.3, 0.05])
     at = np.linspace(0.0, 3.0, 13)
     eta = observation.truth(at, system.theta_at(at), signals.states)
     regression = observation.regression
@@ -210,8 +206,9 @@ def test_weights_of_the_canonical_observer():
     system = shipped("canonical")
     signals = simulate(system, TimeSettings(horizon=2.0), SolverSettings()).signals
     one, half = (
-        observe(system, signals.inputs, signals.outputs,
-                ObserverSettings(name="canonical", weights=w), SolverSettings()).regression
+        observe(
+            system, seen(signals), SolverSettings(), name="canonical", weights=w
+        ).regression
         for w in (None, [0.25, 1.0])
     )
     assert half.psi.values == pytest.approx(0.5 * one.psi.values, abs=1e-14)
@@ -236,13 +233,13 @@ def test_wrong_weights(weights, message):
 @pytest.mark.parametrize(("observer", "noise", "message"), [
     ("gpebo", {"seeds": 0, "outputs": 0.1}, "noise.seeds: expected 1 or more"),
     ("gpebo", {"seeds": 5}, "noise.seeds = 5, but there is no noise"),
-    ("canonical", {"seeds": 5, "outputs": 0.1}, "in continuous time, not canonical"),
-    ("none", {"seeds": 5, "outputs": 0.1}, "needs observer=gpebo in continuous time, not none"),
+    ("canonical", {"seeds": 5, "outputs": 0.1}, "needs observer=gpebo in continuous time"),
+    ("none", {"seeds": 5, "outputs": 0.1}, "needs observer=gpebo in continuous time"),
 ])
 def test_seeds_of_nothing_are_refused(observer, noise, message):
     system = shipped("canonical")
     wrong = Settings(
-        plant={}, estimator={"name": "gradient"}, observer=ObserverSettings(name=observer),
+        plant={}, estimator={"name": "gradient"}, observer={"name": observer},
         noise=NoiseSettings(**noise),
     )
     with pytest.raises(ConfigError, match=message):

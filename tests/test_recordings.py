@@ -23,7 +23,6 @@ from gpebo_cli.recordings.table import LineReader, read_table
 from gpebo_cli.settings import (
     DataSettings,
     NoiseSettings,
-    ObserverSettings,
     Settings,
     TimeSettings,
 )
@@ -303,7 +302,7 @@ def test_a_recording_without_an_observer_is_refused(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(GOOD)
     with pytest.raises(ConfigError, match="observer=none"):
-        recorded(str(path), observer=ObserverSettings(name="none"))
+        recorded(str(path), observer={"name": "none"})
 
 
 # The command line ----------------------------------------------------------------------------

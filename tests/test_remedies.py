@@ -14,7 +14,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import shipped
+from plants import seen, shipped
 from regressions import ETA, three
 from regressions import regression as make_regression
 from scipy.linalg import expm
@@ -33,7 +33,6 @@ from gpebo_cli.regression.dynamics import filtered
 from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.settings import (
     NoiseSettings,
-    ObserverSettings,
     Settings,
     SolverSettings,
     TimeSettings,
@@ -67,7 +66,7 @@ def run(mapping, horizon=40.0, estimator=None, samples=401, **observer):
         Settings(
             plant={}, estimator=estimator or {"name": "least_squares"},
             time=TimeSettings(horizon=horizon, samples=samples),
-            observer=ObserverSettings(**observer),
+            observer={"name": "gpebo", **observer},
         ),
         plant_from_mapping(mapping) if isinstance(mapping, dict) else mapping,
     )
@@ -85,7 +84,7 @@ def observed(name, horizon=20.0, **observer):
     mapping = {"rotating": ROTATING, "unbounded": UNBOUNDED, "mixed": MIXED}.get(name)
     system = shipped(name) if mapping is None else plant_from_mapping(mapping)
     signals = simulate(system, TimeSettings(horizon=horizon), SOLVER).signals
-    found = observe(system, signals.inputs, signals.outputs, ObserverSettings(**observer), SOLVER)
+    found = observe(system, seen(signals), SOLVER, **observer)
     return system, signals, found
 
 
@@ -339,10 +338,7 @@ def test_a_gain_of_ones_own_moves_the_eigenvalues():
     gain = [[2.5], ["1 + 0*t"], [0.3]]
     system = plant_from_mapping(GROWING)
     signals = simulate(system, TimeSettings(horizon=5.0), SOLVER).signals
-    observation = observe(
-        system, signals.inputs, signals.outputs,
-        ObserverSettings(remedy="output_injection", injection=gain), SOLVER,
-    )
+    observation = observe(system, seen(signals), SOLVER, remedy="output_injection", injection=gain)
     Phi = expm(5.0 * (np.array(GROWING["A"]) - np.array([[2.5], [1], [0.3]]) @ GROWING["C"]))
     np.testing.assert_allclose(
         observation.state_map.gain(np.array([5.0]))[0], -Phi, atol=1e-10
@@ -362,10 +358,7 @@ def test_the_automatic_gain_does_not_depend_on_units():
     ratio = []
     for plant, horizon in ((system, 10.0), (fast, 0.01)):
         signals = simulate(plant, TimeSettings(horizon=horizon), SOLVER).signals
-        o = observe(
-            plant, signals.inputs, signals.outputs,
-            ObserverSettings(remedy="output_injection"), SOLVER,
-        )
+        o = observe(plant, seen(signals), SOLVER, remedy="output_injection")
         ratio.append(o.growth_rate * horizon)
     assert ratio[0] < 0.0
     assert slow.growth_rate * 10.0 == pytest.approx(ratio[0], rel=1e-6)
@@ -376,16 +369,16 @@ def test_a_fundamental_matrix_beyond_all_bounds_ends_in_one_line():
     plant = plant_from_mapping({**GROWING, "A": [[9, 1, 0], [-1, 9, 0.2], [0, 0, 8]]})
     signals = simulate(plant, TimeSettings(horizon=20.0), SOLVER).signals
     with pytest.raises(SolverError, match=r"A_0 is unstable; use observer\.remedy="):
-        observe(plant, signals.inputs, signals.outputs, ObserverSettings(), SOLVER)
+        observe(plant, seen(signals), SOLVER)
 
 
 @pytest.mark.parametrize(
     ("observer", "message"),
     [
-        ({"name": "canonical", "remedy": "reset"}, "is for observer=gpebo"),
+        ({"name": "canonical", "remedy": "reset"}, "observer.remedy: no such key"),
         ({"reset_interval": 5.0}, "observer.reset_interval is of observer.remedy=reset"),
         ({"remedy": "reset", "sample_time": 0.1}, "works in continuous time only"),
-        ({"name": "kalman_bucy", "remedy": "reset"}, "is for observer=gpebo"),
+        ({"name": "kalman_bucy", "remedy": "reset"}, "observer.remedy: no such key"),
         ({"reset_keep": 0.5}, "observer.reset_keep is of observer.remedy=reset"),
         ({"remedy": "reset", "injection": [[1.0]]}, "of observer.remedy=output_injection"),
         ({"remedy": "reset", "reset_times": [0.0]}, "not between start and end, 0 and 20"),
@@ -398,7 +391,7 @@ def test_a_fundamental_matrix_beyond_all_bounds_ends_in_one_line():
 def test_settings_that_do_not_fit(observer, message):
     system = plant_from_mapping(UNBOUNDED)
     with pytest.raises(ConfigError) as caught:
-        check(Settings(plant={}, estimator={}, observer=ObserverSettings(**observer)), system)
+        check(Settings(plant={}, estimator={}, observer={"name": "gpebo", **observer}), system)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -407,7 +400,7 @@ def test_many_seeds_go_with_output_injection_and_with_no_other_remedy():
     def settings_of(remedy):
         return Settings(
             plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(horizon=10.0),
-            observer=ObserverSettings(remedy=remedy),
+            observer={"name": "gpebo", "remedy": remedy},
             noise=NoiseSettings(outputs=0.01, sample_time=0.1, seeds=5),
         )
 
@@ -415,7 +408,7 @@ def test_many_seeds_go_with_output_injection_and_with_no_other_remedy():
     result = run_experiment(settings_of("output_injection"), system)
     assert result.noise.seeds == 5
     assert np.isfinite(result.noise.rms).all()
-    with pytest.raises(ConfigError, match=r"goes with observer\.remedy=none or output_injection"):
+    with pytest.raises(ConfigError, match=r"needs .* observer\.remedy=none or output_injection"):
         run_experiment(settings_of("reset"), system)
 
 
@@ -428,7 +421,7 @@ def test_remedies_bear_noise_and_weights(remedy):
             Settings(
                 plant={}, estimator={"name": "least_squares"}, noise=noise,
                 time=TimeSettings(horizon=40.0, samples=201),
-                observer=ObserverSettings(remedy=kind, weights=2.0),
+                observer={"name": "gpebo", "remedy": kind, "weights": [2.0]},
             ),
             plant_from_mapping(UNBOUNDED),
         )
@@ -455,7 +448,7 @@ class Outsider:
 def test_estimators_of_other_packages_are_refused_where_they_cannot_go_on(remedy, message):
     settings_of = Settings(
         plant={}, estimator={}, time=TimeSettings(horizon=20.0),
-        observer=ObserverSettings(remedy=remedy),
+        observer={"name": "gpebo", "remedy": remedy},
     )
     with pytest.raises(ConfigError, match=message):
         run_experiment(settings_of, plant_from_mapping(UNBOUNDED), estimator=Outsider())

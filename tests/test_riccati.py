@@ -15,8 +15,8 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers.observability import window_gramians
-from gpebo_cli.observers.riccati import Filtered, StateSpace, pair, quotient, run_filter
+from gpebo_cli.observers._observability import window_gramians
+from gpebo_cli.observers._riccati import Filtered, StateSpace, pair, quotient, run_filter
 
 Of = Callable[[float], Array]
 

@@ -25,7 +25,7 @@ from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.samples import SampledRegression
-from gpebo_cli.settings import DataSettings, ObserverSettings, Settings, TimeSettings
+from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 RNG = np.random.default_rng(7)
@@ -34,7 +34,7 @@ RNG = np.random.default_rng(7)
 def run(system, estimator, horizon=5.0, **observer):
     settings = Settings(
         plant={}, estimator=estimator, time=TimeSettings(0.0, horizon, 2001),
-        observer=ObserverSettings(**observer),
+        observer={"name": "gpebo", **observer},
     )
     return run_experiment(settings, system)
 
@@ -119,7 +119,7 @@ def test_at_most_as_many_samples_are_kept_as_are_asked_for():
     system = shipped("circuit")
     settings = Settings(
         plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(0.0, 2.0, 21),
-        observer=ObserverSettings(sample_time=0.01),
+        observer={"name": "gpebo", "sample_time": 0.01},
     )
     few = run_experiment(settings, system)
     many = run_experiment(replace(settings, time=TimeSettings(0.0, 2.0, 1001)), system)
@@ -260,7 +260,7 @@ def test_forgetting_with_a_bound_is_refused():
 @pytest.mark.parametrize(
     ("plant", "observer", "part"),
     [
-        ("canonical", {"name": "canonical", "sample_time": 0.1}, "observer=canonical runs in"),
+        ("canonical", {"name": "canonical", "sample_time": 0.1}, "sample_time: no such key"),
         ("circuit", {"sample_time": 30.0}, "longer than the horizon"),
         ("circuit", {"sample_time": 1e-9}, "at most"),
     ],
@@ -280,7 +280,7 @@ STREAM = Settings(
     ("changes", "part"),
     [
         ({"data": DataSettings("csv", "-", "cubic")}, "cubic"),
-        ({"observer": ObserverSettings(sample_time=0.1)}, "sample_time"),
+        ({"observer": {"name": "gpebo", "sample_time": 0.1}}, "sample_time"),
         ({"time": TimeSettings(0.0, 5.0, 11)}, "horizon"),
     ],
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import shipped
+from plants import seen, shipped
 from scipy.integrate import solve_ivp
 
 from gpebo_cli.errors import ConfigError
@@ -13,7 +13,7 @@ from gpebo_cli.model.functions import system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.results.figures import describe, parameters
-from gpebo_cli.settings import ObserverSettings, Settings, SolverSettings, TimeSettings
+from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
@@ -90,7 +90,7 @@ def test_the_regression_holds_with_the_truth_that_varies(plant):
             "C": [[1, 0], [0.2, 1]], "initial_state": [1, 0],
         })
     signals = simulate(system, TimeSettings(horizon=4.0), SOLVER).signals
-    observation = observe(system, signals.inputs, signals.outputs, ObserverSettings(), SOLVER)
+    observation = observe(system, seen(signals), SOLVER)
     t = np.linspace(0.0, 4.0, 41)
     eta = observation.truth(t, system.theta_at(t), signals.states)
     regression = observation.regression
@@ -110,7 +110,7 @@ def test_the_observer_is_not_told():
     one, other = shipped("descriptor"), shipped("descriptor", unknowns={"theta1": 7, "theta2": "t"})
     signals = simulate(one, TimeSettings(horizon=3.0), SOLVER).signals
     first, second = (
-        observe(system, signals.inputs, signals.outputs, ObserverSettings(), SOLVER).regression
+        observe(system, seen(signals), SOLVER).regression
         for system in (one, other)
     )
     assert first.Y.values.tobytes() == second.Y.values.tobytes()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import Any, cast
 
+from gpebo_cli import observers
 from gpebo_cli.api.choice import choose, plain, primary
 from gpebo_cli.api.result import Result
 from gpebo_cli.configs import configuration
@@ -19,7 +20,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.schema import nearest, shown
-from gpebo_cli.settings import NoiseSettings, ObserverSettings, Settings, SolverSettings
+from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
 
 Plant = str | os.PathLike[str] | Mapping[str, object] | DescriptorSystem
 Choice = str | Mapping[str, object]
@@ -238,7 +239,7 @@ def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -
             "time": tuple(primary()["time"]),
             "excitation": tuple(primary()["excitation"]),
             "solver": tuple(field.name for field in fields(SolverSettings)),
-            "observer": tuple(field.name for field in fields(ObserverSettings)),
+            "observer": tuple(observers.settings_of({"name": "gpebo"})),
             "noise": tuple(field.name for field in fields(NoiseSettings)),
         }
         belongs = next((name for name, keys in sections.items() if key in keys), None)

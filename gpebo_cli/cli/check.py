@@ -76,7 +76,7 @@ def main(words: list[str]) -> int:
         from gpebo_cli.experiment.assumptions import check
 
         found = check(job.settings, job.system)
-    title = f"plant {job.system.name}, observer {job.settings.observer.name}"
+    title = f"plant {job.system.name}, observer {job.settings.observer['name']}"
     sys.stdout.write(_json(found) if as_json else _table(title, found))
     return 0 if all(a.holds for a in found) else 1
 

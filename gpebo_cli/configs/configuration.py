@@ -14,7 +14,6 @@ from gpebo_cli.settings import (
     DataSettings,
     ExcitationSettings,
     NoiseSettings,
-    ObserverSettings,
     OutputSettings,
     Settings,
     SolverSettings,
@@ -50,16 +49,14 @@ _RANGES = {
     "solver.max_strangeness_index": (0, 20),
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),
-    "observer.regularisation": (1e-6, 1.0),
     "noise.seed": (0, math.inf),
-    "observer.reset_keep": (0, 1),
     "noise.seeds": (1, 1_000_000),
 }
 _INCHES = (1.5, 40.0)  # how wide a figure may be
 _OPEN = ("start", "horizon")  # of time: null where the data, or a default, decides
 _POSITIVE = (
-    "time.horizon", "observer.sample_time", "excitation.rho", "excitation.window",
-    "noise.sample_time", "observer.reset_interval",
+    "time.horizon", "excitation.rho", "excitation.window",
+    "noise.sample_time",
 )
 
 
@@ -86,7 +83,7 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         estimator=_group(config, "estimator"),
         time=_time(config, recorded=data.name == "csv"),
         solver=read(SolverSettings, _group(config, "solver"), "solver"),
-        observer=read(ObserverSettings, _observer(config), "observer"),
+        observer=_observer(config),
         excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
         output=_output(config, draw=draw),
         noise=read(NoiseSettings, _group(config, "noise"), "noise"),

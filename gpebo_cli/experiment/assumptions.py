@@ -12,11 +12,10 @@ import numpy as np
 
 from gpebo_cli.errors import GpeboError, ModelError
 from gpebo_cli.evidence.excitation import Excitation, assess
-from gpebo_cli.experiment.noise import NoiseLevels, noise_levels, signal_noise
+from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers import observe
+from gpebo_cli.observers import Measurements, Observer, build
 from gpebo_cli.recordings.load import load
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Simulation, simulate
@@ -29,17 +28,18 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
 
     They are about ψ, which noise does not reach: signals are taken without it.
     """
-    levels = noise_levels(settings.noise, system)
+    levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
-        return tuple(_of_observer(settings, system, recording.inputs, recording.outputs, levels))
+        seen = Measurements(recording.inputs, recording.outputs)
+        return () if observer is None else tuple(_of_observer(observer, settings, system, seen))
     found: list[Assumption] = []
     try:
         simulation = simulate(system, settings.time, settings.solver)
     except ModelError as error:
         return (Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),)
     found += of_simulation(system, simulation)
-    if settings.observer.name == "none":
+    if observer is None:
         return tuple(found)
     if any(jump.impulses.any() for _, _, jump in simulation.jumps):
         found.append(
@@ -47,22 +47,20 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
         )
         return tuple(found)
     signals = simulation.signals
-    return (*found, *_of_observer(settings, system, signals.inputs, signals.outputs, levels))
+    noise = signal_noise(settings.noise, levels)
+    seen = Measurements(signals.inputs, signals.outputs, noise)
+    return (*found, *_of_observer(observer, settings, system, seen))
 
 
 def _of_observer(
-    settings: Settings, system: DescriptorSystem, inputs: Trajectory, outputs: Trajectory,
-    levels: NoiseLevels,
+    observer: Observer, settings: Settings, system: DescriptorSystem, seen: Measurements
 ) -> list[Assumption]:
     """What the observer needs of the plant, and of the signals it gets to see."""
     try:
-        observation = observe(
-            system, inputs, outputs, settings.observer, settings.solver,
-            signal_noise(settings.noise, levels),
-        )
+        observation = observer.observe(system, seen, settings.solver)
     except ModelError as error:
         return [Assumption(_named(error), "needed by the observer", False, {"found": str(error)})]
-    t = np.linspace(inputs.mesh.edges[0], inputs.mesh.edges[-1], 101)
+    t = np.linspace(*seen.span, 101)
     excitation = assess(observation.regression, t, settings.excitation)
     return of_observation(observation, excitation)
 

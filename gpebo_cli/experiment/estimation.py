@@ -16,12 +16,12 @@ from gpebo_cli.experiment.assumptions import Observed, warnings
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.experiment.online import Online, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
-from gpebo_cli.experiment.seeds import over_seeds
+from gpebo_cli.experiment.seeds import check_response, over_seeds
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers import Observation, StateMap, observe
-from gpebo_cli.observers.observation import AffineStateMap
+from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, StateMap
+from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.settings import Settings
 
 _SAMPLES_AT_ONCE = 2048
@@ -47,7 +47,7 @@ class Estimated:
 
 
 def continuous(
-    settings: Settings, system: DescriptorSystem, source: Source,
+    settings: Settings, system: DescriptorSystem, source: Source, observer: Observer,
     estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
     """Observer and estimator as differential equations.
@@ -60,10 +60,11 @@ def continuous(
     levels = noise_levels(settings.noise, system)
     t = source.t
     with stage("observe"):
-        observation = observe(
-            system, source.inputs, source.outputs, settings.observer, settings.solver,
-            signal_noise(settings.noise, levels),
+        seen = Measurements(
+            source.inputs, source.outputs, signal_noise(settings.noise, levels)
         )
+        observation = observer.observe(system, seen, settings.solver)
+        check_response(settings.noise, observation.respond)
         regression = observation.regression
         sampler = regression.mesh.sampler(t)
         sampled = RegressionResult(
@@ -92,22 +93,21 @@ def continuous(
 
 
 def at_samples(
-    settings: Settings, system: DescriptorSystem, source: Source,
+    settings: Settings, system: DescriptorSystem, source: Source, samples: Sampling,
     estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
-    """Observer and estimator at samples of the signals, ``observer.sample_time`` apart.
+    """Observer and estimator at samples of the signals, ``samples.step`` apart.
 
     Raises:
         ConfigError: the observer or the estimator works in continuous time only.
         ModelError: an assumption of the observer fails.
         SolverError: a step between samples cannot be resolved.
     """
-    observer, edges = settings.observer, source.inputs.mesh.edges
-    if observer.sample_time is None:
-        raise ValueError("the observer runs in continuous time")
+    check_response(settings.noise, None)
+    start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
     with stage("observe and estimate"):
-        online = Online(settings, system, observer.hold, float(edges[0]), estimator)
-        t = sample_times(observer.sample_time, float(edges[0]), float(edges[-1]))
+        online = Online(settings, system, samples.hold, start, estimator)
+        t = sample_times(samples.step, start, stop)
         u, y = source.inputs(t), source.outputs(t)
         parts = [slice(i, i + _SAMPLES_AT_ONCE) for i in range(0, len(t), _SAMPLES_AT_ONCE)]
         made = joined([online.feed(t[part], u[part], y[part]) for part in parts])

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli import estimators
+from gpebo_cli import estimators, observers
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.evidence.excitation import RELATIVE_LEVEL, Excitation
 from gpebo_cli.experiment.result import Fit
 from gpebo_cli.findings import Assumption, Direction, Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.observers.observation import InitialError
-from gpebo_cli.observers.sampled import SampledState, sampled_observer
+from gpebo_cli.observers._observation import InitialError
+from gpebo_cli.observers.reduced.sampled import SampledState
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 
@@ -75,9 +75,10 @@ class Online:
             ConfigError: the observer or the estimator works in continuous time only.
             ModelError: Assumption 1 fails at the start.
         """
-        self._observer = sampled_observer(
-            system, settings.observer, settings.solver, hold, start
-        )
+        self._observer = observers.able(
+            observers.build(settings.observer), observers.AtSamples,
+            "observer.sample_time and streams need an observer that runs at samples",
+        ).at_samples(system, settings.solver, hold, start)
         if estimator is None:
             estimator = estimators.build(settings.estimator)
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases

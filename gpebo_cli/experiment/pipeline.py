@@ -19,10 +19,10 @@ from gpebo_cli.experiment.estimation import at_samples, continuous
 from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
-from gpebo_cli.experiment.seeds import check_seeds
+from gpebo_cli.experiment.seeds import check_response, check_seeds
 from gpebo_cli.experiment.verdict import verdict
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.observers import check_remedy
+from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
 
 
@@ -62,11 +62,10 @@ def run_experiment(
     """
     levels = noise_levels(settings.noise, system)
     sources.check(settings, levels)
-    observed = settings.observer.name != "none"
-    if observed and estimator is None:
+    observer = build(settings.observer)
+    if observer is not None and estimator is None:
         estimator = estimators.build(settings.estimator)
-    check_seeds(settings.noise, levels, settings.observer)
-    check_remedy(settings.observer)
+    check_seeds(settings.noise, levels)
     stage = _Clock(progress)
     recorded = settings.data.name == "csv"
     with stage("read" if recorded else "simulate"):
@@ -77,10 +76,15 @@ def run_experiment(
         excitation=None, estimation=None, metrics=None, assumptions=source.assumptions,
         timings=stage.seconds, verdict=source.verdict, recording=source.recording,
     )
-    if not observed or estimator is None:
+    if observer is None or estimator is None:
+        check_response(settings.noise, None)
         return result
-    estimate = continuous if settings.observer.sample_time is None else at_samples
-    found = estimate(settings, system, source, estimator, stage)
+    samples = sampling(observer)
+    found = (
+        continuous(settings, system, source, observer, estimator, stage)
+        if samples is None
+        else at_samples(settings, system, source, samples, estimator, stage)
+    )
     warned = warnings(found.observed)
     told = verdict(
         found.excitation, found.estimation.cases, found.estimation.requirement, found.metrics,
@@ -92,7 +96,7 @@ def run_experiment(
         assumptions=(*source.assumptions, *of_observation(found.observed, found.excitation)),
         verdict="; ".join([told + found.note, *warned]), warnings=warned,
         # What the result is labelled with is what estimated.
-        settings=replace(settings, estimator={"name": settings.observer.name})
+        settings=replace(settings, estimator={"name": settings.observer["name"]})
         if found.by_observer else settings,
     )
 

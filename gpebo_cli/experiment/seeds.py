@@ -22,40 +22,44 @@ from gpebo_cli.experiment.noise import (
 from gpebo_cli.experiment.result import NoiseStatistics
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers import Observation
+from gpebo_cli.observers._observation import Observation, Response
 from gpebo_cli.regression.estimator import Estimator
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.settings import NoiseSettings, ObserverSettings
+from gpebo_cli.settings import NoiseSettings
 from gpebo_cli.simulation.simulate import Signals
 
 _NUMBERS = 1 << 20  # in Y of one batch of seeds; estimators hold tens of times that
 
 
-def check_seeds(
-    settings: NoiseSettings, levels: NoiseLevels, observer: ObserverSettings
-) -> None:
-    """Refuse many seeds of nothing, and observers that estimate in another way.
+def check_seeds(settings: NoiseSettings, levels: NoiseLevels) -> None:
+    """Refuse many seeds of nothing.
 
     Raises:
         ConfigError: says what is needed.
     """
     if settings.seeds < 1:
         raise ConfigError(f"noise.seeds: expected 1 or more, got {settings.seeds}")
-    if settings.seeds == 1:
-        return
-    if levels.silent:
+    if settings.seeds > 1 and levels.silent:
         raise ConfigError(f"noise.seeds = {settings.seeds}, but there is no noise; set its levels")
-    if observer.remedy not in ("none", "output_injection"):
+
+
+def check_response(settings: NoiseSettings, respond: Response | None) -> Response:
+    """How the observer responds to noise; many seeds are refused where it cannot tell.
+
+    Raises:
+        ConfigError: says what is possible.
+    """
+    if settings.seeds > 1 and respond is None:
         raise ConfigError(
-            f"noise.seeds = {settings.seeds} goes with observer.remedy=none or output_injection, "
-            f"not {observer.remedy}; with others, run one job per seed: -m noise.seed=0,1,2"
+            f"noise.seeds = {settings.seeds} needs observer=gpebo in continuous time, with "
+            "observer.remedy=none or output_injection; with others, run one job per seed: "
+            "-m noise.seed=0,1,2"
         )
-    if observer.name != "gpebo" or observer.sample_time is not None:
-        asked = observer.name if observer.sample_time is None else "one with a sample_time"
-        raise ConfigError(
-            f"noise.seeds = {settings.seeds} needs observer=gpebo in continuous time, not {asked}; "
-            "with others, run one job per seed: -m noise.seed=0,1,2"
-        )
+    return respond or _no_response
+
+
+def _no_response(of_inputs: Array, of_outputs: Array) -> Array:  # noqa: ARG001  a response
+    raise ValueError("nobody asked how this observer responds to noise")
 
 
 def over_seeds(
@@ -76,8 +80,7 @@ def over_seeds(
         ConfigError: the observer cannot tell how it responds to noise.
         SolverError: a tolerance cannot be reached.
     """
-    if observation.respond is None:
-        raise ConfigError("noise.seeds: this observer cannot tell how it responds to noise")
+    respond = check_response(settings, observation.respond)
     regression = observation.regression
     mesh = regression.mesh
     samples = noise_grid(signals.mesh, settings)
@@ -94,7 +97,7 @@ def over_seeds(
             _columns([e[kind] - first[kind] for e in drawn], grid, mesh, settings.shape)
             for kind in (0, 1)
         )
-        added = observation.respond(of_inputs, of_outputs)
+        added = respond(of_inputs, of_outputs)
         many = LinearRegression(
             Trajectory(mesh, regression.Y.values[..., None] + added),
             regression.psi, regression.parameters, regression.scale,

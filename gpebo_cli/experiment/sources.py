@@ -15,6 +15,7 @@ from gpebo_cli.experiment.verdict import simulation_verdict
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.observers import build, sampling
 from gpebo_cli.recordings.load import Recording, load
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
@@ -60,7 +61,7 @@ def simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels)
             measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
             measured_outputs=np.where(levels.noisy_outputs, measured.outputs(t), simulated.outputs),
         )
-    if settings.observer.name != "none":
+    if settings.observer["name"] != "none":
         _refuse_impulses(system, simulated)
     return Source(
         t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
@@ -93,7 +94,7 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
         ConfigError: names the key and what it may be.
     """
     time, recorded = settings.time, settings.data.name == "csv"
-    if recorded and settings.observer.name == "none":
+    if recorded and settings.observer["name"] == "none":
         raise ConfigError(
             "observer=none simulates the plant, and data=csv does not; choose one of them"
         )
@@ -123,7 +124,7 @@ def check_stream(settings: Settings, system: DescriptorSystem) -> None:
         raise ConfigError(
             "data.hold=cubic needs to know the samples to come; a stream takes zoh or linear"
         )
-    if settings.observer.sample_time is not None:
+    if sampling(build(settings.observer)) is not None:
         raise ConfigError(
             "observer.sample_time: the rows of a stream are the samples; leave it null"
         )
@@ -136,9 +137,10 @@ def check_stream(settings: Settings, system: DescriptorSystem) -> None:
 
 def _grid(settings: Settings, start: float, stop: float) -> Array:
     """The output grid (N,): evenly spaced; of an observer at samples, some of those."""
-    if settings.observer.sample_time is None:
+    samples = sampling(build(settings.observer))
+    if samples is None:
         return np.linspace(start, stop, settings.time.samples)
-    t = sample_times(settings.observer.sample_time, start, stop)
+    t = sample_times(samples.step, start, stop)
     kept: Array = t[kept_samples(1, len(t), settings.time.samples)]
     return kept
 

@@ -21,7 +21,7 @@ f_a and f_b are B u; only the known functions c1, c2 are differentiated.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,8 +31,8 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers.extension import initial_extension, output_scale
-from gpebo_cli.observers.observation import (
+from gpebo_cli.observers._base import Measurements, initial_extension, output_scale, refuse_beyond
+from gpebo_cli.observers._observation import (
     InitialError,
     Observation,
     Reconstruction,
@@ -40,7 +40,7 @@ from gpebo_cli.observers.observation import (
 )
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.schema import nearest
-from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
 _ZERO = 1e-12  # entries below this share of their matrix are zero
@@ -101,97 +101,115 @@ def _differential_size(E: Array) -> int:
     return int(np.argmin(ones)) if not ones.all() else len(E)
 
 
-def observe(
-    system: DescriptorSystem,
-    inputs: Trajectory,
-    outputs: Trajectory,
-    settings: ObserverSettings,
-    solver: SolverSettings,
-) -> Observation:
-    """Propositions 3 and 4 on the signals u (m,) and y (r,), which share a mesh.
+@dataclass(frozen=True)
+class Canonical:
+    """Propositions 3 and 4.
 
-    Raises:
-        ModelError: not in canonical form, or no output satisfies Assumption 3.
-        ConfigError: settings that do not fit the plant.
-        SolverError: the tolerance cannot be reached.
+    Attributes:
+        xi_a0: where the extension starts: by state name, or a list; None: what the plant proposes.
+        output: the one that Proposition 4 rests on; None: the first that fits.
+        L_w: its gain: diagonal, remark4, or two expressions of t.
+        r0: start of its state.
+        weights: how much each output counts, by order or name (absent: 1). None: equally.
     """
-    mesh = inputs.mesh
-    blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())
-    scale = output_scale(settings, system)
-    n_a, q = blocks.A_a.shape[1], system.q
-    n_b = system.n - n_a
-    suitable = _outputs_without_zb(system, blocks, n_a)
-    names = tuple(f"e0_{state}" for state in system.states[:n_a])
-    xi_a0 = initial_extension(settings, system, names)
-    start = np.concatenate([xi_a0[:, None], np.zeros((n_a, q)), np.eye(n_a)], axis=1)
 
-    def coefficients(t: Array, inside: Array) -> LinearEquation:
-        b = canonical_blocks(system, t, inside)
-        f_a = np.einsum("nij,nj->ni", b.B[:, :n_a], inputs(t, inside))
-        rest = np.zeros((len(t), n_a, n_a))
-        f = np.concatenate([f_a[:, :, None], b.F_a, rest], axis=2)
-        seen = (b.C[:, suitable, :n_a], outputs(t, inside)[:, suitable])
-        return LinearEquation(None, b.A_a, f, seen)
+    xi_a0: Mapping[str, float] | list[float] | None = None
+    output: str | None = None
+    L_w: str | list[str] = "diagonal"
+    r0: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    weights: Mapping[str, float] | list[float] | None = None
 
-    def regress(values: Array, C: Array, y: Array) -> tuple[Array, Array]:
-        """Y and ψ of Proposition 3 at the points of the mesh."""
-        seen = C @ values  # C_k [ξ_a, ξ_b, Φ_a]
-        psi = seen[..., 1:]
-        psi[..., q:] *= -1.0
-        weight = scale[suitable]  # √w of each output
-        return weight * (y - seen[..., 0]), weight[:, None] * psi
+    def observe(
+        self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
+    ) -> Observation:
+        """The regression of Proposition 3, and z_b by Proposition 4 where it applies.
 
-    def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-        Y, psi = regress(values, *extras)
-        products = outer_products(psi, Y)
-        shape = values.shape[:2]
-        # Y may vanish identically (a perfect ξ_a): it is resolved relative to what it is made of.
-        size = 1e-3 * float(np.abs(outputs.values[:, :, suitable]).max(initial=0.0))
-        level = float(np.abs(psi).max(initial=0.0))
-        kinds = (
-            (Y, size),
-            (psi, 0.0),
-            (products[..., :-1], 0.0),
-            (products[..., -1], level * size),
-        )
-        return [(signal.reshape(*shape, -1), floor) for signal, floor in kinds]
+        Raises:
+            ModelError: not in canonical form, or no output satisfies Assumption 3.
+            ConfigError: settings that do not fit the plant.
+            SolverError: the tolerance cannot be reached.
+        """
+        refuse_beyond(system)
+        inputs, outputs, mesh = signals.inputs, signals.outputs, signals.mesh
+        blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())
+        scale = output_scale(self.weights, system)
+        n_a, q = blocks.A_a.shape[1], system.q
+        n_b = system.n - n_a
+        suitable = _outputs_without_zb(system, blocks, n_a)
+        names = tuple(f"e0_{state}" for state in system.states[:n_a])
+        xi_a0 = initial_extension(self.xi_a0, system, names)
+        start = np.concatenate([xi_a0[:, None], np.zeros((n_a, q)), np.eye(n_a)], axis=1)
 
-    problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
-    integrate = ivp.solve if solver.name == "ivp" else solve
-    solution = integrate(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
-    mesh, values = solution.trajectory.mesh, solution.trajectory.values
-    Y, psi = regress(values, *solution.extras)
-    xi, xi_b, Phi = values[..., 0], values[..., 1 : 1 + q], values[..., 1 + q :]
-    zb = _unknown_input_observer(system, settings, mesh, inputs, outputs, n_a)
-    return Observation(
-        regression=LinearRegression(
-            Trajectory(mesh, Y),
-            Trajectory(mesh, psi),
-            (*system.unknowns, *names),
-            float(np.abs(psi).max(initial=0.0)),
-        ),
-        state_map=CanonicalStateMap(
-            xi_a=Trajectory(mesh, xi),
-            gain=Trajectory(mesh, np.concatenate([xi_b, -Phi], axis=-1)),
-            zb=zb,
-            n_b=n_b,
-        ),
-        truth=InitialError(
-            np.eye(system.n)[:, :n_a], xi_a0, np.eye(system.n)[:, :n_a], solution.trajectory
-        ),
-        error_estimate=solution.error_estimate,
-        assumptions=(
-            Assumption(
-                "Assumption 3",
-                "at least one output does not see z_b",
-                True,
-                {"outputs": ", ".join(system.outputs[k] for k in suitable)},
+        def coefficients(t: Array, inside: Array) -> LinearEquation:
+            b = canonical_blocks(system, t, inside)
+            f_a = np.einsum("nij,nj->ni", b.B[:, :n_a], inputs(t, inside))
+            rest = np.zeros((len(t), n_a, n_a))
+            f = np.concatenate([f_a[:, :, None], b.F_a, rest], axis=2)
+            seen = (b.C[:, suitable, :n_a], outputs(t, inside)[:, suitable])
+            return LinearEquation(None, b.A_a, f, seen)
+
+        def regress(values: Array, C: Array, y: Array) -> tuple[Array, Array]:
+            """Y and ψ of Proposition 3 at the points of the mesh."""
+            seen = C @ values  # C_k [ξ_a, ξ_b, Φ_a]
+            psi = seen[..., 1:]
+            psi[..., q:] *= -1.0
+            weight = scale[suitable]  # √w of each output
+            return weight * (y - seen[..., 0]), weight[:, None] * psi
+
+        def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+            Y, psi = regress(values, *extras)
+            products = outer_products(psi, Y)
+            shape = values.shape[:2]
+            # Y may vanish identically (a perfect ξ_a): what it is made of is its size.
+            size = 1e-3 * float(np.abs(outputs.values[:, :, suitable]).max(initial=0.0))
+            level = float(np.abs(psi).max(initial=0.0))
+            kinds = (
+                (Y, size),
+                (psi, 0.0),
+                (products[..., :-1], 0.0),
+                (products[..., -1], level * size),
+            )
+            return [(signal.reshape(*shape, -1), floor) for signal, floor in kinds]
+
+        problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
+        integrate = ivp.solve if solver.name == "ivp" else solve
+        solution = integrate(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
+        mesh, values = solution.trajectory.mesh, solution.trajectory.values
+        Y, psi = regress(values, *solution.extras)
+        xi, xi_b, Phi = values[..., 0], values[..., 1 : 1 + q], values[..., 1 + q :]
+        zb = _unknown_input_observer(self, system, mesh, signals, n_a)
+        return Observation(
+            regression=LinearRegression(
+                Trajectory(mesh, Y),
+                Trajectory(mesh, psi),
+                (*system.unknowns, *names),
+                float(np.abs(psi).max(initial=0.0)),
             ),
-            *(zb.assumptions if zb is not None else ()),
-        ),
-        growth=float(np.abs(Phi).max(initial=0.0)),
-        growth_rate=log_norm(Phi[-1, -1]) / float(mesh.edges[-1] - mesh.edges[0]),
-    )
+            state_map=CanonicalStateMap(
+                xi_a=Trajectory(mesh, xi),
+                gain=Trajectory(mesh, np.concatenate([xi_b, -Phi], axis=-1)),
+                zb=zb,
+                n_b=n_b,
+            ),
+            truth=InitialError(
+                np.eye(system.n)[:, :n_a], xi_a0, np.eye(system.n)[:, :n_a], solution.trajectory
+            ),
+            error_estimate=solution.error_estimate,
+            assumptions=(
+                Assumption(
+                    "Assumption 3",
+                    "at least one output does not see z_b",
+                    True,
+                    {"outputs": ", ".join(system.outputs[k] for k in suitable)},
+                ),
+                *(zb.assumptions if zb is not None else ()),
+            ),
+            growth=float(np.abs(Phi).max(initial=0.0)),
+            growth_rate=log_norm(Phi[-1, -1]) / float(mesh.edges[-1] - mesh.edges[0]),
+        )
+
+
+OBSERVER = Canonical
 
 
 def _outputs_without_zb(system: DescriptorSystem, blocks: Blocks, n_a: int) -> list[int]:
@@ -265,8 +283,7 @@ def remark_4_gain(c: Array, N: Array) -> Array:
 
 
 def _unknown_input_observer(
-    system: DescriptorSystem, settings: ObserverSettings, mesh: Mesh, inputs: Trajectory,
-    outputs: Trajectory, n_a: int,
+    settings: Canonical, system: DescriptorSystem, mesh: Mesh, signals: Measurements, n_a: int
 ) -> UnknownInputObserver | None:
     """Proposition 4 where it applies: n_b = 3 and some output sees z_b1, z_b2 and not z_b3."""
     if system.n - n_a != 3:
@@ -274,8 +291,8 @@ def _unknown_input_observer(
     mesh, _ = mesh.split(np.full(mesh.size, _FINER))
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
     b = canonical_blocks(system, t, inside)
-    f_b = np.einsum("nij,nj->ni", b.B[:, n_a:], inputs(t, inside))
-    y = outputs(t, inside)
+    f_b = np.einsum("nij,nj->ni", b.B[:, n_a:], signals.inputs(t, inside))
+    y = signals.outputs(t, inside)
     ell = _output_for_zw(system, settings, b, n_a)
     c, dc = b.C[:, ell, n_a : n_a + 2], b.dC[:, ell, n_a : n_a + 2]
     L = _gain(settings, c, dc, b.N, t, inside)
@@ -307,7 +324,7 @@ def _unknown_input_observer(
 
 
 def _output_for_zw(
-    system: DescriptorSystem, settings: ObserverSettings, b: Blocks, n_a: int
+    system: DescriptorSystem, settings: Canonical, b: Blocks, n_a: int
 ) -> int:
     """ℓ of Assumption 6: asked for by name, or the first output that satisfies it."""
     row = np.abs(b.C[:, :, n_a:])
@@ -337,7 +354,7 @@ def _output_for_zw(
 
 
 def _gain(
-    settings: ObserverSettings, c: Array, dc: Array, N: Array, t: Array, inside: Array
+    settings: Canonical, c: Array, dc: Array, N: Array, t: Array, inside: Array
 ) -> Array:
     """L_w (N, 2) as asked for: diagonal, remark4, or two expressions of t."""
     if settings.L_w == "diagonal":
@@ -353,7 +370,7 @@ def _gain(
     return np.asarray(taylor(parsed, t, 0, inside)[0])
 
 
-def _start(settings: ObserverSettings) -> Array:
+def _start(settings: Canonical) -> Array:
     start = np.array(settings.r0, dtype=np.float64)
     if start.shape != (2,) or not np.isfinite(start).all():
         raise ConfigError(f"observer.r0: got {settings.r0}; accepted: two finite numbers")

@@ -5,82 +5,88 @@ The equations are those of :mod:`gpebo_cli.observers.reduced`.
 
 from __future__ import annotations
 
-from gpebo_cli.findings import Assumption
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers.extension import initial_extension
-from gpebo_cli.observers.observation import AffineStateMap, InitialError, Observation
-from gpebo_cli.observers.reduced.extension import ReducedSystem, extend, reduced_system
-from gpebo_cli.observers.reduced.matrices import weakest
-from gpebo_cli.observers.reduced.regression import Assembled, on_mesh
-from gpebo_cli.observers.reduced.response import respond
-from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.observers._base import Measurements, Sampling
+from gpebo_cli.observers._observation import Observation
+from gpebo_cli.observers.reduced.extension import reduced_system
+from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
+from gpebo_cli.observers.remedies import REMEDIES, Remedy
+from gpebo_cli.observers.remedies.plain import Plain
+from gpebo_cli.settings import SolverSettings
 
 
-def observe(
-    system: DescriptorSystem,
-    inputs: Trajectory,
-    outputs: Trajectory,
-    settings: ObserverSettings,
-    solver: SolverSettings,
-) -> Observation:
-    """Run the dynamic extension on the signals u and y and form the regression.
+@dataclass(frozen=True)
+class Gpebo:
+    """Section II of the paper, with all rows of the residual.
 
-    Args:
-        system: the model; its ``theta`` and ``initial_state`` are not used.
-        inputs: u (m,) and
-        outputs: y (r,), on the same mesh.
-        settings: ξ_a(start) and which rows of the residual to keep.
-        solver: tolerance and limits.
-
-    Raises:
-        ModelError: rank of E not constant, Assumption 1 violated, no outputs.
-        ConfigError: ``xi_a0`` does not fit.
-        SolverError: the tolerance cannot be reached.
+    Attributes:
+        regression: the whole residual, or its last r rows as the paper has it.
+        xi_a0: where the dynamic extension starts: by state name, or a list of n_a numbers; None:
+            what the plant proposes, else zero.
+        weights: how much each output counts, by order or name (absent: 1); only ratios matter.
+            None: equally.
+        sample_time: seconds between samples of an observer in discrete time; None: continuous.
+        hold: what it assumes between samples.
+        remedy: what is done about a Φ that grows (docs/howto/unstable.md).
     """
-    return observe_reduced(reduced_system(system, inputs, outputs, settings, solver), settings)
+
+    regression: Literal["projected", "paper"] = "projected"
+    xi_a0: Mapping[str, float] | list[float] | None = None
+    weights: Mapping[str, float] | list[float] | None = None
+    sample_time: float | None = field(default=None, metadata={"positive": True})  # seconds
+    hold: Literal["zoh", "linear"] = "zoh"
+    remedy: Remedy = field(default=Plain(), metadata={"one_of": REMEDIES})
+
+    def __post_init__(self) -> None:
+        if self.sample_time is not None:
+            self._refuse_remedy()
+
+    def observe(
+        self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
+    ) -> Observation:
+        """The regression and the state map, with the remedy.
+
+        Raises:
+            ModelError: rank of E not constant, Assumption 1 violated.
+            ConfigError: no outputs, or a setting that does not fit the plant.
+            SolverError: the tolerance cannot be reached.
+        """
+        return self.remedy.observe(reduced_system(
+            system, signals, solver,
+            xi_a0=self.xi_a0, weights=self.weights, regression=self.regression,
+        ))
+
+    def sampling(self) -> Sampling | None:
+        """The samples that ``sample_time`` asks for."""
+        return None if self.sample_time is None else Sampling(self.sample_time, self.hold)
+
+    def at_samples(
+        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float
+    ) -> SampledObserver:
+        """The observer in discrete time, whose first sample is at ``start``.
+
+        Raises:
+            ModelError: Assumption 1 fails at the start.
+            ConfigError: a remedy, no outputs, or a setting that does not fit the plant.
+        """
+        self._refuse_remedy()
+        return sampled_observer(
+            system, solver, hold, start,
+            xi_a0=self.xi_a0, weights=self.weights, regression=self.regression,
+        )
+
+    def _refuse_remedy(self) -> None:
+        if not isinstance(self.remedy, Plain):
+            name = next(key for key, kind in REMEDIES.items() if isinstance(self.remedy, kind))
+            raise ConfigError(
+                f"observer.remedy={name} works in continuous time only; at samples "
+                "(observer.sample_time, streams) there is none"
+            )
 
 
-def observe_reduced(reduced: ReducedSystem, settings: ObserverSettings) -> Observation:
-    """:func:`observe` for a reduced system, perhaps with output injection."""
-    system, q, V1 = reduced.system, reduced.system.q, reduced.initial_basis
-    xi_a0 = initial_extension(settings, system, reduced.names)
-    extension = extend(reduced, reduced.mesh, reduced.start(V1 @ xi_a0, V1))
-    mesh, final = extension.mesh, extension.assembled
-    kept = final.kept_rows(system, settings.regression)
-    all_kept = len(kept) == final.Y.shape[1]
-    return Observation(
-        regression=LinearRegression(
-            Y=on_mesh(mesh, final.Y if all_kept else final.Y[:, kept]),
-            psi=on_mesh(mesh, final.psi if all_kept else final.psi[:, kept]),
-            parameters=(*system.unknowns, *reduced.names),
-            scale=final.psi_scale,
-        ),
-        state_map=AffineStateMap(on_mesh(mesh, final.offset), on_mesh(mesh, final.gain)),
-        truth=InitialError(V1, xi_a0, reduced.basis, extension.solution.trajectory),
-        error_estimate=extension.solution.error_estimate,
-        assumptions=assumptions(reduced, mesh, final),
-        growth=extension.growth(q),
-        growth_rate=extension.logarithm(q) / float(mesh.edges[-1] - mesh.edges[0]),
-        respond=lambda e_u, e_y: respond(mesh, reduced.matrices, kept, e_u, e_y),
-    )
-
-
-def assumptions(
-    reduced: ReducedSystem, mesh: Mesh, found: Assembled
-) -> tuple[Assumption, ...]:
-    """Rank of E and Assumption 1, with their evidence at the points of the mesh."""
-    smallest, where = weakest(found.injectivity, found.elimination)
-    return (
-        Assumption(
-            "Rank of E", "rank E(t) is constant", True,
-            {"rank": reduced.rank, "states": reduced.system.n},
-        ),
-        Assumption(
-            "Assumption 1",
-            "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
-            True,
-            {"smallest_singular_value": smallest, "at": float(mesh.points.ravel()[where])},
-        ),
-    )
+OBSERVER = Gpebo

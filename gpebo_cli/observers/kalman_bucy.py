@@ -24,7 +24,7 @@ of the standard deviations of x̂; its correlation with ζ̂ (of order T_s) is n
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,37 +32,23 @@ from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers import gpebo
-from gpebo_cli.observers.extension import initial_extension
-from gpebo_cli.observers.observability import WindowGramians, window_gramians
-from gpebo_cli.observers.observation import AffineStateMap, Observation, Reconstruction
-from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
-from gpebo_cli.observers.reduced.split import initial_basis
-from gpebo_cli.observers.riccati import Filtered, StateSpace, run_filter
+from gpebo_cli.observers._base import ByName, Measurements, SignalNoise
+from gpebo_cli.observers._observability import WindowGramians, window_gramians
+from gpebo_cli.observers._observation import AffineStateMap, Observation, Reconstruction
+from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
+from gpebo_cli.observers.reduced.extension import reduced_system
+from gpebo_cli.observers.reduced.matrices import ObserverMatrices
+from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.schema import per_name
-from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.settings import NoiseSettings, SolverSettings
 
 _LEVEL = 1e-8  # of M's largest eigenvalue over all windows, in units of P(0)⁻¹: below, no evidence
 _INITIAL_VARIANCE = 10.0  # of what observer.P0 leaves out
 
 
 @dataclass(frozen=True, eq=False)
-class SignalNoise:
-    """What is known of the noise on the observer's signals."""
-
-    inputs: Array  # (m,) standard deviation of every sample
-    outputs: Array  # (r,)
-    sample_time: float  # seconds
-
-    @property
-    def variances(self) -> Array:
-        """Of (ν_u, ν_y) at any time, (m + r,)."""
-        return np.concatenate([self.inputs, self.outputs]) ** 2
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedSystem:
+class FilterModel:
     """The linear system above at N times, before its noise is known; ζ in coordinates of a basis.
 
     c, g_y and the noise's way into them are in all e + r rows of the residual; ``rows`` is Z.
@@ -81,8 +67,8 @@ class ReducedSystem:
     projector: Array  # (N, states, states) P
 
 
-def reduced_system(o: ObserverMatrices, u: Array, y: Array) -> ReducedSystem:
-    """The reduced system from the observer's matrices and signals, w in coordinates of its basis.
+def filter_model(o: ObserverMatrices, u: Array, y: Array) -> FilterModel:
+    """The linear system of the filter, w in coordinates of the observer's basis.
 
     Args:
         o: at N times.
@@ -112,7 +98,7 @@ def reduced_system(o: ObserverMatrices, u: Array, y: Array) -> ReducedSystem:
     rows[:, e:, e:] += np.eye(r)
     _, vectors = np.linalg.eigh(0.5 * (rows + transpose(rows)))
     Z = vectors[:, :, e:]
-    return ReducedSystem(
+    return FilterModel(
         A=A,
         b=np.einsum("nij,nj->ni", inward, signals),
         c=c,
@@ -135,7 +121,7 @@ class NoiseModel:
     process: Array  # (n,)
     rows: Array  # (e + r,) zero: V needs none
 
-    def state_space(self, s: ReducedSystem, q: int, basis: Array) -> StateSpace:
+    def state_space(self, s: FilterModel, q: int, basis: Array) -> StateSpace:
         """The model with its covariances, one column of signals, from the basis (n, n_w) of w."""
         Zt = transpose(s.rows)
         D = Zt @ s.in_measurement
@@ -159,7 +145,7 @@ class NoiseModel:
 
 
 def noise_model(
-    s: ReducedSystem, noise: SignalNoise, process: Array, regularisation: float
+    s: FilterModel, noise: SignalNoise, process: Array, regularisation: float
 ) -> NoiseModel:
     """Intensities; V is regularised if at some time it is below what regularises it.
 
@@ -182,94 +168,106 @@ def noise_model(
     return NoiseModel(signals, process, rows if needed else np.zeros_like(rows))
 
 
-def observe(
-    system: DescriptorSystem,
-    inputs: Trajectory,
-    outputs: Trajectory,
-    settings: ObserverSettings,
-    solver: SolverSettings,
-    noise: SignalNoise,
-) -> Observation:
-    """Run the filter on the signals u (m,) and y (r,), which share a mesh.
+@dataclass(frozen=True)
+class KalmanBucy:
+    """Unknown parameters are constant states; it estimates by itself.
 
-    The regression is that of the GPEBO observer, as evidence of excitation.
-
-    Raises:
-        ModelError: as the GPEBO observer: rank of E not constant, Assumption 1 violated.
-        ConfigError: settings that do not fit the plant.
-        SolverError: the tolerance cannot be reached.
+    Attributes:
+        xi_a0: first estimate of the differential states, as for gpebo; of unknowns: 0.
+        P0: its variance: one number, a list, or by name (theta1, w_e1; absent: 10).
+        process: intensity of white noise that drives what is estimated, likewise (absent: 0).
+        regularisation: where the noise leaves measurements exact: standard deviation of the noise
+            assumed instead, relative to each one's own size, at the noise's sample time.
     """
-    evidence = gpebo.observe(system, inputs, outputs, settings, solver)
-    mesh, q = inputs.mesh, system.q
-    points, points_inside = mesh.points.ravel(), mesh.inside.ravel()
-    first = observer_matrices(
-        system, points, points_inside, solver.rank_tol, normalise=True
-    )
-    basis = first.split.basis
 
-    def reduced(t: Array, inside: Array) -> ReducedSystem:
-        o = observer_matrices(system, t, inside, solver.rank_tol, first)
-        return reduced_system(o, inputs(t, inside), outputs(t, inside))
+    xi_a0: Mapping[str, float] | list[float] | None = None
+    P0: float | list[float] | Mapping[str, float] = 10.0
+    process: float | list[float] | Mapping[str, float] = 0.0
+    regularisation: float = field(default=1e-3, metadata={"range": (1e-6, 1.0)})
 
-    V1, initial = initial_basis(first.projector[0], first.split.rank, system.states)
-    fixed = basis.shape[1] == first.split.rank
-    labels = tuple(name.removeprefix("e0_") for name in initial) if fixed else system.states
-    names = (*system.unknowns, *(f"w_{label}" for label in labels))
-    w0 = basis.T @ V1 @ initial_extension(settings, system, initial)
-    start = np.concatenate([np.zeros(q), w0])
-    P0 = _initial_covariance(settings, names, q, basis.T @ V1)
-    process = per_name(settings.process, names, "estimate", "observer.process", absent=0.0)
-    model_noise = noise_model(
-        reduced(points, points_inside), noise, process, settings.regularisation
-    )
+    def observe(
+        self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
+    ) -> Observation:
+        """Run the filter; the regression is that of the GPEBO observer, as evidence of excitation.
 
-    def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
-        s = reduced(t, inside)
-        return model_noise.state_space(s, q, basis), (s.offset, s.gain, s.direct, s.projector)
+        Raises:
+            ModelError: as the GPEBO observer: rank of E not constant, Assumption 1 violated.
+            ConfigError: settings that do not fit the plant.
+            SolverError: the tolerance cannot be reached.
+        """
+        known = reduced_system(system, signals, solver, xi_a0=self.xi_a0)
+        evidence = Plain().observe(known)
+        mesh, q, basis = known.mesh, system.q, known.basis
+        noise = signals.noise or SignalNoise(
+            np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time
+        )
 
-    def monitor(estimate: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-        offset, gain, *_ = extras
-        x = offset + np.einsum("ksij,ksj->ksi", gain, estimate[..., 0])
-        return [(x, 0.0), (gain.reshape(*gain.shape[:2], -1), 0.0)]
+        def reduced(t: Array, inside: Array) -> FilterModel:
+            o = known.matrices(t, inside)
+            return filter_model(o, signals.inputs(t, inside), signals.outputs(t, inside))
 
-    name = f"Kalman-Bucy filter of plant {system.name}"
-    filtered = run_filter(
-        model, start[:, None], P0, mesh, tol=solver.tol, max_elements=solver.max_elements,
-        monitor=monitor, name=name,
-    )
-    offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
+        V1, initial = known.initial_basis, known.names
+        fixed = basis.shape[1] == known.rank
+        labels = tuple(name.removeprefix("e0_") for name in initial) if fixed else system.states
+        names = (*system.unknowns, *(f"w_{label}" for label in labels))
+        w0 = basis.T @ V1 @ known.xi_a0
+        start = np.concatenate([np.zeros(q), w0])
+        P0 = _initial_covariance(self.P0, names, q, basis.T @ V1)
+        process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
+        model_noise = noise_model(
+            reduced(mesh.points.ravel(), mesh.inside.ravel()), noise, process, self.regularisation
+        )
 
-    def information(t: Array, inside: Array) -> tuple[Array, Array]:
-        m = model_noise.state_space(reduced(t, inside), q, basis)
-        return m.A, transpose(m.c) @ np.linalg.solve(m.V, m.c)
+        def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
+            s = reduced(t, inside)
+            return model_noise.state_space(s, q, basis), (s.offset, s.gain, s.direct, s.projector)
 
-    windows = window_gramians(
-        information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
-        max_elements=solver.max_elements,
-    )
-    observability = _uniform_observability(windows, P0, projector, basis, q)
-    spread = Spread(filtered, AffineStateMap(offset, gain), direct, noise.variances)
-    return Observation(
-        regression=evidence.regression,
-        state_map=FilterStateMap(spread, system.states, names),
-        truth=CurrentState(projector, basis),
-        error_estimate=max(evidence.error_estimate, filtered.error_estimate),
-        assumptions=(
-            *evidence.assumptions,
-            _measurement_noise(system, model_noise, noise, settings.regularisation),
-            Assumption(
-                observability.name,
-                "the observability Gramian over windows of a tenth of the horizon stays away from "
-                "singular",
-                observability.holds,
-                observability.evidence,
+        def monitor(estimate: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+            offset, gain, *_ = extras
+            x = offset + np.einsum("ksij,ksj->ksi", gain, estimate[..., 0])
+            return [(x, 0.0), (gain.reshape(*gain.shape[:2], -1), 0.0)]
+
+        name = f"Kalman-Bucy filter of plant {system.name}"
+        filtered = run_filter(
+            model, start[:, None], P0, mesh, tol=solver.tol, max_elements=solver.max_elements,
+            monitor=monitor, name=name,
+        )
+        offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
+
+        def information(t: Array, inside: Array) -> tuple[Array, Array]:
+            m = model_noise.state_space(reduced(t, inside), q, basis)
+            return m.A, transpose(m.c) @ np.linalg.solve(m.V, m.c)
+
+        windows = window_gramians(
+            information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
+            max_elements=solver.max_elements,
+        )
+        observability = _uniform_observability(windows, P0, projector, basis, q)
+        spread = Spread(filtered, AffineStateMap(offset, gain), direct, noise.variances)
+        return Observation(
+            regression=evidence.regression,
+            state_map=FilterStateMap(spread, system.states, names),
+            truth=CurrentState(projector, basis),
+            error_estimate=max(evidence.error_estimate, filtered.error_estimate),
+            assumptions=(
+                *evidence.assumptions,
+                _measurement_noise(system, model_noise, noise, self.regularisation),
+                Assumption(
+                    observability.name,
+                    "the observability Gramian over windows of a tenth of the horizon stays away "
+                    "from singular",
+                    observability.holds,
+                    observability.evidence,
+                ),
             ),
-        ),
-        growth=None,
-        estimator=KalmanBucy(filtered, observability),
-        names=names,
-        note=_note(model_noise, settings.regularisation),
-    )
+            growth=None,
+            estimator=Filter(filtered, observability),
+            names=names,
+            note=_note(model_noise, self.regularisation),
+        )
+
+
+OBSERVER = KalmanBucy
 
 
 def _note(model: NoiseModel, regularisation: float) -> str:
@@ -282,10 +280,10 @@ def _note(model: NoiseModel, regularisation: float) -> str:
 
 
 def _initial_covariance(
-    settings: ObserverSettings, names: tuple[str, ...], q: int, V: Array
+    P0: ByName, names: tuple[str, ...], q: int, V: Array
 ) -> Array:
     """P(start) (n, n), within the range of the coordinates V (n_w, n_a) of V1."""
-    variances = per_name(settings.P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
+    variances = per_name(P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
     inside = np.zeros((len(names), len(names)))
     inside[:q, :q] = np.eye(q)
     inside[q:, q:] = V @ V.T
@@ -402,7 +400,7 @@ class FilterStateMap:
 
 
 @dataclass(frozen=True, eq=False)
-class KalmanBucy:
+class Filter:
     """The filter as an estimator with one case; the regression tells it nothing new."""
 
     filtered: Filtered

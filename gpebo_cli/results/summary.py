@@ -43,8 +43,8 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "plant": system.name,
         "title": system.title,
         "reference": system.reference,
-        "observer": result.settings.observer.name,
-        "sample_time": result.settings.observer.sample_time,
+        "observer": result.settings.observer["name"],
+        "sample_time": result.settings.observer.get("sample_time"),
         "estimator": dict(result.settings.estimator) if estimation else None,
         "noise": (
             asdict(result.settings.noise) if result.signals.measured_outputs is not None else None

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError, SolverError
+from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, LinearSolution, solve
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers.extension import output_scale
-from gpebo_cli.observers.observation import largest_entry, log_norm
+from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.observers._base import (
+    ByName,
+    Measurements,
+    initial_extension,
+    output_scale,
+    refuse_beyond,
+)
+from gpebo_cli.observers._observation import largest_entry, log_norm
 from gpebo_cli.observers.reduced.matrices import (
     AlgebraicEquations,
     Injection,
     ObserverMatrices,
     observer_matrices,
+    weakest,
 )
 from gpebo_cli.observers.reduced.regression import Assembled, regression_signals
 from gpebo_cli.observers.reduced.split import initial_basis
-from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
@@ -31,13 +40,14 @@ class ReducedSystem:
     """w' = A_0 w + b_0 + D_0 θ and 0 = R (𝒜 w + g_y + G θ) on measured signals."""
 
     system: DescriptorSystem
-    inputs: Trajectory
-    outputs: Trajectory
+    signals: Measurements
     solver: SolverSettings
     mesh: Mesh  # where to start integrating
     first: ObserverMatrices  # at the points of the signals' mesh, without injection
     initial_basis: Array  # (n, n_a) V1
     names: tuple[str, ...]  # of e₀'s components
+    xi_a0: Array  # (n_a,) where the extension starts, in the coordinates of V1
+    regression: str  # projected: all rows of the residual, paper: the last r
     injection: Injection | None = None
 
     @property
@@ -55,13 +65,13 @@ class ReducedSystem:
         o = observer_matrices(self.system, t, inside, self.solver.rank_tol, self.first)
         return o if self.injection is None else o.injected(self.injection(o, t, inside))
 
-    def signals(self, t: Array, inside: Array) -> Array:
-        """[u; y] at the times t (N,), shape (N, m + r, 1)."""
-        both = np.concatenate([self.inputs(t, inside), self.outputs(t, inside)], axis=1)
-        return both[:, :, None]
+    def start(self, xi_a: Array | None = None, basis: Array | None = None) -> Array:
+        """[ξ_a | ξ_b | Φ] = [ξ_a | 0 | V] for ξ_a (n,) and V (n, n_a), shape (k, 1 + q + n_a).
 
-    def start(self, xi_a: Array, basis: Array) -> Array:
-        """[ξ_a | ξ_b | Φ] = [ξ_a | 0 | V] for ξ_a (n,) and V (n, n_a), shape (k, 1 + q + n_a)."""
+        By default those of the start, V1 ξ_a0 and V1.
+        """
+        basis = self.initial_basis if basis is None else basis
+        xi_a = basis @ self.xi_a0 if xi_a is None else xi_a
         still = np.zeros((len(xi_a), self.system.q))
         return np.asarray(
             self.basis.T @ np.concatenate([xi_a[:, None], still, basis], axis=1)
@@ -70,36 +80,41 @@ class ReducedSystem:
 
 def reduced_system(
     system: DescriptorSystem,
-    inputs: Trajectory,
-    outputs: Trajectory,
-    settings: ObserverSettings,
+    signals: Measurements,
     solver: SolverSettings,
+    *,
+    xi_a0: Mapping[str, float] | list[float] | None = None,
+    weights: ByName | None = None,
+    regression: str = "projected",
 ) -> ReducedSystem:
-    """The reduced system on the signals u (m,) and y (r,), which share a mesh.
+    """The reduced system on measured signals.
 
     Args:
         system: the model.
-        inputs: u (m,) and
-        outputs: y (r,), on the same mesh.
-        settings: the weights of the outputs.
+        signals: u and y.
         solver: tolerances.
+        xi_a0: ``observer.xi_a0``.
+        weights: of the outputs, ``observer.weights``.
+        regression: which rows of the residual to keep.
 
     Raises:
         ModelError: rank of E not constant, or Assumption 1 violated.
-        ConfigError: no outputs.
+        ConfigError: no outputs, or a setting that does not fit.
     """
+    refuse_beyond(system)
     if system.r == 0:
         raise ConfigError(
             f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
         )
-    mesh = inputs.mesh
+    mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
     first = observer_matrices(
         system, t, inside, solver.rank_tol, normalise=True,
-        output_scale=output_scale(settings, system),
+        output_scale=output_scale(weights, system),
     )
     V1, names = initial_basis(first.split.projector[0], first.split.rank, system.states)
-    return ReducedSystem(system, inputs, outputs, solver, mesh, first, V1, names)
+    start = initial_extension(xi_a0, system, names)
+    return ReducedSystem(system, signals, solver, mesh, first, V1, names, start, regression)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +156,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         return LinearEquation(None, o.dynamics, f, seen)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
-        u, y = reduced.inputs(t, inside), reduced.outputs(t, inside)
+        u, y = reduced.signals.inputs(t, inside), reduced.signals.outputs(t, inside)
         return equations(reduced.matrices(t, inside), u, y)
 
     latest: list[Assembled] = []
@@ -166,8 +181,9 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         solution = ivp.solve(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
     else:
         known = None
-        if mesh is reduced.inputs.mesh and reduced.injection is None:
-            u, y = _over_time(reduced.inputs.values), _over_time(reduced.outputs.values)
+        signals = reduced.signals
+        if mesh is signals.mesh and reduced.injection is None:
+            u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
             known = equations(reduced.first, u, y)
         solution = solve(
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
@@ -187,3 +203,22 @@ def _driven(o: ObserverMatrices, u: Array, y: Array, columns: int) -> tuple[Arra
 def _over_time(signal: Array) -> Array:
     """Values (K, s + 1, …) one point after the other, (K (s + 1), …)."""
     return signal.reshape(signal.shape[0] * signal.shape[1], *signal.shape[2:])
+
+
+def assumptions(
+    reduced: ReducedSystem, mesh: Mesh, found: Assembled
+) -> tuple[Assumption, ...]:
+    """Rank of E and Assumption 1, with their evidence at the points of the mesh."""
+    smallest, where = weakest(found.injectivity, found.elimination)
+    return (
+        Assumption(
+            "Rank of E", "rank E(t) is constant", True,
+            {"rank": reduced.rank, "states": reduced.system.n},
+        ),
+        Assumption(
+            "Assumption 1",
+            "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
+            True,
+            {"smallest_singular_value": smallest, "at": float(mesh.points.ravel()[where])},
+        ),
+    )

@@ -27,7 +27,7 @@ smooth function.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,11 +37,10 @@ from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers.gpebo import observe_reduced
-from gpebo_cli.observers.observation import Observation
-from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
+from gpebo_cli.observers._observation import Observation
+from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices
-from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.observers.remedies.plain import Plain
 
 _TOLERANCE = 1e-6  # of S
 _PER_HORIZON = 4.0  # rate of the injection where A_0 is stable
@@ -49,25 +48,29 @@ _PER_ELEMENT = 10.0  # ‖A_0‖ h
 _MOST_PARTS = 10_000
 
 
-def observe(
-    system: DescriptorSystem,
-    inputs: Trajectory,
-    outputs: Trajectory,
-    settings: ObserverSettings,
-    solver: SolverSettings,
-) -> Observation:
-    """The observer of ``gpebo.observe`` on u (m,) and y (r,), with output injection.
+@dataclass(frozen=True)
+class OutputInjection:
+    """A dynamic extension that forgets.
 
-    Raises:
-        ModelError, ConfigError, SolverError: as there; ConfigError also if ``injection`` does not
-            fit the plant.
+    Attributes:
+        injection: K_o, n rows of as many entries as there are outputs, numbers or expressions of
+            t; None: from a Riccati equation.
     """
-    reduced = reduced_system(system, inputs, outputs, settings, solver)
-    if settings.injection is None:
-        injection, mesh = riccati_injection(reduced)
-    else:
-        injection, mesh = given_injection(system, settings.injection), reduced.mesh
-    return observe_reduced(replace(reduced, injection=injection, mesh=mesh), settings)
+
+    injection: list[list[float | str]] | None = None
+
+    def observe(self, reduced: ReducedSystem) -> Observation:
+        """The observer without a remedy, with A_0 − K_o c in place of A_0.
+
+        Raises:
+            ModelError, SolverError: as there.
+            ConfigError: ``injection`` does not fit the plant.
+        """
+        if self.injection is None:
+            injection, mesh = riccati_injection(reduced)
+        else:
+            injection, mesh = given_injection(reduced.system, self.injection), reduced.mesh
+        return Plain().observe(replace(reduced, injection=injection, mesh=mesh))
 
 
 def given_injection(system: DescriptorSystem, entries: list[list[float | str]]) -> Injection:

@@ -16,19 +16,17 @@ Between resets Φ starts at size 1. Without times being given it is reset before
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers.extension import initial_extension
-from gpebo_cli.observers.gpebo import assumptions
-from gpebo_cli.observers.observation import (
+from gpebo_cli.observers._observation import (
     AffineStateMap,
     Observation,
     error_of_extension,
@@ -37,14 +35,13 @@ from gpebo_cli.observers.observation import (
 from gpebo_cli.observers.reduced.extension import (
     Extension,
     ReducedSystem,
+    assumptions,
     extend,
-    reduced_system,
 )
 from gpebo_cli.observers.reduced.regression import Assembled, on_mesh
 from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.regression.resets import ExtensionState, Reset
-from gpebo_cli.settings import ObserverSettings, SolverSettings
 
 _GROWTH = 100.0  # of Φ between resets: two digits
 _TOLERANCE = 1e-6  # of Φ, where only its size matters
@@ -53,44 +50,51 @@ _FLOOR = 1e-3  # of the size of w and θ: parameters are resolved to so much, re
 _KNOWN = 1e-10  # eigenvalues of G below this share of the largest say nothing about w
 
 
-def observe(
-    system: DescriptorSystem,
-    inputs: Trajectory,
-    outputs: Trajectory,
-    settings: ObserverSettings,
-    solver: SolverSettings,
-) -> Observation:
-    """The observer of ``gpebo.observe`` on u (m,) and y (r,), with resets.
+@dataclass(frozen=True)
+class Resets:
+    """The extension starts again, at intervals and at given times.
 
-    Raises:
-        ModelError, ConfigError, SolverError: as there; ConfigError also for times of resets that
-            are not inside the horizon.
+    Attributes:
+        interval: seconds; without it and without ``times``: before Φ exceeds 100.
+        times: further ones, seconds.
+        keep: share of what is known that counts after a reset; 0: learn anew.
     """
-    reduced = reduced_system(system, inputs, outputs, settings, solver)
-    mesh, times = _with_edges(reduced.mesh, reset_times(reduced, settings))
-    if not len(times):
-        xi = _Start(float(mesh.edges[0]), reduced.initial_basis, _first(reduced, settings))
-        extension = extend(reduced, mesh, reduced.start(xi.xi_a, xi.basis))
-        return _joined(reduced, settings, [xi], [extension], [])
-    cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
-    starts = [_Start(float(mesh.edges[0]), reduced.initial_basis, _first(reduced, settings))]
-    extensions: list[Extension] = []
-    resets: list[Reset] = []
-    known = ExtensionState(np.zeros((system.q + reduced.rank, system.q + reduced.rank + 1)), 0.0)
-    for first, last in pairwise(cuts):
-        piece = Mesh(mesh.edges[first : last + 1], mesh.rule)
-        extensions.append(extend(reduced, piece, reduced.start(starts[-1].xi_a, starts[-1].basis)))
-        if last == mesh.size:
-            break
-        known = _learned(extensions[-1], known)
-        time = float(mesh.edges[last])
-        basis = _basis(reduced, time, float(mesh.inside[last, 0]))
-        reset, start = _restart(reduced, extensions[-1], known, time, basis)
-        reset = replace(reset, keep=settings.reset_keep)
-        known = known.after(reset)
-        resets.append(reset)
-        starts.append(start)
-    return _joined(reduced, settings, starts, extensions, resets)
+
+    interval: float | None = field(
+        default=None, metadata={"key": "reset_interval", "positive": True}
+    )  # seconds
+    times: list[float] = field(default_factory=list, metadata={"key": "reset_times"})
+    keep: float = field(default=1.0, metadata={"key": "reset_keep", "range": (0.0, 1.0)})
+
+    def observe(self, reduced: ReducedSystem) -> Observation:
+        """One regression over all segments, with the maps from each to the next.
+
+        Raises:
+            ModelError, SolverError: as without resets.
+            ConfigError: times that are not inside the horizon.
+        """
+        mesh, times = _with_edges(reduced.mesh, reset_times(reduced, self))
+        cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
+        V1, p = reduced.initial_basis, reduced.system.q + reduced.rank
+        starts = [_Start(float(mesh.edges[0]), V1, V1 @ reduced.xi_a0)]
+        extensions: list[Extension] = []
+        resets: list[Reset] = []
+        known = ExtensionState(np.zeros((p, p + 1)), 0.0)
+        for first, last in pairwise(cuts):
+            piece = Mesh(mesh.edges[first : last + 1], mesh.rule) if len(times) else mesh
+            begun = reduced.start(starts[-1].xi_a, starts[-1].basis)
+            extensions.append(extend(reduced, piece, begun))
+            if last == mesh.size:
+                break
+            known = _learned(extensions[-1], known)
+            time = float(mesh.edges[last])
+            basis = _basis(reduced, time, float(mesh.inside[last, 0]))
+            reset, start = _restart(reduced, extensions[-1], known, time, basis)
+            reset = replace(reset, keep=self.keep)
+            known = known.after(reset)
+            resets.append(reset)
+            starts.append(start)
+        return _joined(reduced, starts, extensions, resets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +134,6 @@ class SegmentErrors:
         return np.concatenate([theta, errors[segment]], axis=1)
 
 
-def _first(reduced: ReducedSystem, settings: ObserverSettings) -> Array:
-    """ξ_a at the start, (n,)."""
-    xi_a0 = initial_extension(settings, reduced.system, reduced.names)
-    return np.asarray(reduced.initial_basis @ xi_a0)
-
-
 def _basis(reduced: ReducedSystem, time: float, inside: float) -> Array:
     """V₊ (n, n_a): the one of the start where the kernel of E is constant."""
     if reduced.first.split.turn is None:
@@ -169,8 +167,7 @@ def _restart(
 
 
 def _joined(
-    reduced: ReducedSystem, settings: ObserverSettings, starts: list[_Start],
-    extensions: list[Extension], resets: list[Reset],
+    reduced: ReducedSystem, starts: list[_Start], extensions: list[Extension], resets: list[Reset],
 ) -> Observation:
     """One regression and one state map over all segments."""
     system = reduced.system
@@ -191,7 +188,7 @@ def _joined(
             np.broadcast_to(a.injectivity, (len(a.Y),)) for a in parts
         ]),
     )
-    kept = whole.kept_rows(system, settings.regression)
+    kept = whole.kept_rows(system, reduced.regression)
     q = system.q
     return Observation(
         regression=LinearRegression(
@@ -213,21 +210,21 @@ def _joined(
     )
 
 
-def reset_times(reduced: ReducedSystem, settings: ObserverSettings) -> Array:
+def reset_times(reduced: ReducedSystem, settings: Resets) -> Array:
     """When to reset, ascending, strictly inside the horizon.
 
     Raises:
         ConfigError: a time outside, or too many.
     """
-    start, stop = float(reduced.mesh.edges[0]), float(reduced.mesh.edges[-1])
-    outside = [t for t in settings.reset_times if not start < t < stop]
+    start, stop = reduced.signals.span
+    outside = [t for t in settings.times if not start < t < stop]
     if outside:
         raise ConfigError(
             f"observer.reset_times: {outside[0]:g} is not between start and end, {start:g} and "
             f"{stop:g}"
         )
-    times = list(settings.reset_times)
-    interval = settings.reset_interval
+    times = list(settings.times)
+    interval = settings.interval
     if interval is not None:
         count = (stop - start) / interval
         if count > _MOST:

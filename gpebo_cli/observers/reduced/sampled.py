@@ -12,6 +12,7 @@ the time between samples for zoh, order 2 for linear. Nothing grows with the num
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,13 +22,13 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers.extension import initial_extension
+from gpebo_cli.observers._base import ByName, initial_extension, output_scale, refuse_beyond
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import regression_signals
 from gpebo_cli.observers.reduced.split import initial_basis, split_in_frame
 from gpebo_cli.recordings.hold import edges, held
 from gpebo_cli.regression.samples import SampledRegression
-from gpebo_cli.settings import ObserverSettings, SolverSettings
+from gpebo_cli.settings import SolverSettings
 
 _STAGES = 4  # per sample, order 7: beyond what any hold is good for
 _PROBED = np.linspace(0.0, 1.0, 17)  # seconds: what turns, does so by more than rounding in them
@@ -181,38 +182,47 @@ def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
 
 
 def sampled_observer(
-    system: DescriptorSystem, settings: ObserverSettings, solver: SolverSettings, hold: str,
-    start: float,
+    system: DescriptorSystem, solver: SolverSettings, hold: str, start: float, *,
+    xi_a0: Mapping[str, float] | list[float] | None = None,
+    weights: ByName | None = None,
+    regression: str = "projected",
 ) -> SampledObserver:
-    """The observer of ``settings`` in discrete time, whose first sample is at ``start``.
+    """The observer in discrete time, whose first sample is at ``start``.
+
+    Args:
+        system: the model.
+        solver: tolerances.
+        hold: zoh or linear.
+        start: seconds.
+        xi_a0: ``observer.xi_a0``.
+        weights: of the outputs, ``observer.weights``.
+        regression: which rows of the residual to keep.
 
     Raises:
-        ConfigError: an observer that there is in continuous time only, no outputs, or ``xi_a0``
-            that does not fit.
+        ConfigError: no outputs, or a setting that does not fit.
         ModelError: Assumption 1 fails at the start.
     """
-    if settings.name != "gpebo":
-        raise ConfigError(
-            f"observer={settings.name} runs in continuous time only; observer=gpebo runs at samples"
-        )
+    refuse_beyond(system)
     if system.r == 0:
         raise ConfigError(
             f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
         )
     t = np.array([start])
-    first = observer_matrices(system, t, t, solver.rank_tol, normalise=True)
+    first = observer_matrices(
+        system, t, t, solver.rank_tol, normalise=True, output_scale=output_scale(weights, system)
+    )
     if not _kernel_is_fixed(system, first, t + _PROBED, solver.rank_tol):
         split = replace(first.split, basis=np.eye(system.n), frame=None)
         first = replace(first, split=split, on_basis=first.algebraic)
     split = first.split
     V1, names = initial_basis(split.projector[0], split.rank, system.states)
-    xi_a0 = initial_extension(settings, system, names)
+    xi_a = initial_extension(xi_a0, system, names)
     in_basis = split.basis.T @ V1
     zeros = np.zeros((len(in_basis), system.q))
     return SampledObserver(
-        system=system, solver=solver, hold=hold, regression=settings.regression, like=first,
-        start=np.concatenate([(in_basis @ xi_a0)[:, None], zeros, in_basis], axis=1),
-        initial_basis=V1, xi_a0=xi_a0, parameters=(*system.unknowns, *names),
+        system=system, solver=solver, hold=hold, regression=regression, like=first,
+        start=np.concatenate([(in_basis @ xi_a)[:, None], zeros, in_basis], axis=1),
+        initial_basis=V1, xi_a0=xi_a, parameters=(*system.unknowns, *names),
     )
 
 

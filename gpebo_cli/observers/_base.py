@@ -1,0 +1,158 @@
+"""What every observer is, what it is given, and what every one of them is told.
+
+ξ_a(start) = V1 ξ_a0,    weights w of the outputs: √(w/max w) y = √(w/max w) C x
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.observers._observation import Observation
+from gpebo_cli.schema import per_name
+from gpebo_cli.settings import SolverSettings
+
+if TYPE_CHECKING:
+    from gpebo_cli.observers.reduced.sampled import SampledObserver
+
+ByName = float | Sequence[float] | Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SignalNoise:
+    """What is known of the noise on the observer's signals."""
+
+    inputs: Array  # (m,) standard deviation of every sample
+    outputs: Array  # (r,)
+    sample_time: float  # seconds
+
+    @property
+    def variances(self) -> Array:
+        """Of (ν_u, ν_y) at any time, (m + r,)."""
+        return np.concatenate([self.inputs, self.outputs]) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """What an observer gets to see."""
+
+    inputs: Trajectory  # u (m,) and
+    outputs: Trajectory  # y (r,), on the same mesh
+    noise: SignalNoise | None = None  # for an observer that weighs by it; None: there is none
+
+    @property
+    def mesh(self) -> Mesh:
+        """On which both signals are given."""
+        return self.inputs.mesh
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time, seconds."""
+        return float(self.mesh.edges[0]), float(self.mesh.edges[-1])
+
+    def at(self, t: Array, inside: Array | None = None) -> Array:
+        """[u; y] at the times t (N,), shape (N, m + r)."""
+        return np.concatenate([self.inputs(t, inside), self.outputs(t, inside)], axis=1)
+
+
+class Observer(Protocol):
+    """Settings of one observer; immutable."""
+
+    def observe(
+        self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
+    ) -> Observation:
+        """From measured signals to a regression, and a map from its parameters to the state.
+
+        Args:
+            system: the plant; its true θ and initial state are not looked at.
+            signals: u and y.
+            solver: tolerances.
+
+        Raises:
+            ModelError: an assumption of the observer fails; names the time and the evidence.
+            ConfigError: settings that do not fit the plant.
+            SolverError: the tolerance cannot be reached.
+        """
+        ...
+
+
+class Sampling(NamedTuple):
+    """An observer that runs at samples."""
+
+    step: float  # seconds between them
+    hold: str  # what it assumes of u and y in between: zoh or linear
+
+
+@runtime_checkable
+class AtSamples(Observer, Protocol):
+    """An observer that can run at samples, as a controller does it."""
+
+    def sampling(self) -> Sampling | None:
+        """At which samples it was asked to run; None: in continuous time."""
+        ...
+
+    def at_samples(
+        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float
+    ) -> SampledObserver:
+        """The observer in discrete time, whose first sample is at ``start``."""
+        ...
+
+
+def initial_extension(
+    given: Mapping[str, float] | list[float] | None, system: DescriptorSystem,
+    names: tuple[str, ...],
+) -> Array:
+    """ξ_a(start) in the coordinates of V1, shape (n_a,): ``observer.xi_a0``, the plant's, or 0.
+
+    Args:
+        given: the setting.
+        system: the plant.
+        names: of e₀'s components.
+
+    Raises:
+        ConfigError: unknown state, or the wrong number of values.
+    """
+    where = "observer.xi_a0"
+    if given is None:
+        given = system.observer_defaults.get("xi_a0")  # type: ignore[assignment]
+        where = f"plant {system.name}: observer_defaults.xi_a0"
+    if given is None:
+        return np.zeros(len(names))
+    labels = [name.removeprefix("e0_") for name in names]
+    return per_name(given, labels, "differential state", where, "finite", absent=0.0)
+
+
+def output_scale(weights: ByName | None, system: DescriptorSystem) -> Array:
+    """√(w/max w) of the weights w, shape (r,): exactly one for outputs that count equally.
+
+    Raises:
+        ConfigError: the wrong number of weights, an unknown output, or no positive one.
+    """
+    if weights is None:
+        return np.ones(system.r)
+    w = per_name(weights, system.outputs, "output", "observer.weights", absent=1.0)
+    if not w.any():
+        raise ConfigError("observer.weights: at least one output must have a positive weight")
+    return np.asarray(np.sqrt(w / w.max()))
+
+
+def refuse_beyond(system: DescriptorSystem) -> None:
+    """Refuse a plant with terms that no observer here makes use of.
+
+    Raises:
+        ConfigError: names them.
+    """
+    source = system.coefficients
+    beyond = [key for key in ("phi", "D", "H") if key not in source.zero]
+    beyond += [f"{key} of {', '.join(sorted(names))}" for key, names in source.signals.items()]
+    if beyond:
+        raise ConfigError(
+            f"plant {system.name}: observers take E x' = A x + B u + F θ, y = C x with functions "
+            f"of t alone, and it has {beyond[0]}; use observer=none"
+        )

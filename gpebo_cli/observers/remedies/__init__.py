@@ -1,0 +1,29 @@
+"""What is done where Φ grows, so that θ̂ → θ no longer implies x̂ → x; one module each."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from gpebo_cli.observers._observation import Observation
+from gpebo_cli.observers.reduced.extension import ReducedSystem
+from gpebo_cli.observers.remedies.current_coordinates import CurrentCoordinates
+from gpebo_cli.observers.remedies.output_injection import OutputInjection
+from gpebo_cli.observers.remedies.plain import Plain
+from gpebo_cli.observers.remedies.reset import Resets
+
+
+class Remedy(Protocol):
+    """How the GPEBO observer runs its dynamic extension."""
+
+    def observe(self, reduced: ReducedSystem) -> Observation:
+        """The regression and the state map of a reduced system on measured signals."""
+        ...
+
+
+REMEDIES = {
+    "none": Plain,
+    "output_injection": OutputInjection,
+    "reset": Resets,
+    "current_coordinates": CurrentCoordinates,
+}
+"""By the value of ``observer.remedy``."""

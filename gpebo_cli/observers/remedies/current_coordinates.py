@@ -1,0 +1,128 @@
+"""The state itself as the parameter: no Φ, for a plant whose A_0 does not forget.
+
+With V an orthonormal basis of range P, ζ = (θ, Vᵀw) moves by known dynamics and is measured by
+what is left of the algebraic equations:
+
+    ζ' = 𝔸 ζ + 𝕓,      𝔸 = [[0, 0], [Vᵀ D_0, Vᵀ A_0 V]],  𝕓 = (0, Vᵀ b_0)
+    Y = ψ ζ,           ψ = [R G, R𝒜 V],  Y = −R g_y
+
+Nothing is integrated here. Estimators that can follow ζ work with it (``estimate_moving``): their
+filters carry ψᵀψ along with the current ζ. Where the kernel of E rotates, w is taken in all n
+coordinates, V = I, and Q w = 0 is measured, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.observers._observation import AffineStateMap, Observation
+from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions
+from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
+from gpebo_cli.observers.reduced.regression import Assembled, on_mesh, regression_signals
+from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.linear import LinearRegression
+
+
+@dataclass(frozen=True, eq=False)
+class CurrentState:
+    """ζ = (θ, Vᵀw) with w = V Vᵀx, or w = P(t) x for V = I."""
+
+    reduced: ReducedSystem
+
+    def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
+        """ζ at the times t (M,), shape (M, q + d)."""
+        basis, x = self.reduced.basis, states(t)
+        if basis.shape[1] > self.reduced.rank:
+            x = np.einsum("mij,mj->mi", self.reduced.matrices(t, t).projector, x)
+        return np.concatenate([theta, x @ basis], axis=1)
+
+
+@dataclass(frozen=True)
+class CurrentCoordinates:
+    """No Φ: what is estimated moves along with the state."""
+
+    def observe(self, reduced: ReducedSystem) -> Observation:
+        """The regression about ζ and its dynamics.
+
+        Raises:
+            ModelError, SolverError: as without a remedy.
+        """
+        system, solver = reduced.system, reduced.solver
+        q, n, basis = system.q, system.n, reduced.basis
+        rotates = basis.shape[1] > reduced.rank
+        k = basis.shape[1]
+        # [ξ_a | ξ_b | Φ] = [0 | 0 | −I] is the identity map from ζ to w.
+        identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
+        p = q + k
+
+        def coefficients(t: Array, inside: Array) -> LinearEquation:
+            o = reduced.matrices(t, inside)
+            signals = reduced.signals.at(t, inside)[:, :, None]
+            A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
+            A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
+            b[:, q:] = (o.from_signals @ signals)[:, :, 0]
+            zero = np.zeros((1, 1, 1))
+            kernel = np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n))
+            seen = (*o.equations(signals), A, b, kernel)
+            return LinearEquation(None, zero, np.zeros((len(t), 1, 1)), seen)
+
+        def assembled(extras: tuple[Array, ...]) -> tuple[Assembled, Array, Array]:
+            flat = [e.reshape(e.shape[0] * e.shape[1], *e.shape[2:]) for e in extras]
+            *parts, A, b, kernel = flat
+            z = np.broadcast_to(identity, (len(A), *identity.shape))
+            a = regression_signals(z, q, basis, AlgebraicEquations(*parts))
+            a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
+            if rotates:
+                a = _with_kernel(a, kernel, q)
+            return a, A, b
+
+        def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+            a, A, b = assembled(extras)
+            return [
+                (signal.reshape(*values.shape[:2], -1), floor)
+                for signal, floor in (*a.kinds(), (A, 0.0), (b, 0.0))
+            ]
+
+        # Nothing to integrate: a constant, and everything else resolved beside it.
+        problem = LinearProblem(
+            coefficients, np.ones((1, 1)), monitor, f"observer of plant {system.name}"
+        )
+        solution = solve(problem, reduced.mesh, tol=solver.tol, max_elements=solver.max_elements)
+        mesh = solution.trajectory.mesh
+        final, A, b = assembled(solution.extras)
+        kept = final.kept_rows(system, reduced.regression)
+        if rotates:
+            kept = np.union1d(kept, np.arange(final.Y.shape[1] - n, final.Y.shape[1]))
+        labels = system.states if rotates else [s.removeprefix("e0_") for s in reduced.names]
+        A_0 = A[:, q:, q:]
+        fastest = float(np.linalg.eigvals(A_0).real.min(initial=0.0))
+        return Observation(
+            regression=LinearRegression(
+                Y=on_mesh(mesh, final.Y[:, kept]),
+                psi=on_mesh(mesh, final.psi[:, kept]),
+                parameters=(*system.unknowns, *(f"w_{label}" for label in labels)),
+                scale=final.psi_scale,
+                dynamics=Dynamics(on_mesh(mesh, A), on_mesh(mesh, b), -2.0 * fastest),
+            ),
+            state_map=AffineStateMap(on_mesh(mesh, final.offset), on_mesh(mesh, final.gain)),
+            truth=CurrentState(reduced),
+            error_estimate=solution.error_estimate,
+            assumptions=assumptions(reduced, mesh, final),
+            growth=None,
+        )
+
+
+def _with_kernel(a: Assembled, kernel: Array, q: int) -> Assembled:
+    """Further rows 0 = Q w, of the size of ψ."""
+    count, n = kernel.shape[:2]
+    rows = np.concatenate([np.zeros((count, n, q)), a.psi_scale * kernel], axis=2)
+    return replace(
+        a,
+        Y=np.concatenate([a.Y, np.zeros((count, n))], axis=1),
+        psi=np.concatenate([a.psi, rows], axis=1),
+    )

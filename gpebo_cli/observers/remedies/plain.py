@@ -1,0 +1,47 @@
+"""No remedy: the dynamic extension runs from start to end, w = ξ_a + ξ_b θ − Φ e₀."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation
+from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions, extend
+from gpebo_cli.observers.reduced.regression import on_mesh
+from gpebo_cli.observers.reduced.response import respond
+from gpebo_cli.regression.linear import LinearRegression
+
+
+@dataclass(frozen=True)
+class Plain:
+    """The observer as Proposition 1 has it."""
+
+    def observe(self, reduced: ReducedSystem) -> Observation:
+        """The regression, and the state from its parameters; perhaps with output injection.
+
+        Raises:
+            ModelError: rank of E not constant, Assumption 1 violated.
+            SolverError: the tolerance cannot be reached.
+        """
+        system, q = reduced.system, reduced.system.q
+        extension = extend(reduced, reduced.mesh, reduced.start())
+        mesh, final = extension.mesh, extension.assembled
+        kept = final.kept_rows(system, reduced.regression)
+        all_kept = len(kept) == final.Y.shape[1]
+        start, stop = reduced.signals.span
+        return Observation(
+            regression=LinearRegression(
+                Y=on_mesh(mesh, final.Y if all_kept else final.Y[:, kept]),
+                psi=on_mesh(mesh, final.psi if all_kept else final.psi[:, kept]),
+                parameters=(*system.unknowns, *reduced.names),
+                scale=final.psi_scale,
+            ),
+            state_map=AffineStateMap(on_mesh(mesh, final.offset), on_mesh(mesh, final.gain)),
+            truth=InitialError(
+                reduced.initial_basis, reduced.xi_a0, reduced.basis, extension.solution.trajectory
+            ),
+            error_estimate=extension.solution.error_estimate,
+            assumptions=assumptions(reduced, mesh, final),
+            growth=extension.growth(q),
+            growth_rate=extension.logarithm(q) / (stop - start),
+            respond=lambda e_u, e_y: respond(mesh, reduced.matrices, kept, e_u, e_y),
+        )

@@ -1,0 +1,118 @@
+"""Dataclasses found by name: the modules of a package, and those that installed packages bring."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, is_dataclass
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Generic, TypeVar, cast
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.schema import keys, nearest, read
+
+T = TypeVar("T")
+Capability = TypeVar("Capability")
+
+_DESCRIPTIVE = ("name", "title", "reference")
+
+
+@dataclass(frozen=True)
+class Registry(Generic[T]):
+    """Estimators or observers by name; a module whose name begins with ``_`` is none.
+
+    A module exports its dataclass in capitals, as ``ESTIMATOR``. Another package offers one as an
+    entry point of the group ``gpebo.estimators``, which names the dataclass.
+    """
+
+    noun: str  # estimator
+
+    @property
+    def group(self) -> str:
+        """The entry points under which other packages offer theirs."""
+        return f"gpebo.{self.noun}s"
+
+    @cached_property
+    def ours(self) -> frozenset[str]:
+        """Names of the modules here."""
+        spec = find_spec(f"gpebo_cli.{self.noun}s")
+        folders = spec.submodule_search_locations if spec else None
+        return frozenset(
+            path.stem for folder in folders or () for path in Path(folder).glob("*.py")
+            if path.stem[0] != "_"
+        )
+
+    @property
+    def _theirs(self) -> dict[str, EntryPoint]:
+        """Those that installed packages bring. A name of ours is ours."""
+        return {entry.name: entry for entry in entry_points(group=self.group)}
+
+    def names(self) -> list[str]:
+        """All there are, those of other packages included."""
+        return sorted({*self.ours, *self._theirs})
+
+    def build(self, settings: Mapping[str, object]) -> T:
+        """The one that ``settings["name"]`` asks for, with the remaining keys as its settings.
+
+        Raises:
+            ConfigError: unknown name or key, with the nearest known one.
+        """
+        rest = {k: v for k, v in settings.items() if k not in _DESCRIPTIVE}
+        return cast(T, read(self.find(settings), rest, self.noun))
+
+    def settings_of(self, settings: Mapping[str, object]) -> list[str]:
+        """The settings that the one called ``settings["name"]`` has.
+
+        Raises:
+            ConfigError: unknown name, with the nearest known one.
+        """
+        return keys(self.find(settings))
+
+    def able(self, one: T | None, capability: type[Capability], asked: str) -> Capability:
+        """``one`` as something that has a capability, a protocol.
+
+        Args:
+            one: any.
+            capability: its protocol.
+            asked: what is asked for and by which setting, for the message.
+
+        Raises:
+            ConfigError: it has not; names those that have.
+        """
+        if isinstance(one, capability):
+            return one
+        there = [name for name in self.names() if issubclass(self.find({"name": name}), capability)]
+        raise ConfigError(f"{asked}; this one cannot, these can: {', '.join(there)}")
+
+    def find(self, settings: Mapping[str, object]) -> type:
+        """The dataclass of ``settings["name"]``.
+
+        Raises:
+            ConfigError: there is none of that name, or it cannot be imported.
+        """
+        name = settings.get("name")
+        if name in self.ours:
+            module = import_module(f"gpebo_cli.{self.noun}s.{name}")
+            return cast("type", getattr(module, self.noun.upper()))
+        if name in (theirs := self._theirs):
+            return self._load(theirs[str(name)])
+        article = "an" if self.noun[0] in "aeiou" else "a"
+        raise ConfigError(
+            f"{self.noun}.name: {name!r} is not {article} {self.noun}; known: "
+            f"{', '.join(self.names())}" + nearest(str(name), self.names())
+        )
+
+    def _load(self, entry: EntryPoint) -> type:
+        """The dataclass that another package's entry point names."""
+        package = entry.dist.name if entry.dist else entry.value
+        where = f"{self.noun}.name: {entry.name} of {package}"
+        try:
+            found = entry.load()
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"{where} cannot be imported: {error}") from error
+        if not (isinstance(found, type) and is_dataclass(found)):
+            raise ConfigError(f"{where} is not a dataclass; {entry.value} must name one")
+        return found
