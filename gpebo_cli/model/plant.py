@@ -159,12 +159,15 @@ class TextCoefficients:
         return breakpoints_of_tape(self.tape, start, stop)
 
 
-def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> DescriptorSystem:
+def plant_from_mapping(
+    mapping: Mapping[str, object], source: str = "", kind: str = "plant"
+) -> DescriptorSystem:
     """Build a plant from the plain data of its file.
 
     Args:
         mapping: the KEYS of a plant file; one that is absent, None or empty is the same.
         source: the file, for messages.
+        kind: what it is called in messages; only a plant needs states.
 
     Raises:
         ConfigError: anything that is missing, unknown, of the wrong kind or size, or not an
@@ -172,9 +175,9 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
     """
     file = f" ({source})" if source else ""
     if not isinstance(mapping, Mapping):
-        raise ConfigError(f"plant{file} must be a mapping with the keys {', '.join(KEYS)}")
-    name = _plant_name(mapping.get("name"), file)
-    plant = f"plant {name}{file}"
+        raise ConfigError(f"{kind}{file} must be a mapping with the keys {', '.join(KEYS)}")
+    name = _plant_name(mapping.get("name"), file, kind)
+    plant = f"{kind} {name}{file}"
     for key in mapping:
         if key not in KEYS:
             hint = nearest(str(key), KEYS)
@@ -183,6 +186,8 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
             )
 
     states = _names(plant, "states", _required(mapping, "states", plant))
+    if not states and kind == "plant":
+        raise ConfigError(f"{plant}: states is empty; a plant has at least one state")
     inputs = _named_values(plant, "inputs", mapping.get("inputs"), "{V: sin(t)}")
     unknowns = _named_values(plant, "unknowns", mapping.get("unknowns"), "{theta1: 1.5}")
     outputs = _names(plant, "outputs", _or_empty(mapping.get("outputs"), ()))
@@ -203,7 +208,7 @@ def plant_from_mapping(mapping: Mapping[str, object], source: str = "") -> Descr
             f"{plant}: the unknown {clash[0]} has the name of the estimated initial error of "
             f"the state {clash[0][3:]}; choose another name"
         )
-    parameters = _parameters(plant, mapping.get("parameters"), signals, elsewhere)
+    parameters = read_parameters(plant, mapping.get("parameters"), signals, elsewhere)
 
     def read(value: object, where: str, allowed: Mapping[str, str] | None = None) -> Expression:
         known = parameters if allowed is None else {**signals, **parameters}
@@ -353,12 +358,12 @@ def _required(mapping: Mapping[str, object], key: str, plant: str) -> object:
     return value
 
 
-def _plant_name(value: object, file: str) -> str:
+def _plant_name(value: object, file: str, kind: str) -> str:
     if value is None:
-        raise ConfigError(f"plant{file}: name is missing")
+        raise ConfigError(f"{kind}{file}: name is missing")
     if not isinstance(value, str) or not _PLANT_NAME.fullmatch(value):
         raise ConfigError(
-            f"plant{file}: name is {_show(value)}; write text of letters, digits, "
+            f"{kind}{file}: name is {_show(value)}; write text of letters, digits, "
             "'_', '-', '.' and blanks that starts with a letter or digit (it names folders)"
         )
     return value
@@ -406,10 +411,7 @@ def _names(plant: str, key: str, value: object) -> tuple[str, ...]:
         raise ConfigError(
             f"{plant}: {key} must be a list of names such as [x1, x2], not {_show(value)}"
         )
-    names = tuple(_name(plant, key, item) for item in items)
-    if key == "states" and not names:
-        raise ConfigError(f"{plant}: states is empty; a plant has at least one state")
-    return names
+    return tuple(_name(plant, key, item) for item in items)
 
 
 def _named_values(plant: str, key: str, value: object, example: str) -> dict[str, object]:
@@ -434,9 +436,20 @@ def _kind_of_name(plant: str, kinds: Mapping[str, Iterable[str]]) -> dict[str, s
     return seen
 
 
-def _parameters(
+def read_parameters(
     plant: str, value: object, signals: Mapping[str, Expression], elsewhere: Mapping[str, str]
 ) -> dict[str, Expression]:
+    """The named expressions of a file, each of which may use those above it.
+
+    Args:
+        plant: what the file is, for messages.
+        value: of its key ``parameters``.
+        signals: inputs and outputs by name.
+        elsewhere: names that may not be used, with what they are.
+
+    Raises:
+        ConfigError: a value that is no expression of the language, or a name that cannot be one.
+    """
     given = _named_values(plant, "parameters", value, "{R: 2 + sin(t)}")
     parameters: dict[str, Expression] = {}
     later = dict.fromkeys(given, "a parameter defined further down")

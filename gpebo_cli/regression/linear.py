@@ -55,7 +55,8 @@ class LinearRegression:
         """
         mesh = initial_mesh(0.0, horizon, [], elements, radau_rule(9))
         rows = Trajectory(mesh, psi(mesh.points))
-        return cls(Trajectory(mesh, Y(mesh.points)), rows, tuple(parameters), largest(rows.values))
+        return cls(Trajectory(mesh, Y(mesh.points)), rows, tuple(parameters),
+                   float(np.abs(rows.values).max(initial=0.0)))
 
     @property
     def mesh(self) -> Mesh:

@@ -81,6 +81,7 @@ def parse(
     names: Mapping[str, Expression],
     where: str,
     elsewhere: Mapping[str, str] | None = None,
+    calls: Mapping[str, tuple[int, Callable[..., Node]]] | None = None,
 ) -> Expression:
     """Read one entry of a plant.
 
@@ -89,6 +90,7 @@ def parse(
         names: what names in the text stand for, besides the RESERVED ones.
         where: what the entry is, such as ``"plant circuit: A[0][1]"``; starts every message.
         elsewhere: names that exist but may not be used here, with what they are ("an input").
+        calls: more functions, by name how many arguments they take and what makes their node.
 
     Raises:
         ConfigError: anything else than an expression of the language, or one without a value.
@@ -104,7 +106,7 @@ def parse(
         kind = "empty" if value is None else f"a {type(value).__name__}"
         raise ConfigError(f"{where} is {kind}; write a number or an expression")
 
-    reader = _Reader(names, elsewhere or {})
+    reader = _Reader(names, elsewhere or {}, {**_CALLS, **(calls or {})})
     try:
         node = reader.read(_syntax_tree(value), 0)
     except FoldError as error:
@@ -169,9 +171,13 @@ def _syntax_tree(text: str) -> ast.expr:
 class _Reader:
     """One text's walk; collects the named expressions it meets."""
 
-    def __init__(self, names: Mapping[str, Expression], elsewhere: Mapping[str, str]) -> None:
+    def __init__(
+        self, names: Mapping[str, Expression], elsewhere: Mapping[str, str],
+        calls: Mapping[str, tuple[int, Callable[..., Node]]],
+    ) -> None:
         self.names = names
         self.elsewhere = elsewhere
+        self.calls = calls
         self.used: dict[str, Expression] = {}
 
     def read(self, tree: ast.expr, depth: int) -> Node:
@@ -209,12 +215,12 @@ class _Reader:
         return node
 
     def _call(self, name: str, tree: ast.Call, depth: int) -> Node:
-        if name not in _CALLS:
-            hint = nearest(name, _CALLS)
+        if name not in self.calls:
+            hint = nearest(name, self.calls)
             raise FoldError(
-                f"there is no function {shorten(name)}{hint} (accepted: {', '.join(_CALLS)})"
+                f"there is no function {shorten(name)}{hint} (accepted: {', '.join(self.calls)})"
             )
-        count, made = _CALLS[name]
+        count, made = self.calls[name]
         if len(tree.args) != count or tree.keywords:
             given = "keywords" if tree.keywords else len(tree.args)
             wanted = "one argument" if count == 1 else "two arguments"

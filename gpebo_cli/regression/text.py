@@ -1,0 +1,324 @@
+"""A regression Y = ψη given as text: functions of time and of named signals, filters among them.
+
+Besides the language of plants there are the operators that regressions are built with,
+
+    lp(x, λ)      λ/(p + λ) x:      z' = λ (x − z),  z(start) = 0
+    hp(x, λ)      p λ/(p + λ) x  =  λ (x − lp(x, λ))
+    integral(x)   ∫ x from the start
+    delay(x, d)   x(t − d), zero before the start
+
+which may be nested. They are exact on the mesh: filters and integrals by the mesh's own rule, and
+elements end where a delayed signal jumps or has a kink.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError, SolverError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.expressions import Expression, Tape, breakpoints_of_tape, nodes, parse, record
+from gpebo_cli.model.expressions.nodes import Node
+from gpebo_cli.model.expressions.syntax import signal
+from gpebo_cli.model.plant import plant_from_mapping, read_parameters
+from gpebo_cli.numerics.collocation import wanted_parts
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved_kinds
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.regression.linear import LinearRegression, outer_products
+from gpebo_cli.schema import nearest, shown
+
+KEYS = (
+    "name", "title", "reference", "parameters", "unknowns", "signals", "Y", "psi", "units",
+    "labels",
+)
+"""Keys of a regression file; name, unknowns and psi are required."""
+
+_FIRST_ELEMENTS = 16
+_MAX_DELAYED = 10_000  # edges that delays may ask for
+
+
+@dataclass(frozen=True, eq=False)
+class Operator:
+    """One operator of the text; its value is a further signal."""
+
+    name: str  # lp, hp, integral or delay
+    argument: Tape  # of one output
+    number: float  # λ in 1/s or d in s; 0 for integral
+
+    def __call__(self, x: Trajectory) -> Array:
+        """The operator's values at the points of the mesh, (K, s + 1)."""
+        if self.name == "integral":
+            return x.integral().values
+        if self.name == "lp":
+            return x.low_pass(self.number).values
+        if self.name == "hp":
+            return np.asarray(self.number * (x.values - x.low_pass(self.number).values))
+        start = x.mesh.edges[0]
+        t, inside = (times.ravel() - self.number for times in (x.mesh.points, x.mesh.inside))
+        since = inside > start
+        out = np.zeros(len(t))
+        out[since] = x(np.maximum(t[since], start), inside[since])
+        return out.reshape(x.values.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class TextRegression:
+    """Y = ψη as text; ``Y`` is None where it is ψ times the true η."""
+
+    system: DescriptorSystem  # without states; its inputs are the signals, its θ is η
+    operators: tuple[Operator, ...]
+    psi: Tape  # rows · p outputs
+    Y: Tape | None  # rows outputs
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of ψ."""
+        return len(self.psi.outputs) // self.system.q
+
+    def on(
+        self, signals: Trajectory, Y: Trajectory | None, tol: float, max_elements: int
+    ) -> tuple[LinearRegression, float]:
+        """The regression along signals, on a mesh that resolves all that it is made of.
+
+        Args:
+            signals: (m,) by the system's inputs.
+            Y: (rows,) where the text has none.
+            tol: relative to each signal's own size.
+            max_elements: refuse to go beyond.
+
+        Returns:
+            The regression and the error estimate of its signals.
+
+        Raises:
+            ConfigError: an expression without a finite value; names it and the time.
+            SolverError: the tolerance cannot be reached.
+        """
+
+        def evaluated(mesh: Mesh) -> tuple[Array, Array, list[tuple[Array, float]]]:
+            columns = self._signals(signals, mesh)
+            psi = self._at(self.psi, mesh, columns).reshape(*mesh.points.shape, self.rows, -1)
+            if self.Y is not None:
+                right = self._at(self.Y, mesh, columns)
+            else:
+                assert Y is not None  # noqa: S101  a source gives it
+                right = Y(mesh.points.ravel(), mesh.inside.ravel())
+            right = right.reshape(*mesh.points.shape, self.rows)
+            flat = columns[0].reshape(*mesh.points.shape, -1)
+            products = outer_products(psi, right)
+            kinds = [flat[..., k : k + 1] for k in range(flat.shape[2])]
+            kinds += [psi.reshape(*mesh.points.shape, -1), right,
+                      products.reshape(*mesh.points.shape, -1)]
+            return psi, right, [(kind, 0.0) for kind in kinds]
+
+        mesh, (psi, right, _), error = resolved(
+            evaluated, self._mesh(signals), tol, max_elements, f"regression {self.system.name}"
+        )
+        regression = LinearRegression(
+            Trajectory(mesh, right), Trajectory(mesh, psi), self.system.unknowns,
+            float(np.abs(psi).max(initial=0.0)),
+        )
+        return regression, error
+
+    def _mesh(self, signals: Trajectory) -> Mesh:
+        """The signals' mesh with an edge wherever a delayed signal jumps or has a kink."""
+        mesh = signals.mesh
+        start, stop = float(mesh.edges[0]), float(mesh.edges[-1])
+        tapes = [self.psi, *([] if self.Y is None else [self.Y])]
+        tapes += [operator.argument for operator in self.operators]
+        found = [self.system.coefficients.breakpoints(start, stop), _jumps(signals)]
+        cuts = np.concatenate(found + [breakpoints_of_tape(tape, start, stop) for tape in tapes])
+        for operator in self.operators:
+            if operator.name == "delay":
+                later = np.concatenate([[start], cuts]) + operator.number
+                cuts = np.unique(np.concatenate([cuts, later[later < stop]]))
+                if len(cuts) > _MAX_DELAYED:
+                    raise ConfigError(
+                        f"regression {self.system.name}: its delays make {len(cuts)} corners in "
+                        f"the horizon; at most {_MAX_DELAYED} are followed"
+                    )
+        new = cuts[~np.isin(cuts, mesh.edges)]
+        if not len(new):
+            return mesh
+        return Mesh(np.unique(np.concatenate([mesh.edges, new])), mesh.rule)
+
+    def _signals(self, signals: Trajectory, mesh: Mesh) -> Array:
+        """The signals and all operators at the points of a mesh, (1, K (s + 1), m + operators)."""
+        m = self.system.m
+        columns = np.zeros((1, mesh.points.size, m + len(self.operators)))
+        columns[0, :, :m] = signals(mesh.points.ravel(), mesh.inside.ravel())
+        for k, operator in enumerate(self.operators):
+            x = self._at(operator.argument, mesh, columns).reshape(mesh.points.shape)
+            columns[0, :, m + k] = operator(Trajectory(mesh, x)).ravel()
+        return columns
+
+    @staticmethod
+    def _at(tape: Tape, mesh: Mesh, columns: Array) -> Array:
+        """Outputs of a tape at the points of a mesh, (K (s + 1), outputs)."""
+        return np.asarray(tape.taylor(mesh.points.ravel(), 0, mesh.inside.ravel(), columns)[0])
+
+
+def resolved(
+    evaluated: Callable[[Mesh], tuple[Array, Array, list[tuple[Array, float]]]], mesh: Mesh,
+    tol: float, max_elements: int, name: str,
+) -> tuple[Mesh, tuple[Array, Array, list[tuple[Array, float]]], float]:
+    """Cut elements until what is evaluated on the mesh is resolved; what it is then, and the tail.
+
+    Raises:
+        SolverError: ``max_elements`` do not reach ``tol``; names the time.
+    """
+    floor: Array | None = None
+    while True:
+        found = evaluated(mesh)
+        tail = unresolved_kinds(found[-1], mesh.rule)
+        poor = tail > tol
+        if floor is not None:  # cutting no longer helps: what is left is rounding
+            poor &= ~((tail > 0.25 * floor) & (tail < 1e-6))
+        if not poor.any():
+            return mesh, found, float(tail.max(initial=0.0))
+        parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
+        if parts.sum() > max_elements:
+            at = float(mesh.edges[int(np.argmax(tail))])
+            raise SolverError(
+                f"{name} is not resolved with {max_elements} elements, near t = {at:.6g}; raise "
+                "solver.max_elements or solver.tol"
+            )
+        before = np.repeat(tail, parts)
+        mesh, kept = mesh.split(parts)
+        floor = np.where(kept < 0, before, np.inf)
+
+
+def _jumps(signals: Trajectory) -> Array:
+    """Edges at which some signal jumps by more than rounding."""
+    left, right = signals.values[:-1, -1], signals.values[1:, 0]
+    size = np.abs(signals.values).max(axis=(0, 1), initial=0.0)
+    found = (np.abs(right - left) > 1e-9 * size).any(axis=1)
+    return np.asarray(signals.mesh.edges[1:-1][found])
+
+
+class _Operators:
+    """Collects the operators that are met while texts are parsed; equal ones are one."""
+
+    def __init__(self, signals: int) -> None:
+        self.found: dict[tuple[object, ...], Operator] = {}
+        self._signals = signals
+        self.calls: dict[str, tuple[int, Callable[..., Node]]] = {
+            "lp": (2, lambda x, rate: self._node("lp", x, rate)),
+            "hp": (2, lambda x, rate: self._node("hp", x, rate)),
+            "delay": (2, lambda x, time: self._node("delay", x, time)),
+            "integral": (1, lambda x: self._node("integral", x, nodes.number(0.0))),
+        }
+
+    def _node(self, name: str, argument: Node, number: Node) -> Node:
+        what = "its rate λ" if name in ("lp", "hp") else "the delay"
+        if not number.is_number or (name != "integral" and number.value <= 0.0):
+            raise nodes.FoldError(f"{name}: {what} must be a positive number")
+        if argument.derivatives:
+            raise nodes.FoldError(f"{name}: d(.) cannot stand inside; use hp for a derivative")
+        key = (name, _structure(argument), number.value)
+        if key not in self.found:
+            tape = record([Expression(argument, name, f"argument of {name}")])
+            self.found[key] = Operator(name, tape, number.value)
+        place = self._signals + list(self.found).index(key)
+        return nodes.signal(f"{name}(…)", place)
+
+
+def _structure(node: Node) -> tuple[object, ...]:
+    """Equal for equal expressions."""
+    return (node.operation, node.value, *map(_structure, node.arguments))
+
+
+def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> TextRegression:
+    """Build a regression from the plain data of its file.
+
+    Args:
+        mapping: KEYS; ``unknowns`` maps names to true values, ``signals`` names to expressions of
+            t (or null: they come from a recording), ``Y`` is a list of expressions of t and the
+            signals (absent: ψ times the truth), ``psi`` has one row for each.
+        source: the file, for messages.
+
+    Raises:
+        ConfigError: anything that is missing, unknown, of the wrong size, or not an expression.
+    """
+    file = f" ({source})" if source else ""
+    if not isinstance(mapping, Mapping):
+        raise ConfigError(f"regression{file} must be a mapping with the keys {', '.join(KEYS)}")
+    where = f"regression {mapping.get('name')}{file}"
+    for key in mapping:
+        if key not in KEYS:
+            raise ConfigError(
+                f"{where}: unknown key {shown(key)}{nearest(str(key), KEYS)} "
+                f"(accepted: {', '.join(KEYS)})"
+            )
+    signals = mapping.get("signals") or {}
+    if not isinstance(signals, Mapping):
+        raise ConfigError(f"{where}: signals must map names to expressions, such as {{u: sin(t)}}")
+    psi_rows, right = _list(mapping, "psi", where), mapping.get("Y")
+    count = len(psi_rows)
+    system = plant_from_mapping(
+        {
+            **{k: v for k, v in mapping.items() if k not in ("signals", "Y", "psi", "parameters")},
+            "inputs": {name: 0 if value is None else value for name, value in signals.items()},
+            "states": [], "E": [], "A": [], "initial_state": [],
+            "outputs": [] if right is not None else [f"Y_{i + 1}" for i in range(count)],
+        },
+        source, "regression",
+    )
+    if not system.unknowns:
+        raise ConfigError(f"{where}: unknowns is missing; it maps each parameter to its true value")
+    named = {name: signal(name, k, "a signal") for k, name in enumerate(system.inputs)}
+    elsewhere = dict.fromkeys(system.unknowns, "an unknown")
+    known = named | read_parameters(where, mapping.get("parameters"), named, elsewhere)
+    operators = _Operators(system.m)
+
+    def read(value: object, what: str) -> Expression:
+        return parse(value, known, f"{where}: {what}", elsewhere, operators.calls)
+
+    psi: list[Expression] = []
+    for i, row in enumerate(psi_rows):
+        if not isinstance(row, Sequence) or isinstance(row, str) or len(row) != system.q:
+            raise ConfigError(
+                f"{where}: psi[{i}] must be a list with an entry for each of the {system.q} "
+                f"unknowns ({', '.join(system.unknowns)}), not {shown(row)}"
+            )
+        psi += [read(value, f"psi[{i}][{j}]") for j, value in enumerate(row)]
+    Y = None
+    if right is not None:
+        texts = _list(mapping, "Y", where)
+        if len(texts) != count:
+            raise ConfigError(f"{where}: Y has {len(texts)} entries and psi has {count} rows")
+        Y = record([read(value, f"Y[{i}]") for i, value in enumerate(texts)])
+    return TextRegression(system, tuple(operators.found.values()), record(psi), Y)
+
+
+def _list(mapping: Mapping[str, object], key: str, where: str) -> Sequence[object]:
+    value = mapping.get(key)
+    if not isinstance(value, Sequence) or isinstance(value, str) or not value:
+        raise ConfigError(f"{where}: {key} must be a list, one entry for each row of Y = ψη")
+    return value
+
+
+def signals_of_time(
+    system: DescriptorSystem, start: float, stop: float, stages: int, tol: float, max_elements: int
+) -> Trajectory:
+    """The signals that a regression's text gives as functions of time, resolved on a mesh.
+
+    Raises:
+        ConfigError: a signal without a finite value; names it and the time.
+        SolverError: the tolerance cannot be reached.
+    """
+    cuts = system.coefficients.breakpoints(start, stop)
+    mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(stages))
+
+    def evaluated(mesh: Mesh) -> tuple[Array, Array, list[tuple[Array, float]]]:
+        u = system.coefficients.taylor(mesh.points.ravel(), 0, mesh.inside.ravel()).u[0]
+        values = u.reshape(*mesh.points.shape, system.m)
+        kinds = [(values[..., k : k + 1], 0.0) for k in range(system.m)]
+        return values, values, kinds or [(np.zeros((*mesh.points.shape, 1)), 0.0)]
+
+    mesh, (values, _, _), _ = resolved(
+        evaluated, mesh, tol, max_elements, f"regression {system.name}"
+    )
+    return Trajectory(mesh, values)

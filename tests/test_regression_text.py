@@ -1,0 +1,111 @@
+"""Regressions given as text: operators against closed forms and direct integration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from gpebo_cli import ConfigError, estimators
+from gpebo_cli.regression.text import regression_from_mapping, signals_of_time
+
+T = np.linspace(0.0, 10.0, 201)
+
+
+def on_mesh(mapping, tol=1e-12):
+    model = regression_from_mapping({"name": "r", **mapping})
+    signals = signals_of_time(model.system, 0.0, 10.0, 14, tol, 100_000)
+    regression, error = model.on(signals, None, tol, 100_000)
+    assert error <= 1e-10
+    return regression
+
+
+def values(*texts, **signals):
+    """Each text at the times T."""
+    mapping = {"unknowns": {"a": 1.0}, "signals": signals, "Y": list(texts)}
+    return on_mesh({**mapping, "psi": [[1.0]] * len(texts)}).Y(T).T
+
+
+def test_operators_of_a_sine_have_closed_forms():
+    low, high, total, late = values("lp(u, 2)", "hp(u, 2)", "integral(u)", "delay(u, 1.5)",
+                                    u="sin(t)")
+    expected = (4 * np.sin(T) - 2 * np.cos(T) + 2 * np.exp(-2 * T)) / 5
+    np.testing.assert_allclose(low, expected, atol=1e-11)
+    np.testing.assert_allclose(high, 2 * (np.sin(T) - expected), atol=1e-11)
+    np.testing.assert_allclose(total, 1 - np.cos(T), atol=1e-12)
+    np.testing.assert_allclose(late, np.where(T > 1.5, np.sin(T - 1.5), 0.0), atol=1e-12)
+
+
+def test_operators_may_be_nested_and_multiplied():
+    found = values("hp(lp(u*u, 1), 3)", "integral(u*lp(u, 2))", u="sin(t)")
+
+    def slope(t, z):
+        u = np.sin(t)
+        return [u * u - z[0], 3 * (z[0] - z[1]), 2 * (u - z[2]), u * z[2]]
+
+    z = solve_ivp(slope, (0, 10), np.zeros(4), "DOP853", T, rtol=1e-13, atol=1e-15).y
+    np.testing.assert_allclose(found, [3 * (z[0] - z[1]), z[3]], atol=1e-10)
+
+
+def test_a_delay_moves_jumps_exactly():
+    (found,) = values("delay(delay(w, 0.7), 1.1)*t", w="step(t - 3.3)*exp(-t)")
+    shifted = T - 1.8
+    expected = np.where(shifted > 3.3, np.exp(-shifted), 0.0) * T
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@given(rate=st.floats(1e-3, 1e6), frequency=st.floats(0.1, 30.0))
+@settings(max_examples=15, deadline=None)
+def test_low_and_high_pass_add_up_to_the_signal(rate, frequency):
+    """lp + hp/λ = 1, and λ/(p + λ) of an exponential is known, at any rate."""
+    total, low = values(
+        f"lp(u, {rate!r}) + hp(u, {rate!r})/{rate!r}", f"lp(v, {rate!r})",
+        u=f"cos({frequency!r}*t)", v="exp(-t)",
+    )
+    np.testing.assert_allclose(total, np.cos(frequency * T), atol=1e-10)
+    if abs(rate - 1.0) > 0.1:
+        expected = rate / (rate - 1.0) * (np.exp(-T) - np.exp(-rate * T))
+        np.testing.assert_allclose(low, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["ls_drem", "least_squares"])
+def test_estimators_find_the_parameters(name):
+    """y' = a y + b u, filtered by λ/(p + λ) so that y is not differentiated."""
+    regression = on_mesh({
+        "unknowns": {"a": -0.5, "b": 2.0},
+        "signals": {"u": "1", "y": "4*(1 - exp(-t/2))"},
+        "Y": ["hp(y, 3)"], "psi": [["lp(y, 3)", "lp(u, 3)"]],
+    })
+    estimator = estimators.build({"name": name})
+    found = estimators.estimate(estimator, regression, T).parameters(slice(0, 1))
+    np.testing.assert_allclose(found[0, -1], [-0.5, 2.0], atol=1e-5)  # f₀ is in it
+
+
+GOOD = {"name": "r", "unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": ["u"], "psi": [["u"]]}
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"unknowns": {}}, "unknowns is missing"),
+    ({"psi": [["u", "u"]]}, "psi[0] must be a list with an entry for each of the 1 unknowns (a)"),
+    ({"psi": []}, "psi must be a list"),
+    ({"Y": ["u", "u"]}, "Y has 2 entries and psi has 1 rows"),
+    ({"Y": ["lp(u)"]}, "lp takes two arguments, not 1"),
+    ({"Y": ["lp(u, u)"]}, "its rate λ must be a positive number"),
+    ({"Y": ["delay(u, -1)"]}, "the delay must be a positive number"),
+    ({"Y": ["lp(d(t*t), 1)"]}, "d(.) cannot stand inside"),
+    ({"Y": ["a*u"]}, "a is an unknown and cannot be used here"),
+    ({"Y": ["lpp(u, 1)"]}, "there is no function 'lpp'; did you mean lp?"),
+    ({"Phi": 1}, "unknown key 'Phi'; did you mean"),
+    ({"signals": {"u": "sin("}}, "regression r: inputs.u"),
+])
+def test_mistakes(change, message):
+    with pytest.raises(ConfigError) as error:
+        regression_from_mapping({**GOOD, **change})
+    assert message in str(error.value)
+
+
+def test_an_expression_without_a_value_is_named_with_its_time():
+    with pytest.raises(ConfigError, match="1/u"):
+        on_mesh({**GOOD, "psi": [["1/u"]]})
