@@ -29,8 +29,15 @@ class DataSettings:
     """Where u and y come from: the simulated plant, or a recording."""
 
     name: Literal["none", "csv"] = "none"
-    file: str | None = None  # a CSV file; "-" is standard input
+    file: str | None = None  # CSV, Parquet or MAT; "-" is standard input, as CSV
     hold: Literal["zoh", "linear", "cubic"] = "linear"  # what is assumed between samples
+    columns: Mapping[str, str] | None = None  # what a signal (t, V, y) is called in the file
+    scale: Mapping[str, float] | None = None  # by signal: from the file's unit to ours
+    time_unit: Literal["s", "ms", "min", "h", "datetime"] = "s"  # of t in the file
+    separator: str = ","  # between cells: a character, or comma, semicolon, tab, space
+    decimal: Literal[".", ","] = "."
+    missing: Literal["refuse", "hold", "interpolate", "drop"] = "refuse"  # of empty cells and nan
+    frame: object = None  # from Python: a pandas.DataFrame in place of a file
 
 
 @dataclass(frozen=True)

@@ -235,7 +235,7 @@ def test_a_plant_from_functions_and_from_a_mapping(tmp_path):
     np.testing.assert_allclose(one["x2"], other["x2"], atol=1e-13)
     np.testing.assert_allclose(one["x2"], -0.5 * one["x1"], atol=1e-12)
     text = (one.save(tmp_path, figures=False) / "config.yaml").read_text()
-    assert text.startswith("# The plant or the estimator was given as a Python object")
+    assert text.startswith("# The plant, the estimator or the data was a Python object")
     assert load_plant(system) is system
 
 

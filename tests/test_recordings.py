@@ -5,11 +5,18 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
+from importlib.util import find_spec
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
+import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from plants import shipped
+from scipy.io import savemat
 from test_cli import gpebo
 
 from gpebo_cli import check, run
@@ -213,6 +220,12 @@ BAD = {
     "a header only": (GOOD[:6], ["0 rows"]),
     "one row": (GOOD[:12], ["1 rows"]),
     "an open quote": ('t,V,y\n0,"1,2\n', ["line 2", "not CSV"]),
+    "digits of another script": ("t,V,y\n0,１.５,2\n1,1,3\n", ["line 2", "column V"]),
+    "a no-break space": ("t,V,y\n0,1,2\n1,\u00a01,3\n", ["line 3", "column V", "not a number"]),
+    "a vertical tab": ("t,V,y\n0,1,2\n1,\v1,3\n", ["line 3", "column V", "not a number"]),
+    "a form feed": ("t,V,y\n0,1,2\n1,1\f,3\n", ["line 3", "column V", "not a number"]),
+    "a separator of lines": ("t,V,y\n0,1,2\u20281,1,3\n", ["line 2", "5 cells"]),
+    "a truth value": ("t,V,y\n0,1,2\n1,True,3\n", ["line 3", "column V", "not a number"]),
 }
 
 
@@ -222,7 +235,7 @@ def test_a_mistake_in_a_file_is_named_with_its_place(tmp_path, mistake):
     path = tmp_path / "bad.csv"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        read_table(str(path), shipped("circuit"))
+        read_table(DataSettings("csv", str(path)), shipped("circuit"))
     message = str(caught.value)
     assert str(path) in message
     assert "\n" not in message
@@ -233,7 +246,7 @@ def test_a_mistake_in_a_file_is_named_with_its_place(tmp_path, mistake):
 @pytest.mark.parametrize("mistake", [m for m in BAD if "line" in BAD[m][1][0]])
 def test_a_stream_says_the_same(mistake):
     text, parts = BAD[mistake]
-    reader = LineReader("standard input", shipped("circuit"))
+    reader = LineReader("standard input", DataSettings("csv"), shipped("circuit"))
     rows, message = reader.feed(text.encode(), last=True)
     for part in parts:
         assert part in message
@@ -242,7 +255,7 @@ def test_a_stream_says_the_same(mistake):
 
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_rows_are_the_same_however_a_stream_is_cut(size):
-    reader = LineReader("standard input", shipped("circuit"))
+    reader = LineReader("standard input", DataSettings("csv"), shipped("circuit"))
     content, rows = GOOD.replace("\n", "\r\n").encode(), []
     for i in range(0, len(content), size):
         more, message = reader.feed(content[i : i + size])
@@ -251,19 +264,201 @@ def test_rows_are_the_same_however_a_stream_is_cut(size):
     assert rows == [[0.0, 1.0, 2.0], [0.5, 1.0, 3.0], [1.0, 2.0, 3.0]]
 
 
+CELLS = st.sampled_from([
+    "0", "1", "2.5", "-1e3", ".5", "5.", " 7 ", "\t8", "+9", "1e400", "nan", "inf", "", "１", "1_0",
+    "0x1", "True", "\u00a01", "\v2", "3\f", "4\r", "5\0", "1e", '"6"', '"7', "1 2", "\u20289",
+])
+
+
+@given(st.lists(st.lists(CELLS, min_size=2, max_size=4), max_size=5), st.booleans())
+def test_a_file_and_a_stream_agree_whatever_stands_there(tmp_path_factory, rows, windows):
+    end = "\r\n" if windows else "\n"
+    times = [[str(k), *cells] for k, cells in enumerate(rows)]
+    content = "".join(",".join(cells) + end for cells in [["t", "V", "y"], *times]).encode()
+    path = tmp_path_factory.mktemp("alike") / "r.csv"
+    path.write_bytes(content)
+    streamed, wrong = LineReader("S", DataSettings("csv"), shipped("circuit")).feed(
+        content, last=True
+    )
+    try:
+        found = read_table(DataSettings("csv", str(path)), shipped("circuit")).samples
+        read = np.column_stack([found.t, found.inputs, found.outputs]).tolist()
+        assert (read, "") == (streamed, wrong)
+    except ConfigError as error:
+        said = str(error).replace(str(path), "S")
+        assert said == wrong or (not wrong and len(streamed) < 2 and "rows below" in said)
+
+
+@pytest.mark.parametrize("blank", ["\n\n", "\n \n\t\n", "\r\n\r\n"])
+def test_blank_lines_count_unless_they_are_the_last(tmp_path, blank):
+    path = tmp_path / "r.csv"
+    path.write_bytes((GOOD + blank).encode())
+    assert len(read_table(DataSettings("csv", str(path)), shipped("circuit")).samples.t) == 3
+    reader = LineReader("S", DataSettings("csv"), shipped("circuit"))
+    rows, wrong = reader.feed((GOOD + blank).encode())
+    assert (len(rows), wrong) == (3, "")
+    assert "line 5" in reader.feed(b"9,1,1\n")[1]
+
+
+def test_many_rows_are_read_in_seconds(tmp_path):
+    t = np.arange(200_000) * 0.1
+    path = write(tmp_path / "r.csv", {"t": t, "V": np.sin(t), "y": np.cos(t)})
+    start = perf_counter()
+    found = read_table(DataSettings("csv", path), shipped("circuit")).samples
+    assert perf_counter() - start < 4.0
+    np.testing.assert_array_equal(found.t, t)
+    np.testing.assert_array_equal(found.outputs[:, 0], np.cos(t))
+
+
+# Files as they come from elsewhere ------------------------------------------------------------
+
+ELSEWHERE = """\
+"Time / ms";"U in (V)";note;"I, measured"\r
+0;1000,5;start;2,5\r
+500;2000;;-1e1\r
+1000;;"";3\r
+1500;1;"a; b";,25\r
+"""
+NAMES = {"t": "Time / ms", "V": "U in (V)", "y": "I, measured"}
+
+
+def elsewhere(path, **more):
+    return DataSettings(
+        "csv", str(path), columns=NAMES, scale={"V": 1e-3}, time_unit="ms", separator=";",
+        decimal=",", **more,
+    )
+
+
+@pytest.mark.parametrize(
+    ("missing", "t", "V"),
+    [
+        ("hold", [0.0, 0.5, 1.0, 1.5], [1.0005, 2.0, 2.0, 1e-3]),
+        ("interpolate", [0.0, 0.5, 1.0, 1.5], [1.0005, 2.0, 1.0005, 1e-3]),
+        ("drop", [0.0, 0.5, 1.5], [1.0005, 2.0, 1e-3]),
+    ],
+)
+def test_names_units_separators_and_gaps_are_said(tmp_path, missing, t, V):
+    path = tmp_path / "r.csv"
+    path.write_text(ELSEWHERE, newline="")
+    data = elsewhere(path, missing=missing)
+    found = read_table(data, shipped("circuit")).samples
+    np.testing.assert_allclose(found.t, t, rtol=1e-15)
+    np.testing.assert_allclose(found.inputs[:, 0], V, rtol=1e-12)
+    if missing == "interpolate":
+        with pytest.raises(ConfigError, match="a stream takes refuse, hold or drop"):
+            LineReader("S", data, shipped("circuit"))
+        return
+    rows, wrong = LineReader("S", data, shipped("circuit")).feed(ELSEWHERE.encode())
+    assert wrong == ""
+    np.testing.assert_array_equal([row[0] for row in rows], found.t)
+    np.testing.assert_array_equal([row[1] for row in rows], found.inputs[:, 0])
+
+
+def test_a_gap_is_refused_unless_it_is_said_what_to_do(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text(ELSEWHERE, newline="")
+    with pytest.raises(ConfigError, match=r"line 4, column U in \(V\): the sample is missing"):
+        read_table(elsewhere(path), shipped("circuit"))
+    path.write_text(ELSEWHERE.replace("1000,5", ""), newline="")
+    for missing in ("hold", "interpolate"):
+        with pytest.raises(ConfigError, match=r"line 2, column U .*none before it"):
+            read_table(elsewhere(path, missing=missing), shipped("circuit"))
+
+
+def test_dates_are_seconds_after_the_first(tmp_path):
+    path = tmp_path / "r.csv"
+    days = ["2024-02-28T23:59:59", "2024-02-29 00:00:00.25", "2024-03-01T00:00:00.25Z"]
+    path.write_text("t,V,y\n" + "".join(f"{day},1,2\n" for day in days))
+    data = DataSettings("csv", str(path), time_unit="datetime")
+    expected = [0.0, 1.25, 86401.25]
+    assert read_table(data, shipped("circuit")).samples.t.tolist() == expected
+    rows, wrong = LineReader("S", data, shipped("circuit")).feed(path.read_bytes())
+    assert ([row[0] for row in rows], wrong) == (expected, "")
+    path.write_text("t,V,y\n" + "".join(f"{day},1,2\n" for day in [days[0], "29/02/2024"]))
+    with pytest.raises(ConfigError, match=r"line 3, column t: '29/02/2024' is not a date"):
+        read_table(data, shipped("circuit"))
+
+
+def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
+    rows = {"t": [0.0, 0.5, 1.0], "V": [1.0, 2.0, 4.0], "y": [3.0, 5.0, 6.0]}
+    frame = pd.DataFrame(rows)
+    savemat(tmp_path / "r.mat", {**rows, "note": "text", "single": 3.0})
+    tables = [
+        read_table(DataSettings("csv", frame=frame), shipped("circuit")),
+        read_table(DataSettings("csv", frame=frame.set_index("t")), shipped("circuit")),
+        read_table(DataSettings("csv", str(tmp_path / "r.mat")), shipped("circuit")),
+    ]
+    dated = frame.set_index(pd.Timestamp("2024-01-01") + pd.to_timedelta(frame["t"], unit="s"))
+    tables.append(
+        read_table(DataSettings("csv", frame=dated.drop(columns="t")), shipped("circuit"))
+    )
+    if find_spec("pyarrow"):
+        frame.to_parquet(tmp_path / "r.parquet")
+        path = str(tmp_path / "r.parquet")
+        tables.append(read_table(DataSettings("csv", path), shipped("circuit")))
+    for table in tables:
+        assert table.samples.t.tolist() == rows["t"]
+        assert table.samples.inputs[:, 0].tolist() == rows["V"]
+        assert table.samples.outputs[:, 0].tolist() == rows["y"]
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({"V": ["a", "b", "c"]}, "column V: "),
+        ({"V": [1.0, np.nan, 2.0]}, "row 1, column V: nan is not a finite number"),
+        ({"t": [0.0, 1.0, 1.0]}, "times must increase"),
+        ({"t": [0.0, np.nan, 1.0]}, "row 1, column t"),
+        ({"V": [True, False, True]}, "column V: bool"),
+    ],
+)
+def test_what_is_wrong_with_a_data_frame(change, part):
+    good = {"t": [0.0, 0.5, 1.0], "V": [1.0, 2.0, 4.0], "y": [3.0, 5.0, 6.0]}
+    frame = pd.DataFrame(good | change)
+    with pytest.raises(ConfigError) as caught:
+        read_table(DataSettings("csv", frame=frame), shipped("circuit"))
+    assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "part"),
+    [
+        ({"columns": {"W": "x"}}, "data.columns: 'W' is no signal"),
+        ({"columns": {"V": "U"}}, "no column U"),
+        ({"scale": {"v": 2.0}}, "did you mean V?"),
+        ({"separator": "ab"}, "data.separator"),
+        ({"separator": ".", }, "data.separator"),
+    ],
+)
+def test_settings_that_do_not_fit_the_file(tmp_path, settings, part):
+    path = tmp_path / "r.csv"
+    path.write_text(GOOD)
+    with pytest.raises(ConfigError) as caught:
+        read_table(DataSettings("csv", str(path), **settings), shipped("circuit"))
+    assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "pipe"])
+def test_a_device_or_a_pipe_is_no_recording(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe")
+    path = os.path.join(tmp_path, name)  # an absolute name stays as it is
+    with pytest.raises(ConfigError, match="a device or a pipe, not a regular file"):
+        read_table(DataSettings("csv", path), shipped("circuit"))
+
+
 def test_files_that_are_not_text(tmp_path):
     path = tmp_path / "r.csv"
     for content, part in ((b"t,V,y\n0,1,\xff\n", "line 2"), (GOOD.encode("utf-16"), "UTF-16")):
         path.write_bytes(content)
         with pytest.raises(ConfigError, match=part):
-            read_table(str(path), shipped("circuit"))
+            read_table(DataSettings("csv", str(path)), shipped("circuit"))
 
 
 def test_a_byte_order_mark_quotes_and_other_columns_do_no_harm(tmp_path):
     path = tmp_path / "r.csv"
     content = b'\xef\xbb\xbf"t",note,y,V\r\n0,"a, b",2,1\r\n1,,3,"4"\r\n\r\n'
     path.write_bytes(content)
-    table = read_table(str(path), shipped("circuit"))
+    table = read_table(DataSettings("csv", str(path)), shipped("circuit"))
     assert table.samples.inputs.tolist() == [[1.0], [4.0]]
     assert table.samples.outputs.tolist() == [[2.0], [3.0]]
     assert table.lines == (2, 3)
@@ -363,6 +558,21 @@ def test_noise_is_not_added_to_a_recording(tmp_path):
     path.write_text(GOOD)
     with pytest.raises(ConfigError, match="has its own"):
         recorded(str(path), noise=NoiseSettings(outputs=0.1))
+
+
+def test_a_data_frame_from_python(tmp_path):
+    columns = signals_of(simulated(samples=401))
+    frame = pd.DataFrame({"time": columns["t"] / 60.0, "V": columns["V"], "y": columns["y"]})
+    path = write(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y")})
+    data = {"frame": frame, "columns": {"t": "time"}, "time_unit": "min"}
+    result = run("circuit", estimator="ls_drem", data=data)
+    expected = run("circuit", estimator="ls_drem", data=path)
+    assert run("circuit", data=pd.read_csv(path)).t[-1] == 20.0
+    np.testing.assert_allclose(
+        result.estimates["il"], expected.estimates["il"], rtol=1e-6, atol=1e-6
+    )
+    saved = result.save(tmp_path / "out", figures=False)
+    assert (saved / "config.yaml").read_text().startswith("# The plant, the estimator or the data")
 
 
 def test_a_recording_from_python(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from gpebo_cli import observers
 from gpebo_cli.api.choice import choose, plain, primary
@@ -21,6 +21,9 @@ from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 Plant = str | os.PathLike[str] | Mapping[str, object] | DescriptorSystem
 Choice = str | Mapping[str, object]
@@ -38,7 +41,7 @@ def run(
     observer: Choice | None = None,
     solver: Choice | None = None,
     noise: Choice | None = None,
-    data: Choice | os.PathLike[str] | None = None,
+    data: Choice | os.PathLike[str] | DataFrame | None = None,
     time: Mapping[str, object] | None = None,
     excitation: Mapping[str, object] | None = None,
     config_dir: Folder | None = None,
@@ -58,8 +61,10 @@ def run(
         observer: a name, or a mapping; ``"none"`` simulates only.
         solver: a name, or a mapping such as ``{"tol": 1e-9}``.
         noise: a name, or a mapping such as ``{"name": "gaussian", "outputs": 0.01, "seed": 1}``.
-        data: the path of a recording (CSV), or a mapping with its ``file`` and ``hold``; by default
-            the plant is simulated.
+        data: a recording: the path of a file (CSV, Parquet, MAT), a ``pandas.DataFrame`` with
+            columns ``t`` and those of the signals, or a mapping with a ``file`` or ``frame`` and
+            how to read it (``hold``, ``columns``, ``scale``, ``time_unit``, …); by default the
+            plant is simulated.
         time: ``start`` and ``horizon`` in seconds, ``samples`` of the output grid.
         excitation: ``rho`` and ``window`` (seconds) of the evidence.
         config_dir: a folder of yours, with ``plant/NAME.yaml``, ``estimator/NAME.yaml``, …
@@ -103,7 +108,7 @@ def check(
     observer: Choice | None = None,
     solver: Choice | None = None,
     noise: Choice | None = None,
-    data: Choice | os.PathLike[str] | None = None,
+    data: Choice | os.PathLike[str] | DataFrame | None = None,
     time: Mapping[str, object] | None = None,
     excitation: Mapping[str, object] | None = None,
     config_dir: Folder | None = None,
@@ -199,15 +204,18 @@ def _configure(
     _check_gains(gains, config["estimator"])
     config["estimator"] |= plain(gains)
     settings = configuration.settings(config, draw=True)
+    config["data"].pop("frame", None)  # no data of a configuration
     return configuration.complete(config, settings), system, settings
 
 
-def _recording(data: Choice | os.PathLike[str] | None) -> object:
-    """``data`` as the group has it: a path, or a mapping with a file, is a recording."""
+def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
+    """``data`` as the group has it: a path, a frame, or a mapping with one is a recording."""
     if isinstance(data, Mapping):
         return {"name": "csv", **data}
-    if data is None or data == "none":
+    if data is None or (isinstance(data, str) and data == "none"):
         return data
+    if not isinstance(data, str | os.PathLike):
+        return {"name": "csv", "frame": data}
     return {"name": "csv", "file": os.fspath(data)}
 
 

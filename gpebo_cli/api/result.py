@@ -267,7 +267,8 @@ class Result:
         details = replace(self.details, settings=replace(settings, output=output))
         word = (None if chosen else "none") if isinstance(chosen, bool) else chosen
         name = str(self.config["estimator"]["name"])
-        repeats = bool(self.config["plant"]) and name in estimators.names()
+        own = self.details.settings.data.frame is not None
+        repeats = bool(self.config["plant"]) and name in estimators.names() and not own
         head = configuration.REPEATS if repeats else _NOT_REPEATED
         text = configuration.config_text({**self.config, "figures": word}, head)
         write_run(details, Path(folder), text)
@@ -275,5 +276,5 @@ class Result:
 
 
 _NOT_REPEATED = (
-    "The plant or the estimator was given as a Python object; this file does not repeat the run"
+    "The plant, the estimator or the data was a Python object; this file does not repeat the run"
 )

@@ -32,7 +32,7 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
         ModelError: an assumption fails.
     """
     begin, online = stream(settings, system), None
-    reader = LineReader(_SOURCE, system)
+    reader = LineReader(_SOURCE, settings.data, system)
     while True:
         piece = os.read(0, _PIECE)
         rows, wrong = reader.feed(piece, last=not piece)

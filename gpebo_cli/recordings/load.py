@@ -55,14 +55,12 @@ def load(
     Raises:
         ConfigError: the file is not a recording of this plant, or shorter than the span.
     """
-    if data.file is None:
-        raise ConfigError("data=csv needs data.file=FILE, or data.file=- for standard input")
     if data.file == "-":
         raise ConfigError(
             "data.file=-: standard input is for gpebo run, once and without a sweep; give a file"
         )
-    table = read_table(data.file, system)
-    span = _span(data.file, table, time)
+    table = read_table(data, system)
+    span = _span(table, time)
     samples = table.samples
     m = system.m
     values = np.concatenate([samples.inputs, samples.outputs], axis=1)
@@ -78,9 +76,9 @@ def load(
     )
 
 
-def _span(path: str, table: Table, time: TimeSettings) -> tuple[float, float]:
+def _span(table: Table, time: TimeSettings) -> tuple[float, float]:
     """Start and end of the experiment, both within the recording."""
-    t = table.samples.t
+    path, t = table.header.source, table.samples.t
     first, last = float(t[0]), float(t[-1])
     slack = _ROUNDING * max(abs(first), abs(last))
     start = first if math.isinf(time.start) else time.start

@@ -1,25 +1,45 @@
-"""A recording as text: CSV with a column ``t`` and columns named like the plant's signals.
+"""A recording as a table: which columns are the plant's signals, and their numbers, row by row.
 
-Every row that is read is checked as it is read, so that a file and a stream say the same about
-the same mistake: source, line (the header is line 1), column, what stands there and what would do.
+:class:`RowReader` says what a row may be, for files and for streams. Of a file pandas reads the
+rows, in pieces; where it meets anything but plain numbers the rows are read again one by one, to
+name the mistake with its source, line (the header is line 1) and column.
 """
 
 from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import math
-from collections.abc import Iterable, Iterator, Sequence
+import os
+import re
+import stat
+from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.schema import nearest, shown
+from gpebo_cli.settings import DataSettings
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 TIME = "t"
-_SEPARATORS = {";": "semicolons", "\t": "tabs"}
+_SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+_SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+_WORDS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}  # as data.separator
+# ASCII digits only: Python would read １.５, 1_0 and what stands beside a no-break space, too.
+_NUMBER = r"[ \t]*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[ \t]*"
+_MISSING = ("", "nan", "na", "n/a", "null", "none")  # where data.missing allows it
+_BLANK = b" \t\r"
+_PIECE = 1 << 16  # rows that are text at the same time
+_LONGEST_LINE, _MOST_BLANK = 1 << 20, 1000
+_DATE = "a date and time as in 2024-05-31T12:00:00.250"
 
 
 @dataclass(frozen=True)
@@ -28,9 +48,10 @@ class Header:
 
     source: str  # a file's name or "standard input", for messages
     width: int  # columns of the table
-    names: tuple[str, ...]  # of those that are read: t, inputs, outputs, states that are there
+    names: tuple[str, ...]  # in the table, of those that are read: t, inputs, outputs, states
     positions: tuple[int, ...]
     known: tuple[int, ...]  # numbers of the states that are there
+    scale: tuple[float, ...]  # by which each column is multiplied; of t to seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +66,7 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A whole file: its samples and which file it was."""
+    """A whole recording: its samples and where they are from."""
 
     header: Header
     samples: Samples
@@ -53,43 +74,64 @@ class Table:
     sha256: str
 
 
-def read_table(path: str, system: DescriptorSystem) -> Table:
-    """Read the recording in the file ``path``.
+def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
+    """Read the recording that ``data`` names: CSV, Parquet, MAT, or a data frame.
 
     Raises:
         ConfigError: it cannot be read, or something in it is not what a recording has; one line
             that names the file, the line and the column.
     """
+    if data.frame is not None:
+        return _from_frame("data", data.frame, data, system, "")
+    if data.file is None:
+        raise ConfigError("data=csv needs data.file=FILE, or data.file=- for standard input")
+    path, content = data.file, read_file(data.file)
+    sha256 = hashlib.sha256(content).hexdigest()
+    kind = os.path.splitext(path)[1].lower()
+    if kind in (".parquet", ".mat"):
+        return _from_frame(path, _frame(path, kind, content), data, system, sha256)
+    check_text(path, content)
+    content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n")
+    end = content.find(b"\n", len(content.rstrip(_BLANK + b"\n")))  # of the last line of all
+    content = content if end < 0 else content[:end]
+    if not content.strip(_BLANK):
+        raise ConfigError(f"{path} is empty; expected a header and rows")
+    first, _, body = content.partition(b"\n")
+    header = read_header(path, split_cells(path, 1, first.decode(), data), data, system)
+    values = _read_body(header, data, body)
+    if len(values) < 2:
+        raise ConfigError(f"{path} has {len(values)} rows below its header; at least 2 are needed")
+    return _table(header, data, values, system, sha256, first_line=2)
+
+
+def read_file(path: str) -> bytes:
+    """The content of a regular file: a device or a pipe might never end.
+
+    Raises:
+        ConfigError: it is none, or cannot be read.
+    """
     try:
+        kind = os.stat(path).st_mode
+        if stat.S_ISDIR(kind):
+            raise ConfigError(f"data.file: {path} is a folder, not a file")
+        if not stat.S_ISREG(kind):
+            raise ConfigError(f"data.file: {path} is a device or a pipe, not a regular file")
         with open(path, "rb") as stream:
-            content = stream.read()
-    except IsADirectoryError:
-        raise ConfigError(f"data.file: {path} is a folder, not a file") from None
+            return stream.read()
     except OSError as error:
         raise ConfigError(f"data.file: {path} cannot be read: {error.strerror}") from error
     except ValueError as error:  # a NUL in the name
         raise ConfigError(f"data.file: {shown(path)} is no name of a file") from error
-    rows = _cells(path, _text(path, content))
-    _, first = next(rows, (0, None))
-    if first is None:
-        raise ConfigError(f"{path} is empty; expected a header and rows")
-    header = read_header(path, first, system)
-    reader = RowReader(header)
-    lines, values = [], []
-    for line, cells in rows:
-        values.append(reader.read(line, cells))
-        lines.append(line)
-    if len(values) < 2:
-        raise ConfigError(f"{path} has {len(values)} rows below its header; at least 2 are needed")
-    return Table(
-        header, samples(header, np.array(values), system), (lines[0], lines[-1]),
-        hashlib.sha256(content).hexdigest(),
-    )
 
 
-def _text(path: str, content: bytes) -> str:
+def check_text(path: str, content: bytes) -> None:
+    """Refuse what is not UTF-8, by its line.
+
+    Raises:
+        ConfigError: says which line it is.
+    """
     try:
-        return content.decode("utf-8-sig")  # a spreadsheet's byte order mark does no harm
+        content.decode()
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         utf16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -97,54 +139,69 @@ def _text(path: str, content: bytes) -> str:
         raise ConfigError(f"{path}, line {line}: not UTF-8 text{what}; save it as UTF-8") from None
 
 
-def _cells(source: str, text: str) -> Iterator[tuple[int, list[str]]]:
-    """Lines, counted from 1, and their cells; empty lines at the end do not count."""
-    lines = text.splitlines()
-    while lines and not lines[-1].strip():
-        lines.pop()
-    for number, line in enumerate(lines, start=1):
-        yield number, split_cells(source, number, line)
+def separator(data: DataSettings) -> str:
+    """The character between cells.
+
+    Raises:
+        ConfigError: it is no such character.
+    """
+    found = _WORDS.get(data.separator, data.separator)
+    if len(found) != 1 or found in '"\r\n' or found.isalnum() or found == data.decimal:
+        raise ConfigError(
+            f"data.separator: expected one character, not {data.decimal!r} (that is data.decimal), "
+            f"or {', '.join(_WORDS)}; got {shown(data.separator)}"
+        )
+    return found
 
 
-def split_cells(source: str, line: int, text: str) -> list[str]:
+def split_cells(source: str, line: int, text: str, data: DataSettings) -> list[str]:
     """The cells of one line; cells may be quoted.
 
     Raises:
         ConfigError: the line is not CSV.
     """
     if '"' not in text:
-        return text.split(",")
+        return text.split(separator(data))
     try:
-        return next(csv.reader([text], strict=True))
+        return next(csv.reader([text], delimiter=separator(data), strict=True))
     except csv.Error as error:
         raise ConfigError(f"{source}, line {line}: not CSV: {error}") from None
 
 
-def read_header(source: str, cells: Sequence[str], system: DescriptorSystem) -> Header:
-    """Find the columns of the plant's signals among the names in the first line.
+def read_header(
+    source: str, cells: Sequence[str], data: DataSettings, system: DescriptorSystem
+) -> Header:
+    """Find the columns of the plant's signals among the names of a table's columns.
 
-    A column ``<name>_measured``, as ``signals.csv`` of a run with noise has it beside the truth, is
-    what an observer gets to see, and is read in place of ``<name>``.
+    ``data.columns`` says what a signal is called there. Without it, a column ``<name>_measured``,
+    as ``signals.csv`` of a run with noise has it beside the truth, is what an observer gets to see,
+    and is read in place of ``<name>``.
 
     Raises:
-        ConfigError: a column is missing or stands there twice.
+        ConfigError: a column is missing or stands there twice, or a name is no signal's.
     """
-    names = [cell.strip() for cell in cells]
-    if len(names) == 1:
-        for separator, word in _SEPARATORS.items():
-            if separator in names[0]:
+    names, columns, scale = [cell.strip() for cell in cells], data.columns or {}, data.scale or {}
+    signals = (TIME, *system.inputs, *system.outputs)
+    for key, given in (("columns", columns), ("scale", scale)):
+        for name in given:
+            if name not in (*signals, *system.states):
                 raise ConfigError(
-                    f"{source}, line 1: cells are separated by {word}; use commas, and points in "
-                    "numbers"
+                    f"data.{key}: {shown(name)} is no signal of plant {system.name}; those are "
+                    f"{', '.join((*signals, *system.states))}" + nearest(name, signals)
                 )
-    known = tuple(i for i, state in enumerate(system.states) if state in names)
-    seen = (
-        f"{name}_measured" if f"{name}_measured" in names else name
-        for name in (*system.inputs, *system.outputs)
-    )
-    needed = (TIME, *seen)
-    wanted = (*needed, *(system.states[i] for i in known))
-    for name in wanted:
+    if len(names) == 1 and data.separator == ",":
+        for character, word in _SEPARATORS.items():
+            if character in names[0]:
+                raise ConfigError(
+                    f"{source}, line 1: cells are separated by {word}; expected commas, or "
+                    f"data.separator='{character if character != chr(9) else 'tab'}'"
+                )
+    measured = {name: f"{name}_measured" for name in signals if f"{name}_measured" in names}
+    called = {name: columns.get(name, measured.get(name, name)) for name in signals}
+    known = tuple(i for i, x in enumerate(system.states) if columns.get(x, x) in names)
+    called |= {x: columns.get(x, x) for x in (system.states[i] for i in known)}
+    wanted = tuple(called.values())
+    for name in (*wanted, *(columns[x] for x in columns if x not in called)):
         count = names.count(name)
         if count > 1:
             raise ConfigError(f"{source}, line 1: column {name} stands there {count} times")
@@ -152,24 +209,30 @@ def read_header(source: str, cells: Sequence[str], system: DescriptorSystem) -> 
             unused = [other for other in names if other not in wanted]
             same = [other for other in unused if other.casefold() == name.casefold()]
             hint = f"; did you mean {same[0]}?" if same else nearest(name, unused)
+            needed = ", ".join(called[signal] for signal in signals)
             raise ConfigError(
                 f"{source}, line 1: there is no column {name}; plant {system.name} needs "
-                f"{', '.join(needed)}, the header has {shown(', '.join(names))}"
-                + hint
+                f"{needed}, the header has {shown(', '.join(names))}{hint}; data.columns says what "
+                "a signal is called"
             )
-    positions = tuple(names.index(name) for name in wanted)
-    return Header(source, len(names), wanted, positions, known)
+    factors = {TIME: _SECONDS.get(data.time_unit, 1.0), **scale}
+    return Header(
+        source, len(names), wanted, tuple(map(names.index, wanted)), known,
+        tuple(factors.get(name, 1.0) for name in called),
+    )
 
 
 class RowReader:
     """Reads one row after the other; remembers the time of the last one."""
 
-    def __init__(self, header: Header) -> None:
-        self._header = header
+    def __init__(self, header: Header, data: DataSettings) -> None:
+        self._header, self._data = header, data
         self._last = (-math.inf, 0)  # time and line
+        self._origin: Any = None  # of dates
+        self._number = re.compile(_NUMBER.replace(r"\.", re.escape(data.decimal)))
 
     def read(self, line: int, cells: Sequence[str]) -> list[float]:
-        """The numbers of the columns that are read.
+        """The numbers of the columns that are read; NaN where a sample is allowed to be missing.
 
         Raises:
             ConfigError: too few or too many cells, one that is empty or not a finite number, or
@@ -181,37 +244,84 @@ class RowReader:
             raise ConfigError(
                 f"{header.source}, line {line} {what}; the header has {header.width}"
             )
-        try:
-            values = [float(cells[i]) for i in header.positions]
-        except ValueError:
-            values = [math.nan]
-        if not all(map(math.isfinite, values)) or any("_" in cells[i] for i in header.positions):
-            raise ConfigError(self._wrong_cell(line, cells))
+        row = zip(header.names, header.positions, header.scale, strict=True)
+        values = [
+            self._value(f"{header.source}, line {line}, column {name}", cells[k], first=i == 0)
+            * scale
+            for i, (name, k, scale) in enumerate(row)
+        ]
         t, (before, line_before) = values[0], self._last
         if t <= before:
             how = "repeats" if t == before else "is before"
             raise ConfigError(
-                f"{header.source}, line {line}, column {TIME}: {t!r} {how} {before!r} of line "
-                f"{line_before}; times must increase"
+                f"{header.source}, line {line}, column {header.names[0]}: {t!r} {how} {before!r} "
+                f"of line {line_before}; times must increase"
             )
-        self._last = (t, line)
+        if not math.isnan(t):
+            self._last = (t, line)
         return values
 
-    def _wrong_cell(self, line: int, cells: Sequence[str]) -> str:
-        """The first cell that is not a finite number, as a message."""
-        header = self._header
-        for name, position in zip(header.names, header.positions, strict=True):
-            cell = cells[position]
-            where = f"{header.source}, line {line}, column {name}"
-            if not cell.strip():
-                return f"{where}: the sample is missing; every row needs a number there"
-            try:
-                number = float(cell.replace("_", "?"))  # Python would read 1_0 as 10
-            except ValueError:
-                return f"{where}: {shown(cell)} is not a number"
-            if not math.isfinite(number):
-                return f"{where}: {shown(cell.strip())} is not a finite number"
-        raise AssertionError("no cell is wrong")
+    def _value(self, where: str, cell: str, *, first: bool) -> float:
+        policy = self._data.missing
+        if cell.strip(" \t").lower() in _MISSING:
+            if policy == "drop" or (policy != "refuse" and not first):
+                return math.nan
+            if not cell.strip(" \t"):
+                raise ConfigError(
+                    f"{where}: the sample is missing; every row needs a number there"
+                    + ("" if first else ", or data.missing says what to do")
+                )
+        if first and self._data.time_unit == "datetime":
+            [value], self._origin = seconds([cell], self._origin)
+            if math.isnan(value):
+                raise ConfigError(f"{where}: {shown(cell)} is not {_DATE}")
+            return float(value)
+        if self._number.fullmatch(cell) is None:
+            text = cell.strip(" \t").lower().lstrip("+-")
+            what = "a finite number" if text in ("nan", "inf", "infinity") else "a number"
+            raise ConfigError(f"{where}: {shown(cell)} is not {what}")
+        value = float(cell.replace(self._data.decimal, "."))
+        if not math.isfinite(value):
+            raise ConfigError(f"{where}: {shown(cell.strip())} is not a finite number")
+        return value
+
+
+def seconds(cells: Sequence[str], origin: Any) -> tuple[Array, Any]:
+    """Dates and times as seconds after ``origin``, by default the first one; NaN: it is none."""
+    import pandas as pd
+
+    times = pd.to_datetime(list(cells), format="ISO8601", utc=True, errors="coerce")
+    origin = times[0] if origin is None else origin
+    return np.asarray((times - origin).total_seconds(), dtype=np.float64), origin
+
+
+def fill(
+    header: Header, data: DataSettings, values: Array, line: Sequence[int] | IntArray
+) -> Array:
+    """Rows (N, columns) without gaps, as ``data.missing`` wants it.
+
+    Raises:
+        ConfigError: there is no sample to hold, or none on one side to interpolate from.
+    """
+    gaps = np.isnan(values)
+    if data.missing == "drop":
+        return np.asarray(values[~gaps.any(axis=1)])
+    for k in np.flatnonzero(gaps.any(axis=0)):
+        there = np.flatnonzero(~gaps[:, k])
+        sides = [0] if data.missing == "hold" else [0, -1]
+        for side in sides:
+            if gaps[side, k]:
+                raise ConfigError(
+                    f"{header.source}, line {line[side]}, column {header.names[k]}: the sample is "
+                    f"missing, and there is none {'before' if side == 0 else 'after'} it for "
+                    f"data.missing={data.missing}"
+                )
+        if data.missing == "hold":
+            last = np.searchsorted(there, np.arange(len(values)), side="right") - 1
+            values[:, k] = values[there[last], k]
+        else:
+            values[:, k] = np.interp(values[:, 0], values[there, 0], values[there, k])
+    return values
 
 
 def samples(header: Header, values: Array, system: DescriptorSystem) -> Samples:
@@ -222,14 +332,145 @@ def samples(header: Header, values: Array, system: DescriptorSystem) -> Samples:
     return Samples(values[:, 0], values[:, 1 : 1 + m], values[:, 1 + m : 1 + m + r], states)
 
 
+def _table(
+    header: Header, data: DataSettings, values: Array, system: DescriptorSystem, sha256: str,
+    first_line: int,
+) -> Table:
+    line = np.arange(first_line, first_line + len(values))
+    kept = line[~np.isnan(values).any(axis=1)] if data.missing == "drop" else line
+    values = fill(header, data, values, line)
+    if len(values) < 2:
+        raise ConfigError(f"{header.source} has {len(values)} rows without gaps; 2 are needed")
+    found = samples(header, values, system)
+    return Table(header, found, (int(kept[0]), int(kept[-1])), sha256)
+
+
+def _read_body(header: Header, data: DataSettings, body: bytes) -> Array:
+    """The rows below the header, (N, columns): by pandas, or one by one."""
+    plain = data.missing == "refuse" and data.time_unit != "datetime"
+    if plain and not re.search(rb'["\r\v\f\0]', body) and _even(header, data, body):
+        values = _by_pandas(header, data, body)
+        if values is not None and not np.any(np.diff(values[:, 0]) <= 0):
+            return values
+    reader, numbers = RowReader(header, data), array("d")
+    for line, text in enumerate(body.split(b"\n") if body else (), start=2):
+        cells = split_cells(header.source, line, text.decode(), data)
+        numbers.extend(reader.read(line, cells))
+    return np.array(numbers).reshape(-1, len(header.names))
+
+
+def _even(header: Header, data: DataSettings, body: bytes) -> bool:
+    """Whether all lines have as many cells as the header."""
+    character = separator(data).encode()
+    if len(character) != 1 or not body:
+        return False
+    letters = np.frombuffer(body, dtype=np.uint8)
+    ends = np.append(np.flatnonzero(letters == ord("\n")), len(letters))
+    marks = np.flatnonzero(letters == ord(character))
+    return bool((np.diff(np.searchsorted(marks, ends), prepend=0) == header.width - 1).all())
+
+
+def _by_pandas(header: Header, data: DataSettings, body: bytes) -> Array | None:
+    """Rows of nothing but finite numbers, or None."""
+    from pandas import read_csv
+
+    number = re.compile(_NUMBER.replace(r"\.", re.escape(data.decimal))).fullmatch
+    pieces = []
+    for piece in read_csv(
+        io.BytesIO(body), header=None, names=list(range(header.width)), dtype=str,
+        usecols=list(header.positions), na_filter=False, skip_blank_lines=False,
+        sep=separator(data), quoting=csv.QUOTE_NONE, lineterminator="\n", chunksize=_PIECE,
+    ):
+        columns = [piece[k].tolist() for k in header.positions]
+        if not all(all(map(number, cells)) for cells in columns):
+            return None
+        if data.decimal != ".":
+            columns = [[cell.replace(data.decimal, ".") for cell in cells] for cells in columns]
+        numbers = np.array([list(map(float, cells)) for cells in columns])
+        pieces.append(numbers.T * header.scale)
+    values = np.concatenate(pieces)
+    return values if np.isfinite(values).all() else None
+
+
+def _frame(path: str, kind: str, content: bytes) -> DataFrame:
+    """A Parquet file, or the vectors of equal length in a MAT file."""
+    import pandas as pd
+
+    try:
+        if kind == ".parquet":
+            return pd.read_parquet(io.BytesIO(content))
+        from scipy.io import loadmat
+
+        found = loadmat(cast("Any", io.BytesIO(content)), squeeze_me=True)
+    except ImportError as error:
+        raise ConfigError(f"data.file: {path}: {error}") from error
+    except Exception as error:  # a stranger's bytes: whatever a library says of them
+        raise ConfigError(f"data.file: {path} cannot be read as {kind}: {error}") from error
+    vectors = {k: v for k, v in found.items() if getattr(v, "ndim", 0) == 1}
+    longest = max(map(len, vectors.values()), default=0)
+    return pd.DataFrame({k: v for k, v in vectors.items() if len(v) == longest})
+
+
+def _from_frame(
+    source: str, frame: Any, data: DataSettings, system: DescriptorSystem, sha256: str
+) -> Table:
+    """The recording in a data frame; its index counts if it has a name or is made of times."""
+    import pandas as pd
+
+    if not isinstance(frame, pd.DataFrame):
+        raise ConfigError(f"data: expected a file or a pandas.DataFrame, got {shown(frame)}")
+    if isinstance(frame.index, pd.DatetimeIndex) or frame.index.name is not None:
+        called = (data.columns or {}).get(TIME, TIME)
+        name = called if frame.index.name is None else str(frame.index.name)
+        frame = frame.rename_axis(index=name).reset_index()
+    header = read_header(source, [str(name) for name in frame.columns], data, system)
+    columns = []
+    for name, k, scale in zip(header.names, header.positions, header.scale, strict=True):
+        column = frame.iloc[:, k]
+        if pd.api.types.is_datetime64_any_dtype(column):
+            values = (column - column.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
+        elif pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
+            values = column.to_numpy(dtype=np.float64, na_value=np.nan) * scale
+        elif k == header.positions[0] and data.time_unit == "datetime":
+            values, _ = seconds([str(cell) for cell in column], None)
+        else:
+            raise ConfigError(f"{source}, column {name}: {column.dtype} is not numbers")
+        columns.append(values)
+    values = np.column_stack(columns)
+    wrong = ~np.isfinite(values) if data.missing == "refuse" else np.isinf(values)
+    if data.missing != "drop":
+        wrong[:, 0] |= np.isnan(values[:, 0])
+    if len(values) < 2:
+        raise ConfigError(f"{source} has {len(values)} rows; at least 2 are needed")
+    for row, k in np.argwhere(wrong)[:1]:
+        raise ConfigError(
+            f"{source}, row {row}, column {header.names[k]}: {values[row, k]} is not a finite "
+            "number; data.missing says what to do about gaps"
+        )
+    t = values[~np.isnan(values[:, 0]), 0]
+    for row in np.flatnonzero(np.diff(t) <= 0)[:1]:
+        raise ConfigError(
+            f"{source}, column {header.names[0]}: {t[row + 1]!r} follows {t[row]!r}; times must "
+            "increase"
+        )
+    return _table(header, data, values, system, sha256, first_line=0)
+
+
 class LineReader:
     """Rows from pieces of text as they come; nothing is kept but the piece of a line."""
 
-    def __init__(self, source: str, system: DescriptorSystem) -> None:
-        self._source, self._system = source, system
+    def __init__(self, source: str, data: DataSettings, system: DescriptorSystem) -> None:
+        if data.missing == "interpolate":
+            raise ConfigError(
+                "data.missing=interpolate needs the sample after a gap; a stream takes refuse, "
+                "hold or drop"
+            )
+        self._source, self._data, self._system = source, data, system
         self._rest, self._line = b"", 0
         self._reader: RowReader | None = None
         self._header: Header | None = None
+        self._before: list[float] = []
+        self._blank: list[tuple[int, bytes]] = []  # at the end of a table blank lines do not count
 
     @property
     def header(self) -> Header | None:
@@ -250,24 +491,32 @@ class LineReader:
             return [], f"{self._source}, line {self._line + 1}: longer than {_LONGEST_LINE} bytes"
         rows: list[list[float]] = []
         try:
-            for line in lines:
+            for text in lines:
                 self._line += 1
-                rows.extend(self._row(line))
+                self._blank.append((self._line, text))
+                if text.strip(_BLANK) or len(self._blank) > _MOST_BLANK:
+                    waiting, self._blank = self._blank, []
+                    for line in waiting:
+                        rows.extend(self._row(*line))
         except ConfigError as error:
             return rows, str(error)
         return rows, ""
 
-    def _row(self, line: bytes) -> Iterable[list[float]]:
+    def _row(self, number: int, line: bytes) -> Iterator[list[float]]:
         try:
-            text = line.decode("utf-8-sig" if self._line == 1 else "utf-8").rstrip("\r")
+            text = line.decode("utf-8-sig" if number == 1 else "utf-8").removesuffix("\r")
         except UnicodeDecodeError:
-            raise ConfigError(f"{self._source}, line {self._line}: not UTF-8 text") from None
-        cells = split_cells(self._source, self._line, text)
-        if self._reader is None:
-            self._header = read_header(self._source, cells, self._system)
-            self._reader = RowReader(self._header)
-            return []
-        return [self._reader.read(self._line, cells)]
-
-
-_LONGEST_LINE = 1 << 20
+            raise ConfigError(f"{self._source}, line {number}: not UTF-8 text") from None
+        cells = split_cells(self._source, number, text, self._data)
+        if self._reader is None or self._header is None:
+            self._header = read_header(self._source, cells, self._data, self._system)
+            self._reader = RowReader(self._header, self._data)
+            return
+        row = self._reader.read(number, cells)
+        if any(map(math.isnan, row)):
+            if self._data.missing == "drop":
+                return
+            both = np.array([self._before, row] if self._before else [row])
+            row = fill(self._header, self._data, both, [number])[-1].tolist()
+        self._before = row
+        yield row
