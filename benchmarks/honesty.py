@@ -120,7 +120,7 @@ class Manufactured:
     @property
     def constant(self) -> frozenset[str]:
         """What does not depend on time."""
-        return frozenset({"B", "F", "C", "theta"} | ({"E", "A"} if self.still else set()))
+        return frozenset({"B", "C"} | self.zero | ({"E", "A"} if self.still else set()))
 
     def breakpoints(self, start: float, stop: float) -> Array:  # noqa: ARG002
         """None."""
@@ -133,7 +133,23 @@ class Manufactured:
     def _z(self, t: Array, order: int) -> Array:
         return np.stack([jet(t, order) for jet in self.solution], axis=2)[..., None]
 
-    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:  # noqa: ARG002
+    @property
+    def zero(self) -> frozenset[str]:
+        """What vanishes."""
+        return frozenset({"F", "theta", "phi", "D", "H"})
+
+    @property
+    def signals(self) -> dict[str, frozenset[str]]:
+        """No matrix depends on one."""
+        return {}
+
+    def truth(self, t: Array) -> Array:
+        """No unknowns."""
+        return np.zeros((len(t), 0))
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None  # noqa: ARG002
+    ) -> Coefficients:
         """See :class:`gpebo_cli.model.descriptor.CoefficientSource`."""
         n = len(self.rows)
         P, Q, z = self.P(t, order), self.Q(t, order + 1), self._z(t, order + 1)
@@ -143,8 +159,11 @@ class Manufactured:
         f = product(P, self.nilpotent @ slope(z) - self.dynamics @ z[:-1])[..., 0] * self.rows
         identity = np.zeros((order + 1, len(t), n, n))
         identity[0] = np.eye(n)
-        nothing = np.zeros((order + 1, len(t), n, 0))
-        return Coefficients(E, A, identity, nothing, identity, f, nothing[..., 0, :])
+        zero = np.zeros_like(E)
+        nothing = zero[..., :0]
+        return Coefficients(
+            E, A, identity, nothing, identity, f, nothing[..., 0, :], zero[..., 0], zero, nothing
+        )
 
 
 def canonical(rng: Random, n: int, nu: int, dynamics: Array) -> tuple[Array, Array]:

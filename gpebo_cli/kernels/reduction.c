@@ -543,14 +543,25 @@ static PyObject *handed_over(Call *call, const Reduced *out)
 }
 
 /* Size of the terms of [Â2 | f2] in one lane (a, n + 1): of those in the remaining rows, and |X|
-   times those in the pivots' rows. */
-static void terms(const Model *m, const Elimination *el, const double *g, npy_intp l, double *size)
+   times those in the pivots' rows and |M11| |Y|, twice, where M11 Y = [N1 | g1] are the higher
+   derivatives. M11, transposed, is what the last solution has kept. own: r (r + n + 1) numbers. */
+static void terms(const Model *m, const Elimination *el, const double *g, npy_intp l, double *own,
+                  double *size)
 {
-    const npy_intp n = m->n, r = el->rank;
-    for (npy_intp i = 0; i < el->a; i++, size += n + 1) {
-        const double *own = el->N2 + i * n * LANES + l;
+    const npy_intp n = m->n, r = el->rank, width = n + 1;
+    double *M11 = own, *Y = own + r * r;
+    for (npy_intp i = 0; i < r; i++) {
+        for (npy_intp k = 0; k < r; k++)
+            M11[i * r + k] = el->memory[(k * r + i) * LANES + l];
         for (npy_intp j = 0; j < n; j++)
-            size[j] = fabs(own[j * LANES]);
+            Y[i * width + j] = el->N1[(i * n + j) * LANES + l];
+        Y[i * width + n] = g[el->rows[i] * LANES + l];
+    }
+    solve_in_place(M11, Y, r, width);
+    for (npy_intp i = 0; i < el->a; i++, size += width) {
+        const double *rest = el->N2 + i * n * LANES + l;
+        for (npy_intp j = 0; j < n; j++)
+            size[j] = fabs(rest[j * LANES]);
         size[n] = fabs(g[el->rows[r + i] * LANES + l]);
         for (npy_intp k = 0; k < r; k++) {
             const double x = fabs(el->X[(i * r + k) * LANES + l]);
@@ -560,6 +571,12 @@ static void terms(const Model *m, const Elimination *el, const double *g, npy_in
             for (npy_intp j = 0; j < n; j++)
                 size[j] += x * fabs(other[j * LANES]);
             size[n] += x * fabs(g[el->rows[k] * LANES + l]);
+            for (npy_intp q = 0; q < r; q++) {
+                const double factor = 2.0 * x * fabs(el->memory[(q * r + k) * LANES + l]);
+                if (factor != 0.0)
+                    for (npy_intp j = 0; j < width; j++)
+                        size[j] += factor * fabs(Y[q * width + j]);
+            }
         }
     }
 }
@@ -645,12 +662,12 @@ static PyObject *reduced(PyObject *module, PyObject *const *given, Py_ssize_t co
         return failed(&call);
     }
     double *buffer = make(&call, n, d, times, times, &out)
-                         ? old_scratch(&call, LANES * (n * n + 2 * n + a * (n + 1)) + 3 * n)
+                         ? old_scratch(&call, LANES * (n * n + 2 * n + a * (n + 1)) + 3 * n + r * (r + n + 1))
                          : NULL;
     if (buffer == NULL)
         return failed(&call);
     double *vector = buffer + n * (n + 1) * LANES, *sizes = vector + n * LANES;
-    double *of_E1 = sizes + LANES * a * (n + 1), *of_A = of_E1 + n, *of_basis = of_A + n;
+    double *of_E1 = sizes + LANES * a * (n + 1), *of_A = of_E1 + n, *of_basis = of_A + n, *own = of_basis + n;
     for (npy_intp j = 0; j < n; j++) {
         of_E1[j] = m.time / m.columns[j];
         of_A[j] = 1.0 / m.columns[j];
@@ -667,7 +684,7 @@ static PyObject *reduced(PyObject *module, PyObject *const *given, Py_ssize_t co
                        LANES * sizeof(double));
         for (npy_intp l = 0; l < used; l++)
             if ((first + l) % every == 0)
-                terms(&m, &el, f.f, l, sizes + l * a * (n + 1));
+                terms(&m, &el, f.f, l, own, sizes + l * a * (n + 1));
         eliminate(&m, &el);
         double good[LANES];
         EACH good[l] = el.residual[l] <= residual * el.of_M[l] && el.of_X[l] <= growth ? 1.0 : 0.0;
@@ -711,117 +728,8 @@ static PyObject *reduced(PyObject *module, PyObject *const *given, Py_ssize_t co
     return handed_over(&call, &out);
 }
 
-/* reduced_constant(E, A, rows, columns, time, mu, B, F, u, theta, Z1 (1, n, d), Z2 (1, size, a),
-   every) -> as `reduced`, where E and A are constant: matrices have a leading axis of 1. known is
-   0 where [Z1ᵀE; Â2] is singular. */
-static PyObject *reduced_constant(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    Model m;
-    Forcing f;
-    Reduced out;
-    npy_intp every;
-    if (!begin(&call, given, count, 13))
-        return NULL;
-    PyArrayObject *first_basis, *second_basis;
-    if (!model(&call, &m) || !forcing(&call, &m, &f) ||
-        (first_basis = doubles(&call, 10, 3)) == NULL ||
-        (second_basis = doubles(&call, 11, 3)) == NULL || !whole_number(&call, 12, &every))
-        return failed(&call);
-    const npy_intp n = m.n, size_of_M = m.size, a = size(second_basis, 2), d = n - a;
-    const npy_intp times = f.times;
-    if (!same("times of Z1", size(first_basis, 0), 1) ||
-        !same("times of Z2", size(second_basis, 0), 1) ||
-        !same("rows of Z1", size(first_basis, 1), n) ||
-        !same("rows of Z2", size(second_basis, 1), size_of_M) ||
-        !same("columns of Z1", size(first_basis, 2), d))
-        return failed(&call);
-    if (every < 1) {
-        PyErr_SetString(PyExc_ValueError, "it takes a look at every time, or less often");
-        return failed(&call);
-    }
-    const double *Z1 = data(first_basis), *Z2 = data(second_basis);
-    double *e = make(&call, n, d, times, 1, &out)
-                    ? old_scratch(&call, 2 * n * size_of_M + 2 * n * n + a * n + a + 2 * LANES * n)
-                    : NULL;
-    if (e == NULL)
-        return failed(&call);
-    double *A = e + n * size_of_M, *whole = A + n * size_of_M, *inverse = whole + n * n;
-    double *sizes = inverse + n * n, *of_f2 = sizes + a * n;
-    double *vector = of_f2 + a, *lanes = vector + LANES * n;
-    scaled(&m, 0, e, A);
-    memset(whole, 0, n * n * sizeof(double));
-    memset(inverse, 0, n * n * sizeof(double));
-    memset(sizes, 0, a * n * sizeof(double));
-    double *A1 = data(out.A1), *E1 = data(out.E1), *A2 = whole + d * n;
-    memset(A1, 0, d * n * sizeof(double));
-    for (npy_intp i = 0; i < n; i++) {
-        inverse[i * n + i] = 1.0;
-        for (npy_intp k = 0; k < d; k++)
-            for (npy_intp j = 0; j < n; j++) {
-                whole[k * n + j] += Z1[i * d + k] * e[i * n + j];
-                A1[k * n + j] += Z1[i * d + k] * A[i * n + j];
-            }
-    }
-    for (npy_intp p = 0; p < size_of_M; p++)
-        for (npy_intp k = 0; k < a; k++)
-            for (npy_intp j = 0; j < n; j++) {
-                A2[k * n + j] += Z2[p * a + k] * A[p * n + j];
-                sizes[k * n + j] += fabs(Z2[p * a + k]) * fabs(A[p * n + j]);
-            }
-    for (npy_intp j = 0; j < n; j++) {
-        for (npy_intp k = 0; k < d; k++) {
-            E1[k * n + j] = whole[k * n + j] * m.time / m.columns[j];
-            A1[k * n + j] /= m.columns[j];
-        }
-        for (npy_intp k = 0; k < a; k++)
-            data(out.A2)[k * n + j] = A2[k * n + j] / m.columns[j];
-    }
-    int regular = solve_in_place(whole, inverse, n, n);
-    for (npy_intp i = 0; i < n * n; i++) {
-        regular = regular && fabs(inverse[i]) < HUGE_VAL;
-        inverse[i] *= m.columns[i / n];
-    }
-    if (!regular)
-        return handed_over(&call, &out);
-    for (npy_intp i = 0; i < n; i++)
-        for (npy_intp j = 0; j < d; j++)
-            data(out.basis)[i * d + j] = inverse[i * n + j] / m.time;
-    raise_to(data(out.amplification), n + 1, inverse, 1, sizes, n, a, n);
-    for (npy_intp first = 0; first < times; first += LANES) {
-        const npy_intp used = times - first < LANES ? times - first : LANES;
-        force(&m, &f, first, used);
-        multiply_same(vector, Z1, f.f, d, n, 1);
-        scatter(data(out.f1), vector, 1, d, first, used, NULL);
-        multiply_same(vector, Z2, f.f, a, size_of_M, 1);
-        scatter(data(out.f2), vector, 1, a, first, used, NULL);
-        for (npy_intp i = 0; i < n; i++) {
-            double *to = lanes + i * LANES;
-            EACH to[l] = 0.0;
-            for (npy_intp k = 0; k < a; k++)
-                EACH to[l] -= inverse[i * n + d + k] * vector[k * LANES + l];
-        }
-        scatter(data(out.offset), lanes, 1, n, first, used, NULL);
-        for (npy_intp l = 0; l < used; l++) {
-            if ((first + l) % every)
-                continue;
-            for (npy_intp k = 0; k < a; k++) {
-                of_f2[k] = 0.0;
-                for (npy_intp p = 0; p < size_of_M; p++)
-                    of_f2[k] += fabs(Z2[p * a + k] * f.f[p * LANES + l]);
-            }
-            raise_to(data(out.amplification) + n, n + 1, inverse, 1, of_f2, n, a, 1);
-        }
-    }
-    unscale(&m, data(out.amplification));
-    data(out.known)[0] = 1.0;
-    return handed_over(&call, &out);
-}
-
 PyMethodDef reduction_kernels[] = {
     KERNEL(all_levels),
     KERNEL(reduced),
-    KERNEL(reduced_constant),
     {NULL, NULL, 0, NULL},
 };

@@ -297,7 +297,7 @@ static void dynamics_of(const Model *m, const Look *look, double *memory, double
 }
 
 /* start(E, A, rows, columns, time, mu, place, rank_tol) -> known (2,), smallest (1, 3),
-   rows, columns (size,), Z1 (n, d), Z2 (size, a), dynamics (1, d, d) at one of the times, where to
+   rows, columns (size,), Z1 (n, d), dynamics (1, d, d) at one of the times, where to
    start from at the others. known says whether, and how many constraints there are: with more
    than n of them, or where LAPACK has to look, the rest means nothing. The dynamics Z1ᵀA T are NaN
    where [Z1ᵀE; Z2ᵀN] is singular. */
@@ -326,8 +326,7 @@ static PyObject *start(PyObject *module, PyObject *const *given, Py_ssize_t coun
     PyArrayObject *rows = smallest ? fresh_indices(&call, size) : NULL;
     PyArrayObject *columns = rows ? fresh_indices(&call, size) : NULL;
     PyArrayObject *Z1 = columns ? zeros(&call, 2, (npy_intp[]){n, d}) : NULL;
-    PyArrayObject *Z2 = Z1 ? zeros(&call, 2, (npy_intp[]){size, a}) : NULL;
-    PyArrayObject *dynamics = Z2 ? fresh(&call, 3, (npy_intp[]){1, d, d}) : NULL;
+    PyArrayObject *dynamics = Z1 ? fresh(&call, 3, (npy_intp[]){1, d, d}) : NULL;
     double *whole = dynamics ? old_scratch(&call, 2 * n * n) : NULL;
     if (whole == NULL)
         return failed(&call);
@@ -339,9 +338,6 @@ static PyObject *start(PyObject *module, PyObject *const *given, Py_ssize_t coun
         for (npy_intp i = 0; i < n; i++)
             for (npy_intp j = 0; j < d; j++)
                 data(Z1)[i * d + j] = look.Z1[j * n + i];
-        for (npy_intp i = 0; i < size; i++)
-            for (npy_intp j = 0; j < a; j++)
-                data(Z2)[i * a + j] = look.Z2[j * size + i];
         dynamics_of(&m, &look, whole, data(dynamics));
         derivative_array(&m, look.e, look.a, look.M);
         seen = pivots(look.M, size, size - a, first, second);
@@ -350,84 +346,7 @@ static PyObject *start(PyObject *module, PyObject *const *given, Py_ssize_t coun
     }
     data(known)[0] = seen;
     data(known)[1] = (double)look.constraints;
-    return results(&call, 7, known, smallest, rows, columns, Z1, Z2, dynamics);
-}
-
-/* ---- scalings, dips, consistent states --------------------------------------------------- */
-
-static double power_of_two(double x) { return exp2(rint(log2(x))); }
-
-/* balance(E, A (K + 1, N or 1, n, n)) -> rows, columns (n,), time (1,): powers of two that bring
-   rows and columns of E/time and A to comparable size over time; NaN or worse where E and A are. */
-static PyObject *balance(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    Series from[2];
-    if (!begin(&call, given, count, 2))
-        return NULL;
-    if (!series(&call, 0, 4, &from[0]) || !series(&call, 1, 4, &from[1]))
-        return failed(&call);
-    PyArrayObject *E = (PyArrayObject *)given[0], *A = (PyArrayObject *)given[1];
-    const npy_intp n = size(E, 2);
-    if (!same("rows and columns of E", n, size(E, 3)) || !same("rows of E and A", n, size(A, 2)) ||
-        !same("rows and columns of A", n, size(A, 3)))
-        return failed(&call);
-    PyArrayObject *rows = fresh(&call, 1, &n), *columns = rows ? fresh(&call, 1, &n) : NULL;
-    PyArrayObject *time = columns ? fresh(&call, 1, (npy_intp[]){1}) : NULL;
-    double *most = time ? old_scratch(&call, 2 * n * n) : NULL;
-    if (most == NULL)
-        return failed(&call);
-    double *row = data(rows), *column = data(columns), tau = 1.0;
-    memset(most, 0, 2 * n * n * sizeof(double));
-    int some[2] = {0, 0};
-    for (int which = 0; which < 2; which++) {
-        double *to = most + which * n * n;
-        if (from[which].orders < 1)
-            continue;
-        for (npy_intp t = 0; t < (from[which].time ? from[which].times : 1); t++) {
-            const double *x = from[which].at + t * from[which].time;
-            for (npy_intp i = 0; i < n * n; i++)
-                to[i] = fabs(x[i]) <= to[i] ? to[i] : fabs(x[i]); /* NaN comes through */
-        }
-        for (npy_intp i = 0; i < n * n; i++)
-            some[which] |= to[i] != 0.0;
-    }
-    for (npy_intp i = 0; i < n; i++)
-        row[i] = column[i] = 1.0;
-    for (int round = 0; round < 4; round++) {
-        if (some[0] && some[1]) {
-            double squares[2] = {0.0, 0.0};
-            for (int which = 0; which < 2; which++)
-                for (npy_intp i = 0; i < n * n; i++) {
-                    const double x = row[i / n] * most[which * n * n + i] * column[i % n];
-                    squares[which] += x * x;
-                }
-            tau = sqrt(squares[0] / squares[1]);
-        }
-        for (npy_intp i = 0; i < n; i++) {
-            double largest = 0.0;
-            for (npy_intp j = 0; j < n; j++) {
-                const double x = (most[i * n + j] / tau + most[n * n + i * n + j]) * column[j];
-                largest = x <= largest ? largest : x;
-            }
-            row[i] = largest > 0.0 ? 1.0 / largest : 1.0;
-        }
-        for (npy_intp j = 0; j < n; j++) {
-            double largest = 0.0;
-            for (npy_intp i = 0; i < n; i++) {
-                const double x = (most[i * n + j] / tau + most[n * n + i * n + j]) * row[i];
-                largest = x <= largest ? largest : x;
-            }
-            column[j] = largest > 0.0 ? 1.0 / largest : 1.0;
-        }
-    }
-    for (npy_intp i = 0; i < n; i++) {
-        row[i] = power_of_two(row[i]);
-        column[i] = power_of_two(column[i]);
-    }
-    data(time)[0] = power_of_two(tau);
-    return results(&call, 3, rows, columns, time);
+    return results(&call, 6, known, smallest, rows, columns, Z1, dynamics);
 }
 
 /* dips(values (N, 3), share, fall, most) -> steady (1,), found (M, 2): column and place of local
@@ -489,89 +408,6 @@ static PyObject *dips(PyObject *module, PyObject *const *given, Py_ssize_t count
     return results(&call, 2, steady, found);
 }
 
-/* consistent(E (n, n), A2 (a, n), f2 (a,), x0 (n,), least, rounding) -> known (1,), x (n,) with
-   A2 x = −f2 and least |E (x − x0)|; numbers that move by less than `rounding` of the largest stay
-   what they were. Where a pivot is below `least` of the largest, known is 0. */
-static PyObject *consistent(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    double least, rounding;
-    if (!begin(&call, given, count, 6))
-        return NULL;
-    PyArrayObject *E = doubles(&call, 0, 2), *A2 = E ? doubles(&call, 1, 2) : NULL;
-    PyArrayObject *f2 = A2 ? doubles(&call, 2, 1) : NULL, *x0 = f2 ? doubles(&call, 3, 1) : NULL;
-    if (x0 == NULL || !number(&call, 4, &least) || !number(&call, 5, &rounding))
-        return failed(&call);
-    const npy_intp n = size(x0, 0), a = size(A2, 0), d = n - a;
-    if (!same("columns of E", size(E, 1), n) || !same("rows of E", size(E, 0), n) ||
-        !same("columns of A2", size(A2, 1), n) || !same("rows of A2 and f2", a, size(f2, 0)))
-        return failed(&call);
-    if (d < 0) {
-        PyErr_SetString(PyExc_ValueError, "more constraints than states");
-        return failed(&call);
-    }
-    PyArrayObject *known = zeros(&call, 1, (npy_intp[]){1});
-    PyArrayObject *x = known ? zeros(&call, 1, &n) : NULL;
-    PyArrayObject *order_of = x ? fresh_indices(&call, n) : NULL;
-    double *W = order_of ? old_scratch(&call, 4 * n * n + 4 * n) : NULL;
-    if (W == NULL)
-        return failed(&call);
-    double *mirrors = W + n * n, *kernel = mirrors + n * n, *image = kernel + n * n;
-    double *y = image + n * n, *right = y + n, *step = right + n, *moved = step + n;
-    npy_intp *order = (npy_intp *)PyArray_DATA(order_of);
-    /* A2 = P L Qᵀ: of A2 δ = −(A2 x0 + f2) the shortest is Q₁ L⁻¹ Pᵀ of the right-hand side. */
-    memcpy(W, data(A2), a * n * sizeof(double));
-    triangularise(W, a, n, mirrors, order);
-    for (npy_intp k = 0; k < a; k++) {
-        const npy_intp i = order[k];
-        y[k] = -data(f2)[i] - dot(data(A2) + i * n, data(x0), n);
-        for (npy_intp j = 0; j < k; j++)
-            y[k] -= W[k * n + j] * y[j];
-        if (!(fabs(W[k * n + k]) > least * fabs(W[0])))
-            return results(&call, 2, known, x);
-        y[k] /= W[k * n + k];
-    }
-    memcpy(step, y, a * sizeof(double));
-    memset(step + a, 0, d * sizeof(double));
-    for (npy_intp k = a - 1; k >= 0; k--) {
-        const double along = dot(mirrors + k * n, step, n);
-        for (npy_intp i = 0; i < n; i++)
-            step[i] -= along * mirrors[k * n + i];
-    }
-    /* In the kernel what keeps E δ short: the columns of E Q₂ are rows here, = L̃ Q̃ᵀ. */
-    columns_of_q(mirrors, a, n, a, kernel);
-    for (npy_intp i = 0; i < n; i++) {
-        moved[i] = -dot(data(E) + i * n, step, n);
-        for (npy_intp k = 0; k < d; k++)
-            image[k * n + i] = dot(data(E) + i * n, kernel + k * n, n);
-    }
-    triangularise(image, d, n, mirrors, order);
-    for (npy_intp k = 0; k < d; k++) {
-        const double along = dot(mirrors + k * n, moved, n);
-        for (npy_intp i = 0; i < n; i++)
-            moved[i] -= along * mirrors[k * n + i];
-    }
-    if (!solve_upper(image, d, n, least, moved))
-        return results(&call, 2, known, x);
-    for (npy_intp i = 0; i < n; i++) {
-        data(x)[i] = data(x0)[i] + step[i];
-        for (npy_intp k = 0; k < d; k++)
-            data(x)[i] += kernel[order[k] * n + i] * moved[k];
-    }
-    double largest = 0.0;
-    for (npy_intp i = 0; i < n; i++) {
-        largest = fabs(data(x)[i]) > largest ? fabs(data(x)[i]) : largest;
-        largest = fabs(data(x0)[i]) > largest ? fabs(data(x0)[i]) : largest;
-    }
-    for (npy_intp i = 0; i < n; i++)
-        if (fabs(data(x)[i] - data(x0)[i]) <= rounding * largest)
-            data(x)[i] = data(x0)[i];
-    data(known)[0] = 1.0;
-    return results(&call, 2, known, x);
-}
-
 PyMethodDef structure_kernels[] = {
-    KERNEL(levels), KERNEL(start),      KERNEL(balance),
-    KERNEL(dips),   KERNEL(consistent), {NULL, NULL, 0, NULL},
+    KERNEL(levels), KERNEL(start), KERNEL(dips), {NULL, NULL, 0, NULL},
 };

@@ -12,44 +12,44 @@ from math import comb, factorial
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.reduction.strangeness_free import StrangenessFree, strangeness_free_form
 from gpebo_cli.reduction.structure import Structure
 
-_UNMOVED = 32 * float(np.finfo(float).eps)  # what moves by less, relatively, has not moved
-_PLAIN = 1e-8  # pivots above this, relatively, need no singular values
-_SMALL = 32  # largest number of states for the compiled kernel
+_EPS = float(np.finfo(float).eps)
+_ROUNDING = 16  # units in the last place of everything that a value is made of
 _IMPULSE = 1e-9  # impulses below this share of the state's size are rounding
 
 
-def consistent_state(reduced: StrangenessFree, x0: Array) -> Array:
+def consistent_state(form: StrangenessFree, x0: Array, weights: Array) -> Array:
     """The consistent x nearest to x0 in its differential part, shape (n,).
 
-    Minimises ‖E (x − x0)‖ subject to A2 x + f2 = 0. Unique, because E has full column rank on
-    the kernel of A2.
+    Minimises ‖W E (x − x0)‖ subject to A2 x + f2 = 0, where W makes the rows of E comparable.
+    Unique, because E has full column rank on the kernel of A2. A state that satisfies the
+    constraints to rounding is returned as it is.
 
     Args:
-        reduced: the strangeness-free equations at times of which the start is the first.
+        form: the strangeness-free equations at times of which the start is the first.
         x0: the state asked for (n,).
+        weights: W (n,), see :class:`gpebo_cli.reduction.derivative_array.Scaling`.
     """
-    E, A2, f2 = reduced.E[0], reduced.A2[0], reduced.f2[0]
-    if len(A2) == 0:
+    if form.basis is None or form.offset is None:
         return x0.copy()
-    if kernels.compiled is not None and len(x0) <= _SMALL:
-        known, nearest = kernels.compiled.consistent(E, A2, f2, x0, _PLAIN, _UNMOVED)
-        if known[0]:
-            return np.asarray(nearest)
-    U, sigma, Vt = np.linalg.svd(A2)
-    a = len(sigma)
-    particular = Vt[:a].T @ ((U.T @ (-f2 - A2 @ x0)) / sigma)  # of A2 δ = −(A2 x0 + f2)
-    kernel = Vt[a:].T
-    free = np.linalg.lstsq(E @ kernel, -E @ particular, rcond=None)[0]
-    x = x0 + particular + kernel @ free
+    E, E1, T, offset = form.E[0], form.E1[0], form.basis[0], form.offset[0]
+    size = np.abs(x0)
+    moved = T @ (E1 @ x0) + offset - x0  # to the consistent state with the same z = E1 x
+    through = form.amplification[:, :-1] @ size + form.amplification[:, -1]
+    terms = np.abs(T) @ (np.abs(E1) @ size) + np.abs(offset) + size
+    if (np.abs(moved) <= _ROUNDING * _EPS * (through + terms)).all():
+        return x0.copy()
+    if (np.abs(E @ moved) > _ROUNDING * _EPS * (np.abs(E) @ (through + terms))).any():
+        image = weights[:, None] * (E @ T)
+        norms = np.linalg.norm(image, axis=0)
+        moved -= T @ (np.linalg.lstsq(image / norms, weights * (E @ moved), rcond=None)[0] / norms)
+    x = x0 + moved
     # What did not move keeps the digits it was given.
-    rounding = _UNMOVED * max(np.abs(x).max(), np.abs(x0).max())
-    return np.where(np.abs(x - x0) <= rounding, x0, x)
+    return np.where(np.abs(moved) <= 2 * _ROUNDING * _EPS * (terms + np.abs(x)), x0, x)
 
 
 @dataclass(frozen=True, eq=False)

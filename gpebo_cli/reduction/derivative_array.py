@@ -15,11 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 
 # Largest derivative array for the compiled kernels: beyond it LAPACK's blocks are worth its calls.
 SMALL = 32
+_NOTHING = 1e-13  # entries below this, after scaling, are rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +33,9 @@ class Scaling:
     rows: Array  # (n,)
     columns: Array  # (n,) x = columns * x̃
     time: float  # τ, derivatives are taken with respect to t/τ
+    # (n,) powers of ten by which the rows of E are of comparable size: equations within a decade of
+    # each other count as they were written.
+    weights: Array
 
 
 def forcing(c: Coefficients) -> Array:
@@ -67,29 +70,45 @@ def derivative_array(e: Array, a: Array, mu: int) -> tuple[Array, Array]:
 
 
 def balance(c: Coefficients) -> Scaling:
-    """Scalings that bring the rows and columns of E/τ and A to comparable size over time."""
-    if kernels.compiled is not None:
-        rows, columns, time = kernels.compiled.balance(c.E, c.A)
-        return Scaling(rows, columns, float(time[0]))
-    E, A = np.abs(c.E[0]).max(axis=0), np.abs(c.A[0]).max(axis=0)
-    rows, columns, tau = np.ones(len(E)), np.ones(len(E)), 1.0
-    both = bool(E.any() and A.any())
-    for _ in range(4):
-        if both:
-            scaled_E, scaled_A = rows[:, None] * E * columns, rows[:, None] * A * columns
-            tau = float(np.sqrt(np.vdot(scaled_E, scaled_E) / np.vdot(scaled_A, scaled_A)))
-        W = E / tau + A
-        rows = _reciprocal((W * columns).max(axis=1))
-        columns = _reciprocal((W * rows[:, None]).max(axis=0))
-    return Scaling(_power_of_two(rows), _power_of_two(columns), float(_power_of_two(np.array(tau))))
+    """Scalings that bring the entries of E/τ and A to comparable size, in any units.
+
+    The logarithms of the factors minimise Σ (ln|E_ij| + r_i + c_j − τ)² + Σ (ln|A_ij| + r_i + c_j)²
+    over all entries that are not zero, |·| being the largest over time: multiplying an equation, a
+    state or the time by a number changes its factor alone.
+    """
+    n = c.E.shape[2]
+    sizes = np.array([np.abs(c.E[0]).max(axis=0), np.abs(c.A[0]).max(axis=0)])
+    logs = np.log(np.maximum(sizes, np.finfo(float).tiny))
+    factors, there = np.zeros(2 * n + 1), sizes > 0.0
+    normal = np.zeros((2 * n + 1, 2 * n + 1))
+    while True:
+        both, of_E = there.sum(axis=0), there[0]
+        known = np.where(there, logs, 0.0)
+        normal[:n, n:-1], normal[n:-1, :n] = both, both.T
+        normal[:n, -1], normal[n:-1, -1] = -of_E.sum(axis=1), -of_E.sum(axis=0)
+        normal[-1] = normal[:, -1]
+        diagonal = [both.sum(axis=1), both.sum(axis=0), of_E.sum(keepdims=True)[0]]
+        np.fill_diagonal(normal, np.concatenate(diagonal))
+        sums = known.sum(axis=0)
+        right = np.concatenate([-sums.sum(axis=1), -sums.sum(axis=0), [known[0].sum()]])
+        factors = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+        r, columns, tau = factors[:n], factors[n:-1], factors[-1]
+        scaled_sizes = sizes * np.exp(r[:, None] + columns - np.array([tau, 0.0])[:, None, None])
+        rest = there & (scaled_sizes > _NOTHING * np.sqrt(
+            scaled_sizes.max(axis=(0, 2))[:, None] * scaled_sizes.max(axis=(0, 1))
+        ))
+        if (rest == there).all():
+            break
+        there = rest  # once more without what turned out to be rounding
+    # A factor of all rows is left open, and means nothing.
+    weights = 10.0 ** np.rint((r - r[0]) / np.log(10.0)) if n else np.zeros(0)
+    return Scaling(
+        _power_of_two(r), _power_of_two(columns), float(_power_of_two(tau)), np.asarray(weights)
+    )
 
 
-def _reciprocal(x: Array) -> Array:
-    return 1.0 / np.where(x > 0, x, 1.0)
-
-
-def _power_of_two(x: Array) -> Array:
-    return np.asarray(np.exp2(np.rint(np.log2(x))))
+def _power_of_two(logarithm: Array) -> Array:
+    return np.asarray(np.exp2(np.rint(logarithm / np.log(2.0))))
 
 
 def who(system: DescriptorSystem) -> str:

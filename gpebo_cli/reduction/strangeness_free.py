@@ -10,9 +10,9 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem
-from gpebo_cli.numerics.linalg import frobenius_norm, inverse_or_none, transpose
+from gpebo_cli.numerics.linalg import frobenius_norm, inverse_or_none, joined, transpose
 from gpebo_cli.reduction.derivative_array import SMALL, derivative_array, forcing, scaled, who
-from gpebo_cli.reduction.structure import RESIDUAL, Bases, Pivots, Structure
+from gpebo_cli.reduction.structure import RESIDUAL, Pivots, Structure
 
 _MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
 _LOOKS = 32  # times at which the sensitivity to rounding is looked at
@@ -36,7 +36,7 @@ class StrangenessFree:
     # By how much relative rounding of each state and of f2 reaches each state through the
     # constraints, the most at some of the times.
     amplification: Array  # (n, n + 1)
-    E: Array  # (N, n, n) the model's own
+    E: Array  # (N or 1, n, n) the model's own
     u: Array  # (N, m) the inputs and
     C: Array  # (N, r, n) the output matrix at the same times
     direct: Array | None  # (N, r) D u + H θ, what the state has no part in; None: nothing
@@ -73,28 +73,22 @@ def strangeness_free_form(
     g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
     reference = structure.reference
     some = slice(0, None, _every(len(t)))
-    if isinstance(reference, Bases):
-        Z1 = reference.Z1
-        A2, f2 = transpose(reference.Z2) @ N, transpose(reference.Z2) @ g
-        size = np.abs(transpose(reference.Z2)) @ np.abs(np.concatenate(
-            [np.broadcast_to(N, (len(g), *N.shape[1:]))[some], g[some]], axis=2
-        ))
-        inverse, poor = inverse_or_none(np.concatenate([transpose(Z1) @ e[0], A2], axis=1))
-    else:
-        Z1, A2, f2, size, inverse, poor = _by_elimination(reference, e[0], M, N, g, some)
-        if poor.any():
-            Z1 = np.repeat(Z1, len(t), axis=0)
-            Z1[poor], Z2 = _by_singular_vectors(
-                system, structure, e[0][poor], M[poor], N[poor], t[poor]
-            )
-            A2[poor], f2[poor] = transpose(Z2) @ N[poor], transpose(Z2) @ g[poor]
-            # What the elimination made grow there is not used, and amplifies nothing.
-            looked = np.arange(len(t))[some]
-            again = poor[looked]
-            terms = np.abs(np.concatenate([N[poor], g[poor]], axis=2))
-            size[again] = (np.abs(transpose(Z2)) @ terms)[(np.cumsum(poor) - 1)[looked[again]]]
-            whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
-            inverse[poor], poor[poor] = inverse_or_none(whole)
+    Z1, A2, f2, size, inverse, poor = _by_elimination(reference, e[0], M, N, g, some)
+    if poor.any():
+        Z1 = np.repeat(Z1, len(M), axis=0)
+        Z1[poor], Z2 = _by_singular_vectors(
+            system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
+        )
+        # What the elimination made grow there is not used, and amplifies nothing.
+        A2[poor] = transpose(Z2) @ N[poor]
+        everywhere = np.broadcast_to(poor, len(t))
+        f2[everywhere] = transpose(Z2) @ g[everywhere]
+        terms = np.abs(joined(N, g, axis=2))
+        again = np.arange(len(t))[some][everywhere[some]]
+        which = again if len(M) > 1 else np.zeros_like(again)
+        size[everywhere[some]] = np.abs(transpose(Z2))[np.cumsum(poor)[which] - 1] @ terms[again]
+        whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
+        inverse[poor], poor[poor] = inverse_or_none(whole)
     if poor.any():
         raise ModelError(
             f"{who(system)}: the equations do not determine the state near "
@@ -153,19 +147,18 @@ def _reduced_compiled(
         F = np.concatenate([F, c.phi[..., None]], axis=3)
         theta = np.concatenate([theta, one], axis=2)
     model = (c.E, c.A, s.rows, s.columns, s.time, structure.mu, c.B, F, c.u, theta)
-    if isinstance(reference, Bases):
-        E = E[:1]
-        found = compiled.reduced_constant(*model, reference.Z1, reference.Z2, _every(count))
-    else:
-        found = compiled.reduced(
-            *model, reference.rows, reference.columns, reference.rank, reference.Z1,
-            _every(count), _MAX_GROWTH, RESIDUAL,
-        )
+    found = compiled.reduced(
+        *model, reference.rows, reference.columns, reference.rank, reference.Z1,
+        _every(count), _MAX_GROWTH, RESIDUAL,
+    )
     known, E1, A1, f1, A2, f2, basis, offset, amplification = found
     if not known[0]:
         return None
     if not structure.a:
         basis = offset = None
+    if structure.time_invariant:
+        E1, A1, A2, E = (matrix[:1] for matrix in (E1, A1, A2, E))
+        basis = None if basis is None else basis[:1]
     return StrangenessFree(
         E1, A1, f1, A2, f2, basis, offset, amplification, E, c.u[0], c.C[0],
         direct_part(c, zero),
@@ -181,7 +174,7 @@ def _by_elimination(
     where the pivots will not do.
     """
     count, n, r = len(M), E.shape[1], pivots.rank
-    right = np.concatenate([N, g], axis=2)[:, pivots.rows]
+    right = joined(N, g, axis=2)[:, pivots.rows]
     poor = np.zeros(count, dtype=bool)
     if r < len(pivots.rows):
         M = M[:, pivots.rows[:, None], pivots.columns]
@@ -194,21 +187,26 @@ def _by_elimination(
             everywhere = np.ones(count, dtype=bool)
             left = right[:, r:]
             size = np.abs(left[some])
-            A2, f2 = left[:, :, :n], left[:, :, n:]
+            A2, f2 = left[:count, :, :n].copy(), left[:, :, n:].copy()
             return pivots.Z1[None], A2, f2, size, np.zeros_like(E), everywhere
         residual = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:])
         poor = (residual > RESIDUAL * frobenius_norm(M)) | (frobenius_norm(X) > _MAX_GROWTH)
         constraints = right[:, r:] - X @ right[:, :r]
-        size = np.abs(right[some, r:]) + np.abs(X[some]) @ np.abs(right[some, :r])
+        # What rounding of M leaves of the higher derivatives, which it should eliminate, counts.
+        pivot = M[some if count > 1 else slice(1), :r, :r]
+        derivatives = np.linalg.solve(pivot, right[some, :r])
+        through = np.abs(right[some, :r]) + 2.0 * np.abs(pivot) @ np.abs(derivatives)
+        size = np.abs(right[some, r:]) + np.abs(X[some] if count > 1 else X) @ through
     else:
         constraints = right[:, r:]
         size = np.abs(constraints[some])
-    A2 = constraints[:, :, :n]
+    A2 = constraints[:count, :, :n].copy()
     whole = np.concatenate([pivots.Z1.T @ E, A2], axis=1)
     scale = np.maximum(np.abs(whole).max(axis=2), np.finfo(float).tiny)
     inverse, singular = inverse_or_none(whole / scale[:, :, None])
     poor |= singular | (frobenius_norm(inverse) > _MAX_GROWTH)
-    return pivots.Z1[None], A2, constraints[:, :, n:], size, inverse / scale[:, None, :], poor
+    f2 = constraints[:, :, n:].copy()
+    return pivots.Z1[None], A2, f2, size, inverse / scale[:, None, :], poor
 
 
 def _by_singular_vectors(

@@ -6,7 +6,7 @@ Kunkel & Mehrmann, Differential-Algebraic Equations, Hypothesis 3.48: ranks of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import frobenius_norm, inverse_or_none, transpose
+from gpebo_cli.numerics.linalg import frobenius_norm, transpose
 from gpebo_cli.reduction.derivative_array import (
     SMALL,
     Scaling,
@@ -48,14 +48,6 @@ class Pivots:
 
 
 @dataclass(frozen=True, eq=False)
-class Bases:
-    """Z1 and Z2 themselves, where E and A are constant."""
-
-    Z1: Array  # (1, n, d) orthonormal
-    Z2: Array  # (1, (μ+1) n, a) orthonormal
-
-
-@dataclass(frozen=True, eq=False)
 class Structure:
     """The characteristic values of the system and how they were judged."""
 
@@ -67,7 +59,7 @@ class Structure:
     # Smallest one counted as nonzero, relative, at the probes where a bound of it is smallest.
     smallest_singular_value: float
     time_invariant: bool  # E and A are constant
-    reference: Pivots | Bases  # of one time, to start from at the others
+    reference: Pivots  # of one time, to start from at the others
     steady: bool  # no singular value behind the ranks comes near zero between the ends
     # z' = this z + … with z = Z1ᵀE x: Z1ᵀA T, [Z1ᵀE; Â2] T = [I; 0]; None where not determined
     dynamics: Array | None  # (N or 1, d, d) at the probes, 1/s
@@ -157,7 +149,7 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
 
 def _judged(
     t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, invariant: bool
-) -> tuple[_Levels, Pivots | Bases | None]:
+) -> tuple[_Levels, Pivots | None]:
     """Levels at all times, or at one that says why this μ will not do; and where to start from.
 
     ``c`` may have more times than t where E and A are constant.
@@ -173,19 +165,19 @@ def _judged(
     one = _levels(t[middle], e[:, middle], aa[:, middle], mu, rank_tol)
     if one.failure:
         return one, None
-    reference = _reference(e[:, middle], aa[:, middle], mu, one, invariant)
+    reference = _reference(e[:, middle], aa[:, middle], mu, one)
     levels = _all_levels(t, e, aa, mu, rank_tol, one, reference)
     return levels, None if levels.failure else reference
 
 
 def _judged_compiled(
     t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, invariant: bool
-) -> tuple[_Levels, Pivots | Bases | None] | None:
+) -> tuple[_Levels, Pivots | None] | None:
     """:func:`_judged`; None where it takes LAPACK to tell, or to say what is wrong."""
     compiled: Any = kernels.compiled
     n, middle = c.E.shape[2], len(t) // 2
     model = (c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu)
-    known, smallest, rows, columns, Z1, Z2, dynamics = compiled.start(*model, middle, rank_tol)
+    known, smallest, rows, columns, Z1, dynamics = compiled.start(*model, middle, rank_tol)
     trusted, counted = known.tolist()
     a = int(counted)
     if not trusted:
@@ -194,11 +186,11 @@ def _judged_compiled(
     failure = _too_many(a, n, at) if a > n else _why_not(at, smallest, rank_tol)
     if failure:
         return _Levels(a, smallest, failure), None
+    r = (mu + 1) * n - a
     if invariant:
         finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
         least = float(smallest.min())
-        return _Levels(a, smallest, "", least, dynamics=finite), Bases(Z1[None], Z2[None])
-    r = (mu + 1) * n - a
+        return _Levels(a, smallest, "", least, dynamics=finite), Pivots(r, rows, columns, Z1)
     known, smallest, dynamics = compiled.all_levels(
         *model, rows, columns, r, Z1, rank_tol, max(_PLAIN, 10.0 * rank_tol), RESIDUAL
     )
@@ -221,7 +213,6 @@ class _Levels:
     smallest: Array  # (N, 3) of M, Â2 and E T2, relative to the size of their factors; or bounds
     failure: str
     least: float = np.inf  # of those that were computed
-    Z2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, (μ+1) n, a)
     T2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, n, d)
     dynamics: Array | None = None  # (N or 1, d, d) in scaled time, see ``Structure``
 
@@ -263,7 +254,7 @@ def _levels(
     failure = _why_not(t, smallest, rank_tol)
     if failure:
         return _Levels(a, smallest, failure)
-    return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)), Z2, T2)
+    return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)), T2)
 
 
 def _why_not(t: Array, smallest: Array, rank_tol: float) -> str:
@@ -288,7 +279,7 @@ _PLAIN = 1e-5  # bounds of singular values above this need no closer look
 
 def _all_levels(
     t: Array, e: Array, aa: Array, mu: int, rank_tol: float, one: _Levels,
-    reference: Pivots | Bases,
+    reference: Pivots,
 ) -> _Levels:
     """:func:`_levels` at all times t, given those of one time, ``one``.
 
@@ -300,11 +291,6 @@ def _all_levels(
 
     Singular values are computed where a bound is small, or smallest.
     """
-    if isinstance(reference, Bases):
-        A2 = transpose(reference.Z2) @ derivative_array(e[:, :1], aa[:, :1], mu)[1]
-        whole = np.concatenate([transpose(reference.Z1) @ e[0, :1], A2], axis=1)
-        inverse, _ = inverse_or_none(whole)
-        return replace(one, dynamics=_dynamics(reference.Z1[0], aa[0, :1], inverse))
     M, N = derivative_array(e, aa, mu)
     r = reference.rank
     dynamics: Array | None = None
@@ -427,13 +413,9 @@ def _line(
     return _levels(t, e, aa, mu, rank_tol, a).smallest[:, column]
 
 
-def _reference(
-    e: Array, aa: Array, mu: int, one: _Levels, invariant: bool
-) -> Pivots | Bases:
+def _reference(e: Array, aa: Array, mu: int, one: _Levels) -> Pivots:
     """Where to start from at other times, from the coefficients and the levels of one."""
     Z1 = np.linalg.svd(e[0, 0] @ one.T2[0], full_matrices=False)[0]
-    if invariant:
-        return Bases(Z1[None], one.Z2[:1])
     M = derivative_array(e, aa, mu)[0][0]
     r = len(M) - one.a
     return Pivots(r, *_pivots(M, r), Z1)

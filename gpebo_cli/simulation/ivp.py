@@ -39,16 +39,47 @@ def underlying_ode(
     Returns:
         A (N, n, n) and f (N, n).
     """
-    mu, n = structure.mu + 1, system.n
+    n, scaling = system.n, structure.scaling
+    M, N, g = _array(system, structure, t, inside, structure.mu + 1)
+    inverse = np.linalg.pinv(M, rcond=structure.rank_tol)[:, :n]
+    # Back from x̃ = x/columns and time t/τ.
+    back = scaling.columns[:, None] / scaling.time
+    return back * (inverse @ N) / scaling.columns, (back * (inverse @ g))[:, :, 0]
+
+
+def _array(
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array, mu: int
+) -> tuple[Array, Array, Array]:
+    """M, N and g (N, (μ + 1) n, 1) of the derivative array, scaled."""
     c = system.coefficients.taylor(t, mu, inside)
     scaling = structure.scaling
     M, N = derivative_array(*scaled(c, scaling), mu)
     weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
     g = np.moveaxis(forcing(c) * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
-    inverse = np.linalg.pinv(M, rcond=structure.rank_tol)[:, :n]
-    # Back from x̃ = x/columns and time t/τ.
-    back = scaling.columns[:, None] / scaling.time
-    return back * (inverse @ N) / scaling.columns, (back * (inverse @ g))[:, :, 0]
+    return M, N, g
+
+
+def consistent_start(
+    system: DescriptorSystem, structure: Structure, t: float, inside: float
+) -> Array:
+    """The start (n,) of this path, by singular vectors of the derivative array and constraints.
+
+    The same question as in :func:`gpebo_cli.reduction.consistency.consistent_state`.
+    """
+    now, scaling, x0 = np.array([t]), structure.scaling, system.initial_state
+    M, N, g = _array(system, structure, now, np.array([inside]), structure.mu)
+    Z2 = np.linalg.svd(M[0])[0][:, len(M[0]) - structure.a :]
+    constraints = Z2.T @ N[0]
+    size = np.abs(constraints).max(axis=1, initial=0.0)
+    constraints, missing = constraints / size[:, None], (Z2.T @ g[0])[:, 0] / size
+    wrong = missing + constraints @ (x0 / scaling.columns)
+    U, sigma, Vt = np.linalg.svd(constraints)
+    moved = -Vt[: len(sigma)].T @ ((U.T @ wrong) / sigma)
+    kernel = Vt[len(sigma) :].T
+    E = system.coefficients.taylor(now, 0, np.array([inside])).E[0, 0]
+    image = scaling.weights[:, None] * E * scaling.columns
+    free = np.linalg.lstsq(image @ kernel, -image @ moved, rcond=None)[0]
+    return np.asarray(x0 + scaling.columns * (moved + kernel @ free))
 
 
 def solve(

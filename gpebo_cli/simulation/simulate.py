@@ -92,7 +92,12 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
     mesh, c = _known_resolved(system, structure, mesh, cuts, solver)
     first = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
-    x0 = _initial_state(system, first)
+    if solver.name == "ivp":
+        inside = float(mesh.inside[0, 0])
+        x0 = ivp.consistent_start(system, structure, start, inside)
+    else:
+        x0 = consistent_state(first, system.initial_state, structure.scaling.weights)
+    _check_start(system, x0)
 
     happened: dict[float, tuple[Array, Jump]] = {}
     restarts: dict[float, Callable[[Array], Array]] = {}
@@ -288,15 +293,12 @@ def _equations(reduced: StrangenessFree) -> LinearEquation:
     return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints)
 
 
-def _initial_state(system: DescriptorSystem, reduced: StrangenessFree) -> Array:
-    """The consistent state at the start, from the equations at times of which it is the first."""
-    x0 = consistent_state(reduced, system.initial_state)
+def _check_start(system: DescriptorSystem, x0: Array) -> None:
     if not all(map(isfinite, x0.tolist())):
         raise ModelError(
             f"plant {system.name}: no finite consistent state at the start; look for entries that "
             "are huge or infinite there"
         )
-    return x0
 
 
 def _width(edges: Array, cut: float) -> float:

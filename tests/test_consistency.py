@@ -1,0 +1,122 @@
+"""Consistent states: at the start, from any state, in any units; and what jumps may not do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.honesty import made
+from gpebo_cli.errors import ModelError
+from gpebo_cli.model.descriptor import Coefficients
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.reduction.consistency import consistent_state
+from gpebo_cli.reduction.derivative_array import balance
+from gpebo_cli.reduction.strangeness_free import strangeness_free_form
+from gpebo_cli.reduction.structure import analyse
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.ivp import consistent_start
+from gpebo_cli.simulation.simulate import simulate
+
+SEEDS = st.integers(0, 2**32 - 1)
+ZERO = np.zeros(1)
+
+
+def case(seed, nu, extra, scale=0.0):
+    """A manufactured system, its structure, and its equations at t = 0."""
+    found = made(np.random.default_rng(seed), nu + extra, nu, scale=scale)
+    structure = analyse(found.system, 0.0, 5.0, max_mu=6, rank_tol=1e-10)
+    return found, structure, strangeness_free_form(found.system, structure, ZERO, ZERO)
+
+
+@settings(deadline=None, max_examples=40)
+@given(SEEDS, st.integers(1, 4), st.integers(0, 4), st.sampled_from([0.0, 3.0, 8.0]))
+def test_a_consistent_state_is_returned_as_it_is(seed, nu, extra, scale):
+    """The truth at the start satisfies the constraints to rounding, whatever the units."""
+    found, structure, form = case(seed, nu, extra, scale)
+    x0 = found.exact(ZERO)[0]
+    same = consistent_state(form, x0, structure.scaling.weights)
+    assert same.tolist() == x0.tolist()
+
+
+@settings(deadline=None, max_examples=40)
+@given(SEEDS, st.integers(1, 4), st.integers(0, 4), st.sampled_from([0, 1, 6]))
+def test_both_paths_start_from_the_same_state(seed, nu, extra, spread):
+    """By elimination and by singular vectors, with equations in any units."""
+    found, structure, form = case(seed, nu, extra)
+    rng = np.random.default_rng(seed)
+    x0 = found.system.initial_state + rng.normal(size=found.system.n)
+    expected = consistent_state(form, x0, structure.scaling.weights)
+    rows = 10.0 ** rng.integers(-spread, spread + 1, found.system.n)
+    source = replace(found.system.coefficients, rows=rows)
+    system = replace(found.system, coefficients=source, initial_state=x0)
+    structure = analyse(system, 0.0, 5.0, max_mu=6, rank_tol=1e-10)
+    form = strangeness_free_form(system, structure, ZERO, ZERO)
+    size = np.abs(expected).max()
+    same = consistent_state(form, x0, structure.scaling.weights)
+    np.testing.assert_allclose(same, expected, atol=1e-8 * size)
+    alone = consistent_start(system, structure, 0.0, 0.0)
+    np.testing.assert_allclose(alone, expected, atol=1e-8 * size)
+    assert np.abs(form.A2[0] @ alone + form.f2[0]).max() < 1e-7 * size * np.abs(form.A2[0]).max()
+
+
+def test_rows_in_other_units_move_no_consistent_start():
+    """Index 2 with rows in units of 1e-8 and 1e8, both paths against the closed form."""
+    cos, sin = np.cos(0.7), np.sin(0.7)
+    rows = np.diag([1e-8, 1.0, 1e8]) @ np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    columns = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    E = rows @ np.array([[1.0, 0, 0], [0, 0, 0], [0, 1, 0]]) @ columns
+    A = rows @ np.diag([-1.0, 1, 1]) @ columns
+
+    def truth(t):
+        return np.array([np.cos(t), np.sin(2 * t) + 1, np.cos(3 * t)]).T @ columns
+
+    plant = plant_from_mapping({
+        "name": "rows", "states": ["a", "b", "c"], "E": E.tolist(), "A": A.tolist(),
+        "B": rows.tolist(), "initial_state": truth(0.0).tolist(),
+        "inputs": {"u": "cos(t) - sin(t)", "v": "-sin(2*t) - 1", "w": "2*cos(2*t) - cos(3*t)"},
+    })
+    times = np.linspace(0, 5, 101)
+    for solver, most in (("collocation", 1e-12), ("ivp", 1e-6)):
+        found = simulate(plant, TimeSettings(horizon=5.0), SolverSettings(name=solver, tol=1e-10))
+        assert np.abs(found.signals.states(times) - truth(times)).max() < most
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_jump_of_E_times_a_jump_of_the_state_is_refused(sign):
+    """E jumps where a state does: their product means nothing, whichever sign it has."""
+    plant = plant_from_mapping({
+        "name": "jumps", "states": ["a", "b"], "inputs": {"u": f"{sign}*step(t - 1)"},
+        "E": [[f"1 + {sign}*step(t - 1)/2", 0], [0, 0]], "A": [[0, 1], [1, 0]], "B": [[0], [1]],
+        "initial_state": {"a": 0, "b": 0},
+    })
+    with pytest.raises(ModelError, match=r"E jumps at t = 1 .* take the conserved quantity"):
+        simulate(plant, TimeSettings(horizon=2.0), SolverSettings())
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(1, 7), st.booleans())
+def test_scalings_undo_units(seed, n, of_E):
+    """Equations, states and time in other units change the factors and nothing that is scaled."""
+    rng = np.random.default_rng(seed)
+    E, A = rng.normal(size=(2, 1, 3, n, n)) * (rng.random((2, 1, 1, n, n)) < 0.7)
+    E *= of_E
+
+    def scaled(rows, columns, time):
+        nothing = np.zeros((1, 3, n, 0)), np.zeros((1, 3, 0))
+        weight = rows[:, None] * columns
+        c = Coefficients(E * weight * time, A * weight, *[nothing[0]] * 3, *[nothing[1]] * 2,
+                         nothing[1], *[nothing[0]] * 2)
+        s = balance(c)
+        assert all((np.log2(part) % 1 == 0).all() for part in (s.rows, s.columns, s.time))
+        both = s.rows[:, None] * s.columns
+        return c.E * both / s.time, c.A * both, s.weights * rows
+
+    plain = scaled(np.ones(n), np.ones(n), 1.0)
+    rows, columns = 2.0 ** rng.integers(-30, 30, n), 2.0 ** rng.integers(-30, 30, n)
+    changed = scaled(rows, columns, 2.0 ** rng.integers(-30, 30))
+    for one, other in zip(plain[:2], changed[:2], strict=True):
+        np.testing.assert_allclose(other, one, rtol=3.1, atol=0.0)
