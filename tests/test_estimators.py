@@ -13,7 +13,10 @@ from regressions import ETA, adjugate, fading, integrate, regression, three
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators import LinearRegression, Trajectory
 from gpebo_cli.estimators._extension import kreisselmeier, lion
+from gpebo_cli.numerics.mesh import initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import observe
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -315,6 +318,68 @@ def test_stiff_gradient_matches_its_limit():
     high = run("gradient", CLEAN, gamma=1e14)[0]
     low = run("gradient", CLEAN, gamma=1e10)[0]
     np.testing.assert_allclose(high, low, atol=1e-8)
+
+
+def cosines(p):
+    """p exciting functions of time, nearly dependent over short times."""
+    def psi(t):
+        return np.stack([np.cos((0.3 + 0.7 * k) * t + 0.3 * k) for k in range(p)], axis=-1)
+
+    return psi
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    p=st.integers(1, 8), gamma=st.floats(-2, 18), alpha=st.floats(-4, 8), f0=st.floats(-12, 2),
+    noise=st.sampled_from([0.0, 1e-9, 1e-3, 0.3]),
+)
+def test_no_gain_breaks_ls_drem(p, gamma, alpha, f0, noise):
+    """At the end: the exponential of its energy, or where it is fast, least squares itself."""
+    eta = np.arange(1.0, p + 1) * (-1.0) ** np.arange(p)
+    made = regression(cosines(p), eta, disturbance=lambda t: noise * np.sin(3.0 * t))
+    gains = {"gamma": 10.0**gamma, "alpha": 10.0**alpha, "f0": 10.0**f0}
+    estimates = estimate("ls_drem", made, **gains)
+    final = estimates.parameters(slice(None))[0, -1]
+    energy = estimates.requirement.evidence["gamma_times_integral"]
+    if noise == 0.0:
+        np.testing.assert_allclose(final, eta * -np.expm1(-energy), rtol=1e-5, atol=1e-8)
+        return
+    G = made.gram(T)
+    best = np.linalg.solve(G[-1, :, :p], G[-1, :, p])
+    late = estimates.delta(T)[0, 50:]
+    lag = 1.0 / (gains["gamma"] * late.min() ** 2)  # seconds behind the batch solution
+    if lag < 1e-3:
+        assert np.abs(final - best).max() <= (lag + 1e-6) * p * 10.0
+
+
+def test_a_closed_form_takes_a_gain_that_resolves_nothing_early():
+    """The law against quadrature in the variable ∫Δ², where G is known to all digits."""
+    made, gamma = regression(three, ETA, disturbance=wobble), 1e5
+    t = np.linspace(0, 10, 40_001)
+    G = made.gram(t)
+    share = np.linalg.eigvalsh(G[..., :3])
+    delta = np.prod(share / (share + 1e-4), axis=1)
+    rate = gamma * delta**2
+    known = np.flatnonzero(share[:, 0] > 1e-9 * share[:, 2])[0]
+    best = np.linalg.solve(G[known:, :, :3], G[known:, :, 3:])[..., 0]
+    ours = run("ls_drem", made, t=t, gamma=gamma, f0=1e-4)[0]
+    # η̂ = η̄ − η̄'/(γΔ²) + …, where the law is fast
+    lagging = best - np.gradient(best, t[known:], axis=0) / rate[known:, None]
+    late = t[known:] > 2.0
+    np.testing.assert_allclose(ours[known:][late], lagging[late], atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["ls_drem", "drem", "fct"])
+def test_many_rows_of_rough_data(name):
+    """Every element of its own, as of a recording: refined a stretch at a time."""
+    mesh = initial_mesh(0.0, 300.0, [], 30_000, radau_rule(3))
+    psi = three(mesh.points)[..., None, :]
+    rough = 0.1 * np.random.default_rng(0).standard_normal((mesh.size, 1, 1))
+    made = LinearRegression(
+        Trajectory(mesh, psi @ ETA + rough), Trajectory(mesh, psi), ("a", "b", "c"), 2.0
+    )
+    final = run(name, made, t=np.array([0.0, 300.0]))[0, -1]
+    np.testing.assert_allclose(final, ETA, atol=0.02)
 
 
 # --- gains ----------------------------------------------------------------------------------

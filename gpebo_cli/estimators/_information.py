@@ -59,6 +59,12 @@ class Spectrum:
     rotated: Array  # (M, p, c) Vᵀ h_z
     memory: Array  # (M,) z
 
+    @property
+    def digits(self) -> Array:
+        """Smallest eigenvalue over the largest, (M,); 0 where G_z = 0."""
+        smallest, largest = self.eigenvalues[:, 0], self.eigenvalues[:, -1]
+        return np.divide(smallest, largest, out=np.zeros_like(largest), where=largest > 0.0)
+
 
 def information(
     regression: LinearRegression, alpha: float, f0: float, beta: float, bound: float | None,

@@ -22,10 +22,10 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     """
     p = extended.values.shape[-2]
 
-    def signals(t: Array, inside: Array) -> tuple[Array, Array]:
+    def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         values = extended(t, inside)
-        delta, Y, _ = determinant_and_adjugate_action(values[..., :p], values[..., p:])
-        return delta, Y.reshape(len(t), -1)
+        delta, Y, digits = determinant_and_adjugate_action(values[..., :p], values[..., p:])
+        return delta, Y.reshape(len(t), -1), digits
 
     def determinant(t: Array) -> Array:
         return np.asarray(np.linalg.det(extended(t)[..., :p]))

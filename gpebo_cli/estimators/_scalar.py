@@ -16,12 +16,12 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import SolverError
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 
-# (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p)
-MixedSignals = Callable[[Array, Array], tuple[Array, Array]]
+# (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p), and σ_min/σ_max of Ω (N,)
+MixedSignals = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 # Relative variation of η̄, weighted by what it can do: below the first η̄ counts as constant, below
 # the second as linear in I between neighbouring points, which is then accurate enough.
@@ -29,6 +29,10 @@ _CONSTANT, _SMALL = 1e-13, 1e-8
 _TOLERANCE = 1e-10
 _MAX_ELEMENTS = 100_000
 _MAX_PARTS = 8
+_ROUNDING = 1e-15  # relative error of Ω; σ_max/σ_min times that is the one of 𝐘/Δ
+_UNKNOWN = 0.1  # relative error of 𝐘/Δ from which on it says nothing
+_SLACK = 30.0  # how far above its mean rounding may show in a polynomial's last coefficients
+_STRETCH = 2048  # elements that are refined together: memory does not grow with the horizon
 _LANES = 1 << 22  # numbers in one batch of gains
 
 
@@ -60,13 +64,17 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     Raises:
         SolverError: the law cannot be resolved.
     """
-    variation, last = law_variation(path.energy, path.quotient, float(gains.max(initial=0.0)))
+    largest = float(gains.max(initial=0.0))
+    variation, last = law_variation(path.energy, path.quotient, largest)
     size = max(last, float(np.abs(start).max()), path.floor)
+    if variation > _CONSTANT * size:  # more than rounding?
+        variation = _known_variation(path, largest, size)
     if variation <= _CONSTANT * size:
         return constant_law(path, start, gains)
     if variation <= _SMALL * size:
         return linear_law(path, start, gains)
-    lanes = path.mesh.points.size * path.quotient.shape[2] * path.mesh.rule.stages
+    elements = min(path.mesh.size, _STRETCH)
+    lanes = elements * path.mesh.points.shape[1] * path.quotient.shape[2] * path.mesh.rule.stages
     batch = max(1, _LANES // lanes)
     starts = np.broadcast_to(start, (len(gains), start.shape[-1]))
     return np.concatenate([
@@ -90,6 +98,18 @@ def law_variation(energy: Array, quotient: Array, gain: float) -> tuple[float, f
         float((weight[..., None] * change).max(initial=0.0)),
         float(np.abs(quotient[-1]).max(initial=0.0)),
     )
+
+
+def _known_variation(path: ScalarPath, gain: float, size: float) -> float:
+    """:func:`law_variation` of what is more than the rounding of 𝐘/Δ."""
+    mesh = path.mesh
+    digits = path.signals(mesh.points.ravel(), mesh.inside.ravel())[2].reshape(mesh.points.shape)
+    rounding = _SLACK * _ROUNDING / np.maximum(digits, _ROUNDING)
+    length = np.maximum(np.diff(path.energy, axis=1), 0.0)
+    weight = np.minimum(1.0, gain * length)[..., None]
+    change = np.abs(np.diff(path.quotient, axis=1))
+    known = change - size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
+    return float((weight * known).max(initial=0.0))
 
 
 def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:
@@ -133,20 +153,48 @@ def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
 
 
 def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
-    """The law on a mesh refined until every gain of the batch is resolved."""
-    mesh, p, g = path.mesh, path.quotient.shape[2], len(gains)
+    """The law as it stands, (g, M, p), a stretch of elements after the other."""
+    mesh, rule, p = path.mesh, path.mesh.rule, path.quotient.shape[2]
+    lanes = len(gains) * (rule.stages + 1) * rule.stages * p
+    stretch = int(np.clip(_LANES // lanes, 16, _STRETCH))
+    out = np.empty((len(gains), len(path.t), p))
+    element = mesh.sampler(path.t).element
+    eta, size = start, path.floor
+    for first in range(0, mesh.size, stretch):
+        piece = Mesh(mesh.edges[first : first + stretch + 1], rule)
+        ends = path.quotient[first : first + stretch, -1]
+        piece, values = _resolved(path, piece, ends, eta, gains, size)
+        eta, size = values[-1, -1], max(size, float(np.abs(values).max()))
+        within = (element >= first) & (element < first + stretch)
+        sampled = piece.sampler(path.t[within])(values)
+        out[:, within] = np.swapaxes(sampled, 0, 1)
+    return out
+
+
+def _resolved(
+    path: ScalarPath, mesh: Mesh, ends: Array, start: Array, gains: Array, size: float
+) -> tuple[Mesh, Array]:
+    """Point values (K, s + 1, g, p) on a mesh refined until every gain is resolved.
+
+    Args:
+        path: the mixed regression.
+        mesh: a stretch of its mesh.
+        ends: η̄ at the end of each of its elements, (K, p).
+        start: η̂ at its start, (g, p).
+        gains: γ, (g, p or 1).
+        size: below which η̂ is rounding.
+    """
+    maps, noise = _element_maps(path, mesh, ends, gains)
     while True:
-        delta, Y = path.signals(mesh.points.ravel(), mesh.inside.ravel())
-        delta, Y = delta.reshape(mesh.points.shape), Y.reshape(*mesh.points.shape, p)
-        values = _solve_batch(mesh, delta, Y, start, gains)  # (K, s + 1, g, p)
-        tail = unresolved(values.reshape(*values.shape[:2], g * p), mesh.rule, path.floor)
-        poor = tail > _TOLERANCE
+        values = _values(maps, start)
+        tail = unresolved(values.reshape(*values.shape[:2], -1), mesh.rule, size)
+        so_far = np.maximum.accumulate(np.abs(values).max(axis=(1, 2, 3)))
+        poor = tail * np.maximum(so_far, size) > np.maximum(_TOLERANCE * so_far, noise)
         # The signals themselves are known to about 1e-12 of their size; nothing is gained below
         # steps at which they do not change.
-        poor &= mesh.steps > 1e-12 * np.maximum(np.abs(mesh.edges[1:]), mesh.steps.max())
+        poor &= mesh.steps > 1e-12 * np.maximum(np.abs(mesh.edges[1:]), path.mesh.steps.max())
         if not poor.any():
-            sampled = mesh.sampler(path.t)(values)
-            return np.ascontiguousarray(np.swapaxes(sampled, 0, 1))
+            return mesh, values
         parts = np.ones(mesh.size, dtype=np.intp)
         wanted = 1.25 * (tail[poor] / _TOLERANCE) ** (1.0 / mesh.rule.stages)
         parts[poor] = np.clip(np.ceil(wanted), 2, _MAX_PARTS).astype(np.intp)
@@ -155,33 +203,71 @@ def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
                 f"the estimator is not resolved near t = {mesh.edges[int(np.argmax(tail))]:.6g} "
                 f"with {_MAX_ELEMENTS} elements; lower its gain"
             )
-        mesh, _ = mesh.split(parts)
+        finer, kept = mesh.split(parts)
+        ends, new = np.repeat(ends, parts, axis=0), kept < 0
+        made, made_noise = _element_maps(path, finer, ends, gains, new)
+        maps, noise = maps[kept], noise[kept]
+        maps[new], noise[new] = made, made_noise
+        mesh = finer
 
 
-def _solve_batch(mesh: Mesh, delta: Array, Y: Array, start: Array, gains: Array) -> Array:
-    """Collocation of η̂' = γΔ𝐘 − γΔ²η̂ for gains (g, p or 1): point values (K, s + 1, g, p)."""
-    rule, (g, lanes), p = mesh.rule, gains.shape, start.shape[-1]
-    h = mesh.steps[:, None, None]
-    rate = (h * (delta[:, 1:] ** 2)[:, None, :])[:, None] * gains[None, :, :, None]  # (K, g, l, s)
+def _element_maps(
+    path: ScalarPath, mesh: Mesh, ends: Array, gains: Array, chosen: BoolArray | slice = slice(None)
+) -> tuple[Array, Array]:
+    """What η̂ at the left end makes of it at each node, and to how many digits that is known.
+
+    By collocation of η̂' = γΔ𝐘 − γΔ²η̂. Where the directions of Ω are so unequal that 𝐘/Δ is
+    rounding, the law has its closed form with the next η̄ that is known, which has no more error.
+
+    Returns:
+        (K, g, l, s, 1 + p/l): factor and shifts, l being 1 or p; and the error of η̂ that the
+        rounding of 𝐘/Δ makes, (K,).
+    """
+    points, inside = mesh.points[chosen], mesh.inside[chosen]
+    rule, h, (g, lanes), p = mesh.rule, mesh.steps[chosen], gains.shape, ends.shape[1]
+    delta, Y, digits = path.signals(points.ravel(), inside.ravel())
+    delta, Y = delta.reshape(points.shape)[:, 1:], Y.reshape(*points.shape, p)[:, 1:]
+    size, per_lane = len(h), p // lanes  # parameters that share a gain
+    energy = h[:, None] * delta**2
+    rate = energy[:, None, None] * gains[None, :, :, None]  # (K, g, l, s)
     operator = np.broadcast_to(
-        rule.differentiation, (mesh.size, g, lanes, rule.stages, rule.stages)
+        rule.differentiation, (size, g, lanes, rule.stages, rule.stages)
     ).copy()
     diagonal = np.arange(rule.stages)
     operator[..., diagonal, diagonal] += rate
-    forcing = h * delta[:, 1:, None] * Y[:, 1:]  # (K, s, p)
-    per_lane = p // lanes  # parameters that share a gain
-    right = np.empty((mesh.size, g, lanes, rule.stages, 1 + per_lane))
+    forcing = (h[:, None] * delta)[..., None] * Y
+    right = np.empty((size, g, lanes, rule.stages, 1 + per_lane))
     right[..., 0] = rule.differentiation.sum(axis=1)
-    by_lane = forcing.reshape(mesh.size, rule.stages, lanes, per_lane)
-    right[..., 1:] = np.moveaxis(by_lane, 1, 2)[:, None] * gains[None, :, :, None, None]
-    solved = np.asarray(np.linalg.solve(operator, right), dtype=np.float64)
-    ends = solved[:, :, :, -1]  # (K, g, l, 1 + per_lane)
-    starts = affine_scan(ends[..., :1], ends[..., 1:], start.reshape(g, lanes, per_lane))[:-1]
-    values = np.empty((mesh.size, rule.stages + 1, g, lanes, per_lane))
+    by_lane = np.moveaxis(forcing.reshape(size, rule.stages, lanes, per_lane), 1, 2)
+    right[..., 1:] = by_lane[:, None] * gains[None, :, :, None, None]
+    maps = np.asarray(np.linalg.solve(operator, right), dtype=np.float64)
+
+    weights = energy * rule.integration[-1]
+    total = weights.sum(axis=1)
+    rounding = _ROUNDING / np.maximum(digits.reshape(points.shape)[:, 1:], _ROUNDING)
+    some = total > 0.0
+    mean = np.divide((weights * rounding).sum(axis=1), total, out=np.ones(size), where=some)
+    unknown = mean > _UNKNOWN
+    decay = np.exp(-(energy[unknown] @ rule.integration.T)[:, None, None] * gains[None, :, :, None])
+    maps[unknown, ..., 0] = decay
+    maps[unknown, ..., 1:] = (1.0 - decay)[..., None] * ends[chosen][unknown].reshape(
+        -1, 1, lanes, 1, per_lane
+    )
+    quotient = np.abs(Y).max(axis=2) / np.where(delta, np.abs(delta), 1.0)
+    error = (weights * rounding * quotient).sum(axis=1)
+    stiff = gains.max() / (1.0 + gains.max() * total)
+    return maps, np.where(unknown, np.inf, _SLACK * error * stiff)
+
+
+def _values(maps: Array, start: Array) -> Array:
+    """Point values (K, s + 1, g, p) from ``start`` (g, p)."""
+    size, g, lanes, stages, columns = maps.shape
+    last = maps[:, :, :, -1]
+    starts = affine_scan(last[..., :1], last[..., 1:], start.reshape(g, lanes, columns - 1))[:-1]
+    values = np.empty((size, stages + 1, g, lanes, columns - 1))
     values[:, 0] = starts
-    inner = solved[..., :1] * starts[:, :, :, None] + solved[..., 1:]  # (K, g, l, s, per_lane)
-    values[:, 1:] = np.moveaxis(inner, 3, 1)
-    return values.reshape(mesh.size, rule.stages + 1, g, p)
+    values[:, 1:] = np.moveaxis(maps[..., :1] * starts[:, :, :, None] + maps[..., 1:], 3, 1)
+    return values.reshape(size, stages + 1, g, -1)
 
 
 def scalar_path(

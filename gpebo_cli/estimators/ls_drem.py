@@ -131,7 +131,7 @@ def mix_least_squares(
     """
     mesh = info.gram.mesh
 
-    def signals(t: Array, inside: Array) -> tuple[Array, Array]:
+    def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         s = info.spectrum(t, inside)
         shares = _shares(s, alpha, f0)
         others = np.stack(
@@ -139,10 +139,10 @@ def mix_least_squares(
         )
         covariance = alpha / (alpha * s.eigenvalues + (s.memory * f0)[:, None])
         Y = s.vectors @ ((others * covariance)[..., None] * s.rotated)
-        return np.prod(shares, axis=1), Y.reshape(len(t), -1)
+        return np.prod(shares, axis=1), Y.reshape(len(t), -1), s.digits
 
     s = info.spectrum(mesh.points.ravel(), mesh.inside.ravel())
-    usable: BoolArray = np.asarray(s.eigenvalues[:, 0] > SINGULAR * s.eigenvalues[:, -1])
+    usable: BoolArray = np.asarray(s.digits > SINGULAR)
     inverse = np.divide(
         s.rotated, s.eigenvalues[..., None], out=np.zeros_like(s.rotated),
         where=usable[:, None, None],
