@@ -248,7 +248,8 @@ def _element_maps(
     some = total > 0.0
     mean = np.divide((weights * rounding).sum(axis=1), total, out=np.ones(size), where=some)
     unknown = mean > _UNKNOWN
-    decay = np.exp(-(energy[unknown] @ rule.integration.T)[:, None, None] * gains[None, :, :, None])
+    passed = np.maximum(np.maximum.accumulate(energy[unknown] @ rule.integration.T, axis=1), 0.0)
+    decay = np.exp(-passed[:, None, None] * gains[None, :, :, None])
     maps[unknown, ..., 0] = decay
     maps[unknown, ..., 1:] = (1.0 - decay)[..., None] * ends[chosen][unknown].reshape(
         -1, 1, lanes, 1, per_lane
