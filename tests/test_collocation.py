@@ -191,12 +191,11 @@ def test_constraints_given_apart_change_nothing():
 @pytest.mark.parametrize("stages", [2, 7, 14])
 @pytest.mark.parametrize("d", [3, 210])
 def test_stages_of_a_constant_system_decouple(stages, d):
-    """On both sides of the size from which the Schur form is used."""
     rng = np.random.default_rng(d)
     rule, step = radau_rule(stages), 0.3
     E, A = np.eye(d) + 0.1 * rng.normal(size=(d, d)) / np.sqrt(d), rng.normal(size=(d, d)) / 9
     right = rng.normal(size=(stages, d, 2))
-    Z = solve_constant(rule, step, E, A, right)
+    Z = solve_constant(stages, step, E, A, right)
     back = np.einsum("ij,kl,jlc->ikc", rule.differentiation / step, E, Z, optimize=True) - A @ Z
     np.testing.assert_allclose(back, right, atol=1e-11 * np.abs(Z).max() * stages**2)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +14,13 @@ import pytest
 
 from gpebo_cli import kernels
 from gpebo_cli.numerics.linalg import affine_scan, spectral_norm
+from gpebo_cli.numerics.radau import radau_rule
 
 needs_kernels = pytest.mark.skipif(
     kernels.kind() == "numpy" and os.environ.get("GPEBO_KERNELS") != "compiled",
     reason="the kernels are not compiled",
 )
+EPS = float(np.finfo(float).eps)
 Case = Callable[[np.random.Generator], tuple[Any, ...]]
 
 
@@ -55,7 +58,82 @@ def _symmetric(rng, p=4, more=1):
     return (A,)
 
 
+def _equation(rng, k=9, s=5, n=3, c=2, *, identity=False, constrained=False, constant=False):
+    rule = radau_rule(s)
+    points = 1 if constant else k * (s + 1)
+    d = n - 1 if constrained else n
+    E = None if identity else rng.normal(size=(points, d, n)) + 2.0 * np.eye(d, n)
+    basis = rng.normal(size=(points, n, d)) + np.eye(n, d) if constrained else None
+    offset = rng.normal(size=(k * (s + 1), n, c)) if constrained else None
+    group = np.arange(k) if not constant else np.arange(k) % 2
+    h = np.where(group == 0, 0.1, 0.2) if constant else rng.uniform(0.1, 0.2, size=k)
+    return (
+        rule.differentiation, h, E, rng.normal(size=(points, d, n)),
+        rng.normal(size=(k * (s + 1), d, c)), basis, offset, group, int(group.max()) + 1,
+    )
+
+
+def _maps(rng, k=7, s=4, n=3, c=2, one=False):
+    return (
+        rng.normal(size=(1 if one else k, s, n, n)) / 2, rng.normal(size=(k, s, n, c)),
+        rng.normal(size=(n, c)),
+    )
+
+
+def _solution(rng, k=7, s=5, n=3, c=2, one=False, amplified=True):
+    return (
+        rng.normal(size=(1 if one else k, s, n, n)) / 2,
+        rng.normal(size=(k, s + 1, n, c)) * 10.0 ** rng.integers(-9, 1, size=(1, 1, n, c)),
+        radau_rule(s).to_legendre, min(4, s - 1),
+        rng.uniform(size=(n, n + 1)) if amplified else None, 1e-3, 1e-3, 0.3,
+    )
+
+
+def _signal(rng, k=8, s=6, c=5):
+    values = rng.normal(size=(k, s + 1, c)) * 10.0 ** rng.integers(-12, 3, size=c)
+    return values, radau_rule(s).to_legendre, min(4, s - 1), 1e-8, 1e-3, 1e-5
+
+
+def _times(rng, k=6, s=4, count=50):
+    rule = radau_rule(s)
+    edges = np.cumsum(rng.uniform(0.1, 1.0, size=k + 1))
+    t = rng.uniform(edges[0] - 0.1, edges[-1] + 0.1, size=count)
+    t[:2], t[3] = edges[:2], edges[0] + rule.nodes[1] * (edges[1] - edges[0])
+    return edges, rule.points, rule.barycentric, t, t + 1e-15 * np.abs(t), 4 * EPS
+
+
+def _samples(rng, k=6, points=5, c=4, count=50):
+    weights, values = rng.normal(size=(count, points)), rng.normal(size=(k, points, c))
+    return rng.integers(0, k, count), weights, values
+
+
+def _filtered(rng, k=6, s=5):
+    rates = np.array([0.1, 3.0, 0.1, 1e6])
+    return (
+        radau_rule(s).differentiation, rng.uniform(0.1, 1.0, size=k),
+        rng.normal(size=(k, s + 1, 4)), rates, rng.normal(size=4),
+    )
+
+
 CASES: list[tuple[str, str, Case]] = [
+    *(("elements", "element_maps", partial(_equation, **options)) for options in (
+        {}, {"identity": True}, {"constrained": True}, {"constant": True},
+        {"constant": True, "constrained": True}, {"constant": True, "identity": True},
+        {"k": 1, "s": 2, "n": 1, "c": 1}, {"n": 7, "s": 14}, {"n": 1, "c": 20},
+    )),
+    ("elements", "chain", _maps),
+    ("elements", "chain", partial(_maps, one=True)),
+    ("elements", "chain", partial(_maps, k=1, n=16, c=9)),
+    ("elements", "estimates", _solution),
+    ("elements", "estimates", partial(_solution, one=True, amplified=False)),
+    ("elements", "estimates", partial(_solution, s=2, k=1)),
+    ("signals", "tails", _signal),
+    ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
+    ("signals", "interpolation", _times),
+    ("signals", "interpolation", partial(_times, k=1)),
+    ("signals", "sample", _samples),
+    ("signals", "sample", partial(_samples, c=33)),
+    ("signals", "low_pass", _filtered),
     ("laws", "mixed", _mixed),
     ("laws", "mixed", lambda rng: _mixed(rng, 8, 1, 1)),
     ("laws", "mixed", lambda rng: _mixed(rng, 1, 6, 1)),
@@ -128,6 +206,22 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("squared_errors", _errors, 5, np.s_[:, :-1]),
     ("mixed", _mixed, 0, np.s_[:, :, :2]),
     ("eigenvalues", _symmetric, 0, np.s_[:, :, :3]),
+    *(("element_maps", partial(_equation, constrained=True), place, np.s_[:-1])
+      for place in range(8)),
+    ("chain", _maps, 0, np.s_[:-1]),
+    ("chain", _maps, 1, np.s_[:, :-1]),
+    ("chain", _maps, 2, np.s_[:-1]),
+    ("estimates", _solution, 0, np.s_[:-1]),
+    ("estimates", _solution, 2, np.s_[:-1]),
+    ("estimates", _solution, 4, np.s_[:-1]),
+    ("tails", _signal, 1, np.s_[:-1]),
+    ("interpolation", _times, 0, np.s_[:1]),
+    ("interpolation", _times, 1, np.s_[:-1]),
+    ("interpolation", _times, 4, np.s_[:-1]),
+    ("sample", _samples, 1, np.s_[:-1]),
+    ("sample", _samples, 2, np.s_[:2]),
+    ("low_pass", _filtered, 1, np.s_[:-1]),
+    ("low_pass", _filtered, 3, np.s_[:-1]),
 ])  # fmt: skip
 def test_arrays_that_do_not_fit_each_other_are_refused(name, case, place, cut):
     """What would lead out of an array is never read."""

@@ -22,7 +22,7 @@ _COMPILED = _ASKED != "numpy" and find_spec(f"{__name__}._compiled") is not None
 if _ASKED == "compiled" and not _COMPILED:
     raise ImportError("GPEBO_KERNELS=compiled, but nothing was compiled when gpebo was installed")
 
-SUBJECTS = ("laws", "spectra")
+SUBJECTS = ("elements", "laws", "signals", "spectra")
 compiled: ModuleType | None = import_module(f"{__name__}._compiled") if _COMPILED else None
 
 
@@ -32,10 +32,12 @@ def kind() -> str:
 
 
 if TYPE_CHECKING:
+    from gpebo_cli.kernels import elements_numpy as elements
     from gpebo_cli.kernels import laws_numpy as laws
+    from gpebo_cli.kernels import signals_numpy as signals
     from gpebo_cli.kernels import spectra_numpy as spectra
 
-    __all__ = ["SUBJECTS", "kind", "laws", "spectra"]
+    __all__ = ["SUBJECTS", "elements", "kind", "laws", "signals", "spectra"]
 else:
     for _subject in SUBJECTS:
         globals()[_subject] = import_module(f"{__name__}.{_subject}_{kind()}")

@@ -1,8 +1,8 @@
-/* What collocation.c and mesh.c share: short sums, and systems of some tens of unknowns. */
+/* Short sums, and one system of some tens of unknowns. */
 #ifndef GPEBO_ELEMENTS_H
 #define GPEBO_ELEMENTS_H
 
-#include "common.h"
+#include "kernel.h"
 
 /* `combine` for a fixed number of columns. */
 #define COMBINE(block)                                                                             \

@@ -21,20 +21,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from math import prod
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.errors import SolverError
+from gpebo_cli.kernels import elements
+from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.mesh import (
     SHARE,
     Mesh,
     Trajectory,
-    legendre_tail,
-    signal_scale,
     unresolved_kinds,
     used_coefficients,
 )
@@ -73,11 +71,6 @@ _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are no
 _EPS = float(np.finfo(float).eps)
 _ROUNDING = 64 * _EPS
 _EQUAL = 1e-11  # relative difference of lengths that is rounding
-# Up to these sizes the kernels are faster than calls of LAPACK and BLAS: at them by a quarter, for
-# one component ten times (24 elements of 14 stages; one core with AVX-512).
-_SMALL_SYSTEM = 100  # unknowns of an element
-_SMALL_STATE = 16  # components, and
-_SMALL_VALUE = 200  # components times columns
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.
 np.empty(_CHUNK // 4)
@@ -185,7 +178,7 @@ def solve(
         floor = np.where(fresh, np.repeat(tail, parts), before)
         maps = _merge(maps, new, kept, fresh)
         mesh, rounds = finer, rounds + 1
-    estimate = max(float(tail.max(initial=0.0)), *_estimates(problem, maps, values, mesh))
+    estimate = max(float(tail.max(initial=0.0)), _estimates(problem, maps, values, mesh))
     return LinearSolution(Trajectory(mesh, values), estimate, rounds, maps.extras)
 
 
@@ -233,50 +226,14 @@ def unresolved_signals(
 
 def _estimates(
     problem: LinearProblem, maps: _ElementMaps, values: Array, mesh: Mesh
-) -> tuple[float, float, float]:
-    """Visible noise, propagated error and rounding, relative to each component's size."""
-    rule = mesh.rule
-    if kernels.compiled is not None and problem.renewal is None and _is_small(*values.shape[2:]):
-        propagated, noise, rounding = kernels.compiled.estimates(
-            maps.homogeneous, values, rule.to_legendre, used_coefficients(rule),
-            problem.amplification, problem.floor, SHARE, _LEVEL,
-        )
-        return noise, propagated, max(_ROUNDING, rounding)
-    last = np.broadcast_to(maps.homogeneous[:, -1], (mesh.size, *maps.homogeneous.shape[2:]))
-    return (
-        _visible_noise(values, mesh),
-        _propagated_error(last, values, mesh, problem.renewal),
-        _rounding(problem, values),
+) -> float:
+    """The largest of accumulated error, visible noise and rounding, relative to the sizes."""
+    renew = None if problem.renewal is None else problem.renewal.error
+    found = elements.estimates(
+        maps.homogeneous, values, mesh.rule.to_legendre, used_coefficients(mesh.rule),
+        problem.amplification, problem.floor, SHARE, _LEVEL, renew,
     )
-
-
-def _is_small(n: int, columns: int) -> bool:
-    """Whether kernels are faster for a solution (n, columns)."""
-    return n <= _SMALL_STATE and n * columns <= _SMALL_VALUE
-
-
-def _rounding(problem: LinearProblem, values: Array) -> float:
-    """Rounding relative to each component: what the large ones and the coefficients bring along."""
-    flat = values.reshape(*values.shape[:2], -1)
-    scale = signal_scale(flat, problem.floor)
-    unit = _EPS * float(np.abs(flat).max(initial=0.0))
-    brought = np.zeros_like(scale)
-    if problem.amplification is not None:
-        size = np.abs(values).max(axis=(0, 1))  # (n, columns)
-        through = problem.amplification[:, :-1] @ size + problem.amplification[:, -1:]
-        brought = _EPS * through.ravel()
-    return max(_ROUNDING, float(((unit + brought) / scale).max(initial=0.0)))
-
-
-def _visible_noise(values: Array, mesh: Mesh) -> float:
-    """Rounding as the last coefficients show it: those of a signal fall, those of noise do not."""
-    if mesh.rule.stages < 4:
-        return 0.0
-    flat = values.reshape(*values.shape[:2], -1)
-    last = np.abs(np.matmul(mesh.rule.to_legendre[-4:], flat))  # degrees s − 3 … s
-    before, after = last[:, :2].max(axis=1), last[:, 2:].max(axis=1)
-    noise = np.where(after >= _LEVEL * before, after, 0.0).max(axis=0)
-    return float((noise / signal_scale(flat)).max(initial=0.0))
+    return max(_ROUNDING, *found)
 
 
 def _check_budget(
@@ -301,12 +258,6 @@ def _check_budget(
 
 def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArray) -> _ElementMaps:
     def merged(before: Array, after: Array) -> Array:
-        if kernels.compiled is not None:
-            width = prod(before.shape[1:])
-            rows: Array = kernels.compiled.merged(
-                before.reshape(len(before), width), after.reshape(len(after), width), kept
-            )
-            return rows.reshape(len(kept), *before.shape[1:])
         out = np.empty((len(kept), *before.shape[1:]))
         out[~fresh] = before if len(before) == 1 else before[kept[~fresh]]
         out[fresh] = after
@@ -386,157 +337,74 @@ def at_points(values: Array, k: int, s: int) -> Array:
     return values.reshape(k, s + 1, *values.shape[1:])
 
 
-def _at_nodes(values: Array, k: int, s: int) -> Array:
-    """(k (s + 1), ...) or (1, ...) at points -> (k, s, ...) at nodes."""
-    if len(values) == 1:
-        return np.broadcast_to(values, (k, s, *values.shape[1:]))
-    return values.reshape(k, s + 1, *values.shape[1:])[:, 1:]
-
-
 def _solve_elements(
     problem: LinearProblem, rule: RadauRule, h: Array, t: Array, c: LinearEquation
 ) -> _ElementMaps:
     k, s = len(h), rule.stages
-    n = len(problem.start)
     extras = tuple([at_points(extra, k, s) for extra in c.extras])
+    basis, offset = (None, None) if c.constraints is None else c.constraints
+    group = _equal_lengths(h) if _is_constant(c) else np.arange(k)
+    groups = int(group.max(initial=-1)) + 1
+    solve = elements.element_maps
+    if _is_constant(c) and s * c.A.shape[1] > _DIRECT:
+        solve = _decoupled_maps
     try:
-        if kernels.compiled is not None and _is_small_system(c, s, n):
-            return _ElementMaps(*_solve_small_elements(rule, h, c), extras)
-        if _is_constant(c):
-            from_left, particular = _solve_equal_elements(rule, h, c, n)
-        else:
-            solved = _solve_distinct_elements(rule, h, c, n)
-            if c.constraints is not None:
-                solved = _at_nodes(c.constraints.basis, k, s) @ solved
-            from_left, particular = solved[..., :n], solved[..., n:]
+        homogeneous, particular = solve(
+            rule.differentiation, h, c.E, c.A, c.f, basis, offset, group, groups
+        )
     except np.linalg.LinAlgError as error:
         raise SolverError(
             f"the {problem.name} has a singular collocation system between t = {t[0, 0]:.6g} "
             f"and {t[-1, -1]:.6g}; loosen solver.tol, or choose a horizon that avoids this time"
         ) from error
-    if c.constraints is not None:
-        particular += _at_nodes(c.constraints.offset, k, s)
-    return _ElementMaps(from_left, particular, extras)
+    if 1 < groups < k:
+        homogeneous = homogeneous[group]
+    return _ElementMaps(homogeneous, particular, extras)
 
 
-def _is_small_system(c: LinearEquation, s: int, n: int) -> bool:
-    """Whether the kernel is faster."""
-    return (
-        s * c.A.shape[1] <= _SMALL_SYSTEM
-        and _is_small(n, c.f.shape[2])
-        and (c.E is not None or c.constraints is None)
-    )
+def _equal_lengths(h: Array) -> IntArray:
+    """Group (K,) of each length; those that differ by rounding only count as equal."""
+    order = np.argsort(h, kind="stable")
+    new = np.diff(h[order]) > _EQUAL * h.max()
+    group = np.empty(len(h), dtype=np.intp)
+    group[order] = np.append(0, np.cumsum(new))
+    return group
 
 
-def _solve_small_elements(rule: RadauRule, h: Array, c: LinearEquation) -> tuple[Array, Array]:
-    """:func:`_solve_equal_elements` or :func:`_solve_distinct_elements` in C, times T, plus p."""
-    basis, offset = (None, None) if c.constraints is None else c.constraints
-    solved: tuple[Array, Array] | None = kernels.compiled.element_maps(  # type: ignore[union-attr]
-        rule.differentiation, h, c.E, c.A, c.f, basis, offset, _EQUAL
-    )
-    if solved is None:
-        raise np.linalg.LinAlgError("a pivot is zero")
-    return solved
-
-
-def _forcing(rule: RadauRule, h: Array, c: LinearEquation) -> Array:
-    """What drives z at the nodes, f + A p − E (D p)/h, shape (k, s, d, columns)."""
-    k, s = len(h), rule.stages
-    f = _at_nodes(c.f, k, s)
-    if c.constraints is None:
-        return f
-    p = _at_nodes(c.constraints.offset, k, s)
-    slope = np.matmul(rule.differentiation / h[:, None, None], p.reshape(k, s, -1))
-    slope = slope.reshape(p.shape)
-    if c.E is not None:
-        slope = _at_nodes(c.E, k, s) @ slope
-    return np.asarray(f + _at_nodes(c.A, k, s) @ p - slope)
-
-
-def _solve_distinct_elements(rule: RadauRule, h: Array, c: LinearEquation, n: int) -> Array:
-    """Block systems (D_ij/h E_i T_j − δ_ij A_i T_i) z_j = …, one factorisation per element.
-
-    Returns:
-        [response to the left end | particular] of z at the nodes, (k, s, d, n + columns).
-    """
-    k, s = len(h), rule.stages
-    A, f = _at_nodes(c.A, k, s), _forcing(rule, h, c)
-    d, columns = f.shape[2:]
-    D_over_h = rule.differentiation / h[:, None, None]  # (k, s, s)
-    start = D_over_h.sum(axis=2)[..., None, None]  # (D𝟙)_i / h
-    right = np.empty((k, s, d, n + columns))
-    if c.E is None:
-        system = np.zeros((k, s, d, s, d))
-        diagonal = np.arange(d)
-        system[:, :, diagonal, :, diagonal] = D_over_h
-        right[..., :n] = start * np.eye(n)
-    else:
-        E = _at_nodes(c.E, k, s)
-        coupling = E[:, :, :, None, :]
-        if c.constraints is not None:
-            T = _at_nodes(c.constraints.basis, k, s)
-            all_nodes = np.swapaxes(T, 1, 2).reshape(k, n, s * d)
-            coupling = (E.reshape(k, s * d, n) @ all_nodes).reshape(k, s, d, s, d)
-            A = A @ T
-        system = coupling * D_over_h[:, :, None, :, None]
-        right[..., :n] = start * E
-    stage = np.arange(s)
-    system[:, stage, :, stage, :] -= np.swapaxes(A, 0, 1)
-    right[..., n:] = f
-    solved = np.linalg.solve(
-        system.reshape(k, s * d, s * d), right.reshape(k, s * d, n + columns)
-    )
-    return np.asarray(solved, dtype=np.float64).reshape(right.shape)
-
-
-def _solve_equal_elements(
-    rule: RadauRule, h: Array, c: LinearEquation, n: int
+def _decoupled_maps(
+    D: Array, h: Array, E: Array | None, A: Array, f: Array, basis: Array | None,
+    offset: Array | None, group: IntArray, groups: int,
 ) -> tuple[Array, Array]:
-    """With constant E, A and T, elements of one length share one factorisation.
-
-    Lengths that differ by rounding only (equal parts of an element) count as equal.
-
-    Returns:
-        T times the responses to the left end (k, s, n, n), or (1, s, n, n) for all, and T times
-        the particular solutions (k, s, n, columns).
-    """
-    k, s = len(h), rule.stages
-    f = _forcing(rule, h, c)
-    d, columns = f.shape[2:]
-    E, A = np.eye(n) if c.E is None else c.E[0], c.A[0]
-    T = np.eye(n) if c.constraints is None else c.constraints.basis[0]
-    start = rule.differentiation.sum(axis=1)[:, None, None]
-    rounded = np.round(h, 12 - int(np.floor(np.log10(h.max()))))
-    responses: list[Array] = []
-    which = np.empty(k, dtype=np.intp)
-    particular = np.empty((k, s, n, columns))
-    for length in np.unique(rounded):
-        same = np.flatnonzero(np.abs(h - length) <= _EQUAL * h.max())
+    """As ``elements.element_maps`` for constant E, A and T: stages are decoupled."""
+    k, s, columns = len(h), len(D), f.shape[2]
+    d, n = A.shape[1:]
+    forcing = forcing_at_nodes(D, h, E, A, f, offset)
+    E_, A_ = np.eye(n) if E is None else E[0], A[0]
+    T = np.eye(n) if basis is None else basis[0]
+    start = D.sum(axis=1)[:, None, None]
+    homogeneous, particular = np.empty((groups, s, n, n)), np.empty((k, s, n, columns))
+    for g in range(groups):
+        same = np.flatnonzero(group == g)
         step = h[same[0]]
         right = np.empty((s, d, n + len(same) * columns))
-        right[:, :, :n] = start / step * E
-        right[:, :, n:] = np.moveaxis(f[same], 0, 2).reshape(s, d, len(same) * columns)
-        solved = T @ solve_constant(rule, step, E @ T, A @ T, right)
-        which[same] = len(responses)
-        responses.append(solved[:, :, :n])
-        columns_apart = solved[:, :, n:].reshape(s, n, len(same), columns)
-        particular[same] = np.moveaxis(columns_apart, 2, 0)
-    if len(responses) == 1:
-        return responses[0][None], particular
-    return np.array(responses)[which], particular
+        right[:, :, :n] = start / step * E_
+        right[:, :, n:] = np.moveaxis(forcing[same], 0, 2).reshape(s, d, len(same) * columns)
+        solved = T @ solve_constant(s, step, E_ @ T, A_ @ T, right)
+        homogeneous[g] = solved[:, :, :n]
+        particular[same] = np.moveaxis(
+            solved[:, :, n:].reshape(s, n, len(same), columns), 2, 0
+        )
+    if offset is not None:
+        particular += at_nodes(offset, k, s)
+    return homogeneous, particular
 
 
-def solve_constant(rule: RadauRule, step: float, E: Array, A: Array, right: Array) -> Array:
+def solve_constant(s: int, step: float, E: Array, A: Array, right: Array) -> Array:
     """(D/h ⊗ E − I ⊗ A) Z = ``right`` for constant E, A (d, d); Z and ``right`` (s, d, columns).
 
     With D = U T Uᴴ the stages decouple from the last to the first: s systems of size d instead of
-    one of size s·d. Below _DIRECT unknowns the one system is faster.
+    one of size s·d.
     """
-    s, d, _ = right.shape
-    if s * d <= _DIRECT:
-        system = np.kron(rule.differentiation / step, E) - np.kron(np.eye(s), A)
-        solved = np.linalg.solve(system, right.reshape(s * d, right.shape[2]))
-        return np.asarray(solved, dtype=np.float64).reshape(right.shape)
     U, T = differentiation_schur(s)
     T = T / step
     Y = np.tensordot(U.conj().T, right, axes=1)
@@ -555,88 +423,22 @@ def _chain(
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, int]:
     """Point values (K, s + 1, n, columns), and how many elements in front are finite."""
-    size, s, n = maps.particular.shape[:3]
-    columns = problem.start.shape[1]
-    renewal = problem.renewal
-    if kernels.compiled is not None and renewal is None and _is_small(n, columns):
-        return _chain_stretches(maps, problem, mesh, restarts)
-    homogeneous = np.broadcast_to(maps.homogeneous, (size, s, n, n))
-    last_h, last_p = homogeneous[:, -1], maps.particular[:, -1]
-    jump = [restarts.get(float(edge)) for edge in mesh.edges[:-1]] if restarts else [None] * size
-    left = np.empty((size, n, columns))
-    state = problem.start
-    values = np.empty((size, s + 1, n, columns))
-    with np.errstate(over="ignore", invalid="ignore"):  # the caller reports what is not finite
-        for k in range(size):
-            restart = jump[k]
-            if restart is not None and k > 0:
-                state = restart(state)
-            if renewal is not None and k > 0 and np.isfinite(state).all():
-                state = renewal.state(state)
-            left[k] = state
-            state = last_h[k] @ state + last_p[k]
-        values[:, 0] = left
-        values[:, 1:] = homogeneous @ left[:, None] + maps.particular
-    finite = np.isfinite(values).all(axis=(1, 2, 3))
-    return values, size if finite.all() else int(np.argmin(finite))
-
-
-def _chain_stretches(
-    maps: _ElementMaps,
-    problem: LinearProblem,
-    mesh: Mesh,
-    restarts: Mapping[float, Callable[[Array], Array]],
-) -> tuple[Array, int]:
-    """:func:`_chain` in C, from one restart to the next."""
-    chain = kernels.compiled.chain  # type: ignore[union-attr]
+    renew = None if problem.renewal is None else problem.renewal.state
     if not restarts:
-        solved: tuple[Array, int] = chain(maps.homogeneous, maps.particular, problem.start)
-        return solved
+        return elements.chain(maps.homogeneous, maps.particular, problem.start, renew)
     edges = mesh.edges.tolist()
     cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
     state, pieces, whole = problem.start, [], 0
     for first, last in pairwise(cuts):
         if first:
             state = restarts[edges[first]](state)
+            if renew is not None:
+                state = renew(state)
         part = slice(first, last)
         same = len(maps.homogeneous) == 1
         homogeneous = maps.homogeneous if same else maps.homogeneous[part]
-        values, finite = chain(homogeneous, maps.particular[part], state)
+        values, finite = elements.chain(homogeneous, maps.particular[part], state, renew)
         whole += finite if whole == first else 0
         pieces.append(values)
         state = values[-1, -1]
     return np.concatenate(pieces), whole
-
-
-def _propagated_error(
-    last_h: Array, values: Array, mesh: Mesh, renewal: Renewal | None
-) -> float:
-    """Largest accumulated end-point error, relative to each component's size.
-
-    The error of an element's right end is carried through the same maps as the solution, so that
-    it decays where the system forgets and grows where it does not.
-
-    The local error of an end point is superconvergent (order 2s − 1 against s + 1 inside): with
-    ρ the decay per Legendre coefficient it is about ρ^(s−1) times the element's tail. Half that
-    exponent is used, to stay on the safe side of it, plus the rounding of one element.
-    """
-    rule = mesh.rule
-    flat = values.reshape(*values.shape[:2], -1)
-    scale = signal_scale(flat)
-    size = np.abs(flat).max(axis=1)  # (K, c)
-    tail = legendre_tail(flat, rule, scale)
-    decay = np.clip(tail / np.maximum(size, np.finfo(float).tiny), 0.0, 1.0) ** (1 / rule.stages)
-    rounding = 4 * _EPS * np.maximum(size, scale * _EPS)
-    local = (tail * decay ** (0.5 * (rule.stages - 1)) + rounding).reshape(-1, *values.shape[2:])
-    # Local errors have signs that nobody knows: all equal, and alternating, so that neither kind
-    # of system can cancel both. Absolute values of the maps were rejected: a rotation would grow.
-    signs = np.ones((len(local), 2, 1, 1))
-    signs[1::2, 1] = -1.0
-    errors = signs * local[:, None]
-    for k in range(1, len(errors)):
-        carried = errors[k - 1]
-        if renewal is not None:
-            carried = renewal.error(values[k - 1, -1], carried)
-        errors[k] += last_h[k] @ carried
-    worst = np.abs(errors).max(axis=(0, 1), initial=0.0)
-    return float((worst.ravel() / scale).max(initial=0.0))

@@ -10,9 +10,8 @@ from math import prod
 
 import numpy as np
 
-from gpebo_cli import kernels
+from gpebo_cli.kernels import signals
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.linalg import affine_scan
 from gpebo_cli.numerics.radau import RadauRule
 
 # Functions that jump are decided this far (relative to the element) inside its ends, so that both
@@ -23,12 +22,11 @@ _CHUNK = 1 << 22  # numbers gathered at once when sampling
 _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
 SHARE = 1e-3  # of the largest component: what is smaller is measured against that
 _FOOT = 1e-8  # of its final size: what a component was before may be that wrong
-_MOST_KINDS = 24  # in one call of a kernel
 _WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
 _MANY = 2000  # times, from which on sampling them by element pays
 _KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
 _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
-_JOINED = (2, 4, 8)  # as many elements become one
+_JOINED = (8, 4, 2)  # as many elements become one
 _MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -63,11 +61,6 @@ class Mesh:
     @cached_property
     def _places(self) -> tuple[Array, Array]:
         """Points, and where functions that jump are decided."""
-        if kernels.compiled is not None:
-            places: tuple[Array, Array] = kernels.compiled.mesh_points(
-                self.edges, self.rule.points, _INSIDE
-            )
-            return places
         points = self.edges[:-1, None] + self.steps[:, None] * self.rule.points
         points[:, -1] = self.edges[1:]
         inside = points.copy()
@@ -81,9 +74,6 @@ class Mesh:
         Returns:
             The new mesh, and for each new element the old one it equals, or −1 if it is new.
         """
-        if kernels.compiled is not None:
-            finer, kept = kernels.compiled.split(self.edges, parts.astype(np.intp, copy=False))
-            return Mesh(finer, self.rule), kept
         parent = np.repeat(np.arange(self.size), parts)
         first = np.cumsum(parts) - parts
         position = np.arange(len(parent)) - first[parent]
@@ -112,31 +102,22 @@ class Mesh:
         bounds = [0, *sorted(inner - {0, self.size}), self.size]
         if len(bounds) > _MANY_PIECES + 1:
             return self
-        if kernels.compiled is not None:
-            edges = kernels.compiled.joined(
-                values, counts, self.edges, np.array(bounds), tol, longest, _FOOT, SHARE, _TINY,
-                *_all_joining(self.rule),
-            )
-            return self if len(edges) == len(self.edges) else Mesh(edges, self.rule)
-        pieces = list(pairwise(bounds))
-        scale = _scale_so_far(values, counts, np.full(len(counts), _TINY))[:, None]
+        scale = _scale_so_far(values, counts, np.full(len(counts), _TINY))
         stays = np.ones(self.size + 1, dtype=bool)
+        free = np.ones(self.size, dtype=bool)
         for count in _JOINED:
-            first = np.concatenate([np.arange(a, b - count + 1, count) for a, b in pieces])
-            # What could not be joined to less will not be joined to more.
-            half = count // 2
-            inside = np.arange(1, half) if half > 1 else np.zeros(0, dtype=np.intp)
-            ready = ~stays[first[:, None] + np.concatenate([inside, half + inside])].any(axis=1)
-            first = first[ready & (count * self.steps[first] <= longest)]
+            first = np.concatenate(
+                [np.arange(a, b - count + 1, count) for a, b in pairwise(bounds)]
+            )
+            first = first[free[first] & (count * self.steps[first] <= longest)]
             together = first[:, None] + np.arange(count)
-            seen = values[together]  # (groups, count, s + 1, c)
-            flat = seen.reshape(len(first), count * seen.shape[2], seen.shape[3])
-            change = np.abs(joining_change(self.rule, count) @ flat).reshape(seen.shape)
-            change /= scale[together]
-            first = first[change.max(axis=(1, 2, 3), initial=0.0) <= tol]
-            if not len(first):
-                break
-            stays[first[:, None] + np.arange(1, count)] = False
+            there, back = joining(self.rule, count)
+            seen = values[together].reshape(len(first), len(back), values.shape[2])
+            change = np.abs(back @ (there @ seen) - seen)
+            change = change.reshape(*together.shape, len(there), values.shape[2])
+            fits = (change <= tol * scale[together, None]).all(axis=(1, 2, 3))
+            stays[together[fits, 1:]] = False
+            free[together[fits]] = False
         return self if stays.all() else Mesh(self.edges[stays], self.rule)
 
     def sampler(self, t: Array, inside: Array | None = None) -> Sampler:
@@ -165,53 +146,25 @@ class Mesh:
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
         rule = self.rule
-        if kernels.compiled is not None:
-            return Sampler(*kernels.compiled.sampler(
-                self.edges, rule.points, rule.barycentric, t, inside, _SNAP, _EXACT
-            ))
         belongs = t + _SNAP * np.abs(t) if inside is None else inside
-        element = np.searchsorted(self.edges, belongs, side="right") - 1
-        element = np.clip(element, 0, self.size - 1)
-        local = (t - self.edges[element]) / self.steps[element]
-        distance = local[:, None] - rule.points
-        exact = np.abs(distance) < _EXACT
-        hit = exact.any(axis=1)
-        with np.errstate(divide="ignore"):
-            weights = rule.barycentric / np.where(exact, 1.0, distance)
-        weights[hit] = exact[hit]
-        weights /= weights.sum(axis=1, keepdims=True)
-        return Sampler(element, weights)
+        return Sampler(*signals.interpolation(
+            self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
+        ))
 
 
 @lru_cache(maxsize=64)
-def joining_change(rule: RadauRule, count: int) -> Array:
-    """By how much point values of ``count`` equal elements change if one polynomial replaces them.
+def joining(rule: RadauRule, count: int) -> tuple[Array, Array]:
+    """From point values of ``count`` equal elements to those of one over all of them, and back.
 
-    Values at the points of the joined element are read from the polynomials of the short ones.
-    Shape (count (s + 1), count (s + 1)), for the point values one element after the other.
-    """
-    there, back = _joining(rule, count)
-    return np.asarray((there @ back).T - np.eye(len(there)))
-
-
-def _joining(rule: RadauRule, count: int) -> tuple[Array, Array]:
-    """From the points of ``count`` equal elements to those of one over all of them, and back.
-
-    Weights of shapes (count (s + 1), s + 1) and (s + 1, count (s + 1)), applied from the right.
+    Shapes (s + 1, count (s + 1)) and (count (s + 1), s + 1), for the values one element after the
+    other: those of the joined element are read from the polynomials of the short ones.
     """
     short = Mesh(np.arange(count + 1) / count, rule)
     joined = Mesh(np.array([0.0, 1.0]), rule)
     size = count * len(rule.points)
     unit = np.eye(size).reshape(count, len(rule.points), size)
     there = short.sampler(joined.points.ravel(), joined.inside.ravel())(unit)
-    back = joined.sampler(short.points.ravel()).weights
-    return np.ascontiguousarray(there.T), np.ascontiguousarray(back.T)
-
-
-@lru_cache(maxsize=16)
-def _all_joining(rule: RadauRule) -> tuple[Array, ...]:
-    """What :func:`joining_change` is made of, for each of _JOINED: for the kernel."""
-    return tuple(matrix for count in _JOINED for matrix in _joining(rule, count))
+    return there, joined.sampler(short.points.ravel()).weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,18 +177,11 @@ class Sampler:
     def __call__(self, values: Array) -> Array:
         """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
         flat = _flat(values)
-        if kernels.compiled is not None and (flat.shape[2] <= _WIDE or self._grouped is None):
-            sampled: Array = kernels.compiled.sample(self.element, self.weights, flat)
+        if self._grouped is None or flat.shape[2] <= _WIDE:
+            sampled = signals.sample(self.element, self.weights, flat)
             return sampled.reshape(len(sampled), *values.shape[2:])
         out = np.empty((len(self.element), flat.shape[2]))
-        if self._grouped is not None:
-            self._by_element(flat, out)
-        else:
-            chunk = max(1, _CHUNK // max(1, flat.shape[1] * flat.shape[2]))
-            for i in range(0, len(out), chunk):
-                part = slice(i, i + chunk)
-                gathered = flat[self.element[part]]
-                out[part] = np.matmul(self.weights[part, None, :], gathered)[:, 0, :]
+        self._by_element(flat, out)
         return out.reshape(len(out), *values.shape[2:])
 
     @cached_property
@@ -298,9 +244,6 @@ class Trajectory:
     def _integral(self, *, on: bool) -> Trajectory:
         """On from the elements before, or from each left end."""
         rule, mesh, flat = self.mesh.rule, self.mesh, _flat(self.values)
-        if kernels.compiled is not None and flat.shape[2] <= _WIDE:
-            out = kernels.compiled.integral(rule.integration, mesh.steps, flat, on)
-            return Trajectory(mesh, out.reshape(self.values.shape))
         out = np.zeros(flat.shape)
         out[:, 1:] = mesh.steps[:, None, None] * np.matmul(rule.integration, flat[:, 1:])
         if on:
@@ -319,24 +262,11 @@ class Trajectory:
         mesh, rule = self.mesh, self.mesh.rule
         shape = self.values.shape[2:]
         rates = np.broadcast_to(np.asarray(rate, dtype=np.float64), shape).ravel()
-        if kernels.compiled is not None:
-            at_start = np.zeros(len(rates)) if start is None else start.ravel()
-            filtered = kernels.compiled.low_pass(
-                rule.differentiation, mesh.steps, _flat(self.values), rates, at_start
-            )
-            if filtered is None:
-                raise np.linalg.LinAlgError("a pivot is zero")
-            return Trajectory(mesh, filtered.reshape(self.values.shape))
-        flat = self.values.reshape(mesh.size, rule.stages + 1, -1)
-        distinct, which = np.unique(rates, return_inverse=True)
-        at_start = np.zeros(flat.shape[2]) if start is None else start.ravel()
-        out = np.empty_like(flat)
-        batch = max(1, _CHUNK // (mesh.size * rule.stages**2))
-        for first in range(0, len(distinct), batch):
-            some = distinct[first : first + batch]
-            columns = [np.flatnonzero(which == first + i) for i in range(len(some))]
-            _filter(mesh, some, columns, flat, at_start, out)
-        return Trajectory(mesh, out.reshape(self.values.shape))
+        at_start = np.zeros(len(rates)) if start is None else start.ravel()
+        filtered = signals.low_pass(
+            rule.differentiation, mesh.steps, _flat(self.values), rates, at_start
+        )
+        return Trajectory(mesh, filtered.reshape(self.values.shape))
 
 
 def _flat(values: Array) -> Array:
@@ -344,31 +274,6 @@ def _flat(values: Array) -> Array:
     if values.ndim == 3:
         return values
     return values.reshape(values.shape[0], values.shape[1], prod(values.shape[2:]))
-
-
-def _filter(
-    mesh: Mesh, rates: Array, columns: Sequence[IntArray], values: Array, start: Array, out: Array
-) -> None:
-    """Z of Z' = −λ (Z − S) from ``start``, for the columns of S that each rate λ belongs to.
-
-    Columns that share a rate share a factorisation; all rates are solved in one batch.
-    """
-    rule = mesh.rule
-    hl = rates[:, None, None, None] * mesh.steps[:, None, None]  # h λ, (rates, K, 1, 1)
-    right = np.zeros((len(rates), mesh.size, rule.stages, 1 + max(map(len, columns))))
-    right[..., 0] = rule.differentiation.sum(axis=1)  # the response to the left end
-    first = np.zeros((len(rates), right.shape[-1] - 1))
-    for i, those in enumerate(columns):
-        first[i, : len(those)] = start[those]
-        right[i, :, :, 1 : 1 + len(those)] = hl[i] * values[:, 1:, those]
-    operator = rule.differentiation + hl * np.eye(rule.stages)
-    solved = np.asarray(np.linalg.solve(operator, right), dtype=np.float64)
-    last = np.moveaxis(solved[:, :, -1], 0, 1)  # (K, rates, 1 + columns)
-    starts = affine_scan(last[..., :1], last[..., 1:], first)[:-1]
-    for i, those in enumerate(columns):
-        left = starts[:, i, None, : len(those)]
-        out[:, :1, those] = left
-        out[:, 1:, those] = solved[i, :, :, :1] * left + solved[i, :, :, 1 : 1 + len(those)]
 
 
 def unresolved(values: Array, rule: RadauRule, floor: float = 0.0) -> Array:
@@ -391,25 +296,13 @@ def unresolved_kinds(kinds: Sequence[tuple[Array, float]], rule: RadauRule) -> A
     Returns:
         shape (K,).
     """
-    if kernels.compiled is not None and len(kinds) <= _MOST_KINDS:
-        tail: Array = kernels.compiled.tails(
-            rule.to_legendre, used_coefficients(rule), _FOOT, SHARE,
-            *[either for kind in kinds for either in kind],
-        )
-        return tail
-    seen = [(values, floor) for values, floor in kinds if values.shape[2]]
-    if not seen:
-        return np.zeros(len(kinds[0][0]))
-    if len(seen) > 1 and sum(values.size for values, _ in seen) > _CHUNK:
-        return np.asarray(np.max([unresolved_kinds([kind], rule) for kind in seen], axis=0))
-    counts = np.array([values.shape[2] for values, _ in seen])
-    floors = np.maximum([floor for _, floor in seen], _TINY)
-    values = seen[0][0] if len(seen) == 1 else np.concatenate([v for v, _ in seen], axis=2)
-    scale = _scale_so_far(values, counts, floors)
-    ratio = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))
+    used = used_coefficients(rule)
+    worst = np.zeros((len(kinds[0][0]), used))
+    for values, floor in kinds:
+        found = signals.tails(values, rule.to_legendre, used, _FOOT, SHARE, floor)
+        np.maximum(worst, found, out=worst)
     # Powers are monotone: the worst component of each degree first, then its power.
-    worst = np.minimum((ratio / scale[:, None]).max(axis=2), 1.0)
-    return np.asarray((worst ** _to_next(rule)).max(axis=1))
+    return np.asarray((np.minimum(worst, 1.0) ** _to_next(rule)).max(axis=1, initial=0.0))
 
 
 def used_coefficients(rule: RadauRule) -> int:

@@ -321,16 +321,8 @@ def _restart(
 
 def _outputs(C: Array, x: Array, direct: Array | None = None) -> tuple[Array, float]:
     """y = C x + direct at points (K, s + 1), and how large it could be: C times x, the largest."""
-    if kernels.compiled is not None:
-        K, points, n = x.shape
-        r = C.shape[2]
-        y, size = kernels.compiled.outputs(
-            C.reshape(C.shape[0] * C.shape[1], r, n), x.reshape(K * points, n)
-        )
-        y = y.reshape(K, points, r)
-    else:
-        size = float(np.abs(C).max(initial=0.0)) * float(np.abs(x).max(initial=0.0))
-        y = np.asarray(np.matmul(C, x[..., None])[..., 0])
+    size = float(np.abs(C).max(initial=0.0)) * float(np.abs(x).max(initial=0.0))
+    y = np.asarray(np.matmul(C, x[..., None])[..., 0])
     if direct is None:
         return y, size
     return y + direct, max(size, float(np.abs(direct).max(initial=0.0)))

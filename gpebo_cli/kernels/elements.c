@@ -1,9 +1,5 @@
-/* gpebo_cli/numerics/collocation.py: element systems, chaining, error estimates. */
+/* Systems of elements, chaining, error estimates; see elements_numpy.py. */
 #include "elements.h"
-
-#include <float.h>
-
-/* --- the element systems ------------------------------------------------------------------ */
 
 /* Values at points, the same at all of them where `step` is 0; NULL for what is not there. */
 typedef struct {
@@ -21,7 +17,7 @@ typedef struct {
     npy_intp s, d, n, columns;
     const double *D; /* (s, s) */
     Moving E, A, f, T, p;
-    double *h;        /* lengths (K,) */
+    const double *h;  /* lengths (K,) */
     double *Dh;       /* (s, s): D/h of an element */
     double *together; /* (n, s d): T at all nodes of an element, side by side */
     double *coupling; /* (s d,): a row of E times that */
@@ -143,31 +139,10 @@ EVERY_WIDTH static void expand(const Equation *q, npy_intp k, const double *W, n
     }
 }
 
-/* Elements 0 … count − 1, one system each; 0 if one is singular. */
-static int distinct_elements(const Equation *q, npy_intp count, double *W, double *homogeneous,
-                             double *particular)
-{
-    const npy_intp m = q->s * q->d, n = q->n, sides = n + q->columns;
-    const npy_intp length = row_length(m, sides);
-    for (npy_intp k = 0; k < count; k++) {
-        for (npy_intp i = 0; i < m; i++)
-            for (npy_intp j = m + sides; j < length; j++)
-                W[i * length + j] = 0.0;
-        lengthen(q, k);
-        assemble(q, k, W, length);
-        drive(q, k, W, length, m + n);
-        if (!eliminate(W, m, sides))
-            return 0;
-        expand(q, k, W, length, m, n, 0, homogeneous + k * q->s * n * n);
-        expand(q, k, W, length, m + n, q->columns, 1, particular + k * q->s * n * q->columns);
-    }
-    return 1;
-}
-
-/* Elements of one length under constant E, A and T: one system for all, whose responses to the
-   left end are the same; 0 if it is singular. */
-static int equal_elements(const Equation *q, const int *members, npy_intp count, double *W,
-                          double *homogeneous, double *particular)
+/* The elements `members` of one length and, if there are several, constant E, A and T: one system
+   for all, with the response to the left end and all particular solutions; 0 if it is singular. */
+static int solve_group(const Equation *q, const npy_intp *members, npy_intp count, double *W,
+                       double *homogeneous, double *particular)
 {
     const npy_intp m = q->s * q->d, n = q->n, columns = q->columns, sides = n + count * columns;
     const npy_intp length = row_length(m, sides);
@@ -189,107 +164,55 @@ static int equal_elements(const Equation *q, const int *members, npy_intp count,
     return 1;
 }
 
-/* An argument with values at points, or None; 0, with an exception, if it is neither, or has not
-   `rows` rows and `columns` columns at each of `points` points or at one for all. */
-static int moving(Call *call, Py_ssize_t place, const char *what, npy_intp points, npy_intp rows,
-                  npy_intp columns, Moving *out)
+/* D, h, E, A, f, T, p, the group of each element (ascending from 0 as they first appear), how many
+   there are -> responses to the left end of each group, particular solutions. */
+static Outcome element_maps(Call *call)
 {
-    *out = (Moving){NULL, 0};
-    if (call->given[place] == Py_None)
-        return 1;
-    PyArrayObject *array = doubles(call, place, 3);
-    if (array == NULL || !same(what, size(array, 1), rows) || !same(what, size(array, 2), columns))
-        return 0;
-    const int constant = size(array, 0) == 1;
-    if (!constant && !same(what, size(array, 0), points))
-        return 0;
-    *out = (Moving){data(array), constant ? 0 : rows * columns};
-    return 1;
-}
-
-/* element_maps(D (s, s), h (K,), E or None, A, f, T or None, p or None, equal)
-
-   E, A (N or 1, d, n) and f (N or 1, d, columns) at the N = K (s + 1) points of K elements; with
-   constraints T (N or 1, n, d) and p (N or 1, n, columns), else d = n. Where E, A and T are
-   constant, lengths that differ by `equal` times the longest, or less, count as equal.
-
-   Returns the responses to the left end (K or 1, s, n, n), one for all elements if they are the
-   same, and the particular solutions (K, s, n, columns); None if a system is singular. */
-static PyObject *element_maps(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 8))
-        return NULL;
-    PyArrayObject *D = doubles(&call, 0, 2), *h = D ? doubles(&call, 1, 1) : NULL;
-    PyArrayObject *A = h ? doubles(&call, 3, 3) : NULL, *f = A ? doubles(&call, 4, 3) : NULL;
-    const double equal = PyFloat_AsDouble(given[7]);
-    if (f == NULL || PyErr_Occurred() || !same("rows and columns of D", size(D, 0), size(D, 1)))
-        return failed(&call);
-    Equation q = {.s = size(D, 0), .d = size(A, 1), .n = size(A, 2), .columns = size(f, 2)};
-    const npy_intp K = size(h, 0), s = q.s, d = q.d, n = q.n, columns = q.columns, m = s * d;
-    const npy_intp points = K * (s + 1);
-    if (!moving(&call, 2, "points, rows or columns of E", points, d, n, &q.E) ||
-        !moving(&call, 3, "points, rows or columns of A", points, d, n, &q.A) ||
-        !moving(&call, 4, "points, rows or columns of f", points, d, columns, &q.f) ||
-        !moving(&call, 5, "points, rows or columns of T", points, n, d, &q.T) ||
-        !moving(&call, 6, "points, rows or columns of p", points, n, columns, &q.p))
-        return failed(&call);
-    if ((q.T.from == NULL && !same("rows and columns of A", d, n)) ||
-        !same("constraints with an offset", q.T.from != NULL, q.p.from != NULL) ||
-        (q.T.from != NULL && !same("constraints with E", 1, q.E.from != NULL)))
-        return failed(&call);
-    q.D = data(D);
-    q.h = data(h);
-    double longest = 0.0;
-    for (npy_intp k = 0; k < K; k++)
-        longest = q.h[k] > longest ? q.h[k] : longest;
-    const int constant = q.A.step == 0 && q.E.step == 0 && q.T.step == 0;
-    const npy_intp sides = n + columns * (constant ? K : 1);
-    q.together = old_scratch(&call, (n + 1) * m + s * n * columns + d * d + s * s + columns);
-    double *W = q.together ? old_scratch(&call, m * row_length(m, sides)) : NULL;
-    int *members = W ? integers(&call, 2 * K) : NULL;
-    PyArrayObject *particular = members ? fresh(&call, 4, (npy_intp[]){K, s, n, columns}) : NULL;
-    if (particular == NULL)
-        return failed(&call);
+    const npy_intp K = SIZE(K), s = SIZE(s), d = SIZE(d), n = SIZE(n), columns = SIZE(c);
+    const npy_intp groups = SIZE(g), m = s * d, *group = call->index[7];
+    Moving at_points[5];
+    for (int i = 0; i < 5; i++)
+        at_points[i] = (Moving){call->in[2 + i], call->step[2 + i]};
+    Equation q = {.s = s, .d = d, .n = n, .columns = columns, .D = call->in[0], .h = call->in[1],
+                  .E = at_points[0], .A = at_points[1], .f = at_points[2], .T = at_points[3],
+                  .p = at_points[4]};
+    if ((q.T.from == NULL) != (q.p.from == NULL) || (q.T.from == NULL && d != n) ||
+        (q.T.from != NULL && q.E.from == NULL))
+        return refused("constraints without an offset or E, or rows", d);
+    npy_intp *members = scratch_indices(call, K + groups), most = 1;
+    if (members == NULL)
+        return ERROR;
+    if (SIZE(P) != 1 && SIZE(P) != K * (s + 1))
+        return refused("points of all elements", SIZE(P));
+    npy_intp *sizes = members + K;
+    memset(sizes, 0, groups * sizeof(npy_intp));
+    for (npy_intp k = 0; k < K; k++) {
+        if (group[k] < 0 || group[k] >= groups)
+            return refused("a group", group[k]);
+        most = ++sizes[group[k]] > most ? sizes[group[k]] : most;
+    }
+    const npy_intp length = row_length(m, n + most * columns);
+    q.together = scratch(call, (n + 1) * m + s * n * columns + d * d + s * s + columns);
+    double *W = q.together ? scratch(call, m * length) : NULL;
+    if (W == NULL)
+        return ERROR;
     q.coupling = q.together + n * m;
     q.slope = q.coupling + m;
     q.AT = q.slope + s * n * columns;
     q.Dh = q.AT + d * d;
     q.taken = q.Dh + s * s;
-    /* The group of one length that each element belongs to, the first element of each group. */
-    int groups = 0, *group = members + K;
-    for (npy_intp k = 0; constant && k < K; k++) {
-        group[k] = 0;
-        while (group[k] < groups && !(fabs(q.h[k] - q.h[members[group[k]]]) <= equal * longest))
-            group[k]++;
-        if (group[k] == groups)
-            members[groups++] = (int)k;
-    }
-    const npy_intp own = constant && groups == 1 ? 1 : K, block = s * n * n;
-    PyArrayObject *homogeneous = fresh(&call, 4, (npy_intp[]){own, s, n, n});
-    if (homogeneous == NULL)
-        return failed(&call);
-    int solved = 1;
-    if (!constant)
-        solved = distinct_elements(&q, K, W, data(homogeneous), data(particular));
-    for (int g = 0; solved && constant && g < groups; g++) {
+    for (npy_intp g = 0, first = 0; g < groups; g++, first = 0) {
         npy_intp found = 0;
-        for (npy_intp k = 0; k < K; k++)
+        while (first < K && (groups == K ? first < g : group[first] != g))
+            first++;
+        for (npy_intp k = first; k < K && found < sizes[g]; k++)
             if (group[k] == g)
-                members[found++] = (int)k;
-        double *first = data(homogeneous) + (own == 1 ? 0 : members[0]) * block;
-        solved = equal_elements(&q, members, found, W, first, data(particular));
-        for (npy_intp i = 1; own != 1 && i < found; i++)
-            memcpy(data(homogeneous) + members[i] * block, first, block * sizeof(double));
+                members[found++] = k;
+        if (found && !solve_group(&q, members, found, W, call->out[0] + g * s * n * n, call->out[1]))
+            return DECLINED;
     }
-    if (!solved) {
-        return no_answer(&call);
-    }
-    return results(&call, 2, homogeneous, particular);
+    return DONE;
 }
-
-/* --- chaining ----------------------------------------------------------------------------- */
 
 /* out (rows, columns) = a (rows, n) x (n, columns) + b (rows, columns). */
 static inline void affine(double *out, const double *a, const double *x, const double *b,
@@ -308,7 +231,7 @@ static inline int all_finite(const double *values, npy_intp count)
     return !bad;
 }
 
-/* Values (K, s + 1, n, columns) by :func:`chain`; returns how many elements in front are finite. */
+/* Values (K, s + 1, n, columns) ; returns how many elements in front are finite. */
 EVERY_WIDTH static npy_intp link_up(double *out, const double *H, npy_intp apart, const double *P,
                                     const double *state, npy_intp K, npy_intp s, npy_intp n,
                                     npy_intp columns)
@@ -324,83 +247,14 @@ EVERY_WIDTH static npy_intp link_up(double *out, const double *H, npy_intp apart
     return whole;
 }
 
-/* chain(homogeneous (K or 1, s, n, n), particular (K, s, n, columns), start (n, columns))
-
-   Returns the values (K, s + 1, n, columns), and how many elements in front are finite. */
-static PyObject *chain(PyObject *module, PyObject *const *given, Py_ssize_t count)
+/* Maps of the elements (or one for all), particular solutions, start -> values at the points, and
+   how many elements in front are finite. */
+static Outcome chain(Call *call)
 {
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 3))
-        return NULL;
-    PyArrayObject *H = doubles(&call, 0, 4), *P = H ? doubles(&call, 1, 4) : NULL;
-    PyArrayObject *start = P ? doubles(&call, 2, 2) : NULL;
-    if (start == NULL)
-        return failed(&call);
-    const npy_intp K = size(P, 0), s = size(P, 1), n = size(P, 2), columns = size(P, 3);
-    const npy_intp constant = size(H, 0) == 1;
-    if ((!constant && !same("elements", size(H, 0), K)) || !same("stages", size(H, 1), s) ||
-        !same("components", size(H, 2), n) || !same("components", size(H, 3), n) ||
-        !same("components of the start", size(start, 0), n) ||
-        !same("columns of the start", size(start, 1), columns))
-        return failed(&call);
-    PyArrayObject *values = fresh(&call, 4, (npy_intp[]){K, s + 1, n, columns});
-    if (values == NULL)
-        return failed(&call);
-    const npy_intp whole = link_up(data(values), data(H), constant ? 0 : s * n * n, data(P),
-                                   data(start), K, s, n, columns);
-    PyObject *answer = Py_BuildValue("(On)", (PyObject *)values, (Py_ssize_t)whole);
-    failed(&call); /* gives back what was held */
-    return answer;
+    call->out[1][0] = (double)link_up(call->out[0], call->in[0], call->step[0], call->in[1],
+                                      call->in[2], SIZE(K), SIZE(s), SIZE(n), SIZE(c));
+    return DONE;
 }
-
-/* --- refinement --------------------------------------------------------------------------- */
-
-/* merged(before (K or 1, width), after (F or 1, width), kept (N,)) -> (N, width)
-
-   Row i is row kept[i] of `before`, or the only one it has; where kept[i] < 0, it is the next one
-   of `after`, or the only one. */
-static PyObject *merged(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 3))
-        return NULL;
-    PyArrayObject *before = doubles(&call, 0, 2), *after = before ? doubles(&call, 1, 2) : NULL;
-    PyArrayObject *kept = after ? indices(&call, 2, 1) : NULL;
-    if (kept == NULL || !same("numbers of an element", size(before, 1), size(after, 1)))
-        return failed(&call);
-    const npy_intp K = size(before, 0), N = size(kept, 0), width = size(before, 1);
-    const npy_intp *from = (const npy_intp *)PyArray_DATA(kept);
-    npy_intp fresh_ones = 0, largest = -1;
-    for (npy_intp i = 0; i < N; i++) {
-        fresh_ones += from[i] < 0;
-        largest = from[i] > largest ? from[i] : largest;
-    }
-    const int shared = size(after, 0) == 1;
-    if (!shared && !same("new elements", size(after, 0), fresh_ones))
-        return failed(&call);
-    if (largest >= 0 && (K == 0 || (K > 1 && largest >= K))) {
-        PyErr_Format(PyExc_ValueError, "element %zd of %zd", (Py_ssize_t)largest, (Py_ssize_t)K);
-        return failed(&call);
-    }
-    PyArrayObject *out = fresh(&call, 2, (npy_intp[]){N, width});
-    if (out == NULL)
-        return failed(&call);
-    double *to = data(out);
-    const double *next = data(after);
-    for (npy_intp i = 0; i < N; i++, to += width) {
-        const double *one = data(before) + (K > 1 && from[i] >= 0 ? from[i] * width : 0);
-        if (from[i] < 0) {
-            one = next;
-            next += shared ? 0 : width;
-        }
-        memcpy(to, one, width * sizeof(double));
-    }
-    return results(&call, 1, out);
-}
-
-/* --- error estimates ---------------------------------------------------------------------- */
 
 #define LAST 4 /* Legendre coefficients that are looked at */
 
@@ -416,7 +270,7 @@ static void floored(double *scale, const double *size, npy_intp C, double share,
 }
 
 /* Local errors (C,) of the right end of an element from its last Legendre coefficients (used, C),
-   see :func:`_propagated_error`. */
+   see elements_numpy.py. */
 static void local_errors(double *local, const double *last, const double *size, const double *scale,
                          npy_intp s, npy_intp used, npy_intp C)
 {
@@ -511,69 +365,29 @@ EVERY_WIDTH static void judge(const Ending *q, double *found)
     found[2] = rounding;
 }
 
-/* estimates(homogeneous (K or 1, s, n, n), values (K, s + 1, n, columns), to_legendre, used,
-   amplification (n, n + 1) or None, floor, share, level)
-
-   Of finite values: the largest accumulated error of an end point, the visible noise, and
-   rounding, each relative to the component's size; the last ones of to_legendre (s + 1, s + 1)
-   are looked at, `used` of them for tails. */
-static PyObject *estimates(PyObject *module, PyObject *const *given, Py_ssize_t count)
+/* Maps, values, to_legendre, `used`, amplification, floor, share, level -> accumulated error,
+   visible noise, rounding. */
+static Outcome estimates(Call *call)
 {
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 8))
-        return NULL;
-    PyArrayObject *H = doubles(&call, 0, 4), *V = H ? doubles(&call, 1, 4) : NULL;
-    PyArrayObject *L = V ? doubles(&call, 2, 2) : NULL, *amplified = NULL;
-    if (L == NULL)
-        return failed(&call);
-    const npy_intp used = PyLong_AsSsize_t(given[3]);
-    const double floor = PyFloat_AsDouble(given[5]), share = PyFloat_AsDouble(given[6]);
-    const double level = PyFloat_AsDouble(given[7]);
-    if (PyErr_Occurred())
-        return failed(&call);
-    const npy_intp K = size(V, 0), s = size(V, 1) - 1, n = size(V, 2), columns = size(V, 3);
-    const npy_intp constant = size(H, 0) == 1, C = n * columns, points = s + 1;
-    if ((!constant && !same("elements", size(H, 0), K)) || !same("stages", size(H, 1), s) ||
-        !same("components", size(H, 2), n) || !same("components", size(H, 3), n) ||
-        !same("rows of to_legendre", size(L, 0), points) ||
-        !same("columns of to_legendre", size(L, 1), points))
-        return failed(&call);
-    const npy_intp rows = points < LAST ? points : LAST;
-    if (used < 0 || used > rows) {
-        PyErr_SetString(PyExc_ValueError, "more Legendre coefficients used than there are");
-        return failed(&call);
-    }
-    if (given[4] != Py_None) {
-        amplified = doubles(&call, 4, 2);
-        if (amplified == NULL || !same("rows of amplification", size(amplified, 0), n) ||
-            !same("columns of amplification", size(amplified, 1), n + 1))
-            return failed(&call);
-    }
-    double found[3], *work = old_scratch(&call, (size_t)(C * (K + 14)));
+    const npy_intp K = SIZE(K), s = SIZE(s), n = SIZE(n), columns = SIZE(c), used = SIZE(u);
+    if (used > s + 1 || used > LAST)
+        return refused("Legendre coefficients", used);
+    double *work = scratch(call, n * columns * (K + 14));
     if (work == NULL)
-        return failed(&call);
+        return ERROR;
     const Ending ending = {
-        .K = K,
-        .s = s,
-        .n = n,
-        .columns = columns,
-        .used = used,
-        .apart = constant ? 0 : s * n * n,
-        .H = data(H),
-        .V = data(V),
-        .to_legendre = data(L),
-        .amplified = amplified ? data(amplified) : NULL,
-        .floor = floor,
-        .share = share,
-        .level = level,
-        .work = work,
+        .K = K, .s = s, .n = n, .columns = columns, .used = used, .apart = call->step[0],
+        .H = call->in[0], .V = call->in[1], .to_legendre = call->in[2],
+        .amplified = call->in[4], .floor = call->number[5], .share = call->number[6],
+        .level = call->number[7], .work = work,
     };
-    judge(&ending, found);
-    failed(&call); /* gives back what was held */
-    return Py_BuildValue("(ddd)", found[0], found[1], found[2]);
+    judge(&ending, call->out[0]);
+    return DONE;
 }
 
-PyMethodDef collocation_kernels[] = {
-    KERNEL(element_maps), KERNEL(merged), KERNEL(chain), KERNEL(estimates), {NULL, NULL, 0, NULL},
+const Kernel element_kernels[] = {
+    {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
+    {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
+    {"estimates", "K?snn Ks+nc s+s+ %u |nn+ # # #", "3", estimates},
+    {NULL, NULL, NULL, NULL},
 };

@@ -1,0 +1,211 @@
+"""Collocation on elements: their systems, chaining, and estimates of the error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gpebo_cli.kernels.arrays import Array, IntArray
+
+_EPS = float(np.finfo(float).eps)
+_TINY = float(np.finfo(float).tiny)
+
+
+def element_maps(
+    D: Array, h: Array, E: Array | None, A: Array, f: Array, basis: Array | None,
+    offset: Array | None, group: IntArray, groups: int,
+) -> tuple[Array, Array]:
+    """X at the nodes of each element = homogeneous X(left end) + particular.
+
+    Block systems (D_ij/h E_i T_j − δ_ij A_i T_i) z_j = (D𝟙)_i/h E_i x_0 + f_i + A_i p_i − E_i
+    (D p)_i/h with X_i = T_i z_i + p_i. Elements of one group, all of one length and with constant
+    E, A and T, share the system of the first of them.
+
+    Args:
+        D: the differentiation matrix of the rule (s, s).
+        h: lengths (K,).
+        E: at the K (s + 1) points of all elements, or at one, as for all that follow: (P or 1, d,
+            n), None for the identity.
+        A: (P or 1, d, n).
+        f: (P or 1, d, c).
+        basis: T (P or 1, n, d), None for the identity.
+        offset: p (P or 1, n, c), None without T.
+        group: of each element (K,), 0 … groups − 1.
+        groups: how many there are, K where each element has a system of its own.
+
+    Returns:
+        homogeneous (groups, s, n, n) and particular (K, s, n, c).
+
+    Raises:
+        LinAlgError: a system is singular.
+    """
+    k, s = len(h), len(D)
+    d, n = A.shape[1:]
+    columns = f.shape[2]
+    first = np.unique(group, return_index=True)[1]
+    step = h[first]
+    E_first = None if E is None else at_nodes(E, k, s)[first]
+    A_first = at_nodes(A, k, s)[first]
+    T_first = None if basis is None else at_nodes(basis, k, s)[first]
+    D_over_h = D / step[:, None, None]  # (groups, s, s)
+    start = D_over_h.sum(axis=2)[..., None, None]  # (D𝟙)_i / h
+    if E_first is None:
+        system = np.zeros((groups, s, d, s, d))
+        diagonal = np.arange(d)
+        system[:, :, diagonal, :, diagonal] = D_over_h
+        from_left = np.broadcast_to(start * np.eye(n), (groups, s, n, n))
+    else:
+        coupling = E_first[:, :, :, None, :]
+        if T_first is not None:
+            together = np.swapaxes(T_first, 1, 2).reshape(groups, n, s * d)
+            coupling = (E_first.reshape(groups, s * d, n) @ together).reshape(groups, s, d, s, d)
+            A_first = A_first @ T_first
+        system = coupling * D_over_h[:, :, None, :, None]
+        from_left = start * E_first
+    stage = np.arange(s)
+    system[:, stage, :, stage, :] -= np.swapaxes(A_first, 0, 1)
+    most = int(np.bincount(group, minlength=groups).max(initial=1))
+    place = np.empty(k, dtype=np.intp)  # of each element among those of its group
+    for g in range(groups if groups < k else 0):
+        place[group == g] = np.arange(np.count_nonzero(group == g))
+    if groups == k:
+        place[:] = 0
+    right = np.zeros((groups, s, d, n + most * columns))
+    right[..., :n] = from_left
+    by_member = right[..., n:].reshape(groups, s, d, most, columns)
+    by_member[group, :, :, place] = forcing_at_nodes(D, h, E, A, f, offset)
+    right[..., n:] = by_member.reshape(groups, s, d, most * columns)
+    solved = np.asarray(np.linalg.solve(
+        system.reshape(groups, s * d, s * d), right.reshape(groups, s * d, n + most * columns)
+    ), dtype=np.float64).reshape(right.shape)
+    if T_first is not None:
+        solved = T_first @ solved
+    particular = solved[..., n:].reshape(groups, s, n, most, columns)[group, :, :, place]
+    if offset is not None:
+        particular = particular + at_nodes(offset, k, s)
+    return np.ascontiguousarray(solved[..., :n]), np.ascontiguousarray(particular)
+
+
+def at_nodes(values: Array, k: int, s: int) -> Array:
+    """(k (s + 1), ...) or (1, ...) at points -> (k, s, ...) at nodes."""
+    if len(values) == 1:
+        return np.broadcast_to(values, (k, s, *values.shape[1:]))
+    return values.reshape(k, s + 1, *values.shape[1:])[:, 1:]
+
+
+def forcing_at_nodes(
+    D: Array, h: Array, E: Array | None, A: Array, f: Array, offset: Array | None
+) -> Array:
+    """What drives z at the nodes, f + A p − E (D p)/h, shape (k, s, d, columns)."""
+    k, s = len(h), len(D)
+    forcing = at_nodes(f, k, s)
+    if offset is None:
+        return forcing
+    p = at_nodes(offset, k, s)
+    slope = np.matmul(D / h[:, None, None], p.reshape(k, s, -1)).reshape(p.shape)
+    if E is not None:
+        slope = at_nodes(E, k, s) @ slope
+    return np.asarray(forcing + at_nodes(A, k, s) @ p - slope)
+
+
+def chain(
+    homogeneous: Array, particular: Array, start: Array,
+    renew: Callable[[Array], Array] | None = None,
+) -> tuple[Array, int]:
+    """Values at all points from the maps of the elements, and how many in front are finite.
+
+    Args:
+        homogeneous: responses to the left ends (K or 1, s, n, n).
+        particular: (K, s, n, c).
+        start: at the first left end (n, c).
+        renew: what replaces the value (n, c) that an element before has reached.
+
+    Returns:
+        (K, s + 1, n, c), and a number of elements.
+    """
+    size, s, n, columns = particular.shape
+    maps = np.broadcast_to(homogeneous, (size, s, n, n))
+    values = np.empty((size, s + 1, n, columns))
+    with np.errstate(over="ignore", invalid="ignore"):  # the caller looks at what is finite
+        state = start
+        for k in range(size):
+            if renew is not None and k > 0 and np.isfinite(state).all():
+                state = renew(state)
+            values[k, 0] = state
+            state = maps[k, -1] @ state + particular[k, -1]
+        values[:, 1:] = maps @ values[:, :1] + particular
+    finite = np.isfinite(values).all(axis=(1, 2, 3))
+    return values, size if finite.all() else int(np.argmin(finite))
+
+
+def estimates(
+    homogeneous: Array, values: Array, to_legendre: Array, used: int,
+    amplification: Array | None, floor: float, share: float, level: float,
+    renew: Callable[[Array, Array], Array] | None = None,
+) -> tuple[float, float, float]:
+    """Accumulated error of the end points, visible noise, and rounding, relative to the sizes.
+
+    The error of an element's right end is carried through the same maps as the solution, so that
+    it decays where the system forgets and grows where it does not. The local error of an end point
+    is superconvergent (order 2s − 1 against s + 1 inside): with ρ the decay per Legendre
+    coefficient it is about ρ^(s−1) times the element's tail. Half that exponent is used, to stay
+    on the safe side of it, plus the rounding of one element. Noise is what the last coefficients
+    show: those of a signal fall, those of noise do not.
+
+    Args:
+        homogeneous: maps (K or 1, s, n, n).
+        values: (K, s + 1, n, c).
+        to_legendre: from values at the points to coefficients (s + 1, s + 1).
+        used: how many of the last coefficients predict the next.
+        amplification: by how much relative rounding of the components, and of 1, reaches each
+            component (n, n + 1), or None.
+        floor: size below which a component is rounding.
+        share: of the largest component; what is smaller is measured against that.
+        level: coefficients that fall by less than this over two degrees are noise.
+        renew: what becomes of errors (e, n, c) where what an element has reached (n, c) is
+            replaced.
+    """
+    s = values.shape[1] - 1
+    flat = values.reshape(*values.shape[:2], -1)
+    whole = np.abs(flat).max(axis=(0, 1))
+    largest = float(whole.max(initial=0.0))
+    scale = np.maximum(whole, max(share * largest, _TINY))
+    last = np.abs(np.matmul(to_legendre[-4:], flat))  # degrees s − 3 … s
+    noise = np.zeros_like(whole)
+    if s >= 4:
+        before, after = last[:, :2].max(axis=1), last[:, 2:].max(axis=1)
+        noise = np.where(after >= level * before, after, 0.0).max(axis=0)
+    local = _local_errors(last[:, last.shape[1] - used :], np.abs(flat).max(axis=1), scale, s)
+    # Local errors have signs that nobody knows: all equal, and alternating, so that neither kind
+    # of system can cancel both. Absolute values of the maps were rejected: a rotation would grow.
+    local = local.reshape(-1, 1, *values.shape[2:])
+    signs = np.ones((len(local), 2, 1, 1))
+    signs[1::2, 1] = -1.0
+    errors = signs * local
+    ends = np.broadcast_to(homogeneous[:, -1], (len(values), *homogeneous.shape[2:]))
+    for k in range(1, len(errors)):
+        carried = errors[k - 1]
+        if renew is not None:
+            carried = renew(values[k - 1, -1], carried)
+        errors[k] += ends[k] @ carried
+    worst = np.abs(errors).max(axis=(0, 1), initial=0.0).ravel()
+    brought = np.zeros_like(whole)
+    if amplification is not None:
+        size = whole.reshape(values.shape[2:])
+        brought = _EPS * (amplification[:, :-1] @ size + amplification[:, -1:]).ravel()
+    floored = np.maximum(whole, max(share * largest, floor, _TINY))
+    return (
+        float((worst / scale).max(initial=0.0)),
+        float((noise / scale).max(initial=0.0)),
+        float(((_EPS * largest + brought) / floored).max(initial=0.0)),
+    )
+
+
+def _local_errors(last: Array, size: Array, scale: Array, s: int) -> Array:
+    """Of the right end of each element (K, c), from its last coefficients (K, used, c)."""
+    power = (s + 1.0) / np.arange(s + 1 - last.shape[1], s + 1)[:, None]
+    tail = scale * (np.minimum(last / scale, 1.0) ** power).max(axis=1, initial=0.0)
+    decay = np.clip(tail / np.maximum(size, _TINY), 0.0, 1.0) ** (1 / s)
+    rounding = 4 * _EPS * np.maximum(size, scale * _EPS)
+    return np.asarray(tail * decay ** (0.5 * (s - 1)) + rounding)

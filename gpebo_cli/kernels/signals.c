@@ -1,0 +1,183 @@
+/* How well a mesh resolves signals, sampling, filters; see signals_numpy.py. */
+#include "elements.h"
+
+/* worst (K, used) of one kind, values (K, points, c); `work` holds (K + 1 + used) c numbers. */
+EVERY_WIDTH static void tails_of_kind(double *worst, const double *to_legendre, npy_intp used,
+                                      npy_intp K, npy_intp points, const double *values, npy_intp c,
+                                      double floor, double foot, double share, double *work)
+{
+    double *scale = work + K * c, *last = scale + c;
+    for (npy_intp k = 0; k < K; k++) { /* largest value of each component so far */
+        for (npy_intp b = 0; b < c; b++)
+            work[k * c + b] = k ? work[(k - 1) * c + b] : 0.0;
+        enlarge(work + k * c, values + k * points * c, points, c);
+    }
+    const double *final = work + (K - 1) * c;
+    for (npy_intp k = 0; k < K; k++) {
+        for (npy_intp b = 0; b < c; b++)
+            scale[b] = larger(work[k * c + b], foot * final[b]);
+        const double level = larger(share * largest_of(0.0, scale, c), floor);
+        for (npy_intp b = 0; b < c; b++)
+            scale[b] = larger(scale[b], level);
+        last_coefficients(last, to_legendre, values + k * points * c, used, points, c);
+        for (npy_intp j = 0; j < used; j++) {
+            for (npy_intp b = 0; b < c; b++)
+                last[j * c + b] /= scale[b];
+            worst[k * used + j] = largest_of(worst[k * used + j], last + j * c, c);
+        }
+    }
+}
+
+/* Values of one kind, to_legendre, `used`, foot, share, floor -> the largest last Legendre
+   coefficients of each element relative to the components' sizes so far. */
+static Outcome tails(Call *call)
+{
+    const npy_intp K = SIZE(K), t = SIZE(t), c = SIZE(c), used = SIZE(u);
+    if (used > t)
+        return refused("Legendre coefficients", used);
+    double *work = scratch(call, (K + 1 + used) * c);
+    if (work == NULL)
+        return ERROR;
+    memset(call->out[0], 0, K * used * sizeof(double));
+    if (K > 0 && c > 0)
+        tails_of_kind(call->out[0], call->in[1] + (t - used) * t, used, K, t, call->in[0], c,
+                      larger(call->number[5], DBL_MIN), call->number[3], call->number[4], work);
+    return DONE;
+}
+
+/* The element in which a time lies, from a guess on: edges[e] ≤ t < edges[e + 1]. */
+static npy_intp element_of(const double *edges, npy_intp K, double t, npy_intp e)
+{
+    if (edges[e] <= t && (e == K - 1 || t < edges[e + 1]))
+        return e;
+    npy_intp above = K; /* the first edge beyond, but one of 1 … K; NaN: the last */
+    for (e = 0; above - e > 1;) {
+        const npy_intp middle = e + (above - e) / 2;
+        if (edges[middle] > t)
+            above = middle;
+        else
+            e = middle;
+    }
+    return e;
+}
+
+/* edges (K + 1,), places and barycentric weights (t,), times, where they are decided, exact ->
+   elements, weights of interpolation; nearer than `exact` a point's own value is taken. */
+static Outcome interpolation(Call *call)
+{
+    const npy_intp K = SIZE(K), width = SIZE(t), N = SIZE(N);
+    const double *edges = call->in[0], *places = call->in[1], *barycentric = call->in[2];
+    if (K < 1)
+        return refused("elements", K);
+    npy_intp e = 0;
+    for (npy_intp i = 0; i < N; i++) {
+        call->index_out[0][i] = e = element_of(edges, K, call->in[4][i], e);
+        const double local = (call->in[3][i] - edges[e]) / (edges[e + 1] - edges[e]);
+        double *restrict row = call->out[1] + i * width, sum = 0.0;
+        int hits = 0;
+        for (npy_intp j = 0; j < width; j++) {
+            const double distance = local - places[j];
+            hits += fabs(distance) < call->number[5];
+            row[j] = barycentric[j] / distance;
+        }
+        for (npy_intp j = 0; hits && j < width; j++)
+            row[j] = fabs(local - places[j]) < call->number[5] ? 1.0 : 0.0;
+        for (npy_intp j = 0; j < width; j++)
+            sum += row[j];
+        for (npy_intp j = 0; j < width; j++)
+            row[j] /= sum;
+    }
+    return DONE;
+}
+
+/* out (N, c): each the weighted sum of the point values (points, c) of its element. */
+EVERY_WIDTH static void weighted_sums(double *out, const npy_intp *element, const double *weights,
+                                      const double *values, npy_intp N, npy_intp points, npy_intp c)
+{
+    for (npy_intp i = 0; i < N; i++, weights += points, out += c) {
+        const double *v = values + element[i] * points * c;
+        combine(out, NULL, weights, points, v, c, c);
+    }
+}
+
+/* element (N,), weights, values -> their weighted sums (N, c). */
+static Outcome sample(Call *call)
+{
+    const npy_intp N = SIZE(N), K = SIZE(K);
+    for (npy_intp i = 0; i < N; i++)
+        if (call->index[0][i] < 0 || call->index[0][i] >= K)
+            return refused("the element of a time", call->index[0][i]);
+    weighted_sums(call->out[0], call->index[0], call->in[1], call->in[2], N, SIZE(t), SIZE(c));
+    return DONE;
+}
+
+/* The columns `chosen` of Z, which share a rate, from `state` on through all elements; W holds
+   s row_length(s, 1 + count) numbers. 0 if a system is singular. */
+static int filter(const Call *call, const npy_intp *chosen, npy_intp count, double *state,
+                  double *W)
+{
+    const npy_intp K = SIZE(K), s = SIZE(s), c = SIZE(c), length = row_length(s, 1 + count);
+    const double *D = call->in[0];
+    for (npy_intp k = 0; k < K; k++) {
+        const double hl = call->in[3][chosen[0]] * call->in[1][k];
+        const double *values = call->in[2] + k * (s + 1) * c;
+        double *out = call->out[0] + k * (s + 1) * c;
+        memset(W, 0, s * length * sizeof(double));
+        for (npy_intp i = 0; i < s; i++) {
+            double *row = W + i * length;
+            for (npy_intp j = 0; j < s; j++) {
+                row[j] = D[i * s + j];
+                row[s] += D[i * s + j]; /* the response to the left end */
+            }
+            row[i] += hl;
+            for (npy_intp b = 0; b < count; b++)
+                row[s + 1 + b] = hl * values[(i + 1) * c + chosen[b]];
+        }
+        if (!eliminate(W, s, 1 + count))
+            return 0;
+        for (npy_intp b = 0; b < count; b++) {
+            out[chosen[b]] = state[b];
+            for (npy_intp i = 0; i < s; i++)
+                out[(i + 1) * c + chosen[b]] =
+                    W[i * length + s] * state[b] + W[i * length + s + 1 + b];
+            state[b] = out[s * c + chosen[b]];
+        }
+    }
+    return 1;
+}
+
+/* D, steps, values, rates (c,), start -> Z of Z' = −λ (Z − S); columns that share a rate share a
+   factorisation. */
+static Outcome low_pass(Call *call)
+{
+    const npy_intp s = SIZE(s), c = SIZE(c);
+    const double *rates = call->in[3];
+    double *W = scratch(call, s * row_length(s, 1 + c) + c);
+    npy_intp *chosen = W ? scratch_indices(call, c) : NULL;
+    if (chosen == NULL)
+        return ERROR;
+    double *state = W + s * row_length(s, 1 + c);
+    for (npy_intp first = 0; first < c; first++) {
+        npy_intp count = 0, before = 0;
+        for (; before < first && rates[before] != rates[first]; before++)
+            continue;
+        if (before < first)
+            continue;
+        for (npy_intp b = first; b < c; b++)
+            if (b == first || rates[b] == rates[first]) {
+                state[count] = call->in[4][b];
+                chosen[count++] = b;
+            }
+        if (!filter(call, chosen, count, state, W))
+            return DECLINED;
+    }
+    return DONE;
+}
+
+const Kernel signal_kernels[] = {
+    {"tails", "Ktc tt %u # # #", "Ku", tails},
+    {"interpolation", "K+ t t N N #", "@N Nt", interpolation},
+    {"sample", "@N Nt Ktc", "Nc", sample},
+    {"low_pass", "ss K Ks+c c c", "Ks+c", low_pass},
+    {NULL, NULL, NULL, NULL},
+};

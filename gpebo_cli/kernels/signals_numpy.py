@@ -1,0 +1,101 @@
+"""Signals on a mesh: whether it resolves them, interpolation, filters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpebo_cli.kernels.arrays import Array, IntArray
+
+_CHUNK = 1 << 22  # numbers gathered at once
+_TINY = float(np.finfo(float).tiny)
+
+
+def tails(
+    values: Array, to_legendre: Array, used: int, foot: float, share: float, floor: float
+) -> Array:
+    """The last Legendre coefficients (K, used) of each element, the largest of all signals.
+
+    Relative to the largest value of each component so far, which is floored at ``foot`` times its
+    final one, ``share`` of the largest component, and ``floor``.
+
+    Args:
+        values: of signals of one kind at the points (K, s + 1, c).
+        to_legendre: (s + 1, s + 1).
+        used: how many of the last coefficients.
+        foot: of a component's final size.
+        share: of the largest component's size.
+        floor: size below which a signal is rounding.
+    """
+    if not values.size:
+        return np.zeros((len(values), used))
+    size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
+    size = np.maximum(size, foot * size[-1])
+    size = np.maximum(size, np.maximum(share * size.max(axis=1, keepdims=True), max(floor, _TINY)))
+    last = np.abs(np.matmul(to_legendre[len(to_legendre) - used :], values))
+    return np.asarray((last / size[:, None]).max(axis=2))
+
+
+def interpolation(
+    edges: Array, places: Array, barycentric: Array, t: Array, belongs: Array, exact: float
+) -> tuple[IntArray, Array]:
+    """Elements (N,) that contain ``belongs`` (N,), weights (N, s + 1) for the values at t (N,).
+
+    Args:
+        edges: of the elements (K + 1,).
+        places: of the points in an element (s + 1,).
+        barycentric: weights of the points (s + 1,).
+        t: times.
+        belongs: times that decide about the element.
+        exact: nearer than this, in elements, a point's own value is taken.
+    """
+    element = np.clip(np.searchsorted(edges, belongs, side="right") - 1, 0, len(edges) - 2)
+    local = (t - edges[element]) / (edges[element + 1] - edges[element])
+    distance = local[:, None] - places
+    near = np.abs(distance) < exact
+    hit = near.any(axis=1)
+    with np.errstate(divide="ignore"):
+        weights = barycentric / np.where(near, 1.0, distance)
+    weights[hit] = near[hit]
+    weights /= weights.sum(axis=1, keepdims=True)
+    return element, weights
+
+
+def sample(element: IntArray, weights: Array, values: Array) -> Array:
+    """Weighted sums (N, c) of the point values (K, s + 1, c) of an element for each time (N,)."""
+    out = np.empty((len(element), values.shape[2]))
+    chunk = max(1, _CHUNK // max(1, values.shape[1] * values.shape[2]))
+    for i in range(0, len(out), chunk):
+        part = slice(i, i + chunk)
+        out[part] = np.matmul(weights[part, None, :], values[element[part]])[:, 0]
+    return out
+
+
+def low_pass(D: Array, steps: Array, values: Array, rates: Array, start: Array) -> Array:
+    """Z (K, s + 1, c) of Z' = −λ (Z − S), one rate λ for each column of S.
+
+    Args:
+        D: the differentiation matrix of the rule (s, s).
+        steps: lengths of the elements (K,).
+        values: S (K, s + 1, c).
+        rates: λ (c,).
+        start: Z at the start (c,).
+
+    Raises:
+        LinAlgError: a system is singular.
+    """
+    out = np.empty_like(values)
+    s = len(D)
+    for rate in np.unique(rates):
+        columns = np.flatnonzero(rates == rate)
+        hl = rate * steps[:, None, None]
+        right = np.empty((len(steps), s, 1 + len(columns)))
+        right[..., 0] = D.sum(axis=1)  # the response to the left end
+        right[..., 1:] = hl * values[:, 1:, columns]
+        solved = np.linalg.solve(D + hl * np.eye(s), right)
+        state = start[columns]
+        for k, element in enumerate(solved):
+            out[k, 0, columns] = state
+            inner = element[:, :1] * state + element[:, 1:]
+            out[k, 1:, columns] = inner.T
+            state = inner[-1]
+    return out
