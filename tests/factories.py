@@ -99,6 +99,7 @@ def make_result(
     excitation = Excitation(
         t=t,
         gram_eigenvalues=eigenvalues,
+        normalised_min=1e-3 * (1 - np.exp(-t)),
         pe_level=0.01 * (1 - np.exp(-t)),
         window=2.0,
         is_ie=True,
@@ -107,6 +108,7 @@ def make_result(
         lambda_min=float(eigenvalues[-1].min(initial=np.inf)),
         condition=1e3,
         weakest_direction=Direction({name: 1 / np.sqrt(p) for name in parameters}),
+        determined_at=dict.fromkeys(parameters, 0.5),
     )
     coarse = t[::thin]
     delta = 1e-3 * (1 - np.exp(-0.02 * coarse**2)) ** 4 if mixing else None

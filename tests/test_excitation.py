@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from plants import reference, seen, shipped
@@ -76,7 +78,9 @@ def test_the_weakest_direction_is_named():
 
 
 def test_rounding_is_not_excitation():
-    zero = regression(lambda t: 1e-16 * three(t), ETA)
+    small = regression(lambda t: 1e-16 * three(t), ETA)
+    assert assess(small, T, ExcitationSettings()).is_ie  # perhaps it has large units
+    zero = replace(small, scale=1.0)  # it is what is left of terms of size 1
     assert not assess(zero, T, ExcitationSettings()).is_ie
 
 

@@ -81,7 +81,7 @@ def test_excitation_table(tmp_path: Path) -> None:
     result = make_result(samples=50)
     assert result.excitation is not None
     header, table = read_table(write(result, tmp_path) / "excitation.csv")
-    assert header == ["t", "gram_eig_1", "gram_eig_2", "gram_eig_3", "pe_level"]
+    assert header == ["t", "gram_eig_1", "gram_eig_2", "gram_eig_3", "pe_level", "normalised_min"]
     np.testing.assert_array_equal(table[:, 1:4], result.excitation.gram_eigenvalues)
     np.testing.assert_array_equal(table[:, 4], result.excitation.pe_level)
 
@@ -202,7 +202,7 @@ def test_summary_has_the_evidence(tmp_path: Path) -> None:
         "lambda_min",
         "condition",
         "weakest_direction",
-        "pe_level_min",
+        "pe_level_min", "normalised_min", "determined_at",
         "window",
     }
     assert list(excitation["weakest_direction"]) == ["e0_e1", "e0_e2", "e0_il"]
@@ -305,7 +305,7 @@ def test_a_regression_without_parameters_is_written(tmp_path: Path) -> None:
     result = make_result(parameters=(), samples=11)
     folder = write(result, tmp_path, figures=True)
     assert read_table(folder / "regression.csv")[0] == ["t", "Y_1"]
-    assert read_table(folder / "excitation.csv")[0] == ["t", "pe_level"]
+    assert read_table(folder / "excitation.csv")[0] == ["t", "pe_level", "normalised_min"]
 
 
 def test_provenance_names_the_versions() -> None:

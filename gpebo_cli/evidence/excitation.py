@@ -6,14 +6,16 @@ Interval excitation, as the paper's Assumption 2 means it, is G(t_c) = ∫ψᵀ�
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gpebo_cli.evidence.knowledge import Knowledge, knowledge
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, Requirement
 from gpebo_cli.kernels import spectra
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
 from gpebo_cli.regression.linear import LinearRegression
@@ -21,7 +23,8 @@ from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
-RELATIVE_LEVEL = 1e-8  # default ρ, of the energy a regressor of its size would have
+_WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hundredfold
+_TINY = float(np.finfo(float).tiny)
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
 WINDOWS = 10  # default PE window: this many per horizon
@@ -31,82 +34,109 @@ WINDOWS = 10  # default PE window: this many per horizon
 class Excitation:
     """Interval and persistent excitation, as evidence and not a bare yes.
 
-    ``gram_eigenvalues[i]`` are those of G(t_i) = ∫ψᵀψ from the start to t_i, ascending.
+    The verdict rests on what is known (:class:`Knowledge`) and on no unit, unless a level ρ of
+    λ_min(G) is asked for. ``gram_eigenvalues[i]`` are those of G(t_i), ascending.
     """
 
     t: Array  # (N,)
     gram_eigenvalues: Array  # (N, p)
+    normalised_min: Array  # (N,) smallest eigenvalue of G with unit diagonal
     pe_level: Array  # (N,) smallest eigenvalue of the Gram matrix over the trailing window
     window: float
     is_ie: bool
-    t_c: float | None  # first time with lambda_min(G) >= rho
-    rho: float
+    t_c: float | None  # first time at which all parameters can be told apart
+    rho: float | None  # level asked of lambda_min(G); None: the verdict is free of units
     lambda_min: float  # at the horizon
-    condition: float  # lambda_max / lambda_min at the horizon
-    weakest_direction: Direction
+    condition: float  # largest over smallest eigenvalue of G with unit diagonal, at the horizon
+    weakest_direction: Direction  # in units of each parameter's own size
+    determined_at: Mapping[str, float | None]  # from when on each parameter is well determined
+
+    @property
+    def level(self) -> float:
+        """The last of ``normalised_min``."""
+        return float(self.normalised_min[-1]) if len(self.normalised_min) else 0.0
+
+    @property
+    def determined(self) -> float | None:
+        """From when on all parameters are well determined."""
+        times = [t for t in self.determined_at.values() if t is not None]
+        return max(times) if times and len(times) == len(self.determined_at) else None
 
 
-def assess(regression: LinearRegression, t: Array, settings: ExcitationSettings) -> Excitation:
-    """Interval and persistent excitation of ψ at the times t (N,).
-
-    Without a level asked for, ρ is 1e-8 of ``scale² · horizon``, where the scale is the size of
-    the terms ψ is made of: a regressor that is zero but for rounding is never exciting.
-    """
+def assess(
+    regression: LinearRegression, t: Array, settings: ExcitationSettings, tol: float = 1e-12
+) -> Excitation:
+    """Interval and persistent excitation of ψ, resolved to ``tol``, at the times t (N,)."""
     mesh = regression.mesh
     horizon = float(mesh.edges[-1] - mesh.edges[0])
-    rho = settings.rho
-    if rho is None:
-        rho = RELATIVE_LEVEL * regression.scale**2 * horizon
     window = settings.window if settings.window is not None else horizon / WINDOWS
-    gram = regression.gram
-    values, direction = _weakest(gram.final)
-    sign = 1.0 if max(direction, key=abs) >= 0.0 else -1.0
-    smallest, largest = max(values[0], 0.0), values[-1]
-    t_c = _first_time(gram, rho)
-    return Excitation(
-        t=t,
-        gram_eigenvalues=np.maximum(spectra.eigenvalues(gram(t)), 0.0),
-        pe_level=segment_level(regression, t, window),
-        window=window,
-        is_ie=t_c is not None,
-        t_c=t_c,
-        rho=rho,
-        lambda_min=smallest,
-        condition=largest / smallest if smallest > 0 else float("inf"),
-        weakest_direction=Direction(
-            dict(zip(regression.parameters, (sign * part for part in direction), strict=True))
-        ),
+    rho, p = settings.rho, regression.p
+    gram = regression.gram  # of parameters that move, on a mesh of its own
+    gram = Trajectory(gram.mesh, gram.values[..., :p])
+    sizes = np.broadcast_to(regression.scale, (mesh.size, p))
+
+    def known(at: Array, matrices: Array) -> Knowledge:
+        element = np.maximum(np.searchsorted(mesh.edges, at, side="left") - 1, 0)
+        return knowledge(matrices, sizes[element], at - mesh.edges[0], tol)
+
+    def reached(at: Array, matrices: Array) -> Array:
+        """At least 0 where ψ is exciting; to be read as a distance from that in logarithms."""
+        level = known(at, matrices).margin if rho is None else spectra.eigenvalues(matrices)[:, 0] / rho
+        return np.asarray(np.log(np.maximum(level, _TINY)))
+
+    values = gram(t)
+    return excitation(
+        known(t, values), t, regression.parameters, np.maximum(spectra.eigenvalues(values), 0.0),
+        segment_level(regression, t, window), window, _first_time(gram, reached), rho,
     )
 
 
-def _weakest(matrix: Array) -> tuple[list[float], list[float]]:
-    """Eigenvalues of a symmetric matrix (p, p), ascending, and the first one's eigenvector.
+def excitation(
+    known: Knowledge, t: Array, parameters: Sequence[str], gram_eigenvalues: Array,
+    pe_level: Array, window: float, t_c: float | None, rho: float | None,
+) -> Excitation:
+    """The evidence from what is known at the times t (N,), the last of which is the end."""
+    spectrum, well = known.eigenvalues[-1], known.share >= _WELL
+    v = known.vectors[-1, :, 0] if len(parameters) else np.zeros(0)
+    sign = 1.0 if max(v, key=abs, default=1.0) >= 0.0 else -1.0
+    smallest = float(spectrum[0]) if len(parameters) else 1.0
+    return Excitation(
+        t=t, gram_eigenvalues=gram_eigenvalues, normalised_min=known.smallest, pe_level=pe_level,
+        window=window, is_ie=t_c is not None, t_c=t_c, rho=rho,
+        lambda_min=float(gram_eigenvalues[-1, 0]) if len(parameters) else 0.0,
+        condition=float(spectrum[-1]) / smallest if smallest > 0.0 else float("inf"),
+        weakest_direction=Direction(dict(zip(parameters, (sign * v).tolist(), strict=True))),
+        determined_at=dict(zip(parameters, since(t, well), strict=True)),
+    )
 
-    Further columns are not looked at.
-    """
-    of_all, vectors = np.linalg.eigh(matrix[:, : len(matrix)])
-    return of_all.tolist(), vectors[:, 0].tolist()
+
+def since(t: Array, holds: BoolArray) -> list[float | None]:
+    """The first of the times t (N,) from which on each column (N, c) holds, None for never."""
+    held = np.logical_and.accumulate(holds[::-1], axis=0).sum(axis=0)
+    return [float(t[len(t) - k]) if k else None for k in held.tolist()]
 
 
-def _first_time(gram: Trajectory, rho: float) -> float | None:
-    """First time with λ_min(G) ≥ ρ: bracketed on the mesh (λ_min never falls), then narrowed.
+def _first_time(
+    gram: Trajectory, reached: Callable[[Array, Array], Array]
+) -> float | None:
+    """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
     Each round looks where the secant points, and at distances around it that fall by fours.
 
     Args:
-        gram: [G | h], shape (p, p + c).
-        rho: the level.
+        gram: G (p, p).
+        reached: of times (M,) and G there.
     """
     mesh, p = gram.mesh, gram.values.shape[2]
-    if rho <= 0:
+    ends = np.flatnonzero(reached(mesh.edges[1:], gram.values[:, -1]) >= 0.0)
+    if len(ends) == 0:
         return None
-    reached = np.flatnonzero(spectra.eigenvalues(gram.values[:, -1])[:, 0] >= rho)
-    if len(reached) == 0:
-        return None
-    k = int(reached[0])
-    points = mesh.points[k]
-    level = spectra.eigenvalues(gram.values[k])[:, 0] - rho
-    element = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1, :, :, :p])
+    before = int(ends[0]) + 1  # elements up to the first at whose end it is reached
+    level = reached(mesh.points[:before].ravel(), gram.values[:before].reshape(-1, p, p))
+    level = level.reshape(before, -1)
+    k = int(np.argmax((level >= 0.0).any(axis=1)))
+    points, level = mesh.points[k], level[k]
+    piece = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
     for _ in range(_ROUNDS):
         j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
         low, high = float(points[max(j - 1, 0)]), float(points[j])
@@ -115,7 +145,7 @@ def _first_time(gram: Trajectory, rho: float) -> float | None:
         share = level[j - 1] / (level[j - 1] - level[j])
         guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
         points = np.unique(np.clip(guess + (high - low) * _AROUND, low, high))
-        level = spectra.eigenvalues(element(points))[:, 0] - rho
+        level = reached(points, piece(points))
         level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
     return high
 

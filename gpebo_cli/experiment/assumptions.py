@@ -61,7 +61,7 @@ def _of_observer(
     except ModelError as error:
         return [Assumption(_named(error), "needed by the observer", False, {"found": str(error)})]
     t = np.linspace(*seen.span, 101)
-    excitation = assess(observation.regression, t, settings.excitation)
+    excitation = assess(observation.regression, t, settings.excitation, settings.solver.tol)
     return of_observation(observation, excitation)
 
 
@@ -166,7 +166,7 @@ def of_observation(observation: Observed, excitation: Excitation) -> list[Assump
             excitation.is_ie,
             {
                 "t_c": excitation.t_c,
-                "rho": excitation.rho,
+                "normalised_min": excitation.level,
                 "lambda_min": excitation.lambda_min,
                 "condition": excitation.condition,
                 "weakest_direction": str(excitation.weakest_direction),

@@ -72,7 +72,7 @@ def continuous(
             regression.parameters, observation.error_estimate,
         )
     with stage("excitation"):
-        excitation = assess(regression, t, settings.excitation)
+        excitation = assess(regression, t, settings.excitation, settings.solver.tol)
     with stage("estimate"):
         try:
             estimation, metrics = _estimate(
@@ -131,7 +131,7 @@ def at_samples(
     with stage("excitation"):
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
         level = sampled_window_level(made.regression, window)[chosen]
-        excitation = online.excitation(t, made.gram_eigenvalues, chosen, level, window)
+        excitation = online.excitation(made, chosen, level, window)
     rows, p = made.regression.rows[1:][chosen], len(online.parameters)
     return Estimated(
         online,

@@ -12,16 +12,17 @@ import numpy as np
 
 from gpebo_cli import estimators, observers
 from gpebo_cli.estimators import InformationRoot
-from gpebo_cli.evidence.excitation import RELATIVE_LEVEL, Excitation
+from gpebo_cli.evidence.excitation import Excitation, excitation
+from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
 from gpebo_cli.experiment.result import Fit
-from gpebo_cli.findings import Assumption, Direction, Requirement
-from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.findings import Assumption, Requirement
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.observers._observation import InitialError
-from gpebo_cli.observers.reduced.sampled import SampledState
+from gpebo_cli.observers.reduced.sampled import TOLERANCE, SampledState
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 
-_NONE, _ALL = np.zeros(0), slice(None)
+_NEWEST, _UNKNOWN = np.array([-1]), np.full(1, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,8 @@ class OnlineEstimates:
     states: Array  # (G, K, n)
     delta: Array | None  # (1 or G, K)
     gram_eigenvalues: Array  # (K, p) of ∫ψᵀψ so far, ascending
+    known: Knowledge  # from all samples so far
+    seen: BoolArray  # (K, n) which states are determined
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
 
 
@@ -51,6 +54,8 @@ def joined(parts: Sequence[OnlineEstimates]) -> OnlineEstimates:
         np.concatenate([part.states for part in parts], axis=1),
         np.concatenate(deltas, axis=1) if deltas else None,
         np.concatenate([part.gram_eigenvalues for part in parts]),
+        Knowledge.joined([part.known for part in parts]),
+        np.concatenate([part.seen for part in parts]),
         np.concatenate([part.extension for part in parts]),
     )
 
@@ -88,11 +93,13 @@ class Online:
             "observer.sample_time needs an estimator that works at samples",
         ).recursive(self.parameters)
         self._gram = InformationRoot(len(self.parameters), np.zeros(1))
+        self._tol = max(settings.solver.tol, TOLERANCE)
         self._rho = settings.excitation.rho
         self.start = start
         self._state: SampledState | None = None
-        self._last: Array | None = None  # S of all data, (p + 1, p + 1)
+        self._root = np.zeros((len(self.parameters) + 1,) * 2)  # S of all data
         self._final = np.zeros((len(self.cases), len(self.parameters)))
+        self._t_c: float | None = None
         self._system = system
         self.count = 0
 
@@ -106,14 +113,22 @@ class Online:
         self._state, block = self._observer.advance(self._state, t, u, y)
         made = self._recursion.update(block.regression)
         roots, _ = self._gram.update(block.regression)
-        self._last = roots[-1, 0]
-        self._final, self.count = made.parameters[:, -1], self.count + len(t)
+        self._root, self.count = roots[-1, 0], self.count + len(t)
         p = len(self.parameters)
-        sigma: Array = np.linalg.svd(roots[:, 0, :p, :p], compute_uv=False).astype(np.float64)
+        S = roots[:, 0, :p, :p]
+        sigma: Array = np.linalg.svd(S, compute_uv=False).astype(np.float64)
+        known = knowledge_of_roots(S, block.scale, t - self.start, self._tol)
+        smallest = sigma.min(axis=1, initial=np.inf) ** 2
+        reached = known.margin >= 1.0 if self._rho is None else smallest >= self._rho
+        if self._t_c is None and reached.any():
+            self._t_c = float(t[np.argmax(reached)])
         gain = np.einsum("knp,gkp->gkn", block.gain, made.parameters)
+        eigenvalues = sigma[:, ::-1] ** 2
+        self._final = made.parameters[:, -1].copy()
+        self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
             block.regression, made.parameters, block.offset + gain, made.delta,
-            sigma[:, ::-1] ** 2, block.extension,
+            eigenvalues, known, known.states(block.gain), block.extension,
         )
 
     def truth(self, extension: Array) -> InitialError:
@@ -160,47 +175,31 @@ class Online:
             ),
         )
 
-    @property
-    def rho(self) -> float:
-        """The level asked of λ_min(G): the one set, or a share of the regressor's own energy."""
-        if self._rho is not None:
-            return self._rho
-        return RELATIVE_LEVEL * self.reached.scale**2 * (self.reached.t - self.start)
-
     def excitation(
-        self, t: Array = _NONE, eigenvalues: Array = _NONE[:, None], shown: IntArray | slice = _ALL,
-        pe_level: Array = _NONE, window: float = np.nan,
+        self, made: OnlineEstimates | None = None, shown: IntArray = _NEWEST,
+        pe_level: Array = _UNKNOWN, window: float = np.nan,
     ) -> Excitation:
-        """The evidence of all samples so far, with what is remembered of their way (perhaps none).
+        """The evidence of all samples so far, with what is remembered of their way.
 
         Args:
-            t: their times (N,).
-            eigenvalues: of G at them, ascending (N, p).
-            shown: which of them are (M,).
-            pe_level: at those (M,).
+            made: what they gave; None: nobody has kept more than the newest.
+            shown: which of those.
+            pe_level: at those that are shown.
             window: of it, seconds.
         """
-        p, rho = len(self.parameters), self.rho
-        root = np.zeros((p, p)) if self._last is None else self._last[:p, :p]
-        _, sigma, Vt = np.linalg.svd(root)
-        v = Vt[-1] * np.sign(Vt[-1, np.argmax(np.abs(Vt[-1]))])
-        smallest, largest = float(sigma[-1] ** 2), float(sigma[0] ** 2)
-        reached = np.flatnonzero(eigenvalues[:, 0] >= rho)
-        return Excitation(
-            t=t[shown], gram_eigenvalues=eigenvalues[shown], pe_level=pe_level, window=window,
-            is_ie=smallest >= rho > 0,
-            t_c=float(t[reached[0]]) if len(reached) else None,
-            rho=rho,
-            lambda_min=smallest,
-            condition=largest / smallest if smallest > 0 else float("inf"),
-            weakest_direction=Direction(dict(zip(self.parameters, map(float, v), strict=True))),
+        t, known, eigenvalues = self._newest if made is None else (
+            made.regression.t, made.known, made.gram_eigenvalues
+        )
+        return excitation(
+            known.at(shown), t[shown], self.parameters, eigenvalues[shown], pe_level, window,
+            self._t_c, self._rho,
         )
 
     def fit(self) -> Fit:
         """How the last estimates explain all data, from S alone: |Y − ψη̂|² = |S[−η̂; 1]|²."""
-        root = np.zeros((1, 1)) if self._last is None else self._last
+        final, root = self._final, self._root
         duration = max(self.reached.t - self.start, float(np.finfo(float).tiny))
-        vectors = np.concatenate([-self._final, np.ones((len(self._final), 1))], axis=1)
+        vectors = np.concatenate([-final, np.ones((len(final), 1))], axis=1)
         residual = np.linalg.norm(vectors @ root.T, axis=1) / np.sqrt(duration)
         return Fit(residual, float(np.linalg.norm(root[:, -1]) / np.sqrt(duration)))
 

@@ -22,17 +22,16 @@ def verdict(
 
     Without true states: how well the estimates explain the data.
     """
-    if excitation.is_ie:
-        since = "" if excitation.t_c is None else f" from t = {excitation.t_c:.4g} s on"
-        first = (
-            f"interval-exciting{since} "
-            f"(λ_min(G) = {excitation.lambda_min:.3g} at the end, ρ = {excitation.rho:.2g})"
-        )
+    if excitation.rho is None:
+        level = f"λ_min(G) = {excitation.level:.3g} with unit diagonal"
     else:
-        first = (
-            f"NOT interval-exciting: λ_min(G) = {excitation.lambda_min:.3g} < ρ = "
-            f"{excitation.rho:.2g}; not excited: {excitation.weakest_direction}"
-        )
+        level = f"λ_min(G) = {excitation.lambda_min:.3g}, ρ = {excitation.rho:.2g}"
+    if excitation.is_ie:
+        first = f"interval-exciting from t = {excitation.t_c:.4g} s on ({level})"
+        if excitation.determined is not None:
+            first += f", parameters well determined from t = {excitation.determined:.4g} s on"
+    else:
+        first = f"NOT interval-exciting: {level}; not excited: {excitation.weakest_direction}"
     parts = [first]
     best = None if metrics is None else _best_case(metrics)
     if metrics is not None and best is not None:

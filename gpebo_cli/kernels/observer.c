@@ -456,7 +456,7 @@ static PyObject *in_frame(PyObject *module, PyObject *const *given, Py_ssize_t c
 
 /* z (N, k, 1 + p), q, basis (n, k), 𝒜B (N or 1, rows, k), g_y (N, rows), G (N or 1, rows, q),
    Q1 (N or 1, rows, b), H (N or 1, n, b) -> Y (N, rows), psi (N, rows, p), offset (N, n), gain
-   (N, n, p), sizes (2,) of the terms of Y and of psi before they cancel. */
+   (N, n, p), sizes (1 + p,) of the terms of Y and of the columns of psi before they cancel. */
 static PyObject *regression_signals(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
@@ -488,9 +488,9 @@ static PyObject *regression_signals(PyObject *module, PyObject *const *given, Py
     PyArrayObject *psi = fresh(&call, 3, (npy_intp[]){N, rows, p});
     PyArrayObject *offset = fresh(&call, 2, (npy_intp[]){N, n});
     PyArrayObject *gain = fresh(&call, 3, (npy_intp[]){N, n, p});
-    PyArrayObject *sizes = zeros(&call, 1, (npy_intp[]){2});
+    PyArrayObject *sizes = zeros(&call, 1, (npy_intp[]){columns});
     const npy_intp total = z.numbers + A.numbers + g.numbers + G.numbers + Q1.numbers + H.numbers +
-                           (rows + b + n) * columns;
+                           (rows + b + n + 1) * columns;
     double *memory = sizes == NULL ? NULL : old_scratch(&call, total * LANES);
     if (memory == NULL)
         return failed(&call);
@@ -498,7 +498,9 @@ static PyObject *regression_signals(PyObject *module, PyObject *const *given, Py
     Lane *of_theta = known + g.numbers, *range = of_theta + G.numbers;
     Lane *elimination = range + Q1.numbers, *terms = elimination + H.numbers;
     Lane *seen = terms + rows * columns, *state = seen + b * columns;
-    Largest in_Y = {{0}, {0}}, in_psi = {{0}, {0}};
+    Lane *most = state + n * columns;
+    Largest in_Y = {{0}, {0}};
+    clear(most, columns);
     for (npy_intp first = 0; first < N; first += LANES) {
         load(signed_z, &z, first);
         for (npy_intp i = 0; i < k; i++) /* w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ */
@@ -521,7 +523,9 @@ static PyObject *regression_signals(PyObject *module, PyObject *const *given, Py
             for (npy_intp j = 0; j < q; j++)
                 for (int l = 0; l < LANES; l++)
                     row[1 + j][l] -= of_theta[i * q + j][l];
-            look_at(&in_psi, row + 1, columns - 1);
+            for (npy_intp j = 1; j < columns; j++)
+                for (int l = 0; l < LANES; l++)
+                    most[j][l] = larger(most[j][l], fabs(row[j][l]));
         }
         clear(seen, b * columns);
         lanes_add(seen, columns, range, b, 1, terms, columns, b, rows, columns, 1.0);
@@ -539,7 +543,9 @@ static PyObject *regression_signals(PyObject *module, PyObject *const *given, Py
         store(data(gain), N, first, state, n, columns, 1, p);
     }
     data(sizes)[0] = largest_of(&in_Y);
-    data(sizes)[1] = largest_of(&in_psi);
+    for (npy_intp j = 1; j < columns; j++)
+        for (int l = 0; l < LANES; l++)
+            data(sizes)[j] = larger(data(sizes)[j], most[j][l]);
     return results(&call, 5, Y, psi, offset, gain, sizes);
 }
 

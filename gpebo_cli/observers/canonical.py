@@ -183,7 +183,7 @@ class Canonical:
                 Trajectory(mesh, Y),
                 Trajectory(mesh, psi),
                 (*system.unknowns, *names),
-                float(np.abs(psi).max(initial=0.0)),
+                np.abs(psi).max(axis=(0, 1, 2), initial=0.0),
             ),
             state_map=CanonicalStateMap(
                 xi_a=Trajectory(mesh, xi),

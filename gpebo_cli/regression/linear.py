@@ -24,8 +24,8 @@ _FEW_COLUMNS = 32  # of a product, up to which BLAS costs more than what there i
 class LinearRegression:
     """Y (rows,) and ψ (rows, p) on one mesh, with the parameters' names.
 
-    ``scale`` is the size of the terms ψ was formed from, before they cancelled: a regressor of
-    1e-16 beside a scale of 1 is zero, whatever its eigenvalues say.
+    ``scale`` is the size of the terms that the columns of ψ were formed from, before they
+    cancelled: a column of 1e-16 beside a scale of 1 is zero, whatever else there is.
 
     Y may have a second axis, (rows, c): c realisations of its noise over one ψ, which noise does
     not reach. All estimators are affine in Y and carry the axis through to their estimates.
@@ -34,7 +34,7 @@ class LinearRegression:
     Y: Trajectory
     psi: Trajectory
     parameters: tuple[str, ...]
-    scale: float
+    scale: Array | float  # (p,), or (K, p): so far, element by element
     resets: tuple[Reset, ...] = ()  # at edges of the mesh, in the order of time
     floor: float = 0.0  # size below which parameters are rounding
     dynamics: Dynamics | None = None  # of parameters that move; then there are no resets

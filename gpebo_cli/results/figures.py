@@ -157,11 +157,11 @@ def gram(result: RunResult) -> list[Panel]:
         Curve(t, eigenvalues[:, i], f"λ{subscript(i + 1)}", line(i), rf"$\lambda_{{{i + 1}}}$")
         for i in range(eigenvalues.shape[1])
     ]
-    level = number_text(excitation.rho)
-    curves.append(
-        Curve(t[[0, -1]], np.full(2, excitation.rho), f"ρ = {level}", style.LIMIT,
-              rf"$\rho$ = {level}")
-    )
+    if (rho := excitation.rho) is not None:
+        level = number_text(rho)
+        curves.append(
+            Curve(t[[0, -1]], np.full(2, rho), f"ρ = {level}", style.LIMIT, rf"$\rho$ = {level}")
+        )
     reached = None
     if excitation.t_c is not None:
         reached = (excitation.t_c, f"t_c = {number_text(excitation.t_c)} s")

@@ -154,9 +154,11 @@ def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:
         "is_ie": excitation.is_ie,
         "t_c": excitation.t_c,
         "rho": excitation.rho,
+        "normalised_min": excitation.level,
         "lambda_min": excitation.lambda_min,
         "condition": excitation.condition,
         "weakest_direction": excitation.weakest_direction.components,
+        "determined_at": excitation.determined_at,
         "pe_level_min": levels.min() if levels.size else None,
         "window": excitation.window,
     }

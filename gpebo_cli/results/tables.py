@@ -74,11 +74,13 @@ def write_regression(path: Path, regression: RegressionResult) -> None:
 
 
 def excitation_table(excitation: Excitation) -> Table:
-    """``t``, the eigenvalues of the Gram matrix in ascending order, and ``pe_level``."""
+    """``t``, the eigenvalues of G in ascending order, ``pe_level`` and ``normalised_min``."""
     count = excitation.gram_eigenvalues.shape[1]
-    header = ["t", *(f"gram_eig_{i}" for i in range(1, count + 1)), "pe_level"]
-    table = np.column_stack([excitation.t, excitation.gram_eigenvalues, excitation.pe_level])
-    return Table(header, table)
+    header = ["t", *(f"gram_eig_{i}" for i in range(1, count + 1)), "pe_level", "normalised_min"]
+    e = excitation
+    return Table(
+        header, np.column_stack([e.t, e.gram_eigenvalues, e.pe_level, e.normalised_min])
+    )
 
 
 def write_excitation(path: Path, excitation: Excitation) -> None:

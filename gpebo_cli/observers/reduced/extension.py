@@ -27,7 +27,7 @@ from gpebo_cli.observers.reduced.matrices import (
     observer_matrices,
     weakest,
 )
-from gpebo_cli.observers.reduced.regression import Assembled, regression_signals
+from gpebo_cli.observers.reduced.regression import Assembled, regression_signals, term_sizes
 from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
@@ -128,6 +128,14 @@ class Extension:
     def mesh(self) -> Mesh:
         """The mesh."""
         return self.solution.trajectory.mesh
+
+    def scale(self, q: int) -> Array:
+        """Size of the terms of each column of ψ so far, element by element, (K, p)."""
+        trajectory = self.solution.trajectory
+        z, *seen = map(_over_time, (trajectory.values, *self.solution.extras))
+        sizes = term_sizes(z, q, AlgebraicEquations(*seen))
+        largest = sizes.reshape(*trajectory.values.shape[:2], -1).max(axis=1)
+        return np.maximum.accumulate(largest, axis=0)
 
     def growth(self, q: int) -> float:
         """Largest entry of Φ."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import orthonormal_complement, transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.regression.linear import outer_products
@@ -25,38 +25,38 @@ class Assembled:
     psi: Array  # (N, e + r, p)
     offset: Array  # (N, n)
     gain: Array  # (N, n, p)
-    Y_scale: float  # size of the terms of Y and ψ before they cancel
-    psi_scale: float
+    Y_scale: float  # size of the terms of Y before they cancel
+    column_scale: Array  # (p,) and of the columns of ψ: each has the unit of its parameter
     elimination: Array  # (N, n, n_b) and
     injectivity: Array  # (N,) as in ``ObserverMatrices``
 
     def kinds(self) -> list[tuple[Array, float]]:
         """Everything the mesh has to resolve, with the size below which it is rounding."""
         squares, right = _products(self.psi, self.Y)
-        Y, psi = 1e-3 * self.Y_scale, 1e-3 * self.psi_scale
+        columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
+        psi, gain = self.psi / columns, self.gain / columns
+        states = np.abs(gain).max(axis=(0, 2), initial=0.0)
+        squares, right = _products(psi, self.Y)
         return [
-            (self.Y, Y),
-            (self.psi, psi),
+            (self.Y, 1e-3 * self.Y_scale),
+            (psi, 1e-3),
             (self.offset, 0.0),
-            (self.gain, 0.0),
-            (squares, psi * self.psi_scale),
-            (right, psi * self.Y_scale),
+            (gain / np.where(states > 0.0, states, 1.0)[:, None], 0.0),
+            (squares, 1e-3),
+            (right, 1e-3 * self.Y_scale),
         ]
 
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
         if regression != "paper":
-            in_psi, in_Y = self._row_sizes()
-            large = (in_psi > _VANISHING * self.psi_scale) | (in_Y > _VANISHING * self.Y_scale)
+            in_psi, in_Y = np.abs(self.psi).max(axis=0), np.abs(self.Y).max(axis=0)
+            large = (in_psi > _VANISHING * self.column_scale).any(axis=1)
+            large |= in_Y > _VANISHING * self.Y_scale
             kept: IntArray = large.nonzero()[0]
             if len(kept):
                 return kept
         rows = self.Y.shape[1]
         return np.arange(rows - system.r, rows)  # eq. (regpsi)
-
-    def _row_sizes(self) -> tuple[Array, Array]:
-        """Largest entry of each row of ψ and of Y over the times, (e + r,) both."""
-        return np.abs(self.psi).max(axis=(0, 2), initial=0.0), np.abs(self.Y).max(axis=0)
 
 
 def _products(psi: Array, Y: Array) -> tuple[Array, Array]:
@@ -81,8 +81,7 @@ def regression_signals(
         Y, psi, offset, gain, sizes = kernels.compiled.regression_signals(
             z, q, basis, algebraic, g_y, G, Q1, H
         )
-        Y_scale, psi_scale = sizes.tolist()
-        return Assembled(Y, psi, offset, gain, Y_scale, psi_scale, H, injectivity)
+        return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity)
     signs = np.ones(z.shape[2])
     signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
     signed = z * signs
@@ -99,10 +98,25 @@ def regression_signals(
         offset=state[:, :, 0],
         gain=-state[:, :, 1:],  # [X_w ξ_b + X_θ | −X_w Φ]
         Y_scale=Y_scale,
-        psi_scale=float(np.abs(terms[:, :, 1:]).max(initial=0.0)),
+        column_scale=np.abs(terms[:, :, 1:]).max(axis=(0, 1), initial=0.0),
         elimination=H,
         injectivity=injectivity,
     )
+
+
+def term_sizes(z: Array, q: int, equations: AlgebraicEquations) -> Array:
+    """Size of the terms that each column of ψ is made of, at N times, (N, p).
+
+    Of the projection too: an equation of large numbers counts as much as it can add to a residual.
+
+    Args:
+        z: [ξ_a | ξ_b | Φ] in the coordinates of the basis, (N, k, 1 + q + n_a).
+        q: number of unknown parameters.
+        equations: at the same times.
+    """
+    terms = np.abs(equations.on_basis @ z[:, :, 1:])
+    terms[:, :, :q] += np.abs(equations.G)
+    return np.asarray((np.abs(orthonormal_complement(equations.range)) @ terms).max(axis=1))
 
 
 def on_mesh(mesh: Mesh, signal: Array) -> Trajectory:

@@ -24,7 +24,7 @@ from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import ByName, initial_extension, output_scale, refuse_beyond
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
-from gpebo_cli.observers.reduced.regression import regression_signals
+from gpebo_cli.observers.reduced.regression import regression_signals, term_sizes
 from gpebo_cli.observers.reduced.split import initial_basis, split_in_frame
 from gpebo_cli.recordings.hold import edges, held
 from gpebo_cli.regression.samples import SampledRegression
@@ -32,7 +32,7 @@ from gpebo_cli.settings import SolverSettings
 
 _STAGES = 4  # per sample, order 7: beyond what any hold is good for
 _PROBED = np.linspace(0.0, 1.0, 17)  # seconds: what turns, does so by more than rounding in them
-_TOLERANCE = 1e-10  # where samples are far apart, steps are cut until this is reached
+TOLERANCE = 1e-10  # where samples are far apart, steps are cut until this is reached
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class SampledState:
     y: Array  # (r,)
     extension: Array  # (k, 1 + q + n_a) [ξ_a | ξ_b | Φ] in the coordinates of the basis
     row: Array  # (rows, p + 1) [ψ | Y]
-    scale: float  # largest term of ψ before cancellation so far
+    scale: Array  # (p,) largest terms of the columns of ψ before cancellation so far
     growth: float  # largest entry of Φ so far
     injectivity: float  # bound of Assumption 1's singular value so far
     error_estimate: float  # of the integration between samples, so far
@@ -58,6 +58,7 @@ class SampledBlock:
     offset: Array  # (K, n)
     gain: Array  # (K, n, p) x = offset + gain η
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
+    scale: Array  # (K, p) of the terms of each column of ψ so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,7 @@ class SampledObserver:
                 coefficients, state.extension, name=f"observer of plant {self.system.name}"
             ),
             Mesh(edges(times, cuts), radau_rule(_STAGES)),
-            tol=max(self.solver.tol, _TOLERANCE),
+            tol=max(self.solver.tol, TOLERANCE),
             max_elements=self.solver.max_elements,
         )
         mesh = solution.trajectory.mesh
@@ -151,18 +152,19 @@ class SampledObserver:
         previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
         growth = float(np.abs(z[..., 1 + system.q :]).max(initial=0.0))
         smallest = float(o.injectivity.min())
-        scale = assembled.psi_scale
+        scale = term_sizes(z, system.q, equations)
         if before is not None:
-            growth, scale = max(growth, before.growth), max(scale, before.scale)
+            growth, scale[0] = max(growth, before.growth), np.maximum(scale[0], before.scale)
             smallest = min(smallest, before.injectivity)
+        scale = np.maximum.accumulate(scale, axis=0)
         state = SampledState(
-            float(t[-1]), u[-1], y[-1], z[-1], rows[-1], scale, growth, smallest,
+            float(t[-1]), u[-1], y[-1], z[-1], rows[-1], scale[-1], growth, smallest,
             0.0 if before is None else before.error_estimate,
         )
         regression = SampledRegression(
             t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]), self.hold
         )
-        return state, SampledBlock(regression, assembled.offset, assembled.gain, z)
+        return state, SampledBlock(regression, assembled.offset, assembled.gain, z, scale)
 
 
 def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
@@ -178,6 +180,7 @@ def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
         np.concatenate([first.offset, rest.offset]),
         np.concatenate([first.gain, rest.gain]),
         np.concatenate([first.extension, rest.extension]),
+        np.concatenate([first.scale, rest.scale]),
     )
 
 

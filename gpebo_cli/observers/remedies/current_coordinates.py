@@ -106,7 +106,7 @@ class CurrentCoordinates:
                 Y=on_mesh(mesh, final.Y[:, kept]),
                 psi=on_mesh(mesh, final.psi[:, kept]),
                 parameters=(*system.unknowns, *(f"w_{label}" for label in labels)),
-                scale=final.psi_scale,
+                scale=final.column_scale,
                 dynamics=Dynamics(on_mesh(mesh, A), on_mesh(mesh, b), -2.0 * fastest),
             ),
             state_map=AffineStateMap(on_mesh(mesh, final.offset), on_mesh(mesh, final.gain)),
@@ -120,7 +120,8 @@ class CurrentCoordinates:
 def _with_kernel(a: Assembled, kernel: Array, q: int) -> Assembled:
     """Further rows 0 = Q w, of the size of ψ."""
     count, n = kernel.shape[:2]
-    rows = np.concatenate([np.zeros((count, n, q)), a.psi_scale * kernel], axis=2)
+    scale = a.column_scale.max(initial=0.0)
+    rows = np.concatenate([np.zeros((count, n, q)), scale * kernel], axis=2)
     return replace(
         a,
         Y=np.concatenate([a.Y, np.zeros((count, n))], axis=1),

@@ -180,7 +180,7 @@ def _joined(
         offset=np.concatenate([a.offset for a in parts]),
         gain=np.concatenate([a.gain for a in parts]),
         Y_scale=max(a.Y_scale for a in parts),
-        psi_scale=max(a.psi_scale for a in parts),
+        column_scale=np.max([a.column_scale for a in parts], axis=0),
         elimination=np.concatenate([
             np.broadcast_to(a.elimination, (len(a.Y), *a.elimination.shape[1:])) for a in parts
         ]),
@@ -195,7 +195,7 @@ def _joined(
             Y=on_mesh(mesh, whole.Y[:, kept]),
             psi=on_mesh(mesh, whole.psi[:, kept]),
             parameters=(*system.unknowns, *reduced.names),
-            scale=whole.psi_scale,
+            scale=np.concatenate([e.scale(q) for e in extensions]),
             resets=tuple(resets),
         ),
         state_map=AffineStateMap(on_mesh(mesh, whole.offset), on_mesh(mesh, whole.gain)),

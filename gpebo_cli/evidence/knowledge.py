@@ -1,0 +1,122 @@
+"""What a Gram matrix tells, whatever the units: which parameters and states can be known.
+
+G(t) = ∫ψᵀψ mixes the units of the parameters. N_ij = G_ij/√(G_ii G_jj) does not: it is the Gram
+matrix of parameters in units of their own size, and its smallest eigenvalue says how well they can
+be told apart. A column of ψ that is zero but for rounding, beside the terms it is made of, has
+no such size: its parameter is not seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+
+_UNRESOLVED = 10.0  # tolerances of the terms of a column of ψ: what is smaller says nothing
+_SINGULAR = 1e-12  # eigenvalues of N below this are rounding of products of float64 numbers
+_SEEN = 1e-6  # part in the kernel of N beyond which a direction is not known
+_MIXED = 1e-14  # over an eigenvalue of N: how far its vector may turn into the kernel's
+_TINY = 1e-100  # squares of its reciprocal are numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """Spectra of N at M times: λ ascending and V."""
+
+    sizes: Array  # (M, p) √G_jj, at least the rounding of the column
+    eigenvalues: Array  # (M, p)
+    vectors: Array  # (M, p, p) columns
+    level: Array  # (M, p) share below which each parameter is rounding
+
+    def at(self, chosen: slice | IntArray) -> Knowledge:
+        """At some of the times."""
+        return Knowledge(
+            self.sizes[chosen], self.eigenvalues[chosen], self.vectors[chosen], self.level[chosen]
+        )
+
+    @staticmethod
+    def joined(parts: Sequence[Knowledge]) -> Knowledge:
+        """At the times of one after those of the other."""
+        return Knowledge(
+            *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Knowledge))
+        )
+
+    @property
+    def smallest(self) -> Array:
+        """The smallest eigenvalue of N, (M,); 1 if there is nothing to estimate."""
+        return np.asarray(np.maximum(self.eigenvalues.min(axis=1, initial=1.0), 0.0))
+
+    @property
+    def margin(self) -> Array:
+        """That eigenvalue over the level of what is not rounding, (M,): from 1 on ψ is exciting."""
+        return np.asarray(self.smallest / self.level.max(axis=1, initial=_SINGULAR))
+
+    @property
+    def share(self) -> Array:
+        """1/(N⁻¹)_jj (M, p): the part of a column's energy that the others do not explain."""
+        spectrum = np.maximum(self.eigenvalues, 1e-4 * _SINGULAR)
+        return np.asarray(1.0 / np.einsum("mjk,mk->mj", self.vectors**2, 1.0 / spectrum))
+
+    @cached_property
+    def _kernel(self) -> tuple[Array, Array]:
+        """V with zeros for the eigenvalues that are not zero, and how far it may be off (M,)."""
+        level = np.einsum("mjk,mj->mk", self.vectors**2, self.level)
+        unknown = self.eigenvalues < level
+        next_one = np.where(unknown, 1.0, self.eigenvalues).min(axis=1, initial=1.0)
+        return self.vectors * unknown[:, None, :], _SEEN + _MIXED / next_one
+
+    @property
+    def parameters(self) -> BoolArray:
+        """Which parameters are determined, (M, p)."""
+        kernel, slack = self._kernel
+        return np.asarray(np.linalg.norm(kernel, axis=2) <= slack[:, None])
+
+    def states(self, gain: Array) -> BoolArray:
+        """Which states x = offset + gain η are, for gain (M, n, p): shape (M, n)."""
+        kernel, slack = self._kernel
+        scaled = gain / self.sizes[:, None, :]
+        size = np.linalg.norm(scaled, axis=2)
+        return np.asarray(np.linalg.norm(scaled @ kernel, axis=2) <= slack[:, None] * size)
+
+
+def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:
+    """What is known from G (M, p, p) at M times.
+
+    Args:
+        gram: further columns are not looked at.
+        terms: size of the terms that the columns of ψ are made of, (M, p) or (p,).
+        elapsed: seconds that G has been gathered for, (M,).
+        tol: to which ψ is resolved, relative to its terms.
+    """
+    p = gram.shape[1]
+    energy = np.einsum("mjj->mj", gram[..., :p])
+    sizes, level = _sizes(np.sqrt(np.maximum(energy, 0.0)), terms, elapsed, tol)
+    normal = np.where(level < 1.0, 1.0, 0.0)
+    normalised = gram[..., :p] / sizes[:, :, None] / sizes[:, None, :]
+    normalised = normalised * normal[:, :, None] * normal[:, None, :]
+    spectrum, vectors = np.linalg.eigh(normalised)
+    return Knowledge(sizes, spectrum, vectors, level)
+
+
+def knowledge_of_roots(
+    root: Array, terms: Array, elapsed: Array, tol: float = 1e-12
+) -> Knowledge:
+    """The same from S (M, p, p) with SᵀS = G: no squares are formed."""
+    sizes, level = _sizes(np.linalg.norm(root, axis=1), terms, elapsed, tol)
+    scaled = root / sizes[:, None, :] * np.where(level < 1.0, 1.0, 0.0)[:, None, :]
+    _, sigma, Vt = np.linalg.svd(scaled)
+    return Knowledge(
+        sizes, sigma[:, ::-1] ** 2, np.swapaxes(Vt, 1, 2)[:, :, ::-1], level
+    )
+
+
+def _sizes(sizes: Array, terms: Array, elapsed: Array, tol: float) -> tuple[Array, Array]:
+    """√G_jj and the levels of columns, from what their rounding would amount to."""
+    rounding = _UNRESOLVED * tol * terms * np.sqrt(np.maximum(elapsed, 0.0))[:, None]
+    at_least = np.maximum(np.maximum(sizes, rounding), _TINY)
+    level = np.where(sizes > rounding, (rounding / at_least) ** 2, 1.0)
+    return at_least, np.maximum(level, _SINGULAR)
