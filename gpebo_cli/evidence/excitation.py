@@ -81,7 +81,8 @@ def assess(
 
     def reached(at: Array, matrices: Array) -> Array:
         """At least 0 where ψ is exciting; to be read as a distance from that in logarithms."""
-        level = known(at, matrices).margin if rho is None else spectra.eigenvalues(matrices)[:, 0] / rho
+        smallest = spectra.eigenvalues(matrices)[:, 0]
+        level = known(at, matrices).margin if rho is None else smallest / rho
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
     values = gram(t)
