@@ -57,6 +57,12 @@ def test_the_experiment_does_not_see_where_a_plant_comes_from():
     np.testing.assert_allclose(ours.simulation.states, text.simulation.states, atol=1e-10)
 
 
+def test_the_result_says_that_nothing_bounds_functions_from_python():
+    for system, bounded in ((circuit(), False), (shipped("circuit"), True)):
+        found = simulate(system, TimeSettings(horizon=2.0), SOLVER)
+        assert found.bounded is bounded
+
+
 def test_given_derivatives_are_used_instead_of_complex_times():
     def real_only(t):
         if np.iscomplexobj(t):

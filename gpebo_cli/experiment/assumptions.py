@@ -91,6 +91,8 @@ def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assu
                 "d": s.d,
                 "a": s.a,
                 "smallest_singular_value": s.smallest_singular_value,
+                # Functions from Python are looked at between the nodes, but nothing bounds them.
+                "bounded_between_nodes": simulation.bounded,
             },
         ),
         Assumption(

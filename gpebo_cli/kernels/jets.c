@@ -1,48 +1,14 @@
 /* Known functions of time: gpebo_cli/model/expressions, their Taylor coefficients; simulation/simulate.py
    and Mesh.joined, the mesh that they ask for. */
 #include "common.h"
+#include "program.h"
 
 #include <fenv.h>
 
 #define MOST_MATRICES 12
 #define MOST_AXES 8
-#define GIVEN 2 /* rows that are always given: t, inside; those of signals follow */
 #define REFUSED (FE_INVALID | FE_DIVBYZERO | FE_OVERFLOW)
 #define IN_CACHE ((npy_intp)1 << 14) /* numbers in all rows of a block */
-
-/* In the order of _OPERATIONS in expressions/program.py. */
-enum {
-    ADD,
-    SUBTRACT,
-    MULTIPLY,
-    DIVIDE,
-    POWER,
-    GREATER_EQUAL,
-    NEGATIVE,
-    SQRT,
-    EXP,
-    LOG,
-    SIN,
-    COS,
-    TAN,
-    SINH,
-    COSH,
-    TANH,
-    ASIN,
-    ACOS,
-    ATAN,
-    ASINH,
-    ACOSH,
-    ATANH,
-    ERF,
-    SIGN,
-    OPERATIONS
-};
-
-/* One operation: what, the row of its result, its operands; see `operand`. */
-typedef struct {
-    npy_intp what, result, left, right;
-} Operation;
 
 /* The rows of one block of times. */
 typedef struct {
@@ -131,15 +97,13 @@ static void run(const Rows *rows, const Operation *code, npy_intp operations, np
         operate(rows, code + k, count);
 }
 
-static int outside(const char *what, npy_intp value)
+int outside(const char *what, npy_intp value)
 {
     PyErr_Format(PyExc_ValueError, "%s: no such one as %zd", what, (Py_ssize_t)value);
     return 0;
 }
 
-/* How many rows the operations use, those given included; 0 with an exception if they are none
-   that can be run. */
-static npy_intp rows_used(PyArrayObject *code, npy_intp given, npy_intp constants)
+npy_intp rows_used(PyArrayObject *code, npy_intp given, npy_intp constants)
 {
     const Operation *operation = PyArray_DATA(code);
     npy_intp rows = given;
@@ -160,6 +124,15 @@ static npy_intp rows_used(PyArrayObject *code, npy_intp given, npy_intp constant
             rows++;
     }
     return rows;
+}
+
+int results_fit(PyArrayObject *results, npy_intp used, npy_intp constants)
+{
+    const npy_intp *row = PyArray_DATA(results);
+    for (npy_intp k = 0; k < PyArray_SIZE(results); k++)
+        if (row[k] >= used || row[k] < -constants)
+            return outside("rows of results", row[k]);
+    return 1;
 }
 
 /* An array (orders, 1, …) as one (orders, times, …) that cannot be written to: constant in time. */
@@ -284,14 +257,10 @@ static PyObject *jets(PyObject *module, PyObject *const *given, Py_ssize_t count
     int varies[MOST_MATRICES] = {0};
     const npy_intp known = GIVEN + size(signals, 0);
     const npy_intp used = rows_used(code, known, size(constants, 0));
-    if (!used || !targets_fit(targets, once, matrices, varies))
+    if (!used || !results_fit(rows_of_results, used, size(constants, 0)) ||
+        !targets_fit(targets, once, matrices, varies))
         return failed(&call);
     const npy_intp *results_rows = PyArray_DATA(rows_of_results);
-    for (npy_intp k = 0; k < orders * outputs; k++)
-        if (results_rows[k] >= used || results_rows[k] < -size(constants, 0)) {
-            outside("rows of results", results_rows[k]);
-            return failed(&call);
-        }
 
     npy_intp block = IN_CACHE / used;
     block = block < 32 ? 32 : block > 512 ? 512 : block;

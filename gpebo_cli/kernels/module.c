@@ -15,8 +15,8 @@ PyMODINIT_FUNC PyInit__compiled(void)
     if (module == NULL)
         return NULL;
     PyMethodDef *subjects[] = {
-        jets_kernels,       
-        structure_kernels, reduction_kernels,  
+        jets_kernels, intervals_kernels,
+        structure_kernels, reduction_kernels,
         observer_kernels,  
     };
     for (size_t i = 0; i < sizeof(subjects) / sizeof(subjects[0]); i++)

@@ -92,6 +92,15 @@ class CoefficientSource(Protocol):
         """Times strictly between ``start`` and ``stop`` where some entry jumps or has a kink."""
         ...
 
+    def resolved(self, edges: Array) -> Array | None:
+        """Edges of cells in which every known function is nearly a polynomial of low degree.
+
+        They are ``edges`` (K + 1,), sorted, jumps and kinks among them, and more: nothing that is
+        looked at between them hides a pulse. None: nothing bounds these functions (from Python).
+        What depends on outputs is not among them.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class DescriptorSystem:

@@ -106,6 +106,10 @@ class FunctionCoefficients:
         """None: functions are taken to be smooth."""
         return np.zeros(0)
 
+    def resolved(self, edges: Array) -> None:  # noqa: ARG002
+        """None: nothing bounds what functions do between the times at which they are looked at."""
+        return
+
     def _fill(self, name: str, values: Array, t: Array, signals: Array | None) -> None:
         """Fill ``values`` (order + 1, N, …), with derivatives as far as they are given."""
         # A derivative that is given is one of time alone, so with signals only values are.

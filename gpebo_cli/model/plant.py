@@ -20,11 +20,13 @@ from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, Descri
 from gpebo_cli.model.expressions import (
     RESERVED,
     Assembly,
+    Bounds,
     Expression,
     Tape,
     breakpoints_of_tape,
     parse,
     record,
+    resolved,
     shorten,
     signal,
 )
@@ -156,7 +158,28 @@ class TextCoefficients:
 
     def breakpoints(self, start: float, stop: float) -> Array:
         """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks."""
-        return breakpoints_of_tape(self.tape, start, stop)
+        if (start, stop) not in self._breakpoints:
+            self._breakpoints[start, stop] = breakpoints_of_tape(self.tape, start, stop)
+        return self._breakpoints[start, stop].copy()
+
+    @cached_property
+    def _breakpoints(self) -> dict[tuple[float, float], Array]:
+        return {}
+
+    def resolved(self, edges: Array) -> Array:
+        """Cells in which nothing narrow hides; see the protocol."""
+        key = edges.tobytes()
+        if key not in self._resolved:
+            self._resolved[key] = resolved(self._bounds, edges)
+        return self._resolved[key]
+
+    @cached_property
+    def _resolved(self) -> dict[bytes, Array]:
+        return {}
+
+    @cached_property
+    def _bounds(self) -> Bounds:
+        return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
 
 
 def plant_from_mapping(

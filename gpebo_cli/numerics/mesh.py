@@ -18,6 +18,7 @@ from gpebo_cli.numerics.radau import RadauRule
 # ends of an element see the limit from within. Nodes in between decide for themselves: a jump
 # that nobody announced then shows up as an unresolved element, not as a wrong number.
 _INSIDE = 1e-3
+FIRST_ELEMENTS = 24  # of a first mesh: enough nodes to notice a pulse, few enough to be free
 _CHUNK = 1 << 22  # numbers gathered at once when sampling
 _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
 SHARE = 1e-3  # of the largest component: what is smaller is measured against that
@@ -356,16 +357,23 @@ def signal_scale(values: Array, floor: float = 0.0) -> Array:
 def initial_mesh(start: float, stop: float, breakpoints: Sequence[float] | Array,
                  elements: int, rule: RadauRule) -> Mesh:
     """About ``elements`` equal elements, with every breakpoint (B,), in seconds, an edge."""
+    return Mesh(initial_edges(start, stop, breakpoints, elements), rule)
+
+
+def initial_edges(
+    start: float, stop: float, breakpoints: Sequence[float] | Array, elements: int = FIRST_ELEMENTS
+) -> Array:
+    """The edges of :func:`initial_mesh`."""
     if not len(breakpoints):
         # The same numbers as np.linspace without its end.
         edges: Array = np.arange(elements + 1, dtype=np.float64)
         edges *= (stop - start) / elements
         edges += start
         edges[-1] = stop
-        return Mesh(edges, rule)
+        return edges
     cuts = np.unique(np.concatenate([[start], np.asarray(breakpoints, dtype=float), [stop]]))
     cuts = cuts[(cuts >= start) & (cuts <= stop)]
     counts = np.maximum(1, np.rint(elements * np.diff(cuts) / (stop - start))).astype(int)
     pieces = [np.linspace(a, b, c, endpoint=False)
               for a, b, c in zip(cuts[:-1], cuts[1:], counts, strict=True)]
-    return Mesh(np.append(np.concatenate(pieces), stop), rule)
+    return np.append(np.concatenate(pieces), stop)

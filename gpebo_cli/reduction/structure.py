@@ -15,6 +15,7 @@ from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import frobenius_norm, transpose
+from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, initial_edges
 from gpebo_cli.reduction.derivative_array import (
     SMALL,
     Scaling,
@@ -121,6 +122,8 @@ def analyse(
             continue
         steady, dips = (True, []) if invariant else _dips(levels.smallest)
         _follow_dips(system, t, levels, dips, mu, scaling, rank_tol)
+        if not levels.a and "E" not in system.coefficients.constant:
+            _refuse_crossing(system, t, c.E[0])
         return Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
             smallest_singular_value=levels.least, time_invariant=invariant,
@@ -133,6 +136,9 @@ def analyse(
     )
 
 
+_BISECTIONS = 60
+_NARROW = 16  # probes in a cell in which something is narrow
+_MOST_PROBES = 1 << 13
 _PLACES = np.sort([1e-3, 1.0 - 1e-3, *(np.arange(1, _PROBES + 1) * 0.6180339887498949 % 1.0)])
 
 
@@ -140,6 +146,16 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
     """Interior times, none of them special: equal spacing would hit the zeros of sin(k π t)."""
     t = start + (stop - start) * _PLACES
     jumps = system.coefficients.breakpoints(start, stop)
+    edges = None
+    if not {"E", "A"} <= system.coefficients.constant:
+        edges = system.coefficients.resolved(initial_edges(start, stop, jumps))
+    if edges is not None:  # where something is narrow
+        steps = np.diff(edges)
+        narrow = np.flatnonzero(steps < 0.4 * (stop - start) / FIRST_ELEMENTS)
+        narrow = narrow[:: 1 + len(narrow) * _NARROW // _MOST_PROBES]
+        places = (np.arange(_NARROW) + 0.5) / _NARROW
+        looks = edges[narrow, None] + steps[narrow, None] * places
+        t = np.unique(np.concatenate([t, looks.ravel()]))
     if not len(jumps):
         return t
     cuts = np.concatenate([[start], jumps, [stop]])
@@ -357,6 +373,26 @@ def _changes(what: str, ranks: Array, k: int, t: Array, sigma: Array) -> str:
     return (
         f"the rank of {what} changes from {ranks[0]} at t = {t[0]:.6g} to {ranks[k]} at "
         f"t = {t[k]:.6g} (singular value {sigma[border]:.1e})"
+    )
+
+
+def _refuse_crossing(system: DescriptorSystem, t: Array, E: Array) -> None:
+    """Without constraints E has to be regular: its determinant keeps its sign from probe to probe.
+
+    A singular value that passes zero faster than the probes are dense shows in this only.
+    """
+    sign = np.linalg.slogdet(E)[0]
+    changes = np.flatnonzero(sign[1:] != sign[:-1])
+    if not len(changes):
+        return
+    low, high = t[changes[0]], t[changes[0] + 1]
+    for _ in range(_BISECTIONS):
+        half = np.array([0.5 * (low + high)])
+        same = np.linalg.slogdet(system.coefficients.taylor(half, 0).E[0])[0] == sign[changes[0]]
+        low, high = (half[0], high) if same else (low, half[0])
+    raise ModelError(
+        f"{who(system)}: the rank of the differential part changes at t = {high:.9g} (det E "
+        "changes its sign); choose a horizon that avoids this time"
     )
 
 

@@ -27,7 +27,7 @@ from gpebo_cli.numerics.collocation import (
     solve,
     wanted_parts,
 )
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved
+from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, Mesh, Trajectory, initial_mesh, unresolved
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
 from gpebo_cli.reduction.strangeness_free import (
@@ -39,7 +39,6 @@ from gpebo_cli.reduction.structure import Structure, analyse
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 
-_FIRST_ELEMENTS = 24  # of the first mesh: enough nodes to notice a pulse, few enough to be free
 _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
 _SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
@@ -75,6 +74,7 @@ class Simulation:
     initial_state: Array  # (n,) consistent
     jumps: tuple[tuple[float, Array, Jump], ...]  # (time, limit from the left, jump)
     error_estimate: float
+    bounded: bool  # known functions are bounded between the nodes: nothing narrow was missed
 
 
 def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Simulation:
@@ -89,8 +89,11 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         system, start, stop, max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol
     )
     cuts = system.coefficients.breakpoints(start, stop)
-    mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
-    mesh, c = _known_resolved(system, structure, mesh, cuts, solver)
+    mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
+    edges = system.coefficients.resolved(mesh.edges)
+    if edges is not None:
+        mesh = Mesh(edges, mesh.rule)
+    mesh, c = _known_resolved(system, structure, mesh, cuts, solver, bounded=edges is not None)
     first = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
     if solver.name == "ivp":
         inside = float(mesh.inside[0, 0])
@@ -136,15 +139,17 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         initial_state=x0,
         jumps=tuple((t, *happened[t]) for t in sorted(happened)),
         error_estimate=solution.error_estimate,
+        bounded=edges is not None,
     )
 
 
 def _known_resolved(
     system: DescriptorSystem, structure: Structure, mesh: Mesh, cuts: Array,
-    solver: SolverSettings,
+    solver: SolverSettings, *, bounded: bool,
 ) -> tuple[Mesh, Coefficients]:
     """The mesh that the known functions ask for, and all of them at its points.
 
+    Where bounds do not already say that nothing narrow hides between the nodes, it is looked for.
     Elements are cut until the inputs are resolved, as far as cutting helps: the solution's mesh
     has to resolve them in any case, and evaluating an input costs next to nothing beside solving
     for the state on elements that are too long. Where nothing needs the elements that short, they
@@ -161,7 +166,7 @@ def _known_resolved(
     if solver.name == "ivp":
         return mesh, c
     given = mesh
-    for _ in range(_LOOK_ROUNDS):
+    for _ in range(0 if bounded else _LOOK_ROUNDS):
         overlooked = _overlooked(system, c, mesh, solver.tol)
         if not overlooked.any():
             break

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.expressions.bounds import roots
 from gpebo_cli.model.expressions.syntax import Expression
 from gpebo_cli.model.expressions.tape import Tape, record
 
-GRID = 2000  # cells in which sign changes of arguments that are not affine are looked for
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one
-_BISECTIONS = 100  # more than enough to leave two neighbouring floats
 
 
 def breakpoints(expressions: Sequence[Expression], start: float, stop: float) -> Array:
@@ -23,9 +22,9 @@ def breakpoints(expressions: Sequence[Expression], start: float, stop: float) ->
 def breakpoints_of_tape(tape: Tape, start: float, stop: float) -> Array:
     """Times strictly between ``start`` and ``stop`` where some expression jumps or has a kink.
 
-    Instants of ``step`` and zeros of affine arguments of ``abs`` and ``sign`` are exact. Zeros of
-    other arguments are found as sign changes over a grid of GRID cells, then bisected to
-    rounding; two zeros in one cell, and zeros without a change of sign, are not seen.
+    Instants of ``step`` and zeros of affine arguments of ``abs``, ``sign``, ``min`` and ``max`` are
+    exact, changes of sign of other arguments isolated by bounds, see :func:`roots`, and bisected to
+    rounding.
 
     Returns:
         Sorted, without repetitions, seconds, shape (number,).
@@ -42,35 +41,12 @@ def breakpoints_of_tape(tape: Tape, start: float, stop: float) -> Array:
     if len(affine) == len(tape.switches) or not start < stop:
         return exact
 
-    found = np.sort(_sign_changes(tape, exact, start, stop))
+    found = np.sort(roots(tape, exact, start, stop))
     near = _SAME * (stop - start)
-    result = [start, *exact, stop]
-    for time in found:
-        if np.abs(np.array(result) - time).min() > near:
-            result.append(float(time))
-    return np.sort(np.array(result))[1:-1]
-
-
-def _sign_changes(tape: Tape, knots: Array, start: float, stop: float) -> Array:
-    """Zeros of all arguments between the knots, unsorted."""
-    grid = np.union1d(np.linspace(start, stop, GRID + 1), knots)
-    left, right = grid[:-1], grid[1:]
-    middle = 0.5 * (left + right)  # decides what jumps at either end of a cell
-    at_left = tape.arguments_of_switches(left, middle)
-    at_right = tape.arguments_of_switches(right, middle)
-
-    # Exactly zero where two cells meet, with opposite signs at their other ends.
-    met = (at_right[:, :-1] == 0) & (at_left[:, :-1] * at_right[:, 1:] < 0)
-    zeros = right[:-1][met.any(axis=0)]
-
-    which, cell = np.nonzero(at_left * at_right < 0)
-    low, high, inside = left[cell], right[cell], middle[cell]
-    sign_low = np.sign(at_left[which, cell])
-    for _ in range(_BISECTIONS):
-        half = 0.5 * (low + high)
-        if np.all((half <= low) | (half >= high)):
-            break
-        value = tape.arguments_of_switches(half, inside)[which, np.arange(len(half))]
-        before = np.sign(value) == sign_low
-        low, high = np.where(before, half, low), np.where(before, high, half)
-    return np.concatenate([zeros, high])
+    known = np.concatenate([[start], exact, [stop]])
+    place = np.searchsorted(known, found)  # between start and stop, where all of them are
+    new = (found - known[np.maximum(place - 1, 0)] > near) & (
+        known[np.minimum(place, len(known) - 1)] - found > near
+    )
+    new[1:] &= np.diff(found) > near
+    return np.sort(np.concatenate([exact, found[new]]))

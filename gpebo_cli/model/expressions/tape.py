@@ -28,6 +28,7 @@ MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in par
 # Recording takes as long as evaluating four times without the kernel: where that is much, it may
 # never be gained again.
 _MOST_COMPILED = 1000
+_SWITCHES = ("abs", "sign", "min", "max")
 _UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
 # Function, its place in the pair of jets computed together, and which pair.
@@ -138,7 +139,7 @@ class Tape:
         known = None if signals is None else recorder.signals
         try:
             with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
-                places = self._run(
+                places = self.run(
                     recorder.t, order, recorder.inside if apart else recorder.t, known
                 )
         except FloatingPointError:
@@ -150,41 +151,63 @@ class Tape:
         targets = np.array([(0, j) for j in range(len(self.outputs))], dtype=np.intp)
         return Assembly(self, targets.reshape(-1, 2), (np.zeros(len(self.outputs)),))
 
-    def arguments_of_switches(self, t: Array, inside: Array) -> Array:
-        """Arguments of abs and sign at the times ``t``, shape (number of switches, N).
+    @cached_property
+    def of_time(self) -> frozenset[int]:
+        """Places whose value time alone decides: no signal is in them that nobody told."""
+        known: set[int] = set()
+        for place, instruction in enumerate(self.instructions):
+            if not math.isnan(instruction.value) and known.issuperset(instruction.arguments):
+                known.add(place)
+        return frozenset(known)
 
-        Raises:
-            ConfigError: as for :meth:`taylor`.
-        """
-        places = self._checked(t, 0, inside, None)
-        result = np.empty((len(self.switches), len(t)))
-        for row, switch in enumerate(self.switches):
-            result[row] = places[switch.argument][0]
-        return result
+    def of(self, places: Sequence[int]) -> Tape:
+        """The tape with other places as outputs, and nothing on it that these do not need."""
+        last = max(places, default=-1) + 1
+        needed = [False] * last
+        for place in places:
+            needed[place] = True
+        for place in reversed(range(last)):
+            if needed[place]:
+                for argument in self.instructions[place].arguments:
+                    needed[argument] = True
+        new = {place: k for k, place in enumerate(k for k in range(last) if needed[k])}
+        kept = [self.instructions[place] for place in new]
+        decided = {i.arguments[-1] for i in kept if i.operation in _SWITCHES}
+        return Tape(
+            tuple(i._replace(arguments=tuple(new[a] for a in i.arguments)) for i in kept),
+            tuple(self.extra[place] for place in new),
+            tuple(new[place] for place in places),
+            tuple(
+                s._replace(argument=new[s.argument])
+                for s in self.switches if s.argument in decided
+            ),
+            tuple(Label(new[place], "…", "an argument", ()) for place in places),
+        )
 
     def _checked(self, t: Array, order: int, inside: Array, signals: list[Jet] | None) -> list[Jet]:
         """Run with every invalid operation refused, even one whose result is finite again."""
         try:
             with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
-                return self._run(t, order, inside, signals)
+                return self.run(t, order, inside, signals)
         except FloatingPointError:
             # Only a second, slower run can tell whose fault it was and when; or that it was
             # nobody's: vectorised loops may raise flags for lanes that they do not return.
             self._refuse(t, order, inside, signals)
             with np.errstate(all="ignore"):
-                return self._run(t, order, inside, signals)
+                return self.run(t, order, inside, signals)
 
-    def _run(
-        self, t: Any, order: int, inside: Any, signals: Any, stop: int | None = None
+    def run(
+        self, t: Any, order: int, inside: Any, signals: Any = None, stop: int | None = None
     ) -> list[Jet]:
         """Jets of all places before ``stop``, those that jump decided at ``inside``.
 
-        The times and signals are arrays (N,), or symbols for them that record what is done.
+        The times and signals are arrays (N,), symbols for them that record what is done, or cells
+        of time.
         """
         deciding: list[Jet] | None = None
         if self.switches and inside is not t:
             last = max(switch.argument for switch in self.switches)
-            deciding = self._run(inside, 0, inside, signals, last + 1)
+            deciding = self.run(inside, 0, inside, signals, last + 1)
         places: list[Jet] = []
         pairs: dict[tuple[int, bool], tuple[int, tuple[Jet, Jet]]] = {}
         for (operation, arguments, value), extra in zip(
@@ -228,7 +251,7 @@ class Tape:
         """Raise the error for the first entry, and in it the innermost name, that is not finite."""
         for times in (t,) if inside is t else (t, inside):
             with np.errstate(all="ignore"):
-                places = self._run(times, order if times is t else 0, inside, signals)
+                places = self.run(times, order if times is t else 0, inside, signals)
             # First index of a time at which a place, or something it is made of, is not finite.
             bad: list[float] = []
             for (operation, arguments, _), jet in zip(self.instructions, places, strict=True):
@@ -350,7 +373,7 @@ def record(expressions: Sequence[Expression], inputs: Sequence[Expression] = ())
             arguments = tuple(place_of[id(a)] for a in children)
             instruction = Instruction(node.operation, arguments, node.value)
             place_of[id(node)] = instructions.setdefault(instruction, len(instructions))
-            if node.operation in ("abs", "sign", "min", "max"):
+            if node.operation in _SWITCHES:
                 switches[arguments[-1]] = Switch(arguments[-1], children[-1].affine)
         if len(instructions) > MAX_INSTRUCTIONS:
             raise ConfigError(

@@ -1,0 +1,190 @@
+/* Known functions over cells of time: gpebo_cli/model/expressions/intervals.py and bounds.py. */
+#include "common.h"
+
+#include "program.h"
+
+#define WIDER (4 * 2.220446049250313e-16)
+#define TINY 2.2250738585072014e-308
+#define HALF_PI 1.5707963267948966
+
+typedef struct {
+    double low, high;
+} Interval;
+
+static const Interval anything = {-INFINITY, INFINITY};
+
+/* The interval a little wider, or anything where an end is not a number. */
+static inline Interval widened(double low, double high)
+{
+    if (low != low || high != high)
+        return anything;
+    return (Interval){low - WIDER * fabs(low) - TINY, high + WIDER * fabs(high) + TINY};
+}
+
+/* 0 · ∞ is 0: the bound is never reached. */
+static inline double times(double x, double y) { return x == 0.0 || y == 0.0 ? 0.0 : x * y; }
+
+static inline Interval product(Interval a, Interval b)
+{
+    const double p = times(a.low, b.low), q = times(a.low, b.high);
+    const double r = times(a.high, b.low), s = times(a.high, b.high);
+    if (p != p || q != q || r != r || s != s)
+        return anything;
+    return widened(fmin(fmin(p, q), fmin(r, s)), fmax(fmax(p, q), fmax(r, s)));
+}
+
+static inline double nearest_to_zero(Interval a) { return fmax(fmax(a.low, -a.high), 0.0); }
+
+static inline double largest(Interval a) { return fmax(fabs(a.low), fabs(a.high)); }
+
+static inline Interval square(Interval a)
+{
+    const double x = nearest_to_zero(a), y = largest(a);
+    return widened(x * x, y * y);
+}
+
+static inline Interval quotient(Interval a, Interval b)
+{
+    if (b.low <= 0.0 && b.high >= 0.0)
+        return anything;
+    return product(a, (Interval){1.0 / b.high, 1.0 / b.low});
+}
+
+static Interval raised(Interval a, double r)
+{
+    if (r == floor(r) && r > 0.0) {
+        if (fmod(r, 2.0) == 0.0)
+            return widened(pow(nearest_to_zero(a), r), pow(largest(a), r));
+        return widened(pow(a.low, r), pow(a.high, r));
+    }
+    if (r > 0.0)
+        return a.high < 0.0 ? anything : widened(pow(fmax(a.low, 0.0), r), pow(a.high, r));
+    return a.low > 0.0 ? widened(pow(a.high, r), pow(a.low, r)) : anything;
+}
+
+static double slack_of(Interval a) { return 4e-16 * largest(a) + 1e-15; }
+
+/* Whether a crest of sin(x + to) at `at`, or one that rounding might have moved, is inside. */
+static int crest(Interval a, double slack, double at)
+{
+    const double first = (a.low - at - slack) / (4 * HALF_PI);
+    const double last = (a.high - at + slack) / (4 * HALF_PI);
+    return !isfinite(last - first) || ceil(first) <= floor(last);
+}
+
+static Interval wave(Interval a, double x, double y, double to)
+{
+    const double slack = slack_of(a);
+    const double low = crest(a, slack, -HALF_PI - to) ? -1.0 : fmin(x, y);
+    const double high = crest(a, slack, HALF_PI - to) ? 1.0 : fmax(x, y);
+    return widened(low, high);
+}
+
+static Interval tangent(Interval a)
+{
+    const double slack = slack_of(a);
+    const double first = (a.low - HALF_PI - slack) / (2 * HALF_PI);
+    const double last = (a.high - HALF_PI + slack) / (2 * HALF_PI);
+    if (!isfinite(last - first) || floor(first) != floor(last))
+        return anything;
+    return widened(tan(a.low), tan(a.high));
+}
+
+/* Of a function that grows, where it is defined: between `first` and `last`. */
+static Interval rising(double (*function)(double), Interval a, double first, double last)
+{
+    if (a.high < first || a.low > last)
+        return anything;
+    return widened(function(fmax(a.low, first)), function(fmin(a.high, last)));
+}
+
+static double signum(double x) { return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : 0.0; }
+
+static Interval image(npy_intp what, Interval a, Interval b, int same_row)
+{
+    switch (what) {
+    case ADD: return widened(a.low + b.low, a.high + b.high);
+    case SUBTRACT: return widened(a.low - b.high, a.high - b.low);
+    case MULTIPLY: return same_row ? square(a) : product(a, b);
+    case DIVIDE: return quotient(a, b);
+    case POWER: return raised(a, b.low);
+    case GREATER_EQUAL: return (Interval){a.low >= b.low, a.high >= b.low};
+    case NEGATIVE: return (Interval){-a.high, -a.low};
+    case SQRT: return rising(sqrt, a, 0.0, INFINITY);
+    case EXP: return rising(exp, a, -INFINITY, INFINITY);
+    case LOG: return rising(log, a, 0.0, INFINITY);
+    case SIN: return wave(a, sin(a.low), sin(a.high), 0.0);
+    case COS: return wave(a, cos(a.low), cos(a.high), HALF_PI);
+    case TAN: return tangent(a);
+    case SINH: return rising(sinh, a, -INFINITY, INFINITY);
+    case COSH: return widened(cosh(nearest_to_zero(a)), cosh(largest(a)));
+    case TANH: return rising(tanh, a, -INFINITY, INFINITY);
+    case ASIN: return rising(asin, a, -1.0, 1.0);
+    case ACOS: return widened(acos(fmax(-1.0, fmin(1.0, a.high))), acos(fmax(-1.0, fmin(1.0, a.low))));
+    case ATAN: return rising(atan, a, -INFINITY, INFINITY);
+    case ASINH: return rising(asinh, a, -INFINITY, INFINITY);
+    case ACOSH: return rising(acosh, a, 1.0, INFINITY);
+    case ATANH: return rising(atanh, a, -1.0, 1.0);
+    case ERF: return rising(erf, a, -INFINITY, INFINITY);
+    default: return (Interval){signum(a.low), signum(a.high)};
+    }
+}
+
+/* intervals(low (N,), high (N,), inside (N,), code (operations, 4), constants (c,),
+             results (orders, outputs))
+
+   least, most (orders, N, outputs): bounds of the outputs of the code, see expressions/program.py,
+   for all times of each cell; jumps are decided at `inside` where the code says so. */
+static PyObject *intervals(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Call call;
+    if (!begin(&call, given, count, 6))
+        return NULL;
+    PyArrayObject *low = doubles(&call, 0, 1), *high = low ? doubles(&call, 1, 1) : NULL;
+    PyArrayObject *inside = high ? doubles(&call, 2, 1) : NULL;
+    PyArrayObject *code = inside ? indices(&call, 3, 2) : NULL;
+    PyArrayObject *constants = code ? doubles(&call, 4, 1) : NULL;
+    PyArrayObject *rows_of_results = constants ? indices(&call, 5, 2) : NULL;
+    if (rows_of_results == NULL || !same("cells", size(low, 0), size(high, 0)) ||
+        !same("cells", size(low, 0), size(inside, 0)) ||
+        !same("numbers of an operation", size(code, 1), 4))
+        return failed(&call);
+    const npy_intp cells = size(low, 0), operations = size(code, 0);
+    const npy_intp orders = size(rows_of_results, 0), outputs = size(rows_of_results, 1);
+    const npy_intp shape[] = {orders, cells, outputs};
+    const npy_intp used = rows_used(code, GIVEN, size(constants, 0));
+    if (!used || !results_fit(rows_of_results, used, size(constants, 0)))
+        return failed(&call);
+    PyArrayObject *least = fresh(&call, 3, shape), *most = least ? fresh(&call, 3, shape) : NULL;
+    const double *constant = data(constants);
+    Interval *row = most ? (Interval *)old_scratch(&call, 2 * used) : NULL;
+    if (row == NULL)
+        return failed(&call);
+    const npy_intp *result = PyArray_DATA(rows_of_results);
+    double *to_low = data(least), *to_high = data(most);
+    for (npy_intp i = 0; i < cells; i++) {
+        row[0] = (Interval){data(low)[i], data(high)[i]};
+        row[1] = (Interval){data(inside)[i], data(inside)[i]};
+        const Operation *operation = PyArray_DATA(code);
+        for (npy_intp k = 0; k < operations; k++, operation++) {
+            const npy_intp left = operation->left, right = operation->right;
+            const Interval a = left < 0 ? (Interval){constant[~left], constant[~left]} : row[left];
+            const Interval b =
+                right < 0 ? (Interval){constant[~right], constant[~right]} : row[right];
+            row[operation->result] = image(operation->what, a, b, left == right && left >= 0);
+        }
+        for (npy_intp k = 0; k < orders; k++)
+            for (npy_intp j = 0; j < outputs; j++) {
+                const npy_intp from = result[k * outputs + j], to = (k * cells + i) * outputs + j;
+                const double x = from < 0 ? constant[~from] : 0.0;
+                to_low[to] = from < 0 ? (x == x ? x : -INFINITY) : row[from].low;
+                to_high[to] = from < 0 ? (x == x ? x : INFINITY) : row[from].high;
+            }
+    }
+    return results(&call, 2, least, most);
+}
+
+PyMethodDef intervals_kernels[] = {
+    KERNEL(intervals), {NULL, NULL, 0, NULL},
+};

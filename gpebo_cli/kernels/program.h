@@ -1,0 +1,53 @@
+/* Operations on rows, recorded by gpebo_cli/model/expressions/program.py. */
+#ifndef GPEBO_PROGRAM_H
+#define GPEBO_PROGRAM_H
+
+#include "common.h"
+
+#define GIVEN 2 /* rows that are always given: t, inside; those of signals follow */
+
+/* In the order of _OPERATIONS in expressions/program.py. */
+enum {
+    ADD,
+    SUBTRACT,
+    MULTIPLY,
+    DIVIDE,
+    POWER,
+    GREATER_EQUAL,
+    NEGATIVE,
+    SQRT,
+    EXP,
+    LOG,
+    SIN,
+    COS,
+    TAN,
+    SINH,
+    COSH,
+    TANH,
+    ASIN,
+    ACOS,
+    ATAN,
+    ASINH,
+    ACOSH,
+    ATANH,
+    ERF,
+    SIGN,
+    OPERATIONS
+};
+
+/* One operation: what, the row of its result, its operands; see `operand`. */
+typedef struct {
+    npy_intp what, result, left, right;
+} Operation;
+
+/* An exception: there is no such thing as `value`; 0. */
+int outside(const char *what, npy_intp value);
+
+/* How many rows the operations use, those given included; 0 with an exception if they are none
+   that can be run. */
+npy_intp rows_used(PyArrayObject *code, npy_intp given, npy_intp constants);
+
+/* Whether results (orders, outputs) are rows or constants that there are. */
+int results_fit(PyArrayObject *results, npy_intp used, npy_intp constants);
+
+#endif

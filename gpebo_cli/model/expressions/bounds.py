@@ -1,0 +1,266 @@
+"""What functions of time can do between the times at which one looks: roots, and nothing narrow.
+
+Sampling cannot settle whether something narrow was missed. Here a cell of time is done with only
+when interval arithmetic says so, and is halved until it does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli import kernels
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.model.expressions.intervals import Interval
+from gpebo_cli.model.expressions.program import Program
+from gpebo_cli.model.expressions.tape import Tape
+
+ORDER = 8  # of the Taylor polynomials that functions are compared with
+RESOLVED = 1e-6  # of its largest value, by which a function may differ from such a polynomial
+COARSER = 3
+_DEEPEST = 45  # halvings of a cell
+_CELLS = 64  # to begin with, where roots are looked for
+_NARROWEST = 1e-13  # of the span; cells are not cut further
+_MOST_CELLS = 1 << 15
+_BISECTIONS = 100  # more than enough to leave two neighbouring floats
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Bounds of what a tape's expressions do over cells of time."""
+
+    tape: Tape
+
+    def of(self, low: Array, high: Array, order: int, inside: Array | None = None
+           ) -> tuple[Array, Array]:
+        """Bounds of the Taylor coefficients of all outputs, for all t of each cell.
+
+        Args:
+            low: where cells begin, (N,).
+            high: where they end.
+            order: highest coefficient wanted.
+            inside: times in the cells at which jumps are decided, where no function jumps within
+                its cell; None: functions may jump, and derivatives of those that do mean nothing.
+
+        Returns:
+            least and largest values, (order + 1, N, number of outputs).
+        """
+        key = order, inside is not None
+        if kernels.compiled is not None:
+            if key not in self._programs:
+                self._programs[key] = self.tape.program(*key)
+            program = self._programs[key]
+            if program is not None:
+                decided = low if inside is None else inside
+                found: tuple[Array, Array] = kernels.compiled.intervals(
+                    low, high, decided, *program
+                )
+                return found
+        cell = Interval(low, high)
+        with np.errstate(all="ignore"):
+            places: list[Any] = self.tape.run(cell, order, cell if inside is None else inside)
+        bounds = np.zeros((2, order + 1, len(low), len(self.tape.outputs)))
+        for column, place in enumerate(self.tape.outputs):
+            for k, value in enumerate(places[place][: order + 1]):
+                bounds[:, k, :, column] = (
+                    (value.low, value.high) if isinstance(value, Interval) else value
+                )
+        return bounds[0], bounds[1]
+
+    @cached_property
+    def _programs(self) -> dict[tuple[int, bool], Program | None]:
+        return {}
+
+
+def resolved(bounds: Bounds, edges: Array) -> Array:
+    """Edges of cells that are few times longer than what hides nothing.
+
+    In cells 2**COARSER times shorter every expression is nearly a polynomial of degree ORDER.
+    "Nearly" is RESOLVED of the largest value that the expression can have anywhere: with
+
+        f(t) = Σ_{k<K} f_k(m) (t − m)^k + f_k(τ) (t − m)^K      for some τ of a cell around m,
+
+    the bounds of f_K over the cell say by how much f can differ from such a polynomial. What is
+    looked at a dozen times between these edges cannot hide a pulse.
+
+    Args:
+        bounds: of expressions of time alone.
+        edges: (K + 1,) where cells have to end, jumps and kinks among them.
+
+    Returns:
+        these edges and more, sorted.
+    """
+    low, high = edges[:-1], edges[1:]
+    depth = np.zeros(len(low), dtype=np.intp)  # how often each has been halved
+    rest, size = _rest(bounds, low, high)
+    while len(low) < _MOST_CELLS:
+        # A bound that nothing reaches falls while its cell is cut.
+        poor = (rest > RESOLVED * size.max(axis=0)).any(axis=1) & (depth < _DEEPEST)
+        if not poor.any():
+            break
+        middle = 0.5 * (low[poor] + high[poor])
+        new = np.concatenate([low[poor], middle]), np.concatenate([middle, high[poor]])
+        deeper = np.tile(depth[poor] + 1, 2)
+        fresh = (*new, deeper, *_rest(bounds, *new))
+        low, high, depth, rest, size = (
+            np.concatenate([old[~poor], more])
+            for old, more in zip((low, high, depth, rest, size), fresh, strict=True)
+        )
+    order = np.argsort(low)
+    return np.append(_coarser(low[order], depth[order], edges), edges[-1])
+
+
+def _coarser(low: Array, depth: IntArray, edges: Array) -> Array:
+    """Left ends of the cells that are left when halves are put together again, COARSER times."""
+    low = low.copy()
+    for _ in range(COARSER):
+        whole = np.searchsorted(edges, low, side="right") - 1
+        width = (edges[whole + 1] - edges[whole]) / 2.0**depth
+        is_right = np.rint((low - edges[whole]) / width).astype(np.int64) % 2 == 1
+        pair = (depth[1:] == depth[:-1]) & is_right[1:] & ~is_right[:-1] & (depth[1:] > 0)
+        gone = np.append(False, pair)
+        depth = depth - np.append(pair, False)
+        low, depth = low[~gone], depth[~gone]
+    return low
+
+
+def _rest(bounds: Bounds, low: Array, high: Array) -> tuple[Array, Array]:
+    """By how much expressions can differ from polynomials in each cell, and how large they get."""
+    least, most = bounds.of(low, high, ORDER, 0.5 * (low + high))
+    half = 0.5 * (high - low)
+    with np.errstate(invalid="ignore", over="ignore"):
+        radius = 0.5 * (most - least) * half[:, None] ** np.arange(ORDER + 1)[:, None, None]
+    radius = np.where(np.isnan(radius), np.inf, radius)
+    return radius.min(axis=0), np.maximum(-least[0], most[0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Cells in which one of the functions may have a root."""
+
+    which: IntArray  # (N,) the function
+    low: Array
+    high: Array
+
+    def __len__(self) -> int:
+        return len(self.which)
+
+    def __getitem__(self, some: BoolArray) -> _Cells:
+        return _Cells(self.which[some], self.low[some], self.high[some])
+
+
+def roots(tape: Tape, knots: Array, start: float, stop: float) -> Array:
+    """Times strictly between ``start`` and ``stop`` where an argument of a switch changes sign.
+
+    A cell is dropped if bounds keep the argument away from zero, searched by bisection where
+    it is monotone, and halved else, down to rounding. (A tangential zero has no change of sign,
+    and switches nothing.)
+
+    Args:
+        tape: expressions with switches.
+        knots: sorted times (B,) at which cells end because something jumps.
+        start: of the search.
+        stop: of it.
+
+    Returns:
+        unsorted, perhaps with repetitions.
+
+    Raises:
+        ConfigError: there are too many.
+    """
+    places = [s.argument for s in tape.switches if s.affine is None]
+    arguments = tape.of([place for place in places if place in tape.of_time])
+    nested = Bounds(arguments.of([s.argument for s in arguments.switches]))
+    bounds, searched = Bounds(arguments), range(len(arguments.outputs))
+    grid = np.union1d(np.linspace(start, stop, _CELLS + 1), knots)
+    which = np.repeat(np.array(searched, dtype=np.intp), len(grid) - 1)
+    active = _Cells(which, np.tile(grid[:-1], len(searched)), np.tile(grid[1:], len(searched)))
+    bracketed: list[_Cells] = []
+    narrowest = _NARROWEST * (stop - start)
+    while len(active):
+        possible, monotone, vanishing = _judged(bounds, nested, active)
+        bracketed.append(active[monotone])
+        rest = possible & ~monotone
+        if rest.sum() > _MOST_CELLS:  # where it is zero, or there is no end of them
+            if not vanishing[rest].all():
+                raise ConfigError(
+                    "an argument of sign, abs, min or max has more changes of sign than can be "
+                    f"followed, near t = {active[rest & ~vanishing].low[0]:.6g}; choose a shorter "
+                    "horizon"
+                )
+            break
+        active = active[rest]
+        tiny = active.high - active.low <= narrowest
+        bracketed.append(_joined(active[tiny]))
+        active = active[~tiny]
+        middle = 0.5 * (active.low + active.high)
+        active = _Cells(
+            np.tile(active.which, 2), np.concatenate([active.low, middle]),
+            np.concatenate([middle, active.high]),
+        )  # fmt: skip
+    cells = _Cells(*(
+        np.concatenate([getattr(c, name) for c in bracketed]) for name in ("which", "low", "high")
+    ))  # fmt: skip
+    return _bisected(arguments, cells)
+
+
+def _judged(
+    bounds: Bounds, nested: Bounds, cells: _Cells
+) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Whether arguments may vanish in their cells, may and are monotone, may in the middle."""
+    low, back = np.unique(np.stack([cells.low, cells.high]), axis=1, return_inverse=True)
+    least, most = bounds.of(low[0], low[1], 1)
+    middle = 0.5 * (low[0] + low[1])
+    at_middle = bounds.of(middle, middle, 0)
+    pick = back.ravel(), cells.which
+    least0, most0, least1, most1 = least[0][pick], most[0][pick], least[1][pick], most[1][pick]
+    inner = nested.of(low[0], low[1], 0)
+    decided = (inner[0][0] > 0) | (inner[1][0] < 0)  # no sign inside of the argument may change
+    smooth = decided.all(axis=1)[back.ravel()]
+    half = 0.5 * (cells.high - cells.low)
+    with np.errstate(invalid="ignore"):
+        reach = half * np.maximum(-least1, most1)
+        away = smooth & ((at_middle[0][0][pick] > reach) | (at_middle[1][0][pick] < -reach))
+    possible = (least0 <= 0) & (most0 >= 0) & ~away
+    vanishing = (at_middle[0][0][pick] <= 0) & (at_middle[1][0][pick] >= 0)
+    return possible, possible & smooth & ((least1 > 0) | (most1 < 0)), vanishing
+
+
+def _joined(cells: _Cells) -> _Cells:
+    """Neighbouring cells of one function as one."""
+    order = np.lexsort((cells.low, cells.which))
+    which, low, high = cells.which[order], cells.low[order], cells.high[order]
+    first = np.ones(len(which), dtype=bool)
+    first[1:] = (which[1:] != which[:-1]) | (low[1:] != high[:-1])
+    last = np.append(first[1:], True)[: len(which)]
+    return _Cells(which[first], low[first], high[last])
+
+
+def _bisected(arguments: Tape, cells: _Cells) -> Array:
+    """The change of sign in each cell that has one between its ends."""
+    low, high = cells.low, cells.high
+    index = np.arange(len(low))
+
+    def sign(t: Array, inside: Array) -> Array:
+        values: Array = arguments.taylor(t, 0, inside)[0][index, cells.which]
+        return np.sign(values)
+
+    middle, width = 0.5 * (low + high), high - low
+    before, after = sign(low, middle), sign(high, middle)
+    # A root that is the end of a cell: the sign changes beyond it.
+    at_low = (before == 0) & (sign(low - width, low - 0.5 * width) * after < 0)
+    at_high = (after == 0) & (sign(high + width, high + 0.5 * width) * before < 0)
+    between = before * after < 0
+    found = np.where(at_low, low, high)
+    for _ in range(_BISECTIONS):
+        half = 0.5 * (low + high)
+        if np.all((half <= low) | (half >= high)):
+            break
+        left = sign(half, half) == before
+        low, high = np.where(left, half, low), np.where(left, high, half)
+    found = np.where(between, high, found)
+    return np.asarray(found[between | at_low | at_high])

@@ -1,0 +1,147 @@
+"""Interval arithmetic over arrays of cells: what a function can do anywhere in a cell.
+
+An :class:`Interval` stands where the rules of :mod:`~gpebo_cli.model.expressions.jets` expect an
+array of times: they then give Taylor coefficients that hold for all t of each cell at once. Every
+result is widened by a few units in the last place, and by the functions' own error. What is not
+defined in a part of a cell, or not at all, may have any value there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+from gpebo_cli.model.descriptor import Array
+
+_WIDER = 4 * float(np.finfo(float).eps)
+_TINY = float(np.finfo(float).tiny)
+_HALF_PI = 0.5 * np.pi
+# The functions that grow all over where they are defined, and where that is.
+_RISING = {
+    "exp": (-np.inf, np.inf), "sinh": (-np.inf, np.inf), "tanh": (-np.inf, np.inf),
+    "arctan": (-np.inf, np.inf), "arcsinh": (-np.inf, np.inf), "erf": (-np.inf, np.inf),
+    "sign": (-np.inf, np.inf), "log": (0.0, np.inf), "sqrt": (0.0, np.inf),
+    "arcsin": (-1.0, 1.0), "arctanh": (-1.0, 1.0), "arccosh": (1.0, np.inf),
+}  # fmt: skip
+
+
+class Interval(NDArrayOperatorsMixin):
+    """All numbers between ``low`` and ``high``, arrays (N,)."""
+
+    __slots__ = ("high", "low")
+
+    def __init__(self, low: Array, high: Array) -> None:
+        unknown = np.isnan(low) | np.isnan(high)
+        self.low = np.where(unknown, -np.inf, low)
+        self.high = np.where(unknown, np.inf, high)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, _method: str, *inputs: Any, **_options: Any) -> Any:
+        """All values that a function can have."""
+        with np.errstate(all="ignore"):
+            low, high = _image(ufunc, *inputs)
+            if ufunc.__name__ in ("negative", "sign", "greater_equal"):
+                return Interval(low, high)
+            slack = _WIDER * np.abs(low) + _TINY, _WIDER * np.abs(high) + _TINY
+            return Interval(low - slack[0], high + slack[1])
+
+    def astype(self, _type: type) -> Interval:
+        """This interval: truth is 0 or 1 in it."""
+        return self
+
+
+def _ends(value: Any) -> tuple[Any, Any]:
+    return (value.low, value.high) if isinstance(value, Interval) else (value, value)
+
+
+def _image(ufunc: np.ufunc, a: Any, b: Any = 0.0) -> tuple[Array, Array]:
+    name = ufunc.__name__
+    (low, high), (least, most) = _ends(a), _ends(b)
+    if name in _RISING:
+        first, last = _RISING[name]
+        inside = (high >= first) & (low <= last)
+        image = ufunc(np.clip(low, first, last)), ufunc(np.clip(high, first, last))
+        return np.where(inside, image[0], np.nan), np.where(inside, image[1], np.nan)
+    image = _OTHERS[name](ufunc, low, high, least, most, a is b)
+    return image[0], image[1]
+
+
+def _product(low: Any, high: Any, least: Any, most: Any) -> tuple[Array, Array]:
+    """0 · ∞ is 0: the bound is never reached."""
+    ends = [np.where((x == 0) | (y == 0), 0.0, x * y) for x in (low, high) for y in (least, most)]
+    return np.minimum.reduce(ends), np.maximum.reduce(ends)
+
+
+def _multiply(_: np.ufunc, low: Any, high: Any, least: Any, most: Any, same: bool) -> Any:
+    if same:
+        return _even(np.square, low, high)
+    return _product(low, high, least, most)
+
+
+def _divide(_: np.ufunc, low: Any, high: Any, least: Any, most: Any, __: bool) -> Any:
+    through_zero = (least <= 0) & (most >= 0)
+    image = _product(low, high, 1.0 / np.asarray(most), 1.0 / np.asarray(least))
+    return np.where(through_zero, -np.inf, image[0]), np.where(through_zero, np.inf, image[1])
+
+
+def _even(function: Callable[[Any], Any], low: Any, high: Any) -> tuple[Array, Array]:
+    """Of a function that falls up to 0 and grows from there."""
+    nearest = np.maximum(np.maximum(low, -np.asarray(high)), 0.0)
+    return function(nearest), function(np.maximum(np.abs(low), np.abs(high)))
+
+
+def _power(_: np.ufunc, low: Any, high: Any, least: Any, __: Any, ___: bool) -> Any:
+    r = float(least)  # exponents are constant
+    if r.is_integer() and r > 0:
+        if r % 2 == 0:
+            return _even(lambda x: np.power(x, r), low, high)
+        return np.power(low, r), np.power(high, r)
+    if r > 0:
+        return np.where(high < 0, np.nan, np.power(np.maximum(low, 0.0), r)), np.power(high, r)
+    defined = low > 0
+    image = np.power(high, r), np.power(low, r)
+    return np.where(defined, image[0], -np.inf), np.where(defined, image[1], np.inf)
+
+
+def _wave(function: np.ufunc, low: Any, high: Any, to: float) -> Any:
+    """Of sin(x + to); a crest counts also where rounding might have moved it into the cell."""
+    slack = 4e-16 * np.maximum(np.abs(low), np.abs(high)) + 1e-15
+
+    def crest(at: float) -> Any:
+        turns = 2 * np.pi
+        first, last = (low + to - at - slack) / turns, (high + to - at + slack) / turns
+        return (np.ceil(first) <= np.floor(last)) | ~np.isfinite(last - first)
+
+    ends = function(low), function(high)
+    return (
+        np.where(crest(-_HALF_PI), -1.0, np.minimum(*ends)),
+        np.where(crest(_HALF_PI), 1.0, np.maximum(*ends)),
+    )
+
+
+def _tan(_: np.ufunc, low: Any, high: Any, __: Any, ___: Any, ____: bool) -> Any:
+    slack = 4e-16 * np.maximum(np.abs(low), np.abs(high)) + 1e-15
+    first, last = (low - _HALF_PI - slack) / np.pi, (high - _HALF_PI + slack) / np.pi
+    pole = (np.floor(first) != np.floor(last)) | ~np.isfinite(last - first)
+    return np.where(pole, -np.inf, np.tan(low)), np.where(pole, np.inf, np.tan(high))
+
+
+_Rule = Callable[..., Any]
+_OTHERS: dict[str, _Rule] = {
+    "add": lambda _, low, high, least, most, __: (low + least, high + most),
+    "subtract": lambda _, low, high, least, most, __: (low - most, high - least),
+    "multiply": _multiply,
+    "divide": _divide,
+    "negative": lambda _, low, high, *__: (-high, -low),
+    "power": _power,
+    "cosh": lambda ufunc, low, high, *_: _even(ufunc, low, high),
+    "sin": lambda ufunc, low, high, *_: _wave(ufunc, low, high, 0.0),
+    "cos": lambda ufunc, low, high, *_: _wave(ufunc, low, high, _HALF_PI),
+    "tan": _tan,
+    "arccos": lambda ufunc, low, high, *_: (
+        ufunc(np.clip(high, -1.0, 1.0)), ufunc(np.clip(low, -1.0, 1.0)),
+    ),
+    "greater_equal": lambda _, low, high, least, *__: (1.0 * (low >= least), 1.0 * (high >= least)),
+}  # fmt: skip

@@ -1,0 +1,159 @@
+"""Bounds of functions over cells of time: they hold, and nothing narrow is missed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kernel_paths import by_both
+from scipy.special import gammaln
+from test_kernels_jets import tape_of, texts
+
+from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.model.expressions import Bounds, breakpoints, parse, record, resolved
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+
+
+def integrated(text, E=1, horizon=20.0, states=1):
+    """What x' = text adds to x, by simulation."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x"], "inputs": {"u": text}, "outputs": ["y"], "E": [[E]],
+        "A": [[0]], "B": [[1]], "C": [[1]], "initial_state": [0],
+    })  # fmt: skip
+    found = simulate(system, TimeSettings(horizon=horizon), SolverSettings())
+    return found.signals.states.final[0]
+
+
+def found(text, start=0.0, stop=20.0):
+    return breakpoints([parse(text, {}, "here")], start, stop)
+
+
+@given(
+    texts(), st.integers(0, 3), st.floats(-1, 1), st.sampled_from([1e-9, 1e-3, 0.1, 1.0]),
+    st.booleans(),
+)  # fmt: skip
+def test_bounds_hold_for_all_times_of_a_cell(line, order, start, width, decided):
+    """With jumps decided in the cell's middle, or none decided and values only."""
+    tape = tape_of(line)
+    low, high = np.array([start]), np.array([start + width])
+    middle = 0.5 * (low + high)
+    t = np.linspace(start, start + width, 33)[1:-1]
+    try:
+        truth = tape.taylor(t, order, np.full_like(t, middle) if decided else None)
+    except ConfigError:  # nothing to hold
+        return
+    if not decided and tape.jumps:
+        truth = truth[:1]
+    for least, most in by_both(
+        lambda: Bounds(tape).of(low, high, order, middle if decided else None)
+    ):
+        slack = 1e-13 * np.maximum(1.0, np.abs(truth))
+        assert (least[: len(truth)] <= truth + slack).all()
+        assert (most[: len(truth)] >= truth - slack).all()
+
+
+@given(texts(), st.integers(0, 3))
+@settings(max_examples=30)
+def test_both_paths_bound_alike(line, order):
+    tape, edges = tape_of(line), np.linspace(-1, 1, 5)
+    one, other = by_both(lambda: Bounds(tape).of(edges[:-1], edges[1:], order, edges[:-1] + 0.25))
+    for a, b in zip(one, other, strict=True):
+        assert (np.isfinite(a) == np.isfinite(b)).all()
+        some = np.isfinite(a)
+        np.testing.assert_allclose(a[some], b[some], rtol=1e-9, atol=1e-9)
+
+
+def test_bounds_are_not_much_wider_than_they_must_be():
+    edges = np.linspace(0, 20, 4001)
+    tape = record([parse("4*cos(2*t)*sin(t/5) + exp(-t)/(2 + t)", {}, "here")])
+    least, most = Bounds(tape).of(edges[:-1], edges[1:], 0, edges[1:])
+    exact = tape.taylor(edges, 0)[0, :, 0]
+    assert np.abs(most[0, :, 0] - least[0, :, 0]).max() < 4 * np.abs(np.diff(exact)).max()
+
+
+@pytest.mark.parametrize(("w", "duty"), [(10, 1e-3), (100, 1e-2), (37, 1e-5)])
+def test_pulse_width_modulation_by_sign(w, duty):
+    """Every pulse has the area 2π/w, the first one starts in its middle."""
+    text = f"(1 + sign(cos({w}*t) - cos(pi*{duty})))/(2*{duty})"
+    periods = np.floor(20 * w / (2 * np.pi))
+    rounding = max(1e-9, 1e-16 / duty**2)  # of the argument, against its slope where it is zero
+    np.testing.assert_allclose(integrated(text), (0.5 + periods) * 2 * np.pi / w, rtol=rounding)
+    k = np.arange(1, periods + 1)
+    edges = (2 * np.pi * k[:, None] + np.pi * duty * np.array([-1, 1])) / w
+    expected = np.append(np.pi * duty / w, edges.ravel())
+    np.testing.assert_allclose(found(text), expected[expected < 20], rtol=rounding)
+
+
+@given(st.lists(st.floats(0.01, 19.99), min_size=1, max_size=6, unique=True),
+       st.sampled_from(["sign", "abs"]), st.integers(1, 3))
+@settings(max_examples=40, deadline=None)
+def test_roots_of_polynomials_that_change_sign_are_all_found(places, function, power):
+    """Also where two are near each other, and roots of higher order."""
+    places = sorted(round(place, 4) for place in places)
+    places = [a for a, b in zip(places, [*places[1:], 99.0], strict=True) if b - a > 1e-4]
+    product = "*".join(f"(t - {place})**{power if k == 0 else 1}" for k, place in enumerate(places))
+    expected = places[power % 2 == 0 :]
+    times = found(f"{function}(sin(t)*0 + {product})")
+    assert len(times) == len(expected)
+    # Rounding of a product moves a threefold root by the cube root of it.
+    np.testing.assert_allclose(times, expected, atol=1e-3 if power == 3 else 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "times"),
+    [
+        ("abs(-(t - 3))", [3]), ("step(-(t - 5))", [5]), ("sign(-(-(t - 2)))", [2]),
+        ("abs(-(t**2 - 4))", [2]), ("abs((t - 5)**2)", []), ("abs((t - 5)**3)", [5]),
+        ("abs(sin(t) - sin(t))", []), ("sign(sign(t - 7) + 0.5)", [7]), ("abs(cos(t) - 1)", []),
+        ("max(t**2, 9)", [3]),
+        ("min(exp(-((t - 7.1)/1e-4)**2), 0.5)", 7.1 + 1e-4 * np.log(2) ** 0.5 * np.array([-1, 1])),
+        ("sign(sin(3.1415926535*t) + 1e9)", []), ("abs((t - 10)*(t + 1))", [10]),
+    ],
+)  # fmt: skip
+def test_selected_breakpoints(text, times):
+    np.testing.assert_allclose(found(text), times, rtol=1e-9)
+
+
+def test_falling_arguments_switch_the_right_way():
+    assert integrated("step(-(t - 5))") == pytest.approx(5.0, rel=1e-12)
+    assert integrated("abs(-(t - 3))", horizon=5.0) == pytest.approx(6.5, rel=1e-12)
+
+
+def test_more_switching_than_can_be_followed_is_refused():
+    with pytest.raises(ConfigError, match="more changes of sign than can be followed, near t = "):
+        found("sign(sin(1e5*t))")
+
+
+@given(st.floats(0.01, 0.99), st.sampled_from([1e-2, 1e-3, 3e-4, 1e-5]))
+@settings(max_examples=40, deadline=None)
+def test_one_narrow_pulse_anywhere_is_integrated(place, width):
+    text = f"exp(-((t - {20 * place})/{width})**2)"
+    np.testing.assert_allclose(integrated(text), width * np.sqrt(np.pi), rtol=1e-8)
+
+
+@pytest.mark.parametrize(("w", "power"), [("25*pi", 2000), ("2.5*pi", 20000)])
+def test_many_narrow_pulses_are_integrated(w, power):
+    mean = np.exp(gammaln((power + 1) / 2) - gammaln(power / 2 + 1)) / np.sqrt(np.pi)
+    np.testing.assert_allclose(integrated(f"cos({w}*t)**{power}"), 20 * mean, rtol=1e-7)
+
+
+def test_the_derivative_of_a_steep_step_is_integrated():
+    np.testing.assert_allclose(integrated("d(tanh(1e4*(t - 7.1234)))"), 2.0, rtol=1e-8)
+
+
+@given(st.floats(0.05, 0.95), st.sampled_from([1e-2, 1e-3, 3e-5]))
+@settings(max_examples=20, deadline=None)
+def test_a_coefficient_that_passes_zero_twice_in_no_time_is_refused(place, width):
+    with pytest.raises(GpeboError, match="changes at t = ") as caught:
+        integrated("1", f"1 - 2*exp(-((t - {20 * place})/{width})**2)")
+    said = float(str(caught.value).split(" t = ")[1].split()[0])
+    assert abs(abs(said - 20 * place) - width * np.sqrt(np.log(2))) < 1e-6
+
+
+def test_smooth_functions_cost_no_cells():
+    tape = record([parse(text, {}, "here") for text in ("sin(t)", "exp(-t)", "1/(2 - cos(2*t))")])
+    edges = np.linspace(0, 20, 25)
+    np.testing.assert_array_equal(resolved(Bounds(tape), edges), edges)
