@@ -195,6 +195,8 @@ WRONG = [
     (["run", "--multrun"], "did you mean --multirun?"),
     (["run", "--multirun=3"], "--multirun takes no value"),
     (["run", "--cfg", "jb"], "--cfg needs one of job, hydra, all, got 'jb'"),
+    (["run", "--resolve"], "--resolve is for what --cfg prints; add --cfg job"),
+    (["run", "--cfg", "job", "-m"], "only one of --multirun, --cfg at a time"),
     (["run", "--config-dir"], "--config-dir needs a value"),
     (["run", "--config-dir", "nowhere"], "--config-dir nowhere: there is no such folder"),
     (["run", "--config-name", "gpbo"], "did you mean gpebo?"),
@@ -289,6 +291,30 @@ def test_a_full_disk_behind_stdout_is_one_line(tmp_path):
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX streams")
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("words", ["", "-m launcher=joblib"])
+def test_closed_streams_are_no_reason_not_to_run(tmp_path, closed, words):
+    """As cron may start a program, and processes that it starts."""
+    command = f"{sys.executable} -m gpebo_cli run {words} observer=none time.samples=3 figures=none"
+    done = subprocess.run(
+        ["sh", "-c", f"exec {command} {closed}"], cwd=tmp_path, env=environment(),
+        capture_output=True, text=True, check=False, timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(list(tmp_path.glob("outputs/*/**/summary.json"))) == 1
+
+
+@pytest.mark.parametrize("words", [["--info", "all"], ["--cfg", "all"]])
+def test_a_reader_that_has_seen_enough_of_hydra_is_no_news(tmp_path, words):
+    command = f"{sys.executable} -m gpebo_cli run {' '.join(words)} | head -1"
+    done = subprocess.run(
+        ["sh", "-c", command], cwd=tmp_path, env=environment(), capture_output=True,
+        text=True, check=False, timeout=60,
+    )
+    assert (done.stderr, done.stdout.count("\n")) == ("", 1)
 
 
 def test_a_reader_that_stops_reading_is_no_error(tmp_path):

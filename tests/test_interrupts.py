@@ -21,7 +21,7 @@ def test_what_a_finaliser_drops_is_raised_at_the_next_stage(capsys):
     reached = []
 
     def run():
-        with interrupts.remembered():
+        with interrupts.Remembered():
             Finaliser()
             reached.append("after the signal")  # Python went on
             interrupts.check()
@@ -34,13 +34,13 @@ def test_what_a_finaliser_drops_is_raised_at_the_next_stage(capsys):
 
 
 def test_what_is_dropped_in_the_last_stage_is_raised_at_the_end():
-    with pytest.raises(KeyboardInterrupt), interrupts.remembered():
+    with pytest.raises(KeyboardInterrupt), interrupts.Remembered():
         Finaliser()
 
 
 def test_without_a_signal_nothing_happens_and_all_is_as_before():
     handler, hook = signal.getsignal(signal.SIGINT), sys.unraisablehook
-    with interrupts.remembered():
+    with interrupts.Remembered():
         interrupts.check()
         assert signal.getsignal(signal.SIGINT) is not handler
     assert signal.getsignal(signal.SIGINT) is handler

@@ -6,13 +6,14 @@ import importlib.util
 import os
 import signal
 import subprocess
+import threading
 import time
 from pathlib import Path
 
 import pytest
 from test_sweep import FAST, begin, gpebo, rows, wait_for, without_seconds
 
-from gpebo_cli.cli.workers import Watch
+from gpebo_cli.cli.workers import apart
 
 WORDS = ["run", "-m", "estimator.gamma=1e6,-1,1e8", *FAST]
 
@@ -118,24 +119,41 @@ def test_a_worker_that_dies_leaves_a_sweep_that_can_be_resumed(tmp_path):
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 def test_a_dead_child_that_nobody_collects_is_noticed():
     """What joblib leaves of a worker that died while it was sending a result."""
-    reasons = []
-    with Watch(reasons.append, patience=0.2):
-        child = subprocess.Popen(["true"])
-        deadline = time.monotonic() + 10
-        while not reasons and time.monotonic() < deadline:
-            time.sleep(0.05)
-    child.wait()
-    assert reasons == ["a worker died while it was sending a result"]
+    ended, started = threading.Event(), []
+
+    def launch():
+        started.append(subprocess.Popen(["true"]))
+        ended.wait(20)
+
+    with pytest.raises(ChildProcessError, match="died while it was sending"):
+        apart(launch, patience=0.2)
+    ended.set()
+    started[0].wait()
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 def test_a_child_that_is_collected_is_not():
-    reasons = []
-    with Watch(reasons.append, patience=0.2):
+    def launch():
         for _ in range(5):
             subprocess.run(["true"], check=True)
             time.sleep(0.1)
-    assert reasons == []
+        return "done"
+
+    assert apart(launch, patience=0.2) == "done"
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_their_parent(tmp_path, how):
+    if reason := why_not("joblib"):
+        pytest.skip(reason)
+    words = ["run", "-m", "time.horizon=range(2000,2100)", *FAST, "hydra/launcher=joblib"]
+    with begin(*words, "hydra.launcher.n_jobs=2", "hydra.sweep.dir=s", cwd=tmp_path) as process:
+        assert len(workers(process.pid)) > 0
+        process.send_signal(how)
+        # Workers and trackers hold these pipes: the end of both is the end of all of them.
+        process.communicate(timeout=8)
+    assert process.returncode == -how
 
 
 def workers(parent):

@@ -23,32 +23,54 @@ COMMANDS = {
 }
 """Commands, and the modules of ``gpebo_cli.cli`` whose ``main`` they are."""
 
-_AT_ONCE = ("list", "new", "completion")  # over before anybody can press Ctrl-C
+
+def entry() -> None:
+    """The process ``gpebo``: :func:`main`, and a Ctrl-C that comes when all is done is too late."""
+    try:
+        code = main()
+        import signal
+
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except KeyboardInterrupt:
+        code = _interrupted()
+    sys.exit(code)
 
 
 def main() -> int:
     """Run the command line in ``sys.argv``; the exit code: 0, 1, 2 or 130."""
     traceback_wanted = os.environ.get("HYDRA_FULL_ERROR") == "1"  # before a command sets it
-    sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    _open_streams()
     try:
-        code = _dispatch(sys.argv[1:])
-        sys.stdout.flush()
+        from gpebo_cli.cli import interrupts
+
+        with interrupts.Remembered():
+            code = _dispatch(sys.argv[1:])
+            sys.stdout.flush()
     except BrokenPipeError:  # the reader, `head` for instance, has seen enough
         _drop_stdout()
         return 0
     except KeyboardInterrupt:
-        _report("interrupted", 130)
-        return _leave(130)
+        return _interrupted()
     except Exception as error:  # noqa: BLE001  whatever it is, its user sees one line
         return _failed(error, traceback_wanted=traceback_wanted)
     return code
 
 
+def _open_streams() -> None:
+    """Streams that whoever started this has closed lead nowhere, as cron's may."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)  # no file is to get its number,
+            os.set_inheritable(number, True)  # nor one of a process that is started here
+            mode = "w" if number else "r"
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
+    sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+
+
 def _failed(error: Exception, *, traceback_wanted: bool) -> int:
     """Report an error as its user should see it; the exit code."""
     if _was_interrupted(error):
-        _report("interrupted", 130)
-        return _leave(130)
+        return _interrupted()
     if traceback_wanted:
         _print_traceback()
     if isinstance(error, GpeboError):
@@ -88,12 +110,7 @@ def _dispatch(words: list[str]) -> int:
     if command in COMMANDS:
         from importlib import import_module
 
-        if command in _AT_ONCE:
-            return int(import_module(f"gpebo_cli.cli.{COMMANDS[command]}").main(rest))
-        from gpebo_cli.cli import interrupts
-
-        with interrupts.remembered():
-            return int(import_module(f"gpebo_cli.cli.{COMMANDS[command]}").main(rest))
+        return int(import_module(f"gpebo_cli.cli.{COMMANDS[command]}").main(rest))
     if command == "__complete":  # asked by the scripts that `gpebo completion` prints
         from gpebo_cli.cli import completion
 
@@ -116,18 +133,24 @@ def _report(message: str, code: int) -> int:
     return code
 
 
-def _leave(code: int) -> int:
-    """End the process with ``code`` now.
+def _interrupted() -> int:
+    """Say so, and end the process now.
 
     If SIGINT arrived inside an ``exec``, as dataclasses use it, CPython remembers that and ends the
     process by the signal whatever is returned here.
     """
     import atexit
+    import signal
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # once is enough
+    _report("interrupted", 130)
     atexit._run_exitfuncs()  # noqa: SLF001  there is no public way to run them early
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:  # nobody reads any more
+            continue
+    os._exit(130)
 
 
 def _drop_stdout() -> None:

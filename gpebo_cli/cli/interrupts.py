@@ -9,33 +9,32 @@ from __future__ import annotations
 
 import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType
 
-_received = threading.Event()
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # every command waits for what is imported here
+    from types import FrameType
 
 
-@contextmanager
-def remembered() -> Iterator[None]:
-    """Remember SIGINT while a command runs, and raise at its end what was lost until then.
+class Remembered:
+    """While it is entered, SIGINT is remembered; at its end what was lost until then is raised."""
 
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed.
-    """
-    if threading.current_thread() is not threading.main_thread():  # only it may have handlers
-        yield
-        return
-    _received.clear()
-    handler, hook = signal.signal(signal.SIGINT, _remember), sys.unraisablehook
-    sys.unraisablehook = _report_dropped
-    try:
-        yield
-        check()
-    finally:
-        signal.signal(signal.SIGINT, handler)
-        sys.unraisablehook = hook
+    received = False  # of the process: there is one Ctrl-C
+
+    def __enter__(self) -> None:
+        Remembered.received = False
+        self._hook = sys.unraisablehook
+        try:
+            self._handler = signal.signal(signal.SIGINT, _remember)
+        except ValueError:  # not the main thread, which alone may have handlers
+            return
+        sys.unraisablehook = _report_dropped
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        sys.unraisablehook = self._hook
+        if hasattr(self, "_handler"):
+            signal.signal(signal.SIGINT, self._handler)
+            if kind is None:
+                check()
 
 
 def check() -> None:
@@ -44,12 +43,12 @@ def check() -> None:
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed.
     """
-    if _received.is_set():
+    if Remembered.received:
         raise KeyboardInterrupt
 
 
 def _remember(_number: int, _frame: FrameType | None) -> None:
-    _received.set()
+    Remembered.received = True
     raise KeyboardInterrupt
 
 

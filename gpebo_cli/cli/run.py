@@ -49,7 +49,7 @@ def main(words: list[str]) -> int:
         sweeper = Plugins.instance().instantiate_sweeper(
             config=config,
             hydra_context=HydraContext(hydra.config_loader, Callbacks()),
-            task_function=partial(run_sweep_job, arguments=arguments),
+            task_function=partial(run_sweep_job, arguments=arguments, starter=os.getpid()),
         )
         sweeper.sweep(list(config.hydra.overrides.task))
     return 0

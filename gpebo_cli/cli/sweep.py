@@ -8,18 +8,17 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobStatus
 from omegaconf import DictConfig, OmegaConf
 
-from gpebo_cli.cli import interrupts
+from gpebo_cli.cli import interrupts, workers
 from gpebo_cli.cli.arguments import Arguments, quoted
 from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS
 from gpebo_cli.cli.job import read_job, run_job
@@ -36,7 +35,6 @@ from gpebo_cli.cli.sweep_folder import (
     write_table,
 )
 from gpebo_cli.cli.sweep_progress import Bar
-from gpebo_cli.cli.workers import Watch, end_children
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results.files import make_folder, write_text
@@ -62,11 +60,17 @@ class Orders:
     max_batch_size: int | None
 
 
-def run_sweep_job(cfg: DictConfig, arguments: Arguments) -> None:
+def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
     """Run one job and record what became of it, in whatever process this is.
 
     A job that fails is recorded and the next one runs; Hydra itself would stop at the first.
+
+    Args:
+        cfg: the job's configuration, without Hydra's section.
+        arguments: the command line, for where files came from.
+        starter: the process of the sweep; if it is killed, this one ends, too.
     """
+    workers.follow(starter)
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
     stop = folder.parent / STOP
@@ -137,7 +141,7 @@ def run_sweep(
     trouble = ""
     finished = False
     try:
-        with Bar(folder, plan, waiting), _watch(launcher, folder, plan):
+        with Bar(folder, plan, waiting):
             trouble = _launch(jobs, waiting, folder, orders, launcher, errors)
         finished = True
     finally:  # also when it is interrupted: what is done is in the table
@@ -148,32 +152,6 @@ def run_sweep(
         write_table(folder, records)
         _print_table(records, folder, rows=finished)
     _raise_failures(records, folder, trouble, stopped=(folder / STOP).exists())
-
-
-def _watch(launcher: Launcher, folder: Path, plan: Plan) -> AbstractContextManager[object]:
-    """For joblib, whose workers are children of this process; others notice for themselves."""
-    if type(launcher).__name__ != "JoblibLauncher":
-        return nullcontext()
-    return Watch(partial(_abandon, folder, plan))
-
-
-def _abandon(folder: Path, plan: Plan, reason: str) -> None:
-    """End the process of a sweep whose launcher is stuck, with what is done in the table."""
-    end_children()
-    records = [
-        replace(r, error="no result") if r.status == "missing" else r
-        for r in read_records(folder, plan)
-    ]
-    write_table(folder, records)
-    _print_table(records, folder, rows=True)
-    sys.stdout.flush()
-    missing = sum(r.status == "missing" for r in records)
-    sys.stderr.write(
-        f"gpebo: error: the launcher gave up: {reason}; {missing} jobs have no result; go on with "
-        f"resume={os.path.relpath(folder)}\n"
-    )
-    sys.stderr.flush()
-    os._exit(1)
 
 
 def _launch(
@@ -195,11 +173,16 @@ def _launch(
     size = 1 if one_by_one else orders.max_batch_size or max(len(waiting), 1)
     where = f"hydra.sweep.dir={quoted(str(folder))}"
     _quiet_ray()
+    forks = type(launcher).__name__ == "JoblibLauncher"
+    if forks:
+        how = {"initializer": workers.follow_or_end, "initargs": (os.getpid(),)}
+        cast("Any", launcher).joblib |= how  # arguments of joblib.Parallel
     for first in range(0, len(waiting), size):
         numbers = waiting[first : first + size]
         batch = [[*jobs[n], where, f"hydra.sweep.subdir='{n}'"] for n in numbers]
         try:
-            returned = launcher.launch(batch, initial_job_idx=numbers[0])
+            launch = partial(launcher.launch, batch, initial_job_idx=numbers[0])
+            returned = workers.apart(launch) if forks else launch()
         except (*LIBRARY_ERRORS, GpeboError):
             raise
         except Exception as error:  # noqa: BLE001  a worker died, a cluster is out of reach

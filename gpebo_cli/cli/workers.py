@@ -1,66 +1,119 @@
-"""Workers that died without their launcher noticing.
+"""Processes that a launcher starts here: they end with this one, and none is missed when it dies.
 
-joblib notices a dead worker, unless it died in the middle of sending a result: then it waits for
-the rest of the message for ever, and does not even collect its dead child. A child that nobody
-collects for several seconds is that case. The sweep must end with its table all the same.
+joblib's workers outlive a parent that is killed, and are told of Ctrl-C beside it. And joblib
+notices a dead worker, unless it died in the middle of sending a result: then it waits for the rest
+of the message for ever, and does not even collect its dead child. So joblib runs on a thread of its
+own, and the main thread looks after both.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import warnings
 from collections.abc import Callable
 from pathlib import Path
-from threading import Event, Thread
-from time import monotonic
-from typing import Self
+from threading import Thread
+from time import monotonic, sleep
+from typing import TypeVar
+
+T = TypeVar("T")
 
 _PATIENCE = 8.0  # seconds; a launcher that is alive collects dead children at once
-_INTERVAL = 1.0
+_INTERVAL = 0.5
+_FAREWELL = 5.0  # seconds that a launcher has to notice that its workers are gone
 
 
-class Watch:
-    """While it is entered, calls ``give_up`` if a child has been dead and uncollected for long.
+def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
+    """What ``launch`` returns, or raises; its processes do not hear Ctrl-C, only this thread does.
 
-    ``give_up`` is called on a thread, with the reason; the main thread is stuck and cannot be
-    interrupted, so it should leave what is to be left and end the process. Where there is no
-    ``/proc``, nothing is watched.
+    Raises:
+        ChildProcessError: a child has been dead and uncollected for longer than ``patience``.
+        KeyboardInterrupt: Ctrl-C was pressed; the processes have been ended.
     """
+    returned: list[T] = []
+    raised: list[BaseException] = []
 
-    def __init__(self, give_up: Callable[[str], None], patience: float = _PATIENCE) -> None:
-        self._give_up = give_up
-        self._patience = patience
-        self._done = Event()
-        self._thread = Thread(target=self._look, daemon=True)
+    def run() -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children inherit it
+        try:
+            returned.append(launch())
+        except BaseException as error:  # noqa: BLE001  raised again below
+            raised.append(error)
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
+    thread = Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        _wait(thread, patience)
+    except BaseException:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the launcher's, about what is done here
+            end_children()
+            thread.join(_FAREWELL)
+        raise
+    if raised:
+        raise raised[0]
+    return returned[0]
 
-    def __exit__(self, *_: object) -> None:
-        self._done.set()
 
-    def _look(self) -> None:
-        since: dict[int, float] = {}
-        while not self._done.wait(min(_INTERVAL, self._patience / 2)):
-            now = monotonic()
-            since = {pid: since.get(pid, now) for pid in children("Z")}
-            if any(now - first >= self._patience for first in since.values()):
-                self._give_up("a worker died while it was sending a result")
-                return
+def _wait(thread: Thread, patience: float) -> None:
+    since: dict[int, float] = {}
+    while thread.is_alive():
+        thread.join(min(_INTERVAL, patience / 2))
+        now = monotonic()
+        since = {pid: since.get(pid, now) for pid in children("Z")}
+        if any(now - first >= patience for first in since.values()):
+            raise ChildProcessError("a worker died while it was sending a result")
+
+
+def follow(starter: int) -> None:
+    """End this process as soon as ``starter``, which it descends from, has ended."""
+    if starter != os.getpid() and starter in ancestors():
+        Thread(target=_follow, args=(starter,), daemon=True).start()
+
+
+def follow_or_end(starter: int) -> None:
+    """Follow ``starter``, unless it has ended already: then end."""
+    if starter not in ancestors():
+        os._exit(1)
+    follow(starter)
+
+
+def _follow(starter: int) -> None:
+    while starter in ancestors():
+        sleep(_INTERVAL)
+    os._exit(1)
+
+
+def ancestors() -> list[int]:
+    """Parent of this process, its parent, and so on; where there is no ``/proc``, the first."""
+    found = [os.getppid()]
+    try:
+        while found[-1] > 1:
+            found.append(_status(found[-1])[1])
+    except (OSError, ValueError):
+        pass
+    return found
 
 
 def children(states: str) -> list[int]:
     """Processes that this one has started and that are in one of the states, as in ``/proc``."""
     found = []
-    for entry in Path("/proc").glob("[0-9]*/stat"):
+    for entry in Path("/proc").glob("[0-9]*"):
         try:
-            state, parent = entry.read_text().rpartition(")")[2].split()[:2]
+            state, parent = _status(int(entry.name))
         except (OSError, ValueError):  # gone in between
             continue
-        if int(parent) == os.getpid() and state in states:
-            found.append(int(entry.parent.name))
+        if parent == os.getpid() and state in states:
+            found.append(int(entry.name))
     return found
+
+
+def _status(pid: int) -> tuple[str, int]:
+    """State and parent of a process."""
+    text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+    state, parent = text.rpartition(")")[2].split()[:2]
+    return state, int(parent)
 
 
 def end_children() -> None:
