@@ -263,7 +263,7 @@ def test_check_is_the_commands():
 
 
 WRONG = [
-    ({"gama": 1}, "run: no such keyword gama; estimator drem has gamma, lambda, initial; did you"),
+    ({"gama": 1}, "run: no such keyword gama; estimator drem has initial, gamma, lambda; did you"),
     ({"gama": 1}, "did you mean gamma?"),
     ({"horizon": 3}, 'did you mean time={"horizon": …}?'),
     ({"estimtor": "drem"}, "did you mean estimator?"),

@@ -10,13 +10,15 @@ from scipy.integrate import solve_ivp
 
 from gpebo_cli import ConfigError, estimators
 from gpebo_cli.regression.text import regression_from_mapping, signals_of_time
+from gpebo_cli.settings import SolverSettings, TimeSettings
 
 T = np.linspace(0.0, 10.0, 201)
 
 
 def on_mesh(mapping, tol=1e-12):
     model = regression_from_mapping({"name": "r", **mapping})
-    signals = signals_of_time(model.system, 0.0, 10.0, 14, tol, 100_000)
+    solver = SolverSettings(tol=tol)
+    signals = signals_of_time(model.system, TimeSettings(horizon=10.0), solver)
     regression, error = model.on(signals, None, tol, 100_000)
     assert error <= 1e-10
     return regression

@@ -18,7 +18,7 @@ from gpebo_cli.experiment import assumptions
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.regression.text import system_from_mapping
 from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
 
@@ -37,6 +37,7 @@ _CHOSEN = tuple(group for group in DATA_GROUPS if group != "plant")
 def run(
     plant: Plant | None = None,
     *,
+    regression: Plant | None = None,
     estimator: EstimatorChoice | None = None,
     observer: Choice | None = None,
     solver: Choice | None = None,
@@ -56,6 +57,8 @@ def run(
     Args:
         plant: a name (``gpebo list plants``), the path of a YAML file, the content of one, or a
             system from :func:`system_from_functions` or :func:`load_plant`.
+        regression: Y = ψη in place of a plant and an observer: a name, the path of a YAML file, or
+            the content of one (docs/howto/regression.md).
         estimator: a name, a mapping with ``name`` and its settings, or an object of your own
             with ``cases`` and ``estimate`` (see :class:`gpebo_cli.estimators.Estimator`).
         observer: a name, or a mapping; ``"none"`` simulates only.
@@ -85,6 +88,10 @@ def run(
         >>> bool(abs(result.errors["il"][1, -1]) < 1e-6)
         True
     """
+    if regression is not None:
+        if plant is not None or observer is not None:
+            raise ConfigError("run: a regression stands in place of a plant and an observer")
+        plant, observer = _regression(regression, config_dir), "regression"
     own = None if estimator is None or isinstance(estimator, str | Mapping) else _own(estimator)
     sections: dict[str, object] = {
         "observer": observer, "estimator": None if own else estimator, "solver": solver,
@@ -142,6 +149,13 @@ def check(
     return assumptions.check(settings, system)
 
 
+def _regression(given: Plant, config_dir: Folder | None) -> Plant:
+    """The content of a regression's file."""
+    if isinstance(given, DescriptorSystem):
+        raise ConfigError("run: regression takes a name, a path or a mapping")
+    return choose("regression", given, config_dir)[0]
+
+
 def load_plant(plant: Plant, config_dir: Folder | None = None) -> DescriptorSystem:
     """A plant by name, from the path of a YAML file, or from the content of one.
 
@@ -156,7 +170,7 @@ def load_plant(plant: Plant, config_dir: Folder | None = None) -> DescriptorSyst
     if isinstance(plant, DescriptorSystem):
         return plant
     content, source = choose("plant", plant, config_dir)
-    return plant_from_mapping(content, source)
+    return system_from_mapping(content, source)
 
 
 def available(group: str, config_dir: Folder | None = None) -> list[str]:
@@ -198,7 +212,7 @@ def _configure(
         config["plant"], system = {}, plant
     else:
         content, source = choose("plant", plant, config_dir)
-        config["plant"], system = plain(content), plant_from_mapping(content, source)
+        config["plant"], system = plain(content), system_from_mapping(content, source)
     for name in _CHOSEN:
         config[name], _ = choose(name, sections[name], config_dir)
     _check_gains(gains, config["estimator"])

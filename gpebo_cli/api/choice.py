@@ -17,6 +17,8 @@ from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.schema import nearest, shown
 
+_WHOLE = ("plant", "regression")  # a mapping or a file of these is all of it
+
 
 def primary() -> dict[str, Any]:
     """The primary configuration, ``conf/gpebo.yaml``."""
@@ -44,7 +46,7 @@ def choose(
     Raises:
         ConfigError: nothing has that name, or the file is wrong.
     """
-    if group == "plant" and isinstance(given, Mapping):
+    if group in _WHOLE and isinstance(given, Mapping):
         return dict(given), ""
     if isinstance(given, Mapping):
         name = given.get("name", default(group))
@@ -52,13 +54,13 @@ def choose(
         return {**base, **plain(given), "name": base.get("name", name)}, source
     if given is None:
         given = default(group)
-    if group == "plant" and (path := _as_path(given)) is not None:
+    if group in _WHOLE and (path := _as_path(given)) is not None:
         path = os.path.expanduser(path)
         if not os.path.exists(path):
             raise ConfigError(f"{path}: there is no such file")
         return files.load_path(path, group), _shortest(path)
     if not isinstance(given, str):
-        wanted = "a name, a path, a mapping or a DescriptorSystem" if group == "plant" else (
+        wanted = "a name, a path, a mapping or a DescriptorSystem" if group in _WHOLE else (
             "a name or a mapping"
         )
         raise ConfigError(f"{group}: expected {wanted}, got {shown(given)}")

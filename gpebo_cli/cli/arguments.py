@@ -153,7 +153,7 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
     multirun = "--multirun" in switches
     _check_questions(switches, values)
     return Arguments(
-        tuple(_override(word, multirun=multirun) for word in overrides),
+        _with_regression([_override(word, multirun=multirun) for word in overrides]),
         frozenset(switches),
         config_dir,
         config_name,
@@ -180,6 +180,20 @@ def _with_data(overrides: list[str], config_name: str) -> list[str]:
     chosen = any(word.startswith("data=") for word in overrides)
     missing = given and not chosen and config_name == PRIMARY
     return ["data=csv", *overrides] if missing else overrides
+
+
+def _with_regression(overrides: list[str]) -> tuple[str, ...]:
+    """``regression=NAME`` stands in place of a plant and of an observer.
+
+    Raises:
+        ConfigError: one of them is chosen, too.
+    """
+    if not any(re.match(r"regression=(?!null$)", word) for word in overrides):
+        return tuple(overrides)
+    for word in overrides:
+        if re.match(r"(plant|observer)=", word):
+            raise ConfigError(f"{word}: regression=NAME stands in place of a plant and an observer")
+    return ("~plant", "observer=regression", *overrides)
 
 
 def quoted(text: str) -> str:

@@ -185,8 +185,8 @@ def _run_job(cfg: DictConfig) -> RunResult:
     from gpebo_cli.cli import composition
     from gpebo_cli.cli.progress import Progress
     from gpebo_cli.experiment.pipeline import run_experiment
-    from gpebo_cli.model.plant import plant_from_mapping
+    from gpebo_cli.regression.text import system_from_mapping
 
     settings = configuration.settings(composition.plain(cfg), draw=False)
     with Progress() as progress:
-        return run_experiment(settings, plant_from_mapping(settings.plant), progress)
+        return run_experiment(settings, system_from_mapping(settings.plant), progress)

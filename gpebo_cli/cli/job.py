@@ -45,10 +45,10 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     settings = configuration.settings(config, draw=draw)
 
     from gpebo_cli.estimators import build
-    from gpebo_cli.model.plant import plant_from_mapping
+    from gpebo_cli.regression.text import system_from_mapping
 
     build(settings.estimator)  # used or not: its name becomes part of a folder's
-    system = plant_from_mapping(settings.plant, _plant_file(arguments))
+    system = system_from_mapping(settings.plant, _plant_file(arguments))
     return Job(settings, system, configuration.complete(config, settings))
 
 

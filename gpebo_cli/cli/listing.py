@@ -11,6 +11,7 @@ from gpebo_cli.errors import ConfigError
 
 KINDS = {
     "plants": "plant",
+    "regressions": "regression",
     "observers": "observer",
     "estimators": "estimator",
     "noise": "noise",

@@ -205,7 +205,10 @@ def _quiet_ray() -> None:
 def _overrides(job: Sequence[str]) -> dict[str, str]:
     """What a job is; where it runs is no part of it, so a sweep may be gone on with elsewhere."""
     pairs = (text.partition("=") for text in job)
-    return {key.lstrip("+"): value for key, _, value in pairs if key != "launcher"}
+    return {
+        key.lstrip("+"): value for key, _, value in pairs
+        if key != "launcher" and not key.startswith("~")
+    }
 
 
 def _digest(config: DictConfig) -> str:

@@ -14,7 +14,7 @@ commands:
   check [OVERRIDES]   every assumption of the plant and the observer, with its evidence
   compare DIR …       one table and figures over finished runs and sweeps
   figures [NAME …]    the paper's figures and tables, in outputs/paper
-  list [KIND]         what there is: plants, observers, estimators, experiments
+  list [KIND]         what there is: plants, regressions, observers, estimators, …
   new KIND NAME       a plant or an estimator of your own, commented, which works as it stands
   completion SHELL    completion of commands, groups and names for bash, zsh or fish
 

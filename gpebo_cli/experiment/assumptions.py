@@ -17,8 +17,9 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.observers import Measurements, Observer, build
 from gpebo_cli.recordings.load import load
+from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
-from gpebo_cli.simulation.simulate import Simulation, simulate
+from gpebo_cli.simulation.simulate import Simulation
 
 _GROWTH = 1e6  # of Φ: above it, the state loses six digits of what the parameters know
 
@@ -35,7 +36,7 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
         return () if observer is None else tuple(_of_observer(observer, settings, system, seen))
     found: list[Assumption] = []
     try:
-        simulation = simulate(system, settings.time, settings.solver)
+        simulation = simulation_of(system, settings.time, settings.solver)
     except ModelError as error:
         return (Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),)
     found += of_simulation(system, simulation)
@@ -78,6 +79,8 @@ _SOLVABILITY = "uniquely solvable, with constant characteristic values (μ, d, a
 
 def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assumption]:
     """Solvability, the consistent start, and for constant systems regularity and D2."""
+    if not system.n:
+        return []
     s = simulation.structure
     moved = float(np.abs(simulation.initial_state - system.initial_state).max(initial=0.0))
     found = [

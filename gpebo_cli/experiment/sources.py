@@ -17,8 +17,9 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.recordings.load import Recording, load
+from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
-from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
+from gpebo_cli.simulation.simulate import Signals, Simulation
 
 _MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
 _ROUNDING = 1e-12  # by which a sample may miss the end of the horizon
@@ -51,7 +52,7 @@ def simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels)
         SolverError: a tolerance cannot be reached.
     """
     t = _grid(settings, settings.time.start, settings.time.start + settings.time.horizon)
-    simulation = simulate(system, settings.time, settings.solver)
+    simulation = simulation_of(system, settings.time, settings.solver)
     measured = measure(simulation.signals, settings.noise, levels)
     simulated = _sample_simulation(system, simulation, t)
     if not levels.silent:

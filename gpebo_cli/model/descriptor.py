@@ -121,6 +121,8 @@ class DescriptorSystem:
     units: dict[str, str] = field(default_factory=dict)  # by state, input, output or unknown
     labels: dict[str, str] = field(default_factory=dict)  # mathtext, by those and by parameters
     observer_defaults: dict[str, object] = field(default_factory=dict)
+    # Y = ψθ in place of equations: a ``regression.text.TextRegression`` of the inputs; no states
+    regression: object = None
 
     @property
     def depends_on_outputs(self) -> bool:

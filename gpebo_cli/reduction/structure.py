@@ -83,6 +83,16 @@ class Structure:
         return max(0.0, float(_largest_real_parts(self.dynamics).max()))
 
 
+def without_equations() -> Structure:
+    """That of a system without states: there is nothing to reduce."""
+    none, ones = np.zeros(0, dtype=np.intp), np.ones(0)
+    return Structure(
+        mu=0, a=0, d=0, scaling=Scaling(ones, ones, 1.0, ones), rank_tol=0.0,
+        smallest_singular_value=np.inf, time_invariant=True,
+        reference=Pivots(0, none, none, np.zeros((0, 0))), steady=True, dynamics=None,
+    )
+
+
 def _largest_real_parts(matrices: Array) -> Array:
     """Largest real parts (N,) of the eigenvalues of matrices (N, d, d), d > 0."""
     if matrices.shape[1] == 1:

@@ -14,7 +14,7 @@ elements end where a delayed signal jumps or has a kink.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,8 +27,11 @@ from gpebo_cli.model.plant import plant_from_mapping, read_parameters
 from gpebo_cli.numerics.collocation import wanted_parts
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved_kinds
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.reduction.structure import without_equations
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.schema import nearest, shown
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
 
 KEYS = (
     "name", "title", "reference", "parameters", "unknowns", "signals", "Y", "psi", "units",
@@ -293,6 +296,22 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
     return TextRegression(system, tuple(operators.found.values()), record(psi), Y)
 
 
+def system_from_mapping(mapping: Mapping[str, object], source: str = "") -> DescriptorSystem:
+    """The plant, or the regression in place of one, that a file describes.
+
+    Args:
+        mapping: of a plant file, or with ``psi`` of a regression file.
+        source: the file, for messages.
+
+    Raises:
+        ConfigError: whatever is wrong in it.
+    """
+    if "psi" not in mapping:
+        return plant_from_mapping(mapping, source)
+    regression = regression_from_mapping(mapping, source)
+    return replace(regression.system, regression=regression)
+
+
 def _list(mapping: Mapping[str, object], key: str, where: str) -> Sequence[object]:
     value = mapping.get(key)
     if not isinstance(value, Sequence) or isinstance(value, str) or not value:
@@ -300,8 +319,37 @@ def _list(mapping: Mapping[str, object], key: str, where: str) -> Sequence[objec
     return value
 
 
+def simulation_of(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
+) -> Simulation:
+    """The plant's solution; of a regression its signals, with Y = ψθ where the text has none.
+
+    Raises:
+        ConfigError: a signal without a finite value; names it and the time.
+        ModelError: the plant cannot be simulated.
+        SolverError: the tolerance cannot be reached.
+    """
+    given = system.regression
+    if not isinstance(given, TextRegression):
+        return simulate(system, time, solver)
+    signals = signals_of_time(system, time, solver)
+    mesh, outputs = signals.mesh, np.zeros((*signals.mesh.points.shape, 0))
+    if given.Y is None:
+        zero = Trajectory(mesh, np.zeros((*mesh.points.shape, given.rows)))
+        regression, _ = given.on(signals, zero, solver.tol, solver.max_elements)
+        mesh, outputs = regression.mesh, regression.psi.values @ system.theta
+        signals = Trajectory(mesh, signals(mesh.points.ravel(), mesh.inside.ravel()).reshape(
+            *mesh.points.shape, system.m
+        ))
+    states = Trajectory(mesh, np.zeros((*mesh.points.shape, 0)))
+    return Simulation(
+        Signals(signals, Trajectory(mesh, outputs), states), without_equations(), np.zeros(0), (),
+        solver.tol, bounded=False,
+    )
+
+
 def signals_of_time(
-    system: DescriptorSystem, start: float, stop: float, stages: int, tol: float, max_elements: int
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> Trajectory:
     """The signals that a regression's text gives as functions of time, resolved on a mesh.
 
@@ -309,8 +357,9 @@ def signals_of_time(
         ConfigError: a signal without a finite value; names it and the time.
         SolverError: the tolerance cannot be reached.
     """
+    start, stop = time.start, time.start + time.horizon
     cuts = system.coefficients.breakpoints(start, stop)
-    mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(stages))
+    mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
 
     def evaluated(mesh: Mesh) -> tuple[Array, Array, list[tuple[Array, float]]]:
         u = system.coefficients.taylor(mesh.points.ravel(), 0, mesh.inside.ravel()).u[0]
@@ -319,6 +368,6 @@ def signals_of_time(
         return values, values, kinds or [(np.zeros((*mesh.points.shape, 1)), 0.0)]
 
     mesh, (values, _, _), _ = resolved(
-        evaluated, mesh, tol, max_elements, f"regression {system.name}"
+        evaluated, mesh, solver.tol, solver.max_elements, f"regression {system.name}"
     )
     return Trajectory(mesh, values)
