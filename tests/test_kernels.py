@@ -115,7 +115,58 @@ def _filtered(rng, k=6, s=5):
     )
 
 
+def _model(rng, times=19, n=3, constant=False):
+    """E x' = A x of index 2: x1' = … , 0 = x1-like, in turned coordinates; and its scales."""
+    orders, count = 2, 1 if constant else times
+    E, A = 0.1 * rng.normal(size=(2, orders, count, n, n))
+    E[:, :, -1] = 0.0
+    E[:, :, :, -1] = 0.0
+    E[0, :, :-1, :-1] += np.eye(n - 1)
+    A[:, :, -1, -1] = 0.0
+    A[0, :, -1, 0], A[0, :, 0, -1] = 1.0, 1.0
+    return E, A, 2.0 ** rng.integers(-2, 3, size=n), 2.0 ** rng.integers(-2, 3, size=n), 0.5, orders
+
+
+def _start(rng, **options):
+    return (*_model(rng, **options), 0, 1e-10)
+
+
+def _levels(rng, constraints=-1, **options):
+    return (*_model(rng, **options), 1e-10, constraints)
+
+
+def _pivots(model):
+    from gpebo_cli.kernels.structure_numpy import reference
+
+    a, _, rows, columns, Z1 = reference(*model, 0, 1e-10)
+    return rows, columns, len(rows) - a, Z1
+
+
+def _bounds(rng, **options):
+    model = _model(rng, **options)
+    return *model, *_pivots(model)
+
+
+def _eliminated(rng, times=19, q=1, growth=3e2, **options):
+    model = _model(rng, times=times, **options)
+    orders, n = model[5], len(model[2])
+    inputs = (
+        rng.normal(size=(orders, 1, n, 2)), rng.normal(size=(orders, times, n, q)),
+        rng.normal(size=(orders, times, 2)), rng.normal(size=(orders, 1, q)),
+    )
+    return *model, *inputs, *_pivots(model), 4, growth, 1e-13
+
+
 CASES: list[tuple[str, str, Case]] = [
+    ("structure", "reference", _start),
+    ("structure", "reference", partial(_start, n=5)),
+    ("structure", "levels", _levels),
+    ("structure", "levels", partial(_levels, constraints=2, times=2)),
+    ("structure", "bounds", _bounds),
+    ("structure", "bounds", partial(_bounds, n=5, times=1)),
+    ("structure", "eliminated", _eliminated),
+    ("structure", "eliminated", partial(_eliminated, n=6, q=0)),
+    ("structure", "eliminated", partial(_eliminated, times=9, constant=True)),
     *(("elements", "element_maps", partial(_equation, **options)) for options in (
         {}, {"identity": True}, {"constrained": True}, {"constant": True},
         {"constant": True, "constrained": True}, {"constant": True, "identity": True},
@@ -171,7 +222,11 @@ def test_twins_agree(subject, name, case, seed):
     for one, other in zip(*both(subject, name, arguments), strict=True):
         expected, found = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
         assert expected.shape == found.shape
+        if name == "reference" and expected.ndim == 2:  # a basis: its span counts
+            expected, found = expected @ expected.T, found @ found.T
         size = np.abs(expected).max(axis=-1, keepdims=True, initial=0.0)
+        if name == "bounds":  # what elimination leaves is rounding
+            size = np.maximum(size, 1e-5)
         # Relative to a vector's largest component; where both are not finite they are the same.
         same = np.abs(found - expected) <= 1e-9 * size
         assert (same | (expected == found) | (np.isnan(expected) & np.isnan(found))).all()
@@ -222,6 +277,12 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("sample", _samples, 2, np.s_[:2]),
     ("low_pass", _filtered, 1, np.s_[:-1]),
     ("low_pass", _filtered, 3, np.s_[:-1]),
+    *(("bounds", _bounds, place, np.s_[:-1]) for place in (2, 3, 6, 7, 9)),
+    ("levels", _levels, 1, np.s_[:, :, :, :-1]),
+    ("levels", _levels, 0, np.s_[:1]),
+    ("reference", _start, 1, np.s_[:, :-1]),
+    *(("eliminated", _eliminated, place, np.s_[:, :-1]) for place in (1, 7, 8)),
+    *(("eliminated", _eliminated, place, np.s_[..., :-1]) for place in (6, 8, 9, 13)),
 ])  # fmt: skip
 def test_arrays_that_do_not_fit_each_other_are_refused(name, case, place, cut):
     """What would lead out of an array is never read."""
@@ -249,6 +310,21 @@ def both_kinds_answer(subject: str, name: str, *arguments: Any) -> tuple[Any, An
         for kind in ("numpy", "compiled")
     )
     return one(*arguments), other(*arguments)
+
+
+@needs_kernels
+def test_where_the_pivots_will_not_do_both_say_so():
+    arguments = _eliminated(np.random.default_rng(0), growth=1e-3)
+    assert both_kinds_answer("structure", "eliminated", *arguments) == (None, None)
+
+
+@needs_kernels
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e200])
+def test_numbers_too_large_for_squares_are_left_to_lapack(value):
+    arguments = list(_levels(np.random.default_rng(0), times=2))
+    arguments[1][0, 1, 0, 0] = value
+    compiled = import_module("gpebo_cli.kernels._compiled")
+    assert compiled.levels(*arguments) is None
 
 
 def test_kernels_are_there_where_they_were_asked_for():

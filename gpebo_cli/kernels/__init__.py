@@ -22,7 +22,7 @@ _COMPILED = _ASKED != "numpy" and find_spec(f"{__name__}._compiled") is not None
 if _ASKED == "compiled" and not _COMPILED:
     raise ImportError("GPEBO_KERNELS=compiled, but nothing was compiled when gpebo was installed")
 
-SUBJECTS = ("elements", "laws", "signals", "spectra")
+SUBJECTS = ("elements", "laws", "signals", "spectra", "structure")
 compiled: ModuleType | None = import_module(f"{__name__}._compiled") if _COMPILED else None
 
 
@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     from gpebo_cli.kernels import laws_numpy as laws
     from gpebo_cli.kernels import signals_numpy as signals
     from gpebo_cli.kernels import spectra_numpy as spectra
+    from gpebo_cli.kernels import structure_numpy as structure
 
-    __all__ = ["SUBJECTS", "elements", "kind", "laws", "signals", "spectra"]
+    __all__ = ["SUBJECTS", "elements", "kind", "laws", "signals", "spectra", "structure"]
 else:
     for _subject in SUBJECTS:
         globals()[_subject] = import_module(f"{__name__}.{_subject}_{kind()}")

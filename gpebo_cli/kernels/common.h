@@ -100,8 +100,6 @@ static inline void multiply(double *restrict C, const double *restrict A, const 
 
 /* An entry in the table of a file; each file is added to the module in module.c. */
 #define KERNEL(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, NULL}
-extern PyMethodDef linear_kernels[], jets_kernels[], intervals_kernels[], mesh_kernels[], structure_kernels[],
-    reduction_kernels[], collocation_kernels[], observer_kernels[], excitation_kernels[],
-    estimation_kernels[];
+extern PyMethodDef jets_kernels[], intervals_kernels[], observer_kernels[];
 
 #endif

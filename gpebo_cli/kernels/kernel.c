@@ -144,8 +144,11 @@ static int define(Call *call, const char *word)
 {
     const npy_intp left = call->size[(int)word[2]], right = call->size[(int)word[4]];
     const npy_intp value = word[3] == '+' ? left + right : word[3] == '-' ? left - right : left * right;
-    call->size[(int)word[0]] = value;
-    return value >= 0 || refused(word, value) == DONE;
+    npy_intp *size = &call->size[(int)word[0]];
+    if (value < 0 || (*size >= 0 && *size != value))
+        return wrong_size(0, word[0], *size, value);
+    *size = value;
+    return 1;
 }
 
 static int one_argument(Call *call, int place, PyObject *given, const char *word)
@@ -314,7 +317,8 @@ static int add_kernels(PyObject *module, const Kernel *kernels)
 
 int add_all_kernels(PyObject *module)
 {
-    const Kernel *tables[] = {law_kernels, spectrum_kernels, element_kernels, signal_kernels};
+    const Kernel *tables[] = {law_kernels,     spectrum_kernels,  element_kernels,
+                              signal_kernels, structure_kernels, reduction_kernels};
     for (size_t i = 0; i < sizeof(tables) / sizeof(tables[0]); i++)
         if (add_kernels(module, tables[i]) < 0)
             return -1;

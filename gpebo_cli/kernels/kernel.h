@@ -83,6 +83,7 @@ PyObject *keep(Call *call, PyObject *made);
 static inline double larger(double a, double b) { return a >= b || a != a ? a : b; }
 
 /* Each file of kernels has a table, which ends with an entry without a name. */
-extern const Kernel law_kernels[], spectrum_kernels[], element_kernels[], signal_kernels[];
+extern const Kernel law_kernels[], spectrum_kernels[], element_kernels[], signal_kernels[],
+    structure_kernels[], reduction_kernels[];
 
 #endif

@@ -122,16 +122,3 @@ void sort_down(double *sigma, double *W, npy_intp count, npy_intp length)
             }
         }
 }
-
-int solve_upper(const double *L, npy_intp columns, npy_intp length, double least, double *x)
-{
-    for (npy_intp k = columns - 1; k >= 0; k--) {
-        const double pivot = L[k * length + k];
-        if (!(fabs(pivot) > least * fabs(L[0])))
-            return 0;
-        for (npy_intp j = k + 1; j < columns; j++)
-            x[k] -= L[j * length + k] * x[j];
-        x[k] /= pivot;
-    }
-    return 1;
-}

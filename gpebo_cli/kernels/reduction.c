@@ -1,735 +1,381 @@
-/* gpebo_cli/simulation: bounds of ranks, and the strangeness-free system, at many times. */
+/* Elimination on the pivots of one time at all others: bounds of singular values, and the
+   strangeness-free equations; see structure_numpy.py. */
+#include "lanes.h"
 #include "structure.h"
 
-#include <float.h>
-
-/* Times that are worked on side by side: what is one number for one time is LANES numbers in a
-   row, so that loops over small matrices are paid for once and vectorised. */
-#define LANES 8
-#define MULTIPLIER 4.0 /* of an elimination on shared pivots; beyond it a time gets its own */
-
-#define EACH for (int l = 0; l < LANES; l++)
-
-static inline int nothing(const double *x)
-{
-    double sum = 0.0;
-    EACH sum += fabs(x[l]);
-    return sum == 0.0;
-}
-
-/* Solves A X = B in every lane, A (n, n, LANES), B (n, columns, LANES) becoming X. Rows are
-   exchanged for all lanes alike, the largest in sum first; a lane for which that leads to
-   multipliers above MULTIPLIER is solved by itself with pivots of its own, and is NaN if
-   singular. memory: (n + columns) n (LANES + 1) numbers. */
-EVERY_WIDTH static void solve_lanes(double *restrict A, double *restrict B, npy_intp n,
-                                    npy_intp columns, double *restrict memory)
-{
-    double *kept_A = memory, *kept_B = memory + n * n * LANES;
-    memcpy(kept_A, A, n * n * LANES * sizeof(double));
-    memcpy(kept_B, B, n * columns * LANES * sizeof(double));
-    double good[LANES];
-    EACH good[l] = 1.0;
-    for (npy_intp k = 0; k < n; k++) {
-        npy_intp best = k;
-        double most = -1.0;
-        for (npy_intp i = k; i < n; i++) {
-            const double *a = A + (i * n + k) * LANES;
-            double sum = 0.0;
-            EACH sum += fabs(a[l]);
-            if (sum > most)
-                most = sum, best = i;
-        }
-        if (best != k) {
-            double *x = A + (k * n + k) * LANES, *y = A + (best * n + k) * LANES;
-            for (npy_intp j = 0; j < (n - k) * LANES; j++) {
-                const double kept = x[j];
-                x[j] = y[j];
-                y[j] = kept;
-            }
-            x = B + k * columns * LANES, y = B + best * columns * LANES;
-            for (npy_intp j = 0; j < columns * LANES; j++) {
-                const double kept = x[j];
-                x[j] = y[j];
-                y[j] = kept;
-            }
-        }
-        double *pivot = A + (k * n + k) * LANES;
-        EACH
-        {
-            good[l] = fabs(pivot[l]) > 0.0 ? good[l] : 0.0;
-            pivot[l] = 1.0 / pivot[l];
-        }
-        const double *known = B + k * columns * LANES;
-        for (npy_intp i = k + 1; i < n; i++) {
-            double *row = A + (i * n + k) * LANES, *right = B + i * columns * LANES;
-            if (nothing(row))
-                continue;
-            double factor[LANES];
-            EACH
-            {
-                factor[l] = row[l] * pivot[l];
-                good[l] = fabs(factor[l]) <= MULTIPLIER ? good[l] : 0.0;
-            }
-            for (npy_intp j = 1; j < n - k; j++)
-                EACH row[j * LANES + l] -= factor[l] * pivot[j * LANES + l];
-            for (npy_intp j = 0; j < columns; j++)
-                EACH right[j * LANES + l] -= factor[l] * known[j * LANES + l];
-        }
-    }
-    for (npy_intp k = n - 1; k >= 0; k--) {
-        double *solved = B + k * columns * LANES;
-        for (npy_intp i = k + 1; i < n; i++) {
-            const double *a = A + (k * n + i) * LANES, *later = B + i * columns * LANES;
-            if (nothing(a))
-                continue;
-            for (npy_intp j = 0; j < columns; j++)
-                EACH solved[j * LANES + l] -= a[l] * later[j * LANES + l];
-        }
-        const double *pivot = A + (k * n + k) * LANES;
-        for (npy_intp j = 0; j < columns; j++)
-            EACH solved[j * LANES + l] *= pivot[l];
-    }
-    double *one = kept_B + n * columns * LANES, *right = one + n * n;
-    for (int l = 0; l < LANES; l++) {
-        if (good[l] != 0.0)
-            continue;
-        for (npy_intp i = 0; i < n * n; i++)
-            one[i] = kept_A[i * LANES + l];
-        for (npy_intp i = 0; i < n * columns; i++)
-            right[i] = kept_B[i * LANES + l];
-        const int solved = solve_in_place(one, right, n, columns);
-        for (npy_intp i = 0; i < n * columns; i++)
-            B[i * LANES + l] = solved ? right[i] : (double)NAN;
-    }
-}
-
-/* C = A B, or C −= A B, in every lane, A (rows, inner, LANES), B (inner, columns, LANES). */
-EVERY_WIDTH static void multiply_lanes(double *restrict C, const double *restrict A,
-                                       const double *restrict B, npy_intp rows, npy_intp inner,
-                                       npy_intp columns, int subtract)
-{
-    if (!subtract)
-        memset(C, 0, rows * columns * LANES * sizeof(double));
-    for (npy_intp i = 0; i < rows; i++, C += columns * LANES)
-        for (npy_intp k = 0; k < inner; k++) {
-            const double *a = A + (i * inner + k) * LANES, *b = B + k * columns * LANES;
-            if (nothing(a))
-                continue;
-            double factor[LANES];
-            EACH factor[l] = subtract ? -a[l] : a[l];
-            for (npy_intp j = 0; j < columns; j++)
-                EACH C[j * LANES + l] += factor[l] * b[j * LANES + l];
-        }
-}
-
-/* C = Aᵀ B with A (inner, rows) the same for all lanes, B (inner, columns, LANES). */
-EVERY_WIDTH static void multiply_same(double *restrict C, const double *restrict A,
-                                      const double *restrict B, npy_intp rows, npy_intp inner,
-                                      npy_intp columns)
-{
-    memset(C, 0, rows * columns * LANES * sizeof(double));
-    for (npy_intp i = 0; i < rows; i++, C += columns * LANES)
-        for (npy_intp k = 0; k < inner; k++) {
-            const double a = A[k * rows + i];
-            const double *b = B + k * columns * LANES;
-            if (a != 0.0)
-                for (npy_intp j = 0; j < columns * LANES; j++)
-                    C[j] += a * b[j];
-        }
-}
-
-/* Frobenius norms of every lane of x (count, LANES), at least the smallest positive number. */
-EVERY_WIDTH static void norms(const double *x, npy_intp count, double *out)
-{
-    double sum[LANES] = {0};
-    for (npy_intp i = 0; i < count; i++)
-        EACH sum[l] += x[i * LANES + l] * x[i * LANES + l];
-    EACH out[l] = sqrt(sum[l]) + DBL_MIN;
-}
-
-/* The first `orders` coefficients at times first … first + used − 1 into out (orders, entries,
-   LANES); lanes that are left repeat the last time. What is constant has to come in once. */
-static void gather(double *out, const Series *from, npy_intp orders, npy_intp first, npy_intp used)
-{
-    if (from->time == 0 && first > 0)
-        return;
-    for (npy_intp k = 0; k < orders; k++, out += from->entries * LANES)
-        for (npy_intp l = 0; l < LANES; l++) {
-            const npy_intp t = first + (l < used ? l : used - 1);
-            const double *at = from->at + k * from->order + t * from->time;
-            for (npy_intp i = 0; i < from->entries; i++)
-                out[i * LANES + l] = at[i];
-        }
-}
-
-/* Elimination on the pivots of one time at all others. */
+/* Where M[rows, columns] is split, and its blocks at LANES times. */
 typedef struct {
     const npy_intp *rows, *columns; /* (size,) of M, the pivots first */
     npy_intp rank, a, d;
-    const double *Z1;                  /* (n, d) */
-    npy_intp *block, *within;          /* (2 size,) where rows and columns stand: block, entry */
-    double *raw_e, *raw_a;             /* (mu + 1, n, n, LANES) as they came */
-    double *e, *a_;                    /* likewise, scaled */
-    double *M11, *M12, *M21, *M22, *X; /* blocks of M[rows, columns], and of its elimination */
-    double *N1, *N2;                   /* (rank, n), (a, n): N[rows], N2 becoming Â2 */
-    double *whole, *inverse;           /* (n, n) */
-    double *scale, *memory;            /* (n,) of the rows of whole */
-    double of_M[LANES], of_N[LANES], of_X[LANES], residual[LANES], largest[LANES];
+    const double *Z1;                /* (n, d) */
+    Lane *e, *A;                     /* (orders, n, n) scaled; A below one another is N */
+    Lane *M11, *M12, *M21, *M22, *X; /* X = M21 M11⁻¹ */
+    Lane *N1, *N2;                   /* (rank, n), (a, n): N[rows], N2 becoming Â2 */
+    Lane *whole, *inverse;           /* (n, n): [Z1ᵀE; Â2] */
+    Lane *work;                      /* (max(rank, n))² twice */
+    Lane of_M, of_N, of_X, residual, sign;
 } Elimination;
 
-/* Arguments place … place + 3: rows, columns (size,), rank, Z1 (n, d). */
-static int elimination(Call *call, Py_ssize_t place, const Model *m, Elimination *el)
+/* Arguments place … place + 3, "@z @z %r nd": rows, columns, rank, Z1. */
+static Outcome begin(Call *call, int place, const Model *m, Elimination *el)
 {
-    PyArrayObject *rows = indices(call, place, 1);
-    PyArrayObject *columns = rows ? indices(call, place + 1, 1) : NULL;
-    PyArrayObject *Z1 = columns ? doubles(call, place + 3, 2) : NULL;
-    if (Z1 == NULL || !whole_number(call, place + 2, &el->rank))
-        return 0;
-    const npy_intp n = m->n, size = m->size, r = el->rank;
-    el->a = size - r;
-    el->d = n - el->a;
-    if (r < 0 || el->a < 0 || el->d < 0) {
-        PyErr_SetString(PyExc_ValueError, "a rank that does not fit");
-        return 0;
-    }
-    if (!same("rows of M", PyArray_DIM(rows, 0), size) ||
-        !same("columns of M", PyArray_DIM(columns, 0), size) ||
-        !same("rows of Z1", PyArray_DIM(Z1, 0), n) ||
-        !same("columns of Z1", PyArray_DIM(Z1, 1), el->d))
-        return 0;
-    el->rows = (const npy_intp *)PyArray_DATA(rows);
-    el->columns = (const npy_intp *)PyArray_DATA(columns);
-    el->Z1 = data(Z1);
-    PyArrayObject *where = fresh_indices(call, 4 * size);
-    const npy_intp a = el->a, widest = r > n ? r : n;
-    double *memory = where ? old_scratch(call, LANES * (4 * n * size + size * size + 2 * a * r +
-                                                    size * n + 2 * n * n + n) +
-                                               2 * widest * widest * (LANES + 1))
-                           : NULL;
-    if (memory == NULL)
-        return 0;
-    el->block = (npy_intp *)PyArray_DATA(where);
-    el->within = el->block + 2 * size;
-    for (npy_intp i = 0; i < 2 * size; i++) {
-        const npy_intp at = i < size ? el->rows[i] : el->columns[i - size];
-        if (at < 0 || at >= size) {
-            PyErr_SetString(PyExc_ValueError, "rows or columns that M does not have");
-            return 0;
-        }
-        el->block[i] = at / n;
-        el->within[i] = at % n;
-    }
-    double **parts[] = {&el->raw_e, &el->raw_a, &el->e,       &el->a_,   &el->M11,
-                        &el->M12,   &el->M21,   &el->M22,     &el->X,    &el->N1,
-                        &el->N2,    &el->whole, &el->inverse, &el->scale};
-    const npy_intp sizes[] = {n * size, n * size, n * size, n * size, r * r, r * a, a * r,
-                              a * a,    a * r,    r * n,    a * n,    n * n, n * n, n};
-    for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++) {
+    const npy_intp n = m->n, size = m->size, r = SIZE(r), a = size - r;
+    *el = (Elimination){.rows = call->index[place], .columns = call->index[place + 1],
+                        .rank = r, .a = a, .d = n - a, .Z1 = call->in[place + 3]};
+    for (npy_intp i = 0; i < size; i++)
+        if (el->rows[i] < 0 || el->rows[i] >= size || el->columns[i] < 0 || el->columns[i] >= size)
+            return refused("a row or a column of M", i);
+    const npy_intp widest = r > n ? r : n;
+    const npy_intp sizes[] = {n * size, n * size, r * r, r * a, a * r, a * a, a * r,
+                              r * n, a * n, n * n, n * n, 2 * widest * (widest + n + 1)};
+    Lane **parts[] = {&el->e, &el->A, &el->M11, &el->M12, &el->M21, &el->M22, &el->X,
+                      &el->N1, &el->N2, &el->whole, &el->inverse, &el->work};
+    npy_intp total = 0;
+    for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++)
+        total += sizes[i];
+    Lane *memory = (Lane *)scratch(call, total * LANES);
+    for (size_t i = 0; memory != NULL && i < sizeof(sizes) / sizeof(sizes[0]); i++) {
         *parts[i] = memory;
-        memory += sizes[i] * LANES;
+        memory += sizes[i];
     }
-    el->memory = memory;
-    return 1;
+    return memory == NULL ? ERROR : DONE;
 }
 
-/* Rows `from` … `to` − 1, columns `left` … `right` − 1 of M[rows, columns] into out, by rows or
-   transposed. */
-static void block_of(const Model *m, const Elimination *el, npy_intp from, npy_intp to,
-                     npy_intp left, npy_intp right, int transposed, double *out)
+/* The first coefficients at some times, each order times a power of `time` and of `weights`. */
+static void load_series(Lane *out, const Series *from, npy_intp orders, npy_intp first,
+                        npy_intp used)
 {
-    const npy_intp n = m->n, size = m->size;
+    for (npy_intp k = 0; k < orders; k++, out += from->entries)
+        lanes_load(out, from->at + k * from->order, from->time, from->entries, first, used);
+}
+
+/* Rows from … to − 1 and columns left … right − 1 of M[rows, columns]. */
+static void block_of(const Model *m, const Elimination *el, npy_intp from, npy_intp to,
+                     npy_intp left, npy_intp right, Lane *out)
+{
+    const npy_intp n = m->n;
     for (npy_intp p = from; p < to; p++)
-        for (npy_intp q = left; q < right; q++) {
-            const npy_intp i = el->block[p], j = el->block[size + q];
-            const npy_intp entry = el->within[p] * n + el->within[size + q];
-            double *at = out + (transposed ? (q - left) * (to - from) + p - from
-                                           : (p - from) * (right - left) + q - left) *
-                                   LANES;
+        for (npy_intp q = left; q < right; q++, out++) {
+            const npy_intp i = el->rows[p] / n, j = el->columns[q] / n;
+            const npy_intp entry = el->rows[p] % n * n + el->columns[q] % n;
+            const double factor = (double)(j + 1);
             if (j > i) {
-                memset(at, 0, LANES * sizeof(double));
+                memset(out, 0, sizeof(Lane));
                 continue;
             }
-            const double *e = el->e + ((i - j) * n * n + entry) * LANES, factor = (double)(j + 1);
-            if (j == i) {
-                EACH at[l] = factor * e[l];
-            } else {
-                const double *a = el->a_ + ((i - j - 1) * n * n + entry) * LANES;
-                EACH at[l] = factor * e[l] - a[l];
-            }
+            const double *e = el->e[(i - j) * n * n + entry];
+            EACH (*out)[l] = factor * e[l];
+            if (j < i)
+                EACH (*out)[l] -= el->A[(i - j - 1) * n * n + entry][l];
         }
 }
 
-/* Scaled coefficients and the blocks of M and N at one block of times; M11 and M21 may be wanted
-   transposed. */
-EVERY_WIDTH static void fill(const Model *m, Elimination *el, npy_intp first, npy_intp used,
-                             int transposed)
+/* Scaled coefficients and the blocks of M and N at one block of times. */
+EVERY_WIDTH static void fill(const Model *m, Elimination *el, npy_intp first, npy_intp used)
 {
     const npy_intp n = m->n, size = m->size, r = el->rank;
-    gather(el->raw_e, &m->E, m->mu + 1, first, used);
-    gather(el->raw_a, &m->A, m->mu + 1, first, used);
     double power = 1.0;
-    for (npy_intp k = 0; k <= m->mu; k++, power *= m->time)
+    load_series(el->e, &m->E, m->orders, first, used);
+    load_series(el->A, &m->A, m->orders, first, used);
+    for (npy_intp k = 0; k < m->orders; k++, power *= m->time)
         for (npy_intp i = 0; i < n * n; i++) {
-            const double weight = m->rows[i / n] * m->columns[i % n];
-            const npy_intp at = (k * n * n + i) * LANES;
-            if (first == 0 || m->E.time)
-                EACH el->e[at + l] = el->raw_e[at + l] * weight * power / m->time;
-            if (first == 0 || m->A.time)
-                EACH el->a_[at + l] = el->raw_a[at + l] * weight * power;
+            const double weight = m->rows[i / n] * m->columns[i % n] * power;
+            EACH el->e[k * n * n + i][l] *= weight / m->time;
+            EACH el->A[k * n * n + i][l] *= weight;
         }
-    block_of(m, el, 0, r, 0, r, transposed, el->M11);
-    block_of(m, el, 0, r, r, size, 0, el->M12);
-    block_of(m, el, r, size, 0, r, transposed, el->M21);
-    block_of(m, el, r, size, r, size, 0, el->M22);
-    norms(el->M11, size * size, el->of_M); /* the four lie one behind the other */
-    if (first == 0 || m->A.time) {
-        norms(el->a_, n * size, el->of_N);
-        EACH el->largest[l] = 0.0;
-        for (npy_intp i = 0; i < n * size; i++)
-            EACH
-            {
-                const double x = fabs(el->a_[i * LANES + l]);
-                el->largest[l] = x > el->largest[l] ? x : el->largest[l];
-            }
-    }
+    block_of(m, el, 0, r, 0, r, el->M11);
+    block_of(m, el, 0, r, r, size, el->M12);
+    block_of(m, el, r, size, 0, r, el->M21);
+    block_of(m, el, r, size, r, size, el->M22);
+    lanes_norm(el->of_M, el->M11, size * size); /* the four lie one behind the other */
+    lanes_norm(el->of_N, el->A, n * size);
+    EACH el->of_M[l] += DBL_MIN, el->of_N[l] += DBL_MIN;
     for (npy_intp p = 0; p < size; p++)
-        memcpy((p < r ? el->N1 + p * n * LANES : el->N2 + (p - r) * n * LANES),
-               el->a_ + (el->block[p] * n + el->within[p]) * n * LANES, n * LANES * sizeof(double));
+        memcpy(p < r ? el->N1 + p * n : el->N2 + (p - r) * n, el->A + el->rows[p] * n,
+               n * sizeof(Lane));
 }
 
 /* With X in place: the residual M22 − X M12 and Â2 = N2 − X N1, [Z1ᵀE; Â2] into whole. */
-static void eliminate(const Model *m, Elimination *el)
+static void eliminate_blocks(const Model *m, Elimination *el)
 {
     const npy_intp n = m->n, r = el->rank, a = el->a;
-    multiply_lanes(el->M22, el->X, el->M12, a, r, a, 1);
-    norms(el->M22, a * a, el->residual);
-    norms(el->X, a * r, el->of_X);
-    multiply_lanes(el->N2, el->X, el->N1, a, r, n, 1);
-    multiply_same(el->whole, el->Z1, el->e, el->d, n, n);
-    memcpy(el->whole + el->d * n * LANES, el->N2, a * n * LANES * sizeof(double));
+    lanes_multiply(el->M22, a, el->X, r, el->M12, a, a, r, a, -1.0);
+    lanes_norm(el->residual, el->M22, a * a);
+    lanes_norm(el->of_X, el->X, a * r);
+    lanes_multiply(el->N2, n, el->X, r, el->N1, n, a, r, n, -1.0);
+    lanes_clear(el->whole, el->d * n);
+    lanes_from_left(el->whole, n, el->Z1, 1, el->d, el->e, el->d, n, n);
+    memcpy(el->whole + el->d * n, el->N2, a * n * sizeof(Lane));
 }
 
-static void identity(double *out, npy_intp n)
+static void identity(Lane *out, npy_intp n)
 {
-    memset(out, 0, n * n * LANES * sizeof(double));
+    lanes_clear(out, n * n);
     for (npy_intp i = 0; i < n; i++)
-        EACH out[(i * n + i) * LANES + l] = 1.0;
+        EACH out[i * n + i][l] = 1.0;
 }
 
-/* all_levels(E, A, rows, columns, time, mu, pivot rows, pivot columns, rank, Z1, rank_tol,
-   plain, residual) -> known (3,), smallest (N, 3), dynamics (N, d, d).
-
-   smallest holds bounds of the singular values, and these themselves where a bound is at most
-   `plain`, where the elimination leaves more than `residual`, where a bound is smallest, and in
-   the middle; known is whether all went well, the least of those computed, and whether the
-   dynamics Z1ᵀA T are finite. Otherwise LAPACK has to look, and the rest means nothing. */
-static PyObject *all_levels(PyObject *module, PyObject *const *given, Py_ssize_t count)
+/* The model, pivots -> bounds of the singular values of M, Â2 and E T2, what elimination leaves
+   relative to the size of M, and the dynamics Z1ᵀA T; not finite where a block is singular. */
+static Outcome bounds(Call *call)
 {
-    (void)module;
-    Call call;
     Model m;
-    Look look;
     Elimination el;
-    double rank_tol, plain, most_left;
-    if (!begin(&call, given, count, 13))
-        return NULL;
-    if (!model(&call, &m) || !elimination(&call, 6, &m, &el) || !prepare(&call, &m, &look) ||
-        !number(&call, 10, &rank_tol) || !number(&call, 11, &plain) ||
-        !number(&call, 12, &most_left))
-        return failed(&call);
-    const npy_intp n = m.n, r = el.rank, a = el.a, d = el.d, times = m.times;
-    PyArrayObject *known = zeros(&call, 1, (npy_intp[]){3});
-    PyArrayObject *smallest = known ? fresh(&call, 2, (npy_intp[]){times, 3}) : NULL;
-    PyArrayObject *dynamics = smallest ? fresh(&call, 3, (npy_intp[]){times, d, d}) : NULL;
-    int *closer = dynamics ? integers(&call, times) : NULL;
-    double *inverse = closer ? old_scratch(&call, LANES * (r * r + 2 * n * n)) : NULL;
-    if (inverse == NULL)
-        return failed(&call);
-    double *AT = inverse + r * r * LANES, *of_z = AT + n * n * LANES;
-    double *bounds = data(smallest), finite = 1.0;
-    for (npy_intp first = 0; first < times; first += LANES) {
-        const npy_intp used = times - first < LANES ? times - first : LANES;
-        fill(&m, &el, first, used, 0);
+    if (read_model(call, &m) == ERROR || begin(call, 6, &m, &el) == ERROR)
+        return ERROR;
+    const npy_intp n = m.n, size = m.size, r = el.rank, a = el.a, d = el.d;
+    for (npy_intp first = 0; first < m.times; first += LANES) {
+        const npy_intp used = m.times - first < LANES ? m.times - first : LANES;
+        Lane of_inverse, determined, of_E, largest = {0};
+        fill(&m, &el, first, used);
+        Lane *pivots = el.work, *inverse = el.work + r * r;
+        memcpy(pivots, el.M11, r * r * sizeof(Lane));
         identity(inverse, r);
-        solve_lanes(el.M11, inverse, r, r, el.memory);
-        multiply_lanes(el.X, el.M21, inverse, a, r, r, 0);
-        eliminate(&m, &el);
+        lanes_solve(pivots, inverse, r, r, el.sign);
+        lanes_clear(el.X, a * r);
+        lanes_multiply(el.X, r, el.M21, r, inverse, r, a, r, r, 1.0);
+        lanes_norm(of_inverse, inverse, r * r);
+        eliminate_blocks(&m, &el);
         identity(el.inverse, n);
-        solve_lanes(el.whole, el.inverse, n, n, el.memory);
-        double of_inverse[LANES], determined[LANES], of_E[LANES];
-        norms(inverse, r * r, of_inverse);
-        norms(el.inverse, n * n, determined);
-        norms(el.e, n * n, of_E);
-        /* Z1ᵀ A T, T being the first columns of the inverse. */
-        double *T = el.whole;
-        for (npy_intp i = 0; i < n; i++)
-            memcpy(T + i * d * LANES, el.inverse + i * n * LANES, d * LANES * sizeof(double));
-        multiply_lanes(AT, el.a_, T, n, n, d, 0);
-        multiply_same(of_z, el.Z1, AT, d, n, d);
+        lanes_solve(el.whole, el.inverse, n, n, el.sign);
+        lanes_norm(determined, el.inverse, n * n);
+        lanes_norm(of_E, el.e, n * n);
+        for (npy_intp i = 0; i < n * size; i++)
+            EACH largest[l] = larger(fabs(el.A[i][l]), largest[l]);
         for (npy_intp l = 0; l < used; l++) {
-            double *bound = bounds + 3 * (first + l), *z = data(dynamics) + (first + l) * d * d;
-            double scale = el.of_M[l] > el.largest[l] ? el.of_M[l] : el.largest[l];
-            scale = scale > DBL_MIN ? scale : DBL_MIN;
+            double *bound = call->out[0] + 3 * (first + l);
+            const double scale = larger(larger(el.of_M[l], largest[l]), DBL_MIN);
+            const double spread = sqrt((double)a + el.of_X[l] * el.of_X[l]);
             bound[0] = r ? 1.0 / (of_inverse[l] * scale) : HUGE_VAL;
-            bound[1] =
-                a ? 1.0 / (determined[l] * sqrt((double)a + el.of_X[l] * el.of_X[l]) * el.of_N[l])
-                  : HUGE_VAL;
-            bound[2] = d ? 1.0 / (determined[l] * of_E[l]) : HUGE_VAL;
-            closer[first + l] = !(bound[0] > plain && bound[1] > plain && bound[2] > plain &&
-                                  el.residual[l] <= most_left * scale);
-            if (!(determined[l] < DBL_MAX && of_inverse[l] < DBL_MAX))
-                return results(&call, 3, known, smallest, dynamics);
-            for (npy_intp i = 0; i < d * d; i++) {
-                z[i] = of_z[i * LANES + l];
-                finite = fabs(z[i]) < HUGE_VAL ? finite : 0.0;
-            }
+            bound[1] = a ? 1.0 / (determined[l] * spread * el.of_N[l]) : HUGE_VAL;
+            bound[2] = d ? 1.0 / (determined[l] * (of_E[l] + DBL_MIN)) : HUGE_VAL;
+            call->out[1][first + l] = el.residual[l] / scale;
         }
+        /* Z1ᵀ A T, T being the first columns of the inverse. */
+        Lane *AT = el.whole, *z = el.work;
+        lanes_clear(AT, n * d);
+        lanes_multiply(AT, d, el.A, n, el.inverse, n, n, n, d, 1.0);
+        lanes_clear(z, d * d);
+        lanes_from_left(z, d, el.Z1, 1, d, AT, d, n, d);
+        lanes_store(call->out[2], z, d, d, 0, d, first, used);
     }
-    for (npy_intp column = 0; column < 3; column++) {
-        npy_intp least = 0;
-        for (npy_intp t = 1; t < times; t++)
-            if (bounds[3 * t + column] < bounds[3 * least + column])
-                least = t;
-        closer[least] = 1;
-    }
-    closer[times / 2] = 1;
-    double least = HUGE_VAL;
-    for (npy_intp t = 0; t < times; t++) {
-        if (!closer[t])
-            continue;
-        if (!look_at(&m, t, -1, rank_tol, 3, &look) || look.constraints != a)
-            return results(&call, 3, known, smallest, dynamics);
-        for (npy_intp column = 0; column < 3; column++) {
-            bounds[3 * t + column] = look.smallest[column];
-            least = look.smallest[column] < least ? look.smallest[column] : least;
-            if (column && !(look.smallest[column] > rank_tol))
-                return results(&call, 3, known, smallest, dynamics);
-        }
-    }
-    data(known)[0] = 1.0;
-    data(known)[1] = least;
-    data(known)[2] = finite;
-    return results(&call, 3, known, smallest, dynamics);
+    return DONE;
 }
 
-/* B, F, u and theta, for f = B u + F theta. */
+/* B, F, u and θ, for f = B u + F θ. */
 typedef struct {
     Series B, F, u, theta;
-    npy_intp inputs, unknowns, times;
-    double *of_B, *of_F, *of_u, *of_theta; /* LANES times of each */
-    double *f;                             /* (mu + 1, n, LANES) scaled: g */
+    npy_intp inputs, unknowns;
+    Lane *matrix, *vector, *g; /* of B or F, of u or θ; g (orders, n) */
 } Forcing;
 
-/* Arguments 6 to 9: B (K + 1, N or 1, n, inputs), F (…, n, unknowns), u (…, inputs), theta. */
-static int forcing(Call *call, const Model *m, Forcing *f)
+/* g_k += Σ_i matrix_i vector_{k−i}. */
+static void add_product(const Model *m, Forcing *f, const Series *matrix, const Series *vector,
+                        npy_intp width, npy_intp first, npy_intp used)
 {
-    if (!series(call, 6, 4, &f->B) || !series(call, 7, 4, &f->F) || !series(call, 8, 3, &f->u) ||
-        !series(call, 9, 3, &f->theta))
-        return 0;
-    PyArrayObject *B = (PyArrayObject *)call->given[6], *F = (PyArrayObject *)call->given[7];
-    f->inputs = f->u.entries;
-    f->unknowns = f->theta.entries;
-    if (!same("rows of B", size(B, 2), m->n) || !same("rows of F", size(F, 2), m->n) ||
-        !same("columns of B", size(B, 3), f->inputs) ||
-        !same("columns of F", size(F, 3), f->unknowns))
-        return 0;
-    f->times = m->times;
-    const Series *all[] = {&f->B, &f->F, &f->u, &f->theta};
-    for (int i = 0; i < 4; i++) {
-        f->times = all[i]->times > f->times ? all[i]->times : f->times;
-        if (all[i]->orders <= m->mu) {
-            PyErr_SetString(PyExc_ValueError, "fewer Taylor coefficients than mu + 1");
-            return 0;
-        }
+    const npy_intp n = m->n;
+    if (width == 0)
+        return;
+    load_series(f->matrix, matrix, m->orders, first, used);
+    load_series(f->vector, vector, m->orders, first, used);
+    for (npy_intp i = 0; i < m->orders; i++)
+        for (npy_intp k = i; k < m->orders; k++)
+            lanes_multiply(f->g + k * n, 1, f->matrix + i * n * width, width,
+                           f->vector + (k - i) * width, 1, n, width, 1, 1.0);
+}
+
+/* g = (f_0, f_1, …) in scaled rows and time, at one block of times. */
+static void force(const Model *m, Forcing *f, npy_intp first, npy_intp used)
+{
+    const npy_intp n = m->n;
+    double power = 1.0;
+    lanes_clear(f->g, m->size);
+    add_product(m, f, &f->B, &f->u, f->inputs, first, used);
+    add_product(m, f, &f->F, &f->theta, f->unknowns, first, used);
+    for (npy_intp k = 0; k < m->orders; k++, power *= m->time)
+        for (npy_intp i = 0; i < n; i++)
+            EACH f->g[k * n + i][l] *= power * m->rows[i];
+}
+
+/* X = M21 M11⁻¹, by M11ᵀ Xᵀ = M21ᵀ. */
+static void multipliers(Elimination *el)
+{
+    const npy_intp r = el->rank, a = el->a;
+    Lane *turned = el->work, *right = el->work + r * r;
+    for (npy_intp i = 0; i < r; i++) {
+        for (npy_intp k = 0; k < r; k++)
+            memcpy(turned + k * r + i, el->M11 + i * r + k, sizeof(Lane));
+        for (npy_intp k = 0; k < a; k++)
+            memcpy(right + i * a + k, el->M21 + k * r + i, sizeof(Lane));
     }
-    for (int i = 0; i < 4; i++)
-        if (all[i]->times != f->times && !same("times of inputs", all[i]->times, 1))
+    lanes_solve(turned, right, r, a, el->sign);
+    for (npy_intp k = 0; k < a; k++)
+        for (npy_intp i = 0; i < r; i++)
+            memcpy(el->X + k * r + i, right + i * a + k, sizeof(Lane));
+}
+
+/* [Z1ᵀE; Â2]⁻¹, its rows times the states' scales, into inverse, judging rows by their own size;
+   `grown` is the norm of what is inverted so. whole is used up. */
+EVERY_WIDTH static void invert(const Model *m, Elimination *el, double *grown)
+{
+    const npy_intp n = m->n;
+    Lane *scales = el->work;
+    identity(el->inverse, n);
+    for (npy_intp i = 0; i < n; i++) {
+        Lane *row = el->whole + i * n;
+        double *scale = scales[i];
+        EACH scale[l] = DBL_MIN;
+        for (npy_intp j = 0; j < n; j++)
+            EACH scale[l] = larger(fabs(row[j][l]), scale[l]);
+        EACH scale[l] = 1.0 / scale[l];
+        for (npy_intp j = 0; j < n; j++)
+            EACH row[j][l] *= scale[l];
+    }
+    lanes_solve(el->whole, el->inverse, n, n, el->sign);
+    lanes_norm(grown, el->inverse, n * n);
+    for (npy_intp i = 0; i < n * n; i++)
+        EACH el->inverse[i][l] *= scales[i % n][l] * m->columns[i / n];
+}
+
+/* x (rows, columns) to some times of out, times factors of the columns. */
+static void hand_over(double *out, Lane *x, npy_intp rows, npy_intp columns, npy_intp first,
+                      npy_intp used, const double *factors, double all)
+{
+    for (npy_intp i = 0; i < rows * columns; i++)
+        EACH x[i][l] *= factors ? all / factors[i % columns] : all;
+    lanes_store(out, x, rows, columns, 0, columns, first, used);
+}
+
+/* The equations at one block of times; 0 where the elimination grows more than `growth` or leaves
+   more than `residual`. */
+static int equations(const Model *m, Elimination *el, Forcing *f, npy_intp first, npy_intp used,
+                     double growth, double residual, double *const *out)
+{
+    const npy_intp n = m->n, r = el->rank, a = el->a, d = el->d;
+    Lane grown, *some = el->e, *f2 = el->M22;
+    fill(m, el, first, used);
+    force(m, f, first, used);
+    multipliers(el);
+    eliminate_blocks(m, el);
+    for (npy_intp l = 0; l < used; l++)
+        if (!(el->residual[l] <= residual * el->of_M[l] && el->of_X[l] <= growth))
             return 0;
-    const npy_intp n = m->n, width = f->inputs + f->unknowns;
-    double *memory = old_scratch(call, LANES * (m->mu + 1) * (n * width + width + n));
-    if (memory == NULL)
-        return 0;
-    f->of_B = memory;
-    f->of_F = f->of_B + LANES * (m->mu + 1) * n * f->inputs;
-    f->of_u = f->of_F + LANES * (m->mu + 1) * n * f->unknowns;
-    f->of_theta = f->of_u + LANES * (m->mu + 1) * f->inputs;
-    f->f = f->of_theta + LANES * (m->mu + 1) * f->unknowns;
+    lanes_clear(some, d * n);
+    lanes_from_left(some, 1, el->Z1, 1, d, f->g, d, n, 1);
+    hand_over(out[2], some, 1, d, first, used, NULL, 1.0);
+    for (npy_intp i = 0; i < a; i++)
+        memcpy(some + i, f->g + el->rows[r + i], sizeof(Lane));
+    for (npy_intp k = 0; k < r; k++)
+        memcpy(el->M12 + k, f->g + el->rows[k], sizeof(Lane));
+    lanes_multiply(some, 1, el->X, r, el->M12, 1, a, r, 1, -1.0);
+    lanes_store(out[4], some, 1, a, 0, a, first, used);
+    memcpy(f2, some, a * sizeof(Lane));
+    lanes_clear(some, d * n);
+    lanes_from_left(some, n, el->Z1, 1, d, el->A, d, n, n);
+    hand_over(out[1], some, d, n, first, used, m->columns, 1.0);
+    memcpy(some, el->whole, d * n * sizeof(Lane));
+    hand_over(out[0], some, d, n, first, used, m->columns, m->time);
+    hand_over(out[3], el->N2, a, n, first, used, m->columns, 1.0);
+    invert(m, el, grown);
+    for (npy_intp l = 0; l < used; l++)
+        if (!(grown[l] <= growth))
+            return 0;
+    lanes_clear(some, n);
+    lanes_multiply(some, 1, el->inverse + d, n, f2, 1, n, a, 1, -1.0);
+    lanes_store(out[6], some, 1, n, 0, n, first, used);
+    for (npy_intp i = 0; i < n; i++)
+        memcpy(some + i * d, el->inverse + i * n, d * sizeof(Lane));
+    hand_over(out[5], some, n, d, first, used, NULL, 1.0 / m->time);
     return 1;
 }
 
-/* f_k += Σ_i matrix_i vector_{k−i}, (mu + 1, n, LANES); a constant matrix is read where it is. */
-EVERY_WIDTH static void add_product(const Model *m, double *f, const Series *matrix,
-                                    const double *lanes, const double *vector, npy_intp width)
+/* Raises most (n, n + 1) to by how much relative rounding of the scaled states, and of 1, reaches
+   each state through the constraints at one block of times: |last columns of the inverse| times
+   the size of the terms of [Â2 | f2], |[N2 g2]| + |X| (|[N1 g1]| + 2 |M11| |M11⁻¹ [N1 g1]|). */
+static void amplify(const Model *m, Elimination *el, Forcing *f, npy_intp first, npy_intp used,
+                    Lane *room, double *most)
 {
-    const npy_intp n = m->n;
-    for (npy_intp i = 0; i <= m->mu; i++)
-        for (npy_intp p = 0; p < n * width; p++) {
-            const double *a = lanes + (i * n * width + p) * LANES;
-            const double once = matrix->at[matrix->time ? 0 : i * matrix->order + p];
-            if (matrix->time ? nothing(a) : once == 0.0)
-                continue;
-            double *to = f + (i * n + p / width) * LANES;
-            const double *x = vector + p % width * LANES;
-            for (npy_intp k = i; k <= m->mu; k++, to += n * LANES, x += width * LANES) {
-                if (matrix->time)
-                    EACH to[l] += a[l] * x[l];
-                else
-                    EACH to[l] += once * x[l];
-            }
-        }
-}
-
-/* g = (f_0, …, f_mu) in scaled rows and time, at one block of times. */
-EVERY_WIDTH static void force(const Model *m, Forcing *f, npy_intp first, npy_intp used)
-{
-    const npy_intp n = m->n, orders = m->mu + 1;
-    if (f->B.time)
-        gather(f->of_B, &f->B, orders, first, used);
-    if (f->F.time)
-        gather(f->of_F, &f->F, orders, first, used);
-    gather(f->of_u, &f->u, orders, first, used);
-    gather(f->of_theta, &f->theta, orders, first, used);
-    memset(f->f, 0, orders * n * LANES * sizeof(double));
-    if (f->unknowns)
-        add_product(m, f->f, &f->F, f->of_F, f->of_theta, f->unknowns);
-    if (f->inputs)
-        add_product(m, f->f, &f->B, f->of_B, f->of_u, f->inputs);
-    double power = 1.0;
-    for (npy_intp k = 0; k < orders; k++, power *= m->time)
-        for (npy_intp i = 0; i < n; i++) {
-            const double weight = power * m->rows[i];
-            EACH f->f[(k * n + i) * LANES + l] *= weight;
-        }
-}
-
-/* x (rows, columns, LANES) to the times first … first + used − 1 of out (N, rows, columns), times
-   factors of the columns where given. */
-static void scatter(double *out, const double *x, npy_intp rows, npy_intp columns, npy_intp first,
-                    npy_intp used, const double *factors)
-{
-    const npy_intp entries = rows * columns;
-    for (npy_intp l = 0; l < used; l++) {
-        double *to = out + (first + l) * entries;
-        const double *from = x + l;
-        for (npy_intp i = 0; i < rows; i++)
-            for (npy_intp j = 0; j < columns; j++, from += LANES)
-                *to++ = factors ? *from * factors[j] : *from;
+    const npy_intp n = m->n, r = el->rank, a = el->a, d = el->d, width = n + 1;
+    Lane grown, *terms = room, *through = room + a * width, *pivots = el->work;
+    Lane *higher = el->work + r * r;
+    fill(m, el, first, used);
+    force(m, f, first, used);
+    for (npy_intp p = 0; p < m->size; p++) {
+        Lane *to = p < r ? higher + p * width : terms + (p - r) * width;
+        memcpy(to, p < r ? el->N1 + p * n : el->N2 + (p - r) * n, n * sizeof(Lane));
+        memcpy(to + n, f->g + el->rows[p], sizeof(Lane));
     }
+    memcpy(pivots, el->M11, r * r * sizeof(Lane));
+    memcpy(through, higher, r * width * sizeof(Lane));
+    lanes_solve(pivots, higher, r, width, el->sign);
+    for (npy_intp i = 0; i < r * width; i++)
+        EACH through[i][l] = fabs(through[i][l]), higher[i][l] = fabs(higher[i][l]);
+    memcpy(pivots, el->M11, r * r * sizeof(Lane));
+    for (npy_intp i = 0; i < r * r; i++)
+        EACH pivots[i][l] = 2.0 * fabs(pivots[i][l]);
+    lanes_multiply(through, width, pivots, r, higher, width, r, r, width, 1.0);
+    multipliers(el);
+    eliminate_blocks(m, el);
+    for (npy_intp i = 0; i < a * r; i++)
+        EACH el->X[i][l] = fabs(el->X[i][l]);
+    for (npy_intp i = 0; i < a * width; i++)
+        EACH terms[i][l] = fabs(terms[i][l]);
+    lanes_multiply(terms, width, el->X, r, through, width, a, r, width, 1.0);
+    invert(m, el, grown);
+    for (npy_intp i = 0; i < n * n; i++)
+        EACH el->inverse[i][l] = fabs(el->inverse[i][l]);
+    Lane *reached = through;
+    lanes_clear(reached, n * width);
+    lanes_multiply(reached, width, el->inverse + d, n, terms, width, n, a, width, 1.0);
+    for (npy_intp i = 0; i < n * width; i++)
+        EACH most[i] = larger(most[i], reached[i][l]);
 }
 
-/* What leaves `reduced` and `reduced_constant`. */
-typedef struct {
-    PyArrayObject *known, *E1, *A1, *f1, *A2, *f2, *basis, *offset, *amplification;
-} Reduced;
-
-static int make(Call *call, npy_intp n, npy_intp d, npy_intp times, npy_intp matrices, Reduced *out)
+/* The model, B, F, u, θ, pivots, at every how many times the amplification is looked at, growth,
+   residual -> E1, A1, f1, A2, f2, basis, offset, amplification. */
+static Outcome eliminated(Call *call)
 {
-    const npy_intp a = n - d;
-    return (out->known = zeros(call, 1, (npy_intp[]){1})) != NULL &&
-           (out->E1 = fresh(call, 3, (npy_intp[]){matrices, d, n})) != NULL &&
-           (out->A1 = fresh(call, 3, (npy_intp[]){matrices, d, n})) != NULL &&
-           (out->f1 = fresh(call, 2, (npy_intp[]){times, d})) != NULL &&
-           (out->A2 = fresh(call, 3, (npy_intp[]){matrices, a, n})) != NULL &&
-           (out->f2 = fresh(call, 2, (npy_intp[]){times, a})) != NULL &&
-           (out->basis = fresh(call, 3, (npy_intp[]){matrices, n, d})) != NULL &&
-           (out->offset = fresh(call, 2, (npy_intp[]){times, n})) != NULL &&
-           (out->amplification = zeros(call, 2, (npy_intp[]){n, n + 1})) != NULL;
-}
-
-static PyObject *handed_over(Call *call, const Reduced *out)
-{
-    return results(call, 9, out->known, out->E1, out->A1, out->f1, out->A2, out->f2, out->basis,
-                   out->offset, out->amplification);
-}
-
-/* Size of the terms of [Â2 | f2] in one lane (a, n + 1): of those in the remaining rows, and |X|
-   times those in the pivots' rows and |M11| |Y|, twice, where M11 Y = [N1 | g1] are the higher
-   derivatives. M11, transposed, is what the last solution has kept. own: r (r + n + 1) numbers. */
-static void terms(const Model *m, const Elimination *el, const double *g, npy_intp l, double *own,
-                  double *size)
-{
-    const npy_intp n = m->n, r = el->rank, width = n + 1;
-    double *M11 = own, *Y = own + r * r;
-    for (npy_intp i = 0; i < r; i++) {
-        for (npy_intp k = 0; k < r; k++)
-            M11[i * r + k] = el->memory[(k * r + i) * LANES + l];
-        for (npy_intp j = 0; j < n; j++)
-            Y[i * width + j] = el->N1[(i * n + j) * LANES + l];
-        Y[i * width + n] = g[el->rows[i] * LANES + l];
-    }
-    solve_in_place(M11, Y, r, width);
-    for (npy_intp i = 0; i < el->a; i++, size += width) {
-        const double *rest = el->N2 + i * n * LANES + l;
-        for (npy_intp j = 0; j < n; j++)
-            size[j] = fabs(rest[j * LANES]);
-        size[n] = fabs(g[el->rows[r + i] * LANES + l]);
-        for (npy_intp k = 0; k < r; k++) {
-            const double x = fabs(el->X[(i * r + k) * LANES + l]);
-            const double *other = el->N1 + k * n * LANES + l;
-            if (x == 0.0)
-                continue;
-            for (npy_intp j = 0; j < n; j++)
-                size[j] += x * fabs(other[j * LANES]);
-            size[n] += x * fabs(g[el->rows[k] * LANES + l]);
-            for (npy_intp q = 0; q < r; q++) {
-                const double factor = 2.0 * x * fabs(el->memory[(q * r + k) * LANES + l]);
-                if (factor != 0.0)
-                    for (npy_intp j = 0; j < width; j++)
-                        size[j] += factor * fabs(Y[q * width + j]);
-            }
-        }
-    }
-}
-
-/* Raises most (n, width), whose rows are `skip` apart, to |P| size where P are the last a columns
-   of inverse (n, n), numbers of which are `apart` apart, and size (a, width). */
-static void raise_to(double *most, npy_intp skip, const double *inverse, npy_intp apart,
-                     const double *size, npy_intp n, npy_intp a, npy_intp width)
-{
-    for (npy_intp i = 0; i < n; i++)
-        for (npy_intp j = 0; j < width; j++) {
-            double sum = 0.0;
-            for (npy_intp k = 0; k < a; k++)
-                sum += fabs(inverse[(i * n + n - a + k) * apart]) * size[k * width + j];
-            most[i * skip + j] = sum > most[i * skip + j] ? sum : most[i * skip + j];
-        }
-}
-
-/* Relative rounding of the model's own states, not of the scaled ones. */
-static void unscale(const Model *m, double *amplification)
-{
-    for (npy_intp i = 0; i < m->n; i++)
-        for (npy_intp j = 0; j < m->n; j++)
-            amplification[i * (m->n + 1) + j] /= m->columns[j];
-}
-
-/* [Z1ᵀE; Â2]⁻¹, its rows times the states' scales, into inverse; where it grows more than that,
-   lanes of `good` become 0. Rows are judged by their own size. whole is used up. */
-EVERY_WIDTH static void invert(const Model *m, Elimination *el, double most_growth, double *good)
-{
-    const npy_intp n = m->n;
-    double scale[LANES], grown[LANES];
-    identity(el->inverse, n);
-    for (npy_intp i = 0; i < n; i++) {
-        double *row = el->whole + i * n * LANES, *factor = el->scale + i * LANES;
-        EACH scale[l] = DBL_MIN;
-        for (npy_intp j = 0; j < n; j++)
-            EACH
-            {
-                const double x = fabs(row[j * LANES + l]);
-                scale[l] = x > scale[l] ? x : scale[l];
-            }
-        EACH factor[l] = 1.0 / scale[l];
-        for (npy_intp j = 0; j < n; j++)
-            EACH row[j * LANES + l] *= factor[l];
-    }
-    solve_lanes(el->whole, el->inverse, n, n, el->memory);
-    norms(el->inverse, n * n, grown);
-    EACH good[l] = grown[l] <= most_growth ? good[l] : 0.0;
-    for (npy_intp i = 0; i < n; i++)
-        for (npy_intp j = 0; j < n; j++) {
-            double *x = el->inverse + (i * n + j) * LANES;
-            const double *factor = el->scale + j * LANES;
-            EACH x[l] *= factor[l] * m->columns[i];
-        }
-}
-
-/* reduced(E, A, rows, columns, time, mu, B, F, u, theta, pivot rows, pivot columns, rank, Z1,
-   every, growth, residual) -> known (1,), E1, A1 (N, d, n), f1 (N, d), A2 (N, a, n), f2 (N, a),
-   basis (N, n, d), offset (N, n), amplification (n, n + 1): the strangeness-free equations in the
-   model's own states. The amplification is looked at at every so many times. Where the elimination
-   grows more than `growth` at some time or leaves more than `residual`, known is 0 and the rest
-   means nothing. */
-static PyObject *reduced(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
     Model m;
     Elimination el;
-    Forcing f;
-    Reduced out;
-    npy_intp every;
-    double growth, residual;
-    if (!begin(&call, given, count, 17))
-        return NULL;
-    if (!model(&call, &m) || !forcing(&call, &m, &f) || !elimination(&call, 10, &m, &el) ||
-        !whole_number(&call, 14, &every) || !number(&call, 15, &growth) ||
-        !number(&call, 16, &residual))
-        return failed(&call);
-    const npy_intp n = m.n, r = el.rank, a = el.a, d = el.d, times = f.times;
-    if (every < 1) {
-        PyErr_SetString(PyExc_ValueError, "it takes a look at every time, or less often");
-        return failed(&call);
+    if (read_model(call, &m) == ERROR || begin(call, 10, &m, &el) == ERROR)
+        return ERROR;
+    const npy_intp n = m.n, p = SIZE(m), q = SIZE(q), widest = p > q ? p : q, every = SIZE(e);
+    if (every < 1)
+        return refused("times between looks", every);
+    Forcing f = {series(call, 6, n * p), series(call, 7, n * q), series(call, 8, p),
+                 series(call, 9, q), p, q, NULL, NULL, NULL};
+    const npy_intp wide = el.rank > n ? el.rank : n;
+    f.matrix = (Lane *)scratch(call, LANES * (m.orders * (n * widest + widest + n) +
+                                              (el.a + wide) * (n + 1)));
+    if (f.matrix == NULL)
+        return ERROR;
+    f.vector = f.matrix + m.orders * n * widest;
+    f.g = f.vector + m.orders * widest;
+    Lane *room = f.g + m.orders * n;
+    for (npy_intp first = 0; first < m.times; first += LANES) {
+        const npy_intp used = m.times - first < LANES ? m.times - first : LANES;
+        if (!equations(&m, &el, &f, first, used, call->number[15], call->number[16], call->out))
+            return DECLINED;
     }
-    double *buffer = make(&call, n, d, times, times, &out)
-                         ? old_scratch(&call, LANES * (n * n + 2 * n + a * (n + 1)) + 3 * n + r * (r + n + 1))
-                         : NULL;
-    if (buffer == NULL)
-        return failed(&call);
-    double *vector = buffer + n * (n + 1) * LANES, *sizes = vector + n * LANES;
-    double *of_E1 = sizes + LANES * a * (n + 1), *of_A = of_E1 + n, *of_basis = of_A + n, *own = of_basis + n;
-    for (npy_intp j = 0; j < n; j++) {
-        of_E1[j] = m.time / m.columns[j];
-        of_A[j] = 1.0 / m.columns[j];
-        of_basis[j] = 1.0 / m.time;
-    }
-    for (npy_intp first = 0; first < times; first += LANES) {
-        const npy_intp used = times - first < LANES ? times - first : LANES;
-        fill(&m, &el, first, used, 1);
-        force(&m, &f, first, used);
-        solve_lanes(el.M11, el.M21, r, a, el.memory);
-        for (npy_intp i = 0; i < a; i++)
-            for (npy_intp k = 0; k < r; k++)
-                memcpy(el.X + (i * r + k) * LANES, el.M21 + (k * a + i) * LANES,
-                       LANES * sizeof(double));
-        for (npy_intp l = 0; l < used; l++)
-            if ((first + l) % every == 0)
-                terms(&m, &el, f.f, l, own, sizes + l * a * (n + 1));
-        eliminate(&m, &el);
-        double good[LANES];
-        EACH good[l] = el.residual[l] <= residual * el.of_M[l] && el.of_X[l] <= growth ? 1.0 : 0.0;
-        scatter(data(out.E1), el.whole, d, n, first, used, of_E1);
-        multiply_same(buffer, el.Z1, el.a_, d, n, n);
-        scatter(data(out.A1), buffer, d, n, first, used, of_A);
-        multiply_same(buffer, el.Z1, f.f, d, n, 1);
-        scatter(data(out.f1), buffer, 1, d, first, used, NULL);
-        scatter(data(out.A2), el.N2, a, n, first, used, of_A);
-        for (npy_intp i = 0; i < a; i++) {
-            double *to = vector + i * LANES;
-            memcpy(to, f.f + el.rows[r + i] * LANES, LANES * sizeof(double));
-            for (npy_intp k = 0; k < r; k++) {
-                const double *x = el.X + (i * r + k) * LANES, *g = f.f + el.rows[k] * LANES;
-                EACH to[l] -= x[l] * g[l];
-            }
-        }
-        scatter(data(out.f2), vector, 1, a, first, used, NULL);
-        invert(&m, &el, growth, good);
-        for (npy_intp l = 0; l < used; l++) {
-            if (good[l] == 0.0)
-                return handed_over(&call, &out);
-            if ((first + l) % every == 0)
-                raise_to(data(out.amplification), n + 1, el.inverse + l, LANES,
-                         sizes + l * a * (n + 1), n, a, n + 1);
-        }
-        for (npy_intp i = 0; i < n; i++) {
-            memcpy(buffer + i * d * LANES, el.inverse + i * n * LANES, d * LANES * sizeof(double));
-            double *to = buffer + n * d * LANES + i * LANES;
-            EACH to[l] = 0.0;
-            for (npy_intp k = 0; k < a; k++) {
-                const double *x = el.inverse + (i * n + d + k) * LANES;
-                EACH to[l] -= x[l] * vector[k * LANES + l];
-            }
-        }
-        scatter(data(out.basis), buffer, n, d, first, used, of_basis);
-        scatter(data(out.offset), buffer + n * d * LANES, 1, n, first, used, NULL);
-    }
-    unscale(&m, data(out.amplification));
-    data(out.known)[0] = 1.0;
-    return handed_over(&call, &out);
+    double *most = call->out[7];
+    memset(most, 0, n * (n + 1) * sizeof(double));
+    Series *each[] = {&m.E, &m.A, &f.B, &f.F, &f.u, &f.theta};
+    for (int i = 0; i < 6; i++)
+        each[i]->time *= every;
+    const npy_intp looks = (m.times + every - 1) / every;
+    for (npy_intp first = 0; first < looks; first += LANES)
+        amplify(&m, &el, &f, first, looks - first < LANES ? looks - first : LANES, room, most);
+    for (npy_intp i = 0; i < n * (n + 1); i++)
+        if (i % (n + 1) < n) /* rounding of the model's own states, not of the scaled ones */
+            most[i] /= m.columns[i % (n + 1)];
+    return DONE;
 }
 
-PyMethodDef reduction_kernels[] = {
-    KERNEL(all_levels),
-    KERNEL(reduced),
-    {NULL, NULL, 0, NULL},
+#define MODEL "oN?nn oN?nn n n # %v "
+
+const Kernel reduction_kernels[] = {
+    {"bounds", MODEL "@z @z %r nd z=v*n a=z-r d=n-a", "N3 N Ndd", bounds},
+    {"eliminated", MODEL "oN?nm oN?nq oN?m oN?q @z @z %r nd %e # # z=v*n a=z-r d=n-a",
+     "Ndn Ndn Nd Nan Na Nnd Nn nn+", eliminated},
+    {NULL, NULL, NULL, NULL},
 };

@@ -1,75 +1,37 @@
-/* gpebo_cli/simulation: derivative arrays, their ranks, scalings, consistent states. */
+/* Derivative arrays at single times: singular values, and where they carry their rank. */
 #include "structure.h"
 
 #include "orthogonal.h"
 
-/* ---- arguments --------------------------------------------------------------------------- */
+/* What there is to see at one time. */
+typedef struct {
+    double *e, *a;       /* (orders, n, n) scaled */
+    double *M;           /* (size, size) */
+    double *W, *mirrors; /* (size, size) */
+    double *square;      /* (size, size) */
+    double *sigma;       /* (size,) of M, from large to small */
+    npy_intp *order;     /* (size,) */
+    double *Z2;          /* (a, size) by rows, orthonormal: Z2ᵀ */
+    double *A2;          /* (a, n) */
+    double *T2;          /* (d, n) by rows: T2ᵀ */
+    double *Z1;          /* (d, n) by rows: Z1ᵀ */
+    double smallest[3];  /* of M, Â2 and E T2, relative; infinite where there is none */
+    npy_intp constraints;
+} Look;
 
-int series(Call *call, Py_ssize_t place, int axes, Series *out)
-{
-    PyObject *given = call->given[place];
-    PyArrayObject *array = (PyArrayObject *)given;
-    int usable = PyArray_Check(given) && PyArray_TYPE(array) == NPY_DOUBLE &&
-                 PyArray_NDIM(array) == axes && PyArray_ISBEHAVED_RO(array);
-    npy_intp step = sizeof(double), entries = 1;
-    for (int axis = axes - 1; usable && axis >= 2; axis--) {
-        usable = size(array, axis) <= 1 || PyArray_STRIDE(array, axis) == step;
-        step *= size(array, axis);
-    }
-    if (!usable && (array = doubles(call, place, axes)) == NULL)
-        return 0;
-    for (int axis = 2; axis < axes; axis++)
-        entries *= size(array, axis);
-    out->at = data(array);
-    out->orders = size(array, 0);
-    out->times = size(array, 1);
-    out->entries = entries;
-    out->order = PyArray_STRIDE(array, 0) / (npy_intp)sizeof(double);
-    out->time = out->times == 1 ? 0 : PyArray_STRIDE(array, 1) / (npy_intp)sizeof(double);
-    return 1;
-}
-
-int model(Call *call, Model *m)
-{
-    if (!series(call, 0, 4, &m->E) || !series(call, 1, 4, &m->A))
-        return 0;
-    PyArrayObject *rows = doubles(call, 2, 1), *columns = rows ? doubles(call, 3, 1) : NULL;
-    if (columns == NULL || !number(call, 4, &m->time) || !whole_number(call, 5, &m->mu))
-        return 0;
-    m->n = size(rows, 0);
-    m->rows = data(rows);
-    m->columns = data(columns);
-    m->size = (m->mu + 1) * m->n;
-    m->times = m->E.times > m->A.times ? m->E.times : m->A.times;
-    PyArrayObject *E = (PyArrayObject *)call->given[0], *A = (PyArrayObject *)call->given[1];
-    if (!same("columns and rows", size(columns, 0), m->n) || !same("rows of E", size(E, 2), m->n) ||
-        !same("columns of E", size(E, 3), m->n) || !same("rows of A", size(A, 2), m->n) ||
-        !same("columns of A", size(A, 3), m->n) ||
-        !(m->E.times == m->times || same("times of E", m->E.times, 1)) ||
-        !(m->A.times == m->times || same("times of A", m->A.times, 1)))
-        return 0;
-    if (m->n < 1 || m->mu < 0 || m->times < 1 || m->E.orders <= m->mu || m->A.orders <= m->mu) {
-        PyErr_SetString(PyExc_ValueError, "fewer Taylor coefficients than mu + 1, or none");
-        return 0;
-    }
-    return 1;
-}
-
-/* ---- one time ---------------------------------------------------------------------------- */
-
-void scaled(const Model *m, npy_intp t, double *e, double *a)
+/* e and a (orders, n, n): the scaled coefficients at time t. */
+static void scaled(const Model *m, npy_intp t, double *e, double *a)
 {
     const npy_intp n = m->n;
     double power = 1.0;
-    for (npy_intp k = 0; k <= m->mu; k++, power *= m->time) {
+    for (npy_intp k = 0; k < m->orders; k++, power *= m->time) {
         const double *E = m->E.at + k * m->E.order + t * m->E.time;
         const double *A = m->A.at + k * m->A.order + t * m->A.time;
-        for (npy_intp i = 0; i < n; i++)
-            for (npy_intp j = 0; j < n; j++) {
-                const double weight = m->rows[i] * m->columns[j];
-                *e++ = E[i * n + j] * weight * power / m->time;
-                *a++ = A[i * n + j] * weight * power;
-            }
+        for (npy_intp i = 0; i < n * n; i++) {
+            const double weight = m->rows[i / n] * m->columns[i % n];
+            *e++ = E[i] * weight * power / m->time;
+            *a++ = A[i] * weight * power;
+        }
     }
 }
 
@@ -78,7 +40,7 @@ static void derivative_array(const Model *m, const double *e, const double *a, d
 {
     const npy_intp n = m->n, size = m->size;
     memset(M, 0, size * size * sizeof(double));
-    for (npy_intp i = 0; i <= m->mu; i++)
+    for (npy_intp i = 0; i < m->orders; i++)
         for (npy_intp j = 0; j <= i; j++)
             for (npy_intp p = 0; p < n; p++) {
                 double *row = M + (i * n + p) * size + j * n;
@@ -89,25 +51,22 @@ static void derivative_array(const Model *m, const double *e, const double *a, d
             }
 }
 
-int prepare(Call *call, const Model *m, Look *look)
+/* Memory for a look at one time after the other; 0 with an exception. */
+static int prepare(Call *call, const Model *m, Look *look)
 {
     const npy_intp n = m->n, size = m->size, many = size * size;
-    double *memory = old_scratch(call, 2 * n * size + 4 * many + size + size * size + 3 * n * n);
-    PyArrayObject *order = memory ? fresh_indices(call, size) : NULL;
-    if (order == NULL)
+    double *memory = scratch(call, 2 * n * size + 5 * many + size + 3 * n * n);
+    look->order = memory ? scratch_indices(call, size) : NULL;
+    if (look->order == NULL)
         return 0;
-    look->order = (npy_intp *)PyArray_DATA(order);
-    look->e = memory;
-    look->a = look->e + n * size;
-    look->M = look->a + n * size;
-    look->W = look->M + many;
-    look->mirrors = look->W + many;
-    look->square = look->mirrors + many;
-    look->sigma = look->square + many;
-    look->Z2 = look->sigma + size;
-    look->A2 = look->Z2 + many;
-    look->T2 = look->A2 + n * n;
-    look->Z1 = look->T2 + n * n;
+    double **parts[] = {&look->e, &look->a, &look->M, &look->W, &look->mirrors, &look->square,
+                        &look->Z2, &look->sigma, &look->A2, &look->T2, &look->Z1};
+    const npy_intp sizes[] = {n * size, n * size, many, many, many, many,
+                              many, size, n * n, n * n, n * n};
+    for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++) {
+        *parts[i] = memory;
+        memory += sizes[i];
+    }
     return 1;
 }
 
@@ -122,7 +81,7 @@ static int triangular_values(const double *W, npy_intp rows, npy_intp length, do
     return orthogonalise(square, rows, rows, sigma);
 }
 
-int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank_tol, int upto, Look *look)
+static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank_tol, int upto, Look *look)
 {
     const npy_intp n = m->n, size = m->size;
     look->smallest[0] = look->smallest[1] = look->smallest[2] = HUGE_VAL;
@@ -202,34 +161,25 @@ int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank_tol, i
     return 1;
 }
 
-/* levels(E, A, rows, columns, time, mu, constraints, column) -> known (1,), smallest (N,): the
-   singular values (column 0: of M, 1: of Â2, 2: of E T2) that belong to so many constraints,
-   relative to the size of their factors. known is 0 where LAPACK has to look. */
-static PyObject *levels(PyObject *module, PyObject *const *given, Py_ssize_t count)
+/* The model, rank_tol, a number of constraints or −1 -> how many there are, and the smallest
+   singular values of M, Â2 and E T2 that count as nonzero, relative to the size of their factors,
+   at each time. */
+static Outcome levels(Call *call)
 {
-    (void)module;
-    Call call;
     Model m;
     Look look;
-    npy_intp constraints, column;
-    if (!begin(&call, given, count, 8))
-        return NULL;
-    if (!model(&call, &m) || !whole_number(&call, 6, &constraints) ||
-        !whole_number(&call, 7, &column) || !prepare(&call, &m, &look))
-        return failed(&call);
-    if (constraints < 0 || constraints > m.n || column < 0 || column > 2) {
-        PyErr_SetString(PyExc_ValueError, "no such level");
-        return failed(&call);
+    if (read_model(call, &m) == ERROR || !prepare(call, &m, &look))
+        return ERROR;
+    const npy_intp asked = (npy_intp)call->number[7];
+    if (asked > m.n)
+        return refused("constraints", asked);
+    for (npy_intp t = 0; t < m.times; t++) {
+        if (!look_at(&m, t, asked, call->number[6], 3, &look))
+            return DECLINED;
+        call->out[0][t] = (double)look.constraints;
+        memcpy(call->out[1] + 3 * t, look.smallest, sizeof(look.smallest));
     }
-    PyArrayObject *known = zeros(&call, 1, (npy_intp[]){1});
-    PyArrayObject *smallest = known ? fresh(&call, 1, (npy_intp[]){m.times}) : NULL;
-    if (smallest == NULL)
-        return failed(&call);
-    npy_intp t = 0;
-    while (t < m.times && look_at(&m, t, constraints, 0.0, (int)column + 1, &look))
-        data(smallest)[t++] = look.smallest[column];
-    data(known)[0] = t == m.times;
-    return results(&call, 2, known, smallest);
+    return DONE;
 }
 
 /* Rows and columns of left (size, size) that carry its rank, `count` of them first and the others
@@ -274,140 +224,40 @@ static void flagged_first(npy_intp *flags, npy_intp size, npy_intp *memory)
     memcpy(flags, memory, size * sizeof(npy_intp));
 }
 
-/* Z1ᵀ A T (d, d) where something has been looked at, NaN where [Z1ᵀE; Z2ᵀN] is singular; T are the
-   first columns of its inverse. memory: 2 n² numbers. */
-static void dynamics_of(const Model *m, const Look *look, double *memory, double *out)
+/* The model, a time, rank_tol -> [constraints], smallest singular values, rows and columns of M
+   that carry its rank (in front), Z1ᵀ in the first rows. */
+static Outcome reference(Call *call)
 {
-    const npy_intp n = m->n, a = look->constraints, d = n - a;
-    double *whole = memory, *inverse = memory + n * n;
-    multiply(whole, look->Z1, look->e, d, n, n);
-    multiply(whole + d * n, look->Z2, look->a, a, m->size, n);
-    memset(inverse, 0, n * n * sizeof(double));
-    for (npy_intp i = 0; i < n; i++)
-        inverse[i * n + i] = 1.0;
-    const int regular = solve_in_place(whole, inverse, n, n);
-    multiply(whole, look->Z1, look->a, d, n, n);
-    for (npy_intp i = 0; i < d; i++)
-        for (npy_intp j = 0; j < d; j++) {
-            double sum = regular ? 0.0 : (double)NAN;
-            for (npy_intp k = 0; k < n; k++)
-                sum += whole[i * n + k] * inverse[k * n + j];
-            out[i * d + j] = sum;
-        }
-}
-
-/* start(E, A, rows, columns, time, mu, place, rank_tol) -> known (2,), smallest (1, 3),
-   rows, columns (size,), Z1 (n, d), dynamics (1, d, d) at one of the times, where to
-   start from at the others. known says whether, and how many constraints there are: with more
-   than n of them, or where LAPACK has to look, the rest means nothing. The dynamics Z1ᵀA T are NaN
-   where [Z1ᵀE; Z2ᵀN] is singular. */
-static PyObject *start(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
     Model m;
     Look look;
-    npy_intp place;
-    double rank_tol;
-    if (!begin(&call, given, count, 8))
-        return NULL;
-    if (!model(&call, &m) || !whole_number(&call, 6, &place) || !number(&call, 7, &rank_tol) ||
-        !prepare(&call, &m, &look))
-        return failed(&call);
-    if (place < 0 || place >= m.times) {
-        PyErr_SetString(PyExc_ValueError, "no such time");
-        return failed(&call);
-    }
-    int seen = look_at(&m, place, -1, rank_tol, 3, &look);
-    const npy_intp n = m.n, size = m.size, a = seen && look.constraints <= n ? look.constraints : 0;
-    const npy_intp d = n - a;
-    PyArrayObject *known = fresh(&call, 1, (npy_intp[]){2});
-    PyArrayObject *smallest = known ? fresh(&call, 2, (npy_intp[]){1, 3}) : NULL;
-    PyArrayObject *rows = smallest ? fresh_indices(&call, size) : NULL;
-    PyArrayObject *columns = rows ? fresh_indices(&call, size) : NULL;
-    PyArrayObject *Z1 = columns ? zeros(&call, 2, (npy_intp[]){n, d}) : NULL;
-    PyArrayObject *dynamics = Z1 ? fresh(&call, 3, (npy_intp[]){1, d, d}) : NULL;
-    double *whole = dynamics ? old_scratch(&call, 2 * n * n) : NULL;
-    if (whole == NULL)
-        return failed(&call);
-    memcpy(data(smallest), look.smallest, sizeof(look.smallest));
-    npy_intp *first = (npy_intp *)PyArray_DATA(rows), *second = (npy_intp *)PyArray_DATA(columns);
-    memset(first, 0, size * sizeof(npy_intp));
-    memset(second, 0, size * sizeof(npy_intp));
-    if (seen && look.constraints <= n) {
-        for (npy_intp i = 0; i < n; i++)
-            for (npy_intp j = 0; j < d; j++)
-                data(Z1)[i * d + j] = look.Z1[j * n + i];
-        dynamics_of(&m, &look, whole, data(dynamics));
-        derivative_array(&m, look.e, look.a, look.M);
-        seen = pivots(look.M, size, size - a, first, second);
-        flagged_first(first, size, look.order);
-        flagged_first(second, size, look.order);
-    }
-    data(known)[0] = seen;
-    data(known)[1] = (double)look.constraints;
-    return results(&call, 6, known, smallest, rows, columns, Z1, dynamics);
+    if (read_model(call, &m) == ERROR || !prepare(call, &m, &look))
+        return ERROR;
+    const npy_intp place = SIZE(p), n = m.n, size = m.size;
+    if (place >= m.times)
+        return refused("a time", place);
+    if (!look_at(&m, place, -1, call->number[7], 3, &look))
+        return DECLINED;
+    const npy_intp a = look.constraints, d = n - a;
+    call->out[0][0] = (double)a;
+    memcpy(call->out[1], look.smallest, sizeof(look.smallest));
+    memset(call->out[4], 0, n * n * sizeof(double));
+    memset(call->index_out[2], 0, size * sizeof(npy_intp));
+    memset(call->index_out[3], 0, size * sizeof(npy_intp));
+    if (a > n) /* so many that the rest means nothing */
+        return DONE;
+    memcpy(call->out[4], look.Z1, d * n * sizeof(double));
+    derivative_array(&m, look.e, look.a, look.M);
+    if (!pivots(look.M, size, size - a, call->index_out[2], call->index_out[3]))
+        return DECLINED;
+    flagged_first(call->index_out[2], size, look.order);
+    flagged_first(call->index_out[3], size, look.order);
+    return DONE;
 }
 
-/* dips(values (N, 3), share, fall, most) -> steady (1,), found (M, 2): column and place of local
-   minima below this share of their column's maximum, ends included, the deepest first and at most
-   so many of each column; columns that are not finite have none. steady is whether no such
-   minimum lies between the ends and no value falls below `fall` of its column's maximum. */
-static PyObject *dips(PyObject *module, PyObject *const *given, Py_ssize_t count)
-{
-    (void)module;
-    Call call;
-    double share, fall;
-    npy_intp most;
-    if (!begin(&call, given, count, 4))
-        return NULL;
-    PyArrayObject *values = doubles(&call, 0, 2);
-    if (values == NULL || !same("columns of values", size(values, 1), 3) ||
-        !number(&call, 1, &share) || !number(&call, 2, &fall) || !whole_number(&call, 3, &most))
-        return failed(&call);
-    const npy_intp times = size(values, 0);
-    PyArrayObject *steady = fresh(&call, 1, (npy_intp[]){1});
-    double *all = steady ? old_scratch(&call, 3 * times) : NULL;
-    if (all == NULL)
-        return failed(&call);
-    double is_steady = 1.0;
-    npy_intp counts[3] = {0, 0, 0};
-    for (npy_intp column = 0; column < 3; column++) {
-        const double *x = data(values) + column;
-        double largest = -HUGE_VAL, *minima = all + column * times;
-        int finite = 1;
-        for (npy_intp t = 0; t < times; t++) {
-            finite &= fabs(x[3 * t]) < HUGE_VAL;
-            largest = x[3 * t] > largest ? x[3 * t] : largest;
-        }
-        for (npy_intp t = 0; finite && t < times; t++) {
-            if (!(x[3 * t] >= fall * largest))
-                is_steady = 0.0;
-            if (!(x[3 * t] < share * largest) || (t > 0 && x[3 * t] > x[3 * (t - 1)]) ||
-                (t + 1 < times && x[3 * t] > x[3 * (t + 1)]))
-                continue;
-            if (t > 0 && t + 1 < times)
-                is_steady = 0.0;
-            npy_intp k = counts[column]++;
-            for (; k > 0 && x[3 * (npy_intp)minima[k - 1]] > x[3 * t]; k--)
-                minima[k] = minima[k - 1];
-            minima[k] = (double)t;
-        }
-        counts[column] = counts[column] < most ? counts[column] : most;
-    }
-    data(steady)[0] = is_steady;
-    PyArrayObject *found = fresh(&call, 2, (npy_intp[]){counts[0] + counts[1] + counts[2], 2});
-    if (found == NULL)
-        return failed(&call);
-    double *to = data(found);
-    for (npy_intp column = 0; column < 3; column++)
-        for (npy_intp k = 0; k < counts[column]; k++) {
-            *to++ = (double)column;
-            *to++ = all[column * times + k];
-        }
-    return results(&call, 2, steady, found);
-}
+#define MODEL "oN?nn oN?nn n n # %v "
 
-PyMethodDef structure_kernels[] = {
-    KERNEL(levels), KERNEL(start), KERNEL(dips), {NULL, NULL, 0, NULL},
+const Kernel structure_kernels[] = {
+    {"levels", MODEL "# #", "N N3", levels},
+    {"reference", MODEL "%p # z=v*n", "1 3 @z @z nn", reference},
+    {NULL, NULL, NULL, NULL},
 };

@@ -1,56 +1,37 @@
-/* The model as the kernels of gpebo_cli/simulation see it; for structure.c and reduction.c. */
+/* A model as the kernels of the reduction see it; for structure.c and reduction.c. */
 #ifndef GPEBO_STRUCTURE_H
 #define GPEBO_STRUCTURE_H
 
-#include "common.h"
+#include "kernel.h"
 
-/* Taylor coefficients (K + 1, N or 1, …) wherever they lie; what is constant in time is read with
-   a stride of 0. Strides are in numbers. */
+/* Taylor coefficients (orders, times, …): numbers from one order and one time to the next. */
 typedef struct {
     const double *at;
-    npy_intp orders, times, entries, order, time;
+    npy_intp order, time, entries;
 } Series;
 
-/* E and A of a model with the scalings of its rows, states and time, differentiated mu times. */
+/* E and A with the scalings of rows, states and time; size = orders n is that of M. */
 typedef struct {
     Series E, A;
     const double *rows, *columns; /* (n,) */
     double time;
-    npy_intp n, mu, size, times; /* size = (mu + 1) n, times = N */
+    npy_intp n, orders, size, times;
 } Model;
 
-/* What there is to see at one time. */
-typedef struct {
-    double *e, *a;       /* (mu + 1, n, n) scaled */
-    double *M;           /* (size, size) */
-    double *W, *mirrors; /* (size, size) */
-    double *square;      /* (size, size) */
-    double *sigma;       /* (size,) of M, from large to small */
-    npy_intp *order;     /* (size,) */
-    double *Z2;          /* (a, size) by rows, orthonormal: Z2ᵀ */
-    double *A2;          /* (a, n) */
-    double *T2;          /* (d, n) by rows: T2ᵀ */
-    double *Z1;          /* (d, n) by rows: Z1ᵀ */
-    double smallest[3];  /* of M, Â2 and E T2, relative; infinite where there is none */
-    npy_intp constraints;
-} Look;
+static inline Series series(const Call *call, int place, npy_intp entries)
+{
+    return (Series){call->in[place], call->order[place], call->step[place], entries};
+}
 
-/* One argument as a Series with `axes` axes; only matrices that are not by rows are copied. */
-int series(Call *call, Py_ssize_t place, int axes, Series *out);
-
-/* Arguments 0 to 5: E, A (K + 1, N or 1, n, n), rows, columns (n,), time and mu. */
-int model(Call *call, Model *m);
-
-/* e and a (mu + 1, n, n): the scaled coefficients at time t. */
-void scaled(const Model *m, npy_intp t, double *e, double *a);
-
-/* Memory for a look at one time after the other; 0 with an exception. */
-int prepare(Call *call, const Model *m, Look *look);
-
-/* Levels at time t, `constraints` < 0: as many as M has singular values that are at most rank_tol
-   times its size; `upto` says how many of the three are asked for. 0 where singular values and
-   elimination do not see the same rank, or nothing converges: LAPACK has to look. */
-int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank_tol, int upto,
-            Look *look);
+/* Arguments 0 to 5, "oN?nn oN?nn n n # %v": E, A, rows, columns, time, orders used. */
+static inline Outcome read_model(Call *call, Model *m)
+{
+    const npy_intp n = SIZE(n), v = SIZE(v);
+    *m = (Model){series(call, 0, n * n), series(call, 1, n * n), call->in[2], call->in[3],
+                 call->number[4], n, v, v * n, SIZE(N)};
+    if (n < 1 || v < 1 || SIZE(o) < v || SIZE(N) < 1)
+        return refused("Taylor coefficients", SIZE(o));
+    return DONE;
+}
 
 #endif

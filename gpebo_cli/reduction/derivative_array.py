@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpebo_cli.kernels.structure_numpy import forcing as kernel_forcing
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 
-# Largest derivative array for the compiled kernels: beyond it LAPACK's blocks are worth its calls.
-SMALL = 32
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 
 
@@ -40,33 +39,7 @@ class Scaling:
 
 def forcing(c: Coefficients) -> Array:
     """Taylor coefficients of f = B u + F θ + φ, shape (K + 1, N, n)."""
-    orders = len(c.E)
-    f = c.phi.copy()
-    for k in range(orders):
-        for i in range(k + 1):
-            f[k] += np.einsum("nij,nj->ni", c.F[i], c.theta[k - i])
-            f[k] += np.einsum("nij,nj->ni", c.B[i], c.u[k - i])
-    return np.asarray(f)
-
-
-def scaled(c: Coefficients, s: Scaling) -> tuple[Array, Array]:
-    """Taylor coefficients of E and A in scaled rows, states and time."""
-    powers = s.time ** np.arange(len(c.E), dtype=np.float64)[:, None, None, None]
-    weight = s.rows[:, None] * s.columns
-    return c.E * weight * powers / s.time, c.A * weight * powers
-
-
-def derivative_array(e: Array, a: Array, mu: int) -> tuple[Array, Array]:
-    """M (N, (μ+1) n, (μ+1) n) and N (N, (μ+1) n, n) from Taylor coefficients (K + 1, N, n, n)."""
-    count, n = e.shape[1], e.shape[2]
-    M = np.zeros((count, mu + 1, n, mu + 1, n))
-    for i in range(mu + 1):
-        for j in range(i + 1):
-            M[:, i, :, j] = (j + 1) * e[i - j]
-            if i - j - 1 >= 0:
-                M[:, i, :, j] -= a[i - j - 1]
-    N = np.moveaxis(a[: mu + 1], 0, 1).reshape(count, (mu + 1) * n, n)
-    return M.reshape(count, (mu + 1) * n, (mu + 1) * n), N
+    return np.asarray(c.phi + kernel_forcing(c.B, c.F, c.u, c.theta, len(c.E)))
 
 
 def balance(c: Coefficients) -> Scaling:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
-from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem
-from gpebo_cli.numerics.linalg import frobenius_norm, inverse_or_none, joined, transpose
-from gpebo_cli.reduction.derivative_array import SMALL, derivative_array, forcing, scaled, who
-from gpebo_cli.reduction.structure import RESIDUAL, Pivots, Structure
+from gpebo_cli.kernels.structure_numpy import (
+    by_elimination,
+    derivative_array,
+    in_own_states,
+    scaled,
+)
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.numerics.linalg import inverse_or_none, joined, transpose
+from gpebo_cli.reduction.derivative_array import forcing, who
+from gpebo_cli.reduction.structure import RESIDUAL, Structure
 
 _MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
 _LOOKS = 32  # times at which the sensitivity to rounding is looked at
@@ -59,62 +64,71 @@ def strangeness_free_form(
     mu, scaling = structure.mu, structure.scaling
     if c is None:
         c = system.coefficients.taylor(t, mu, inside)
-    if kernels.compiled is not None and (mu + 1) * system.n <= SMALL:
-        found = _reduced_compiled(structure, len(t), c, system.coefficients.zero)
-        if found is not None:
-            return found
-    f = forcing(c)
+    zero, direct = system.coefficients.zero, direct_part(c, system.coefficients.zero)
+    reference = structure.reference
+    pivots = reference.rows, reference.columns, reference.rank, reference.Z1
+    F, theta = c.F, c.theta
+    if "phi" not in zero:  # one more unknown, whose value is known to be 1
+        one = np.zeros((*theta.shape[:2], 1))
+        one[0] = 1.0
+        F = np.concatenate([F, c.phi[..., None]], axis=3)
+        theta = np.concatenate([theta, one], axis=2)
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]
-    e, aa = scaled(c._replace(E=E, A=A), scaling)
+    model = (scaling.rows, scaling.columns, scaling.time, mu + 1)
+    every = max(1, len(t) // _LOOKS)
+    found = kernels.structure.eliminated(
+        c.E, c.A, *model, c.B, F, c.u, theta, *pivots, every, _MAX_GROWTH, RESIDUAL
+    )
+    if found is None:
+        found = _with_singular_vectors(system, structure, E, A, forcing(c), t, every)
+    E1, A1, f1, A2, f2, basis, offset, amplification = found
+    if structure.time_invariant:
+        E1, A1, A2, basis = (matrix[:1] for matrix in (E1, A1, A2, basis))
+    none = not structure.a
+    return StrangenessFree(
+        E1, A1, f1, A2, f2, None if none else basis, None if none else offset, amplification,
+        E[0], c.u[0], c.C[0], direct,
+    )
+
+
+def _with_singular_vectors(
+    system: DescriptorSystem, structure: Structure, E: Array, A: Array, f: Array, t: Array,
+    every: int,
+) -> tuple[Array, ...]:
+    """As the kernel ``eliminated``; singular vectors at times where the pivots will not do."""
+    mu, scaling, reference = structure.mu, structure.scaling, structure.reference
+    model = (scaling.rows, scaling.columns, scaling.time)
+    e, aa = scaled(E, A, *model, mu + 1)
     M, N = derivative_array(e, aa, mu)
     # [Â2 | f2] = Z2ᵀ [N | g] with g = (f_0, …, f_μ)
     weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
     g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
-    reference = structure.reference
-    some = slice(0, None, _every(len(t)))
-    Z1, A2, f2, size, inverse, poor = _by_elimination(reference, e[0], M, N, g, some)
-    if poor.any():
-        Z1 = np.repeat(Z1, len(M), axis=0)
-        Z1[poor], Z2 = _by_singular_vectors(
-            system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
-        )
-        # What the elimination made grow there is not used, and amplifies nothing.
-        A2[poor] = transpose(Z2) @ N[poor]
-        everywhere = np.broadcast_to(poor, len(t))
-        f2[everywhere] = transpose(Z2) @ g[everywhere]
-        terms = np.abs(joined(N, g, axis=2))
-        again = np.arange(len(t))[some][everywhere[some]]
-        which = again if len(M) > 1 else np.zeros_like(again)
-        size[everywhere[some]] = np.abs(transpose(Z2))[np.cumsum(poor)[which] - 1] @ terms[again]
-        whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
-        inverse[poor], poor[poor] = inverse_or_none(whole)
+    some = slice(0, None, every)
+    A2, f2, size, inverse, poor = by_elimination(
+        e[0], M, N, g, reference.rows, reference.columns, reference.rank, reference.Z1, every,
+        _MAX_GROWTH, RESIDUAL,
+    )
+    Z1 = np.repeat(reference.Z1[None], len(M), axis=0)
+    Z1[poor], Z2 = _by_singular_vectors(
+        system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
+    )
+    # What the elimination made grow there is not used, and amplifies nothing.
+    A2[poor] = transpose(Z2) @ N[poor]
+    everywhere = np.broadcast_to(poor, len(t))
+    f2[everywhere] = transpose(Z2) @ g[everywhere]
+    terms = np.abs(joined(N, g, axis=2))
+    again = np.arange(len(t))[some][everywhere[some]]
+    which = again if len(M) > 1 else np.zeros_like(again)
+    size[everywhere[some]] = np.abs(transpose(Z2))[np.cumsum(poor)[which] - 1] @ terms[again]
+    whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
+    inverse[poor], poor[poor] = inverse_or_none(whole)
     if poor.any():
         raise ModelError(
             f"{who(system)}: the equations do not determine the state near "
             f"t = {t[int(np.argmax(poor))]:.9g}"
         )
-    # Back to the model's own states: only rows stay scaled, and row scalings do not matter.
-    W1 = transpose(Z1) * scaling.rows
-    inverse = scaling.columns[:, None] * inverse
-    d = structure.d
-    sensitivity = np.abs(inverse[some if len(inverse) > 1 else slice(None), :, d:])
-    amplification = (sensitivity @ size).max(axis=0)
-    amplification[:, :-1] /= scaling.columns
-    return StrangenessFree(
-        E1=W1 @ E[0],
-        A1=W1 @ A[0],
-        f1=_apply(W1, f[0]),
-        A2=A2 / scaling.columns,
-        f2=f2[:, :, 0],
-        basis=inverse[:, :, :d] / scaling.time if structure.a else None,  # the scaled E is E/τ
-        offset=-(inverse[:, :, d:] @ f2)[:, :, 0] if structure.a else None,
-        amplification=amplification,
-        E=E[0],
-        u=c.u[0],
-        C=c.C[0],
-        direct=direct_part(c, system.coefficients.zero),
-    )
+    return in_own_states(E[0], A[0], f[0], Z1, A2, f2, size, inverse, *model, every)
 
 
 def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
@@ -127,86 +141,6 @@ def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
     if {"D", "H"} <= zero:
         return None
     return _apply(c.D[0], c.u[0]) + _apply(c.H[0], c.theta[0])
-
-
-def _every(count: int) -> int:
-    """At every how many of so many times the sensitivity to rounding is looked at."""
-    return max(1, count // _LOOKS)
-
-
-def _reduced_compiled(
-    structure: Structure, count: int, c: Coefficients, zero: frozenset[str]
-) -> StrangenessFree | None:
-    """:func:`strangeness_free_form`; None where the reference will not do at some time."""
-    compiled: Any = kernels.compiled
-    s, reference, E = structure.scaling, structure.reference, c.E[0]
-    F, theta = c.F, c.theta
-    if "phi" not in zero:  # one more unknown, whose value is known to be 1
-        one = np.zeros((*theta.shape[:2], 1))
-        one[0] = 1.0
-        F = np.concatenate([F, c.phi[..., None]], axis=3)
-        theta = np.concatenate([theta, one], axis=2)
-    model = (c.E, c.A, s.rows, s.columns, s.time, structure.mu, c.B, F, c.u, theta)
-    found = compiled.reduced(
-        *model, reference.rows, reference.columns, reference.rank, reference.Z1,
-        _every(count), _MAX_GROWTH, RESIDUAL,
-    )
-    known, E1, A1, f1, A2, f2, basis, offset, amplification = found
-    if not known[0]:
-        return None
-    if not structure.a:
-        basis = offset = None
-    if structure.time_invariant:
-        E1, A1, A2, E = (matrix[:1] for matrix in (E1, A1, A2, E))
-        basis = None if basis is None else basis[:1]
-    return StrangenessFree(
-        E1, A1, f1, A2, f2, basis, offset, amplification, E, c.u[0], c.C[0],
-        direct_part(c, zero),
-    )
-
-
-def _by_elimination(
-    pivots: Pivots, E: Array, M: Array, N: Array, g: Array, some: slice
-) -> tuple[Array, Array, Array, Array, Array, BoolArray]:
-    """Z1 (1, n, d), Â2 (N, a, n), f2 (N, a, 1) on the reference pivots, [Z1ᵀE; Â2]⁻¹.
-
-    Before the inverse, the size of the terms of [Â2 | f2] at ``some`` times; the last one says
-    where the pivots will not do.
-    """
-    count, n, r = len(M), E.shape[1], pivots.rank
-    right = joined(N, g, axis=2)[:, pivots.rows]
-    poor = np.zeros(count, dtype=bool)
-    if r < len(pivots.rows):
-        M = M[:, pivots.rows[:, None], pivots.columns]
-        try:
-            X = transpose(np.asarray(
-                np.linalg.solve(transpose(M[:, :r, :r]), transpose(M[:, r:, :r])),
-                dtype=np.float64,
-            ))
-        except np.linalg.LinAlgError:
-            everywhere = np.ones(count, dtype=bool)
-            left = right[:, r:]
-            size = np.abs(left[some])
-            A2, f2 = left[:count, :, :n].copy(), left[:, :, n:].copy()
-            return pivots.Z1[None], A2, f2, size, np.zeros_like(E), everywhere
-        residual = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:])
-        poor = (residual > RESIDUAL * frobenius_norm(M)) | (frobenius_norm(X) > _MAX_GROWTH)
-        constraints = right[:, r:] - X @ right[:, :r]
-        # What rounding of M leaves of the higher derivatives, which it should eliminate, counts.
-        pivot = M[some if count > 1 else slice(1), :r, :r]
-        derivatives = np.linalg.solve(pivot, right[some, :r])
-        through = np.abs(right[some, :r]) + 2.0 * np.abs(pivot) @ np.abs(derivatives)
-        size = np.abs(right[some, r:]) + np.abs(X[some] if count > 1 else X) @ through
-    else:
-        constraints = right[:, r:]
-        size = np.abs(constraints[some])
-    A2 = constraints[:count, :, :n].copy()
-    whole = np.concatenate([pivots.Z1.T @ E, A2], axis=1)
-    scale = np.maximum(np.abs(whole).max(axis=2), np.finfo(float).tiny)
-    inverse, singular = inverse_or_none(whole / scale[:, :, None])
-    poor |= singular | (frobenius_norm(inverse) > _MAX_GROWTH)
-    f2 = constraints[:, :, n:].copy()
-    return pivots.Z1[None], A2, f2, size, inverse / scale[:, None, :], poor
 
 
 def _by_singular_vectors(

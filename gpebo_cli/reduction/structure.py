@@ -6,24 +6,17 @@ Kunkel & Mehrmann, Differential-Algebraic Equations, Hypothesis 3.48: ranks of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
+from gpebo_cli.kernels.structure_numpy import relative_singular_values
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import frobenius_norm, transpose
+from gpebo_cli.numerics.linalg import frobenius_norm
 from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, initial_edges
-from gpebo_cli.reduction.derivative_array import (
-    SMALL,
-    Scaling,
-    balance,
-    derivative_array,
-    scaled,
-    who,
-)
+from gpebo_cli.reduction.derivative_array import Scaling, balance, who
 
 RESIDUAL = 1e-13  # rows that should vanish after elimination, relative to the array
 _PROBES = 65  # times at which the structure is established before anything is integrated
@@ -180,51 +173,40 @@ def _judged(
 
     ``c`` may have more times than t where E and A are constant.
     """
-    if kernels.compiled is not None and (mu + 1) * c.E.shape[2] <= SMALL:
-        found = _judged_compiled(t, c, mu, scaling, rank_tol, invariant)
-        if found is not None:
-            return found
-    e, aa = scaled(c, scaling)
-    e, aa = e[:, : len(t)], aa[:, : len(t)]
-    # A μ that will not do fails at one time already.
-    middle = slice(len(t) // 2, len(t) // 2 + 1)
-    one = _levels(t[middle], e[:, middle], aa[:, middle], mu, rank_tol)
-    if one.failure:
-        return one, None
-    reference = _reference(e[:, middle], aa[:, middle], mu, one)
-    levels = _all_levels(t, e, aa, mu, rank_tol, one, reference)
-    return levels, None if levels.failure else reference
-
-
-def _judged_compiled(
-    t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, invariant: bool
-) -> tuple[_Levels, Pivots | None] | None:
-    """:func:`_judged`; None where it takes LAPACK to tell, or to say what is wrong."""
-    compiled: Any = kernels.compiled
-    n, middle = c.E.shape[2], len(t) // 2
-    model = (c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu)
-    known, smallest, rows, columns, Z1, dynamics = compiled.start(*model, middle, rank_tol)
-    trusted, counted = known.tolist()
-    a = int(counted)
-    if not trusted:
-        return None
+    model = (c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1)
+    middle, n = len(t) // 2, c.E.shape[2]
     at = t[middle : middle + 1]
+    # A μ that will not do fails at one time already.
+    a, smallest, rows, columns, Z1 = kernels.structure.reference(*model, middle, rank_tol)
+    smallest = smallest[None]
     failure = _too_many(a, n, at) if a > n else _why_not(at, smallest, rank_tol)
     if failure:
         return _Levels(a, smallest, failure), None
-    r = (mu + 1) * n - a
-    if invariant:
-        finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
-        least = float(smallest.min())
-        return _Levels(a, smallest, "", least, dynamics=finite), Pivots(r, rows, columns, Z1)
-    known, smallest, dynamics = compiled.all_levels(
-        *model, rows, columns, r, Z1, rank_tol, max(_PLAIN, 10.0 * rank_tol), RESIDUAL
+    reference = Pivots((mu + 1) * n - a, rows, columns, Z1)
+    E, A = c.E[:, : len(t)], c.A[:, : len(t)]
+    bounds, left, dynamics = kernels.structure.bounds(
+        E, A, *model[2:], rows, columns, reference.rank, Z1
     )
-    trusted, least, is_finite = known.tolist()
-    if not trusted:
-        return None
-    levels = _Levels(a, smallest, "", least, dynamics=dynamics if is_finite else None)
-    return levels, Pivots(r, rows, columns, Z1)
+    finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
+    if invariant:
+        return _Levels(a, smallest, "", float(smallest.min()), dynamics=finite), reference
+    # Away from rank changes bounds serve as well as singular values, and the elimination that
+    # the reduction does anyway gives them for a fraction of the price. Singular values are computed
+    # where a bound is small, or smallest.
+    plain = (bounds > max(_PLAIN, 10.0 * rank_tol)).all(axis=1) & (left <= RESIDUAL)
+    closer = ~plain
+    closer[np.argmin(bounds, axis=0)] = True
+    closer[middle] = True  # of the reference, whose ranks the others must have
+    which = np.flatnonzero(closer)
+    E, A = (x if x.shape[1] == 1 else x[:, which] for x in (E, A))
+    counts, exact = kernels.structure.levels(E, A, *model[2:], rank_tol, -1)
+    if (counts != a).any():
+        sigma = relative_singular_values(E, A, *model[2:])
+        return _Levels(a, bounds, _changes(sigma, counts, t[which])), None
+    bounds[which] = exact
+    failure = _why_not(t[which], exact, rank_tol)
+    levels = _Levels(a, bounds, failure, float(exact.min()), dynamics=finite)
+    return levels, None if failure else reference
 
 
 def _too_many(a: int, n: int, t: Array) -> str:
@@ -239,48 +221,7 @@ class _Levels:
     smallest: Array  # (N, 3) of M, Â2 and E T2, relative to the size of their factors; or bounds
     failure: str
     least: float = np.inf  # of those that were computed
-    T2: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))  # (N, n, d)
     dynamics: Array | None = None  # (N or 1, d, d) in scaled time, see ``Structure``
-
-
-def _levels(
-    t: Array, e: Array, aa: Array, mu: int, rank_tol: float, a: int | None = None
-) -> _Levels:
-    """Ranks at the times t; with ``a`` given, the singular values that belong to that rank.
-
-    ``e`` and ``aa`` are the scaled Taylor coefficients of E and A, (μ + 1, N, n, n).
-    """
-    n = e.shape[-1]
-    M, N = derivative_array(e, aa, mu)
-    U, sigma, _ = np.linalg.svd(M)
-    relative = sigma / _array_size(sigma[:, 0], aa)[:, None]
-    smallest = np.full((len(t), 3), np.inf)
-    if a is None:
-        ranks = (relative > rank_tol).sum(axis=1)
-        if (ranks != ranks[0]).any():
-            k = int(np.argmax(ranks != ranks[0]))
-            return _Levels(0, smallest, _changes("the derivative array", ranks, k, t, relative[k]))
-        a = (mu + 1) * n - int(ranks[0])
-    if a > n:
-        return _Levels(a, smallest, _too_many(a, n, t))
-    r = M.shape[1] - a
-    if r:
-        smallest[:, 0] = relative[:, r - 1]
-    Z2 = U[:, :, r:]
-    A2 = transpose(Z2) @ N
-    _, s2, V2 = np.linalg.svd(A2)
-    s2 = s2 / frobenius_norm(N)[:, None]
-    if a:
-        smallest[:, 1] = s2[:, -1]
-    T2 = transpose(V2)[:, :, a:]
-    s3 = np.linalg.svd(e[0] @ T2, compute_uv=False)
-    s3 = s3 / frobenius_norm(e[0])[:, None]
-    if a < n:
-        smallest[:, 2] = s3[:, -1]
-    failure = _why_not(t, smallest, rank_tol)
-    if failure:
-        return _Levels(a, smallest, failure)
-    return _Levels(a, smallest, "", float(smallest.min(initial=np.inf)), T2)
 
 
 def _why_not(t: Array, smallest: Array, rank_tol: float) -> str:
@@ -294,65 +235,7 @@ def _why_not(t: Array, smallest: Array, rank_tol: float) -> str:
     return ""
 
 
-def _array_size(M: Array, aa: Array) -> Array:
-    """Size of what the derivative array was made from: with E = 0 it is still judged against A."""
-    size = np.maximum(M, np.abs(aa).max(axis=(0, 2, 3)))
-    return np.asarray(np.maximum(size, np.finfo(float).tiny))  # a plant of zeros has none
-
-
 _PLAIN = 1e-5  # bounds of singular values above this need no closer look
-
-
-def _all_levels(
-    t: Array, e: Array, aa: Array, mu: int, rank_tol: float, one: _Levels,
-    reference: Pivots,
-) -> _Levels:
-    """:func:`_levels` at all times t, given those of one time, ``one``.
-
-    Away from rank changes bounds serve as well as singular values, and the elimination that
-    :func:`reduce` does anyway gives them for a fraction of the price. With W = [Z1ᵀE; A2] and
-    A2 = Z2ᵀN, Z2ᵀ = [−X I],
-
-        σ_r(M) ≥ 1/‖M11⁻¹‖,      σ_min(Â2) ≥ 1/(‖W⁻¹‖ ‖Z2‖),      σ_min(E T2) ≥ 1/‖W⁻¹‖.
-
-    Singular values are computed where a bound is small, or smallest.
-    """
-    M, N = derivative_array(e, aa, mu)
-    r = reference.rank
-    dynamics: Array | None = None
-    M = M[:, reference.rows[:, None], reference.columns]
-    N = N[:, reference.rows]
-    bounds = np.full((len(t), 3), np.inf)
-    try:
-        inverse = np.asarray(np.linalg.inv(M[:, :r, :r]), dtype=np.float64)
-        X = M[:, r:, :r] @ inverse
-        whole = np.concatenate([reference.Z1.T @ e[0], N[:, r:] - X @ N[:, :r]], axis=1)
-        states = np.asarray(np.linalg.inv(whole), dtype=np.float64)
-        determined, dynamics = frobenius_norm(states), _dynamics(reference.Z1, aa[0], states)
-        size = _array_size(frobenius_norm(M), aa)
-        left = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:])
-        if r:
-            bounds[:, 0] = 1.0 / (frobenius_norm(inverse) * size)
-        if one.a:
-            spread = np.sqrt(one.a + frobenius_norm(X) ** 2)
-            bounds[:, 1] = 1.0 / (determined * spread * frobenius_norm(N))
-        if one.a < len(e[0, 0]):
-            bounds[:, 2] = 1.0 / (determined * frobenius_norm(e[0]))
-        plain = (bounds > max(_PLAIN, 10.0 * rank_tol)).all(axis=1) & (left <= RESIDUAL * size)
-    except np.linalg.LinAlgError:  # a pivot block that is exactly singular somewhere
-        plain = np.zeros(len(t), dtype=bool)
-    closer = ~plain
-    closer[np.argmin(bounds, axis=0)] = True
-    closer[len(t) // 2] = True  # of the reference, whose ranks the others must have
-    exact = _levels(t[closer], e[:, closer], aa[:, closer], mu, rank_tol)
-    bounds[closer] = exact.smallest
-    return _Levels(exact.a, bounds, exact.failure, float(exact.smallest.min()), dynamics=dynamics)
-
-
-def _dynamics(Z1: Array, A: Array, inverse: Array) -> Array | None:
-    """Z1ᵀA T (N, d, d), T being the first columns of the inverses (N, n, n), if it is finite."""
-    found = np.asarray(Z1.T @ A @ inverse[:, :, : Z1.shape[1]])
-    return found if np.isfinite(found).all() else None
 
 
 def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
@@ -361,9 +244,6 @@ def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
     A dip is a local minimum far below the column's maximum, given as its column and its place;
     the deepest of each column come first. There is none in columns that are not finite.
     """
-    if kernels.compiled is not None:
-        calm, found = kernels.compiled.dips(smallest, _DIP, _FALL, _MOST_DIPS)
-        return bool(calm[0]), [(int(column), int(k)) for column, k in found.tolist()]
     steady, dips = True, []
     for column in range(3):
         values = smallest[:, column]
@@ -378,11 +258,14 @@ def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
     return steady, dips
 
 
-def _changes(what: str, ranks: Array, k: int, t: Array, sigma: Array) -> str:
-    border = min(int(ranks[k]), int(ranks[0]))
+def _changes(sigma: Array, counts: Array, t: Array) -> str:
+    """That the rank of the derivative array, with so many constraints, differs at times t (N,)."""
+    ranks = sigma.shape[1] - counts.astype(int)
+    k = int(np.argmax(ranks != ranks[0]))
+    value = sigma[min(k, len(sigma) - 1), min(int(ranks[k]), int(ranks[0]))]
     return (
-        f"the rank of {what} changes from {ranks[0]} at t = {t[0]:.6g} to {ranks[k]} at "
-        f"t = {t[k]:.6g} (singular value {sigma[border]:.1e})"
+        f"the rank of the derivative array changes from {ranks[0]} at t = {t[0]:.6g} to {ranks[k]} "
+        f"at t = {t[k]:.6g} (singular value {value:.1e})"
     )
 
 
@@ -426,7 +309,7 @@ def _follow_dips(
             grid = left + (right - left) * _CUTS
             grid[-1] = right
             c = system.coefficients.taylor(grid, mu)
-            line = _line(grid, c, mu, scaling, rank_tol, levels.a, column)
+            line = _line(c, mu, scaling, rank_tol, levels.a, column)
             best = int(line.argmin())
             value = float(line[best])
             lowest, where = min(lowest, value), grid[best]
@@ -446,35 +329,10 @@ _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
 
 
 def _line(
-    t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, a: int, column: int
+    c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, a: int, column: int
 ) -> Array:
-    """One column (N,) of the levels that belong to ``a`` constraints, at the times t."""
-    if kernels.compiled is not None and (mu + 1) * c.E.shape[2] <= SMALL:
-        known, line = kernels.compiled.levels(
-            c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu, a, column
-        )
-        if known[0]:
-            return np.asarray(line)
-    e, aa = scaled(c, scaling)
-    return _levels(t, e, aa, mu, rank_tol, a).smallest[:, column]
-
-
-def _reference(e: Array, aa: Array, mu: int, one: _Levels) -> Pivots:
-    """Where to start from at other times, from the coefficients and the levels of one."""
-    Z1 = np.linalg.svd(e[0, 0] @ one.T2[0], full_matrices=False)[0]
-    M = derivative_array(e, aa, mu)[0][0]
-    r = len(M) - one.a
-    return Pivots(r, *_pivots(M, r), Z1)
-
-
-def _pivots(matrix: Array, count: int) -> tuple[IntArray, IntArray]:
-    """All rows and columns, ``count`` that carry the rank first: elimination, complete pivoting."""
-    left = matrix.copy()
-    chosen = np.zeros((2, len(matrix)), dtype=bool)
-    for _ in range(count):
-        i, j = divmod(int(np.abs(left).argmax()), len(left))
-        chosen[0, i] = chosen[1, j] = True
-        left -= left[:, j, None] * (left[i] / left[i, j])
-        left[i], left[:, j] = 0.0, 0.0
-    rows, columns = np.argsort(~chosen, axis=1, kind="stable")
-    return rows, columns
+    """One column (N,) of the levels that belong to ``a`` constraints, at the times of c."""
+    _, found = kernels.structure.levels(
+        c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1, rank_tol, a
+    )
+    return np.asarray(found[:, column])

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from gpebo_cli.errors import SolverError
+from gpebo_cli.kernels.structure_numpy import derivative_array, scaled
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import (
     LinearProblem,
@@ -21,7 +22,7 @@ from gpebo_cli.numerics.collocation import (
     unresolved_signals,
 )
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.reduction.derivative_array import derivative_array, forcing, scaled
+from gpebo_cli.reduction.derivative_array import forcing
 from gpebo_cli.reduction.structure import Structure
 
 _MAX_ROUNDS = 12
@@ -53,7 +54,8 @@ def _array(
     """M, N and g (N, (μ + 1) n, 1) of the derivative array, scaled."""
     c = system.coefficients.taylor(t, mu, inside)
     scaling = structure.scaling
-    M, N = derivative_array(*scaled(c, scaling), mu)
+    e, a = scaled(c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1)
+    M, N = derivative_array(e, a, mu)
     weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
     g = np.moveaxis(forcing(c) * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
     return M, N, g

@@ -1,0 +1,324 @@
+"""Derivative arrays of a descriptor system: ranks at single times, elimination at many.
+
+In Taylor coefficients e_k = E^(k)/k!, a_k = A^(k)/k! of E and A in scaled rows, states and time,
+
+    M_ij = (j + 1) e_{i−j} − a_{i−j−1},   N_i = a_i,   i, j = 0 … μ.
+
+With the rows and columns that carry the rank of M at one time in front, Z2ᵀ = [−X I] with
+X = M21 M11⁻¹ is a left kernel of M at the others, and Â2 = Z2ᵀN are the constraints. A function
+takes the model as E, A (orders, N or 1, n, n), scales of rows and columns (n,), the unit of time,
+and the number μ + 1 of orders that are used.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+
+from gpebo_cli.kernels.arrays import Array, BoolArray, IntArray
+
+_TINY = float(np.finfo(float).tiny)
+
+
+def scaled(
+    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int
+) -> tuple[Array, Array]:
+    """Taylor coefficients of E and A in scaled rows, states and time."""
+    powers = time ** np.arange(orders, dtype=np.float64)[:, None, None, None]
+    weight = rows[:, None] * columns
+    return E[:orders] * weight * powers / time, A[:orders] * weight * powers
+
+
+def derivative_array(e: Array, a: Array, mu: int) -> tuple[Array, Array]:
+    """M (N, (μ+1) n, (μ+1) n) and N (N, (μ+1) n, n) from Taylor coefficients (K + 1, N, n, n)."""
+    count, n = max(e.shape[1], a.shape[1]), e.shape[2]
+    M = np.zeros((count, mu + 1, n, mu + 1, n))
+    for i in range(mu + 1):
+        for j in range(i + 1):
+            M[:, i, :, j] = (j + 1) * e[i - j]
+            if i - j - 1 >= 0:
+                M[:, i, :, j] -= a[i - j - 1]
+    N = np.moveaxis(a[: mu + 1], 0, 1).reshape(a.shape[1], (mu + 1) * n, n)
+    return M.reshape(count, (mu + 1) * n, (mu + 1) * n), N
+
+
+def array_size(M: Array, a: Array) -> Array:
+    """Size of what the derivative array was made from: with E = 0 it is still judged against A."""
+    size = np.maximum(M, np.abs(a).max(axis=(0, 2, 3)))
+    return np.asarray(np.maximum(size, _TINY))  # a plant of zeros has none
+
+
+def relative_singular_values(
+    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int
+) -> Array:
+    """Of M at N times, relative to its size, (N, (μ+1) n)."""
+    e, a = scaled(E, A, rows, columns, time, orders)
+    M, _ = derivative_array(e, a, orders - 1)
+    sigma = np.asarray(np.linalg.svd(M, compute_uv=False), dtype=np.float64)
+    return np.asarray(sigma / array_size(sigma[:, 0], a)[:, None])
+
+
+def levels(
+    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, rank_tol: float,
+    constraints: int,
+) -> tuple[Array, Array]:
+    """How many constraints there are (N,), and the singular values that must not be zero (N, 3).
+
+    These are the smallest of M, Â2 and E T2 that count, relative to the size of their factors;
+    infinite where there is none, and not determined where there are more constraints than states.
+
+    Args:
+        E: with the five that follow, the model.
+        A: see above.
+        rows: see above.
+        columns: see above.
+        time: see above.
+        orders: see above.
+        rank_tol: singular values below this, relative, are zero.
+        constraints: how many of M belong to constraints, whatever they are; −1: as many as are 0.
+    """
+    e, a = scaled(E, A, rows, columns, time, orders)
+    times = range(max(e.shape[1], a.shape[1]))
+    found = [_levels_at(_at(e, k), _at(a, k), rank_tol, constraints) for k in times]
+    return np.array([float(one[0]) for one in found]), np.array([one[1] for one in found])
+
+
+def _at(coefficients: Array, k: int) -> Array:
+    """Coefficients (orders, N or 1, ...) at the time k."""
+    return coefficients[:, k if coefficients.shape[1] > 1 else 0]
+
+
+def _levels_at(
+    e: Array, a: Array, rank_tol: float, constraints: int
+) -> tuple[int, Array, Array]:
+    """Number of constraints, smallest singular values and T2 (n, d) at one time."""
+    n = e.shape[-1]
+    M, N = (x[0] for x in derivative_array(e[:, None], a[:, None], len(e) - 1))
+    U, sigma, _ = np.linalg.svd(M)
+    relative = sigma / array_size(sigma[:1], a[:, None])[0]
+    count = constraints if constraints >= 0 else len(M) - int((relative > rank_tol).sum())
+    smallest = np.full(3, np.inf)
+    if count > n:
+        return count, smallest, np.zeros((n, 0))
+    r = len(M) - count
+    if r:
+        smallest[0] = relative[r - 1]
+    _, s2, V2 = np.linalg.svd(U[:, r:].T @ N)
+    if count:
+        smallest[1] = s2[-1] / (np.linalg.norm(N) + _TINY)
+    T2 = V2.T[:, count:]
+    if count < n:
+        s3 = np.linalg.svd(e[0] @ T2, compute_uv=False)
+        smallest[2] = s3[-1] / (np.linalg.norm(e[0]) + _TINY)
+    return count, smallest, T2
+
+
+def reference(
+    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, place: int,
+    rank_tol: float,
+) -> tuple[int, Array, IntArray, IntArray, Array]:
+    """Where elimination at other times starts from: :func:`levels` and pivots of one time.
+
+    Arguments are those of :func:`levels`, and the time's ``place``.
+
+    Returns:
+        the number of constraints a; the singular values (3,); all rows and all columns of M, those
+        that carry its rank first; and Z1 (n, d), an orthonormal basis of range(E T2). With more
+        constraints than states only the first one means something.
+    """
+    e, a = scaled(E, A, rows, columns, time, orders)
+    e, a = _at(e, place), _at(a, place)
+    count, smallest, T2 = _levels_at(e, a, rank_tol, -1)
+    M = derivative_array(e[:, None], a[:, None], orders - 1)[0][0]
+    if count > len(rows):
+        everything = np.arange(len(M))
+        return count, smallest, everything, everything, np.zeros((len(rows), 0))
+    Z1 = np.linalg.svd(e[0] @ T2, full_matrices=False)[0]
+    return count, smallest, *_pivots(M, len(M) - count), Z1
+
+
+def _pivots(matrix: Array, count: int) -> tuple[IntArray, IntArray]:
+    """All rows and columns, ``count`` that carry the rank first: elimination, complete pivoting."""
+    left = matrix.copy()
+    chosen = np.zeros((2, len(matrix)), dtype=bool)
+    for _ in range(count):
+        i, j = divmod(int(np.abs(left).argmax()), len(left))
+        chosen[0, i] = chosen[1, j] = True
+        left -= left[:, j, None] * (left[i] / left[i, j])
+        left[i], left[:, j] = 0.0, 0.0
+    first, second = np.argsort(~chosen, axis=1, kind="stable")
+    return first, second
+
+
+def frobenius_norm(matrix: Array) -> Array:
+    """Frobenius norms (N,) of matrices (N, i, j), at least the smallest positive number."""
+    return np.asarray(np.sqrt(np.einsum("nij,nij->n", matrix, matrix)) + _TINY)
+
+
+def bounds(
+    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int,
+    pivot_rows: IntArray, pivot_columns: IntArray, rank: int, Z1: Array,
+) -> tuple[Array, Array, Array]:
+    """Lower bounds of the singular values of :func:`levels` at N times, by elimination.
+
+    With W = [Z1ᵀE; Â2],
+
+        σ_r(M) ≥ 1/‖M11⁻¹‖,      σ_min(Â2) ≥ 1/(‖W⁻¹‖ ‖Z2‖),      σ_min(E T2) ≥ 1/‖W⁻¹‖.
+
+    Returns:
+        the bounds (N, 3), zero or NaN where a block is singular; what the elimination leaves of M22
+        relative to the size of M (N,); and the dynamics Z1ᵀA T (N, d, d), T being the first columns
+        of W⁻¹.
+    """
+    e, a = scaled(E, A, rows, columns, time, orders)
+    M, N = derivative_array(e, a, orders - 1)
+    r, d = rank, Z1.shape[1]
+    n = len(rows)
+    M, N = M[:, pivot_rows[:, None], pivot_columns], N[:, pivot_rows]
+    found = np.full((len(M), 3), np.inf)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        inverse = _inverses(M[:, :r, :r])
+        X = M[:, r:, :r] @ inverse
+        whole = np.concatenate(
+            [np.broadcast_to(Z1.T @ e[0], (len(M), d, n)), N[:, r:] - X @ N[:, :r]], axis=1
+        )
+        states = _inverses(whole)
+        determined, size = frobenius_norm(states), array_size(frobenius_norm(M), a)
+        if r:
+            found[:, 0] = 1.0 / (frobenius_norm(inverse) * size)
+        if d < n:
+            spread = np.sqrt(n - d + frobenius_norm(X) ** 2)
+            found[:, 1] = 1.0 / (determined * spread * frobenius_norm(N))
+        if d:
+            found[:, 2] = 1.0 / (determined * frobenius_norm(e[0]))
+        left = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:]) / size
+        return found, left, Z1.T @ a[0] @ states[:, :, :d]
+
+
+def _inverses(matrices: Array) -> Array:
+    """Inverses (N, n, n), infinite where there is none."""
+    try:
+        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        out = np.full_like(matrices, np.inf)
+        for k, one in enumerate(matrices):
+            with suppress(np.linalg.LinAlgError):
+                out[k] = np.linalg.inv(one)
+        return out
+
+
+def forcing(B: Array, F: Array, u: Array, theta: Array, orders: int) -> Array:
+    """Taylor coefficients of B u + F θ, shape (orders, N, n)."""
+    f = np.zeros((orders, max(x.shape[1] for x in (B, F, u, theta)), B.shape[2]))
+    for k in range(orders):
+        for i in range(k + 1):
+            f[k] += np.matmul(F[i], theta[k - i][..., None])[..., 0]
+            f[k] += np.matmul(B[i], u[k - i][..., None])[..., 0]
+    return f
+
+
+def by_elimination(
+    E: Array, M: Array, N: Array, g: Array, pivot_rows: IntArray, pivot_columns: IntArray,
+    rank: int, Z1: Array, every: int, growth: float, residual: float,
+) -> tuple[Array, Array, Array, Array, BoolArray]:
+    """Â2 (N or 1, a, n), f2 (N, a, 1), sizes of the terms of both, [Z1ᵀE; Â2]⁻¹, where it failed.
+
+    Sizes are those at every so many times; elimination fails where it grows more than ``growth``
+    or leaves more than ``residual``.
+    """
+    count, n, r = len(M), E.shape[1], rank
+    some = slice(0, None, every)
+    right = np.concatenate([np.broadcast_to(N, (len(g), *N.shape[1:])), g], axis=2)[:, pivot_rows]
+    M = M[:, pivot_rows[:, None], pivot_columns]
+    with np.errstate(invalid="ignore", over="ignore"):
+        inverse = _inverses(M[:, :r, :r])
+        X = M[:, r:, :r] @ inverse
+        left = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:])
+        poor = ~((left <= residual * frobenius_norm(M)) & (frobenius_norm(X) <= growth))
+        X[poor], inverse[poor] = 0.0, 0.0
+        constraints = right[:, r:] - X @ right[:, :r]
+        # What rounding of M leaves of the higher derivatives, which it should eliminate, counts.
+        seen = some if count > 1 else slice(1)
+        pivot = np.abs(M[seen, :r, :r])
+        derivatives = np.abs(inverse[seen] @ right[some, :r])
+        through = np.abs(right[some, :r]) + 2.0 * pivot @ derivatives
+        size = np.abs(right[some, r:]) + np.abs(X[seen]) @ through
+        A2 = constraints[:count, :, :n].copy()
+        whole = np.concatenate([np.broadcast_to(Z1.T @ E, (count, Z1.shape[1], n)), A2], axis=1)
+        scale = np.maximum(np.abs(whole).max(axis=2, initial=0.0), _TINY)
+        inverse = _inverses(whole / scale[:, :, None])
+        poor |= ~(frobenius_norm(inverse) <= growth)
+    return A2, constraints[:, :, n:].copy(), size, inverse / scale[:, None, :], poor
+
+
+def eliminated(
+    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, B: Array, F: Array,
+    u: Array, theta: Array, pivot_rows: IntArray, pivot_columns: IntArray, rank: int, Z1: Array,
+    every: int, growth: float, residual: float,
+) -> tuple[Array, ...] | None:
+    """E1 x' = A1 x + f1 and 0 = Â2 x + f2 in the model's own states, at N times.
+
+    Args:
+        E: with the five that follow, the model.
+        A: see above.
+        rows: see above.
+        columns: see above.
+        time: see above.
+        orders: see above.
+        B: of f = B u + F θ, (orders, N or 1, n, m).
+        F: likewise, (orders, N or 1, n, q).
+        u: likewise, (orders, N or 1, m).
+        theta: likewise, (orders, N or 1, q).
+        pivot_rows: as in :func:`bounds`, with the three that follow.
+        pivot_columns: likewise.
+        rank: likewise.
+        Z1: likewise.
+        every: at every how many times the amplification is looked at.
+        growth: of the elimination, at most.
+        residual: of M22, relative, at most.
+
+    Returns:
+        E1, A1 (N, d, n), f1 (N, d), Â2 (N, a, n), f2 (N, a), T (N, n, d) and offset (N, n) of the
+        consistent states T z + offset with z = E1 x, and by how much relative rounding of each
+        state, and of 1, reaches each state through the constraints (n, n + 1); None where the
+        elimination fails at some time.
+    """
+    e, a = scaled(E, A, rows, columns, time, orders)
+    M, N = derivative_array(e, a, orders - 1)
+    f = forcing(B[:orders], F[:orders], u[:orders], theta[:orders], orders)
+    times = max(len(M), f.shape[1])
+    f = np.broadcast_to(f, (orders, times, len(rows)))
+    weights = (time ** np.arange(orders))[:, None] * rows
+    g = np.moveaxis(f * weights[:, None, :], 0, 1).reshape(times, -1, 1)
+    A2, f2, size, inverse, poor = by_elimination(
+        e[0], M, N, g, pivot_rows, pivot_columns, rank, Z1, every, growth, residual
+    )
+    if poor.any():
+        return None
+    found = in_own_states(E[0], A[0], f[0], Z1[None], A2, f2, size, inverse, rows, columns, time,
+                          every)
+    return tuple(
+        np.broadcast_to(x, (times, *x.shape[1:])) if len(x) == 1 else x for x in found[:-1]
+    ) + found[-1:]
+
+
+def in_own_states(
+    E: Array, A: Array, f: Array, Z1: Array, A2: Array, f2: Array, size: Array, inverse: Array,
+    rows: Array, columns: Array, time: float, every: int,
+) -> tuple[Array, ...]:
+    """What :func:`eliminated` returns from what is found in scaled rows and states.
+
+    Only rows stay scaled, and row scalings do not matter. E, A and f are those of the model.
+    """
+    W1 = np.swapaxes(Z1, 1, 2) * rows
+    inverse = columns[:, None] * inverse
+    d = Z1.shape[2]
+    some = slice(0, None, every) if len(inverse) > 1 else slice(None)
+    amplification = (np.abs(inverse[some, :, d:]) @ size).max(axis=0)
+    amplification[:, :-1] /= columns
+    return (
+        W1 @ E, W1 @ A, np.matmul(W1, f[:, :, None])[:, :, 0], A2 / columns, f2[:, :, 0],
+        inverse[:, :, :d] / time,  # the scaled E is E/τ
+        -(inverse[:, :, d:] @ f2)[:, :, 0], amplification,
+    )
