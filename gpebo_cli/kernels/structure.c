@@ -96,6 +96,8 @@ static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank
         return 0;
     memcpy(look->W, look->M, size * size * sizeof(double));
     triangularise(look->W, size, size, look->mirrors, look->order);
+    if (!(fabs(look->W[0]) < DBL_MAX)) /* squares that overflow */
+        return 0;
     /* Rows of W with nothing left but rounding: the left kernel is perpendicular to the rest. */
     npy_intp rank = 0;
     const double rounding = 4.0 * DBL_EPSILON * (double)size * fabs(look->W[0]);
