@@ -6,6 +6,7 @@ import io
 import os
 import subprocess
 import sys
+from html import escape
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -118,7 +119,12 @@ def test_what_is_printed_is_what_the_command_prints(circuit, tmp_path):
     lines = done.stdout.splitlines()
     lines.remove("there")
     assert str(circuit).splitlines() == lines
-    assert circuit.verdict in repr(circuit)
+    assert repr(circuit) == (
+        "<gpebo run of circuit, t = 0 to 8 s, gpebo, 201 times, drem with 2 cases>"
+    )
+    shown = circuit._repr_html_()
+    assert escape(circuit.verdict) in shown
+    assert shown.count("<tr>") == 3
 
 
 def test_the_folder_is_the_command_lines_byte_for_byte(circuit, tmp_path):

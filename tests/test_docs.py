@@ -24,6 +24,7 @@ TUTORIAL = ROOT / "docs" / "tutorial.md"
 NOTEBOOK = ROOT / "docs" / "first_run.ipynb"
 HELP = {
     "": usage.HELP, "check": usage.CHECK_HELP, "compare": usage.COMPARE_HELP,
+    "report": usage.REPORT_HELP,
     "figures": usage.FIGURES_HELP, "list": usage.LIST_HELP, "new": usage.NEW_HELP,
     "run": usage.run_help(),
 }

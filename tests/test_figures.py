@@ -296,6 +296,53 @@ def test_one_case_that_diverges_does_not_hide_the_others() -> None:
     assert high > 1e199
 
 
+@pytest.mark.parametrize("label", ["i_{", r"\\nosuch{x}", r"\\frac{1}", "_"])
+def test_a_label_that_cannot_be_set_is_refused(label: str) -> None:
+    result = make_result(samples=5)
+    result = replace(result, system=replace(result.system, labels={"il": label}))
+    with pytest.raises(ConfigError, match=r"^labels\.il: "):
+        draw(result, ["states"])
+
+
+def test_an_error_with_its_sign_on_a_linear_axis() -> None:
+    result = make_result()
+    output = replace(result.settings.output, error="linear")
+    result = replace(result, settings=replace(result.settings, output=output))
+    [(_, figure)] = draw(result, ["state_error_a"])
+    axes = figure.axes[0]
+    assert axes.get_yscale() == "linear"
+    assert axes.get_ylabel() == r"$\hat{e}_{1} - e_{1}$ (V)"
+    expected = estimation_of(result).states[0, :, 0] - result.signals.states[:, 0]
+    np.testing.assert_array_equal(np.asarray(axes.get_lines()[0].get_ydata()), expected)
+
+
+@pytest.mark.parametrize(("width", "inches"), [("column", 3.5), ("page", 7.16), (5.0, 5.0)])
+def test_figures_are_as_wide_as_asked_for(width: float, inches: float) -> None:
+    result = make_result(samples=11)
+    output = replace(result.settings.output, width=width, dpi=100)
+    result = replace(result, settings=replace(result.settings, output=output))
+    for _, figure in draw(result):
+        assert figure.get_figwidth() == pytest.approx(inches)
+
+
+@pytest.mark.parametrize(
+    ("name", "math"),
+    [
+        ("x1", "$x_{1}$"),
+        ("theta", r"$\theta$"),
+        ("theta1", r"$\theta_{1}$"),
+        ("il", "$i_L$"),
+        ("e0_il", "$e_{0,i_L}$"),
+        ("ir2", r"$\mathrm{ir}_{2}$"),
+        ("xi_a0", r"$\xi_{a_{0}}$"),
+        ("leak", r"$\mathrm{leak}$"),
+        ("flow_of_the_inlet", "flow_of_the_inlet"),
+    ],
+)
+def test_names_are_written_as_people_write_them(name: str, math: str) -> None:
+    assert symbols.typeset(name, {"il": "i_L"}) == math
+
+
 def test_at_most_eight_panels_and_it_says_so() -> None:
     panel = style.Panel("x", (style.Curve(np.arange(3.0), np.arange(3.0), "", style.line(0)),))
     figure = style.compose([panel] * 30)

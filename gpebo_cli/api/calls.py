@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, cast, overload
 
 from gpebo_cli import observers
 from gpebo_cli.api.choice import choose, plain, primary
@@ -173,8 +173,18 @@ def load_plant(plant: Plant, config_dir: Folder | None = None) -> DescriptorSyst
     return system_from_mapping(content, source)
 
 
-def available(group: str, config_dir: Folder | None = None) -> list[str]:
+@overload
+def available(group: str, config_dir: Folder | None = None) -> list[str]: ...
+@overload
+def available(group: None = None, config_dir: Folder | None = None) -> dict[str, list[str]]: ...
+def available(
+    group: str | None = None, config_dir: Folder | None = None
+) -> list[str] | dict[str, list[str]]:
     """Names that a group can have: ``plant``, ``observer``, ``estimator``, ``solver``, ….
+
+    Args:
+        group: one of them; without it, the names of all groups by group.
+        config_dir: a folder of yours, with ``GROUP/NAME.yaml``.
 
     Raises:
         ConfigError: there is no such group.
@@ -183,7 +193,11 @@ def available(group: str, config_dir: Folder | None = None) -> list[str]:
         >>> from gpebo_cli import available
         >>> "circuit" in available("plant")
         True
+        >>> "drem" in available()["estimator"]
+        True
     """
+    if group is None:
+        return {name: available(name, config_dir) for name in GROUPS}
     if group not in GROUPS:
         raise ConfigError(
             f"available({shown(group)}): no such group; known: {', '.join(GROUPS)}"

@@ -18,10 +18,11 @@ from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.results import figures
+from gpebo_cli.results import figures, html
 from gpebo_cli.results.figures import truth_at
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.frames import frame
+from gpebo_cli.results.page import case_table as case_cells
 from gpebo_cli.results.report import case_rows, run_lines
 from gpebo_cli.results.style import draw_on
 from gpebo_cli.schema import nearest, shown
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+_SHOWN_CASES = 12  # in a notebook
 _HAT = "_hat"  # of the names of estimates, as in estimates.csv
 
 
@@ -200,8 +202,20 @@ class Result:
         return "\n".join(run_lines(self.details))
 
     def __repr__(self) -> str:
-        name, count = self.details.system.name, len(self.cases)
-        return f"<gpebo run of {name}, {count} case{'' if count == 1 else 's'}: {self.verdict}>"
+        """Short: :attr:`verdict` says how it went."""
+        details = self.details
+        first, last = float(self.t[0]), float(self.t[-1])
+        what = f"{details.settings.observer.get('name')}, {len(self.t)} times"
+        if details.estimation is not None:
+            count = len(details.estimation.cases)
+            name = details.settings.estimator.get("name")
+            what += f", {name} with {count} case{'' if count == 1 else 's'}"
+        return f"<gpebo run of {details.system.name}, t = {first:g} to {last:g} s, {what}>"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the verdict and the cases."""
+        table = html.table(case_cells([("", row) for row in self.cases[:_SHOWN_CASES]]))
+        return html.paragraph(repr(self)) + html.paragraph(self.verdict) + table
 
     def to_pandas(self, table: str = "signals") -> DataFrame:
         """One of the run's tables as a data frame, with the names of the CSV files.

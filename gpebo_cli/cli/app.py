@@ -16,6 +16,7 @@ COMMANDS = {
     "run": "run",
     "check": "check",
     "compare": "compare",
+    "report": "report",
     "figures": "figures",
     "list": "listing",
     "new": "new",

@@ -6,13 +6,14 @@ import csv
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpebo_cli.cli.options import parse
-from gpebo_cli.cli.sweep_folder import PLAN, job_folder, read_plan, read_records
+from gpebo_cli.cli.sweep_folder import PLAN, JobRecord, job_folder, read_plan, read_records
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results.report import columns
 from gpebo_cli.schema import nearest
@@ -90,7 +91,37 @@ def _cases(name: str) -> list[Case]:
 
     Jobs that are not done are counted on stderr.
     """
-    from gpebo_cli.results.finished import is_run, read_run
+    from gpebo_cli.results.finished import read_run
+
+    cases = []
+    for found in find(name):
+        left_out = sum(record.status != "done" for record in found.records)
+        if left_out:
+            total = len(found.records)
+            sys.stderr.write(
+                f"{found.path}: {left_out} of {total} jobs are not done and left out\n"
+            )
+        cases += [case for run in found.runs for case in read_run(*run)]
+    return cases
+
+
+@dataclass(frozen=True)
+class Found:
+    """A run, or a sweep with the ``records`` of its jobs."""
+
+    path: str  # as it was given
+    label: str
+    runs: list[tuple[str, Path, Mapping[str, str]]]  # name, folder, overrides; those that are done
+    records: list[JobRecord] = field(default_factory=list)
+
+
+def find(name: str) -> list[Found]:
+    """What a folder is, or all that is in it.
+
+    Raises:
+        ConfigError: neither a run nor a sweep, and nothing of that kind in it.
+    """
+    from gpebo_cli.results.finished import is_run
 
     folder = Path(name)
     if not folder.is_dir():
@@ -99,7 +130,7 @@ def _cases(name: str) -> list[Case]:
     # The stamps in the names of our own folders say more than where these are.
     label = folder.absolute().name if label.startswith((".", "outputs")) else label
     if is_run(folder):
-        return read_run(label, folder, {})
+        return [Found(name, label, [(label, folder, {})])]
     plan = read_plan(folder)
     if plan is None:
         inside = [p for p in sorted(folder.iterdir()) if is_run(p) or (p / PLAN).is_file()]
@@ -108,17 +139,14 @@ def _cases(name: str) -> list[Case]:
                 f"{name}: neither a finished run (summary.json) nor a sweep (sweep.json), and "
                 "nothing of that kind in it"
             )
-        return [case for path in inside for case in _cases(str(path))]
+        return [found for path in inside for found in find(str(path))]
     records = read_records(folder, plan)
-    done = [record for record in records if record.status == "done"]
-    if len(done) < len(records):
-        left_out = len(records) - len(done)
-        sys.stderr.write(f"{name}: {left_out} of {len(records)} jobs are not done and left out\n")
-    return [
-        case
-        for r in done
-        for case in read_run(f"{label}/{r.job}", job_folder(folder, r.job), r.overrides)
+    done = [
+        (f"{label}/{r.job}", job_folder(folder, r.job), r.overrides)
+        for r in records
+        if r.status == "done"
     ]
+    return [Found(name, label, done, records)]
 
 
 def _new_folder() -> str:

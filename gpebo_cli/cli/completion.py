@@ -168,6 +168,7 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
             *("--output", "--check", "--update", "--help"), "figures.formats=",
         ],
         "compare": ["--sort", "--reverse", "--csv", "--output", "--no-figures", "--help"],
+        "report": ["--output", "--help"],
         "new": [
             "--config-dir", "--from", "--measure", "--unknown", "--help",
             *(["plant", "estimator"] if not before else []),
@@ -176,7 +177,7 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
     }
     if word.startswith("figures.formats="):
         return _listed("figures.formats=", word, FORMATS)
-    if command == "compare":
+    if command in ("compare", "report"):
         if before[-1:] == ["--sort"]:
             return _starting(word, METRICS)
         if not word.startswith("-"):

@@ -13,6 +13,7 @@ commands:
   run [OVERRIDES]     one experiment: simulate, observe, estimate, check excitation
   check [OVERRIDES]   every assumption of the plant and the observer, with its evidence
   compare DIR …       one table and figures over finished runs and sweeps
+  report DIR …        runs and sweeps as one page that stands alone, report.html
   figures [NAME …]    the paper's figures and tables, in outputs/paper
   list [KIND]         what there is: plants, regressions, observers, estimators, …
   new KIND NAME       a plant or an estimator of your own, commented, which works as it stands
@@ -76,6 +77,23 @@ examples:
   gpebo run -m estimator.gamma=1e6,1e8 estimator=drem,lion hydra.sweep.dir=both
   gpebo compare both
   gpebo compare both/0 both/1 --sort final_error_states --csv best.csv --no-figures
+"""
+
+REPORT_HELP = """\
+usage: gpebo report DIR … [--output FILE]
+
+One HTML page over finished runs and sweeps, with everything in it: verdicts, assumptions and their
+evidence, estimates and metrics, figures, configuration, versions. It needs no other file and no
+network; a click enlarges a figure. DIR is a folder of a run or a sweep, or a folder of those.
+
+options:
+  --output FILE       report.html by default
+  -h, --help          this text
+
+examples:
+  gpebo run plant=circuit hydra.run.dir=circuit
+  gpebo report circuit
+  gpebo report circuit --output page.html
 """
 
 CHECK_HELP = """\
@@ -159,6 +177,9 @@ other keys, with their defaults:
   observer.sample_time=null                          seconds; null: continuous time
   excitation.rho=null excitation.window=null         null: chosen from the regressor, the horizon
   figures=null                                       all, none or [names]; null: none in a sweep
+  figures.formats=[png]  figures.width=column        png, pdf, svg; column, page or inches
+  figures.dpi=200  figures.style=null                a style of matplotlib's; null: ours
+  figures.error=log                                  linear: errors with their sign
   output.max_rows=100000                             of estimates.csv
   hydra.run.dir=FOLDER                               where to write
   gpebo run --cfg job prints every key with its value

@@ -13,7 +13,7 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
-from gpebo_cli.results.finished import METRICS, Case, read_errors
+from gpebo_cli.results.finished import METRICS, Case, read_errors, span
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line
 from gpebo_cli.results.symbols import number_text, symbol
 
@@ -85,20 +85,36 @@ def figures(cases: Sequence[Case], metric: str) -> Iterator[tuple[str, Figure]]:
     Raises:
         GpeboError: tables of a run are missing.
     """
-    yield "errors", compose(error_panels(cases))
-    # Sorted by name: the files are called the same however the cases are sorted.
-    numbers = sorted(name for name in varying(cases) if _is_axis(cases, name))
-    for name in numbers:
-        panels = metric_panels(cases, name)
-        if panels:
-            yield f"over_{name}", compose(panels)
-    for across, up in combinations(numbers, 2):
-        for k, (label, members) in enumerate(_groups(cases, (across, up)).items()):
-            grid = heat_grid(members, across, up, metric)
-            if k < _MOST_MAPS and grid is not None:
-                suffix = f"_{k + 1}" if k else ""
-                name = f"{metric}_over_{across}_and_{up}{suffix}"
-                yield name, _heat_map(*grid, (across, up, metric), label)
+    for suffix, members in _comparable(cases).items():
+        yield f"errors{suffix}", compose(error_panels(members))
+        # Sorted by name: the files are called the same however the cases are sorted.
+        numbers = sorted(name for name in varying(members) if _is_axis(members, name))
+        for name in numbers:
+            panels = metric_panels(members, name)
+            if panels:
+                yield f"over_{name}{suffix}", compose(panels)
+        for across, up in combinations(numbers, 2):
+            for k, (label, some) in enumerate(_groups(members, (across, up)).items()):
+                grid = heat_grid(some, across, up, metric)
+                if k < _MOST_MAPS and grid is not None:
+                    name = f"{metric}_over_{across}_and_{up}{suffix}" + (f"_{k + 1}" if k else "")
+                    yield name, _heat_map(*grid, (across, up, metric), label)
+
+
+def _comparable(cases: Sequence[Case]) -> dict[str, list[Case]]:
+    """Cases of one plant over one span of time, by what the names of their figures end with."""
+    spans = {case.folder: span(case.folder) for case in cases}
+    groups: dict[tuple[Value, tuple[float, float]], list[Case]] = {}
+    for case in cases:
+        groups.setdefault((case.settings["plant"], spans[case.folder]), []).append(case)
+    if len(groups) == 1:
+        return {"": list(cases)}
+    plants = [plant for plant, _ in groups]
+    suffixes = (
+        f"_{plant}" + (f"_{plants[:k].count(plant) + 1}" if plants.count(plant) > 1 else "")
+        for k, plant in enumerate(plants)
+    )
+    return dict(zip(suffixes, groups.values(), strict=True))
 
 
 def error_panels(cases: Sequence[Case]) -> list[Panel]:

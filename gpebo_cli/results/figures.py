@@ -19,7 +19,7 @@ from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.names import FIGURE_NAMES
-from gpebo_cli.results.style import Axis, Curve, Panel, compose, line
+from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
 from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
 from gpebo_cli.schema import nearest, shown
 
@@ -284,11 +284,13 @@ def draw(result: RunResult, names: Iterable[str] | None = None) -> Iterator[tupl
     """Draw figures, one at a time, as ``settings.output`` wants them to look.
 
     Raises:
-        ConfigError: a name is unknown, or the run has nothing for it; at once, not at the first
-            figure.
+        ConfigError: a name is unknown, the run has nothing for it, or there is no such style; at
+            once, not at the first figure.
     """
     described = describe(result, names, strict=names is not None)
     look = result.settings.output
+    if described:
+        check_look(look.style, result.system.labels)
     return ((name, compose(panels, look)) for name, panels in described.items())
 
 

@@ -14,6 +14,9 @@ import numpy as np
 from gpebo_cli.errors import GpeboError
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.schema import shown
+
+_TAIL = 1 << 16  # bytes in which the last row of a table is
 
 METRICS = tuple(field.name for field in fields(Metrics))
 
@@ -57,19 +60,43 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
     Raises:
         GpeboError: a file is missing or cannot be understood; it is named.
     """
-    summary = _summary(folder)
+    summary = read_summary(folder)
     if summary.get("estimator") is None:
         return []
     chosen = {"plant": str(summary.get("plant")), "estimator": _estimator(summary)}
-    cases = []
-    for row in _rows(folder / "cases.csv"):
-        numbers = {k: _number(v) for k, v in row.items() if k != "case"}
-        gains = {k: v for k, v in numbers.items() if k not in METRICS}
-        # estimator.gamma=… is in the table already, as the gain.
-        told = {k: v for k, v in overrides.items() if k.removeprefix("estimator.") not in gains}
-        metrics = {name: numbers.get(name, np.nan) for name in METRICS}
-        cases.append(Case(run, folder, int(row["case"]), chosen | told, gains, metrics))
-    return cases
+    columns = read_columns(folder / "cases.csv", "case")
+    gains = [name for name in columns if name not in ("case", *METRICS)]
+    # estimator.gamma=… is in the table already, as the gain.
+    told = {k: v for k, v in overrides.items() if k.removeprefix("estimator.") not in gains}
+    return [
+        Case(
+            run, folder, int(number), chosen | told,
+            {name: float(columns[name][i]) for name in gains},
+            {name: float(columns[name][i]) if name in columns else np.nan for name in METRICS},
+        )
+        for i, number in enumerate(columns["case"])
+    ]
+
+
+def span(folder: Path) -> tuple[float, float]:
+    """First and last time of a finished run's signals.
+
+    Raises:
+        GpeboError: they are missing or cannot be understood.
+    """
+    path = folder / "signals.csv"
+    try:
+        with path.open("rb") as stream:
+            names = stream.readline().decode().rstrip().split(",")
+            first = stream.readline()
+            stream.seek(max(0, path.stat().st_size - _TAIL))
+            last = stream.read().splitlines()[-1]
+        k = names.index("t")
+        return float(first.split(b",")[k]), float(last.split(b",")[k])
+    except OSError as error:
+        raise GpeboError(f"{path}: {error.strerror or error}") from error
+    except (ValueError, IndexError):
+        raise GpeboError(f"{path}: not the signals of a run") from None
 
 
 def read_errors(cases: Sequence[Case]) -> list[ErrorCurves]:
@@ -90,20 +117,17 @@ def read_errors(cases: Sequence[Case]) -> list[ErrorCurves]:
 
 
 def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
-    truth: Mapping[str, float | None] = _summary(folder).get("parameters") or {}
+    truth: Mapping[str, float | None] = read_summary(folder).get("parameters") or {}
     path = folder / "estimates.csv"
-    kept: dict[int, list[dict[str, str]]] = {number: [] for number in sorted(numbers)}
-    for row in _rows(path):
-        number = int(row["case"])
-        if number in kept:
-            kept[number].append(row)
-    signals = _columns(_rows(folder / "signals.csv"))
+    everything = read_columns(path, "case", "t")
+    signals = read_columns(folder / "signals.csv", "t")
     middles = 0.5 * (signals["t"][1:] + signals["t"][:-1])
     out = {}
-    for number, rows in kept.items():
-        if not rows:
+    for number in sorted(numbers):
+        rows = everything["case"] == number
+        if not rows.any():
             raise GpeboError(f"{path}: there is no case {number}")
-        columns = _columns(rows)
+        columns = {name: column[rows] for name, column in everything.items()}
         t = columns["t"]
         nearest = np.searchsorted(middles, t)  # the estimates are on some of the signals' times
         names = [name.removesuffix("_hat") for name in columns if name.endswith("_hat")]
@@ -138,7 +162,12 @@ def _norm(columns: Sequence[Array], count: int) -> Array:
     return np.asarray(np.linalg.norm(np.stack(columns), axis=0))
 
 
-def _summary(folder: Path) -> dict[str, Any]:
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The content of ``summary.json``.
+
+    Raises:
+        GpeboError: it is missing, or is none.
+    """
     path = folder / "summary.json"
     try:
         content = json.loads(path.read_bytes())
@@ -156,21 +185,45 @@ def _estimator(summary: Mapping[str, Any]) -> str:
     return str(estimator.get("name")) if isinstance(estimator, Mapping) else str(estimator)
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
+def read_columns(path: Path, *needed: str) -> dict[str, Array]:
+    """A table of numbers that a run wrote, by column; NaN for an empty cell.
+
+    Raises:
+        GpeboError: it is missing, or not such a table; the line and the column are named.
+    """
     try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            return list(csv.DictReader(stream))
+        content = path.read_bytes()
+        header, *rows = csv.reader(content.decode().splitlines())
     except OSError as error:
         raise GpeboError(f"{path}: {error.strerror or error}") from error
-
-
-def _columns(rows: Sequence[Mapping[str, str]]) -> dict[str, Array]:
-    names = rows[0].keys() if rows else ()
-    return {name: np.array([_number(row[name]) for row in rows]) for name in names}
-
-
-def _number(text: str | None) -> float:
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise GpeboError(f"{path}, line {line}: not UTF-8 text") from None
+    except (csv.Error, ValueError):
+        raise GpeboError(f"{path}: not a table with a header") from None
+    for name in needed:
+        if name not in header:
+            raise GpeboError(f"{path}, line 1: there is no column {name}")
+    for line, row in enumerate(rows, start=2):
+        if len(row) != len(header):
+            raise GpeboError(f"{path}, line {line}: {len(row)} cells; the header has {len(header)}")
     try:
-        return float(text) if text else np.nan
+        numbers = np.array([[float(cell or "nan") for cell in row] for row in rows])
     except ValueError:
-        return np.nan
+        raise GpeboError(_wrong_cell(path, header, rows)) from None
+    for name in needed:
+        for gap in np.flatnonzero(np.isnan(numbers.reshape(len(rows), -1)[:, header.index(name)])):
+            raise GpeboError(f"{path}, line {gap + 2}, column {name}: there is no number")
+    return dict(zip(header, numbers.reshape(len(rows), -1).T, strict=True)) if rows else {
+        name: np.zeros(0) for name in header
+    }
+
+
+def _wrong_cell(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    for line, row in enumerate(rows, start=2):
+        for name, cell in zip(header, row, strict=True):
+            try:
+                float(cell or "nan")
+            except ValueError:
+                return f"{path}, line {line}, column {name}: {shown(cell)} is not a number"
+    raise AssertionError("every cell is a number")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -98,6 +98,28 @@ def our_rc(style: str | None = None) -> Iterator[None]:
         yield
     finally:
         settings.update(theirs)
+
+
+def check_look(style: str | None, labels: Mapping[str, str]) -> None:
+    """Refuse a style or a label of a plant that matplotlib does not understand.
+
+    Raises:
+        ConfigError: says which one.
+    """
+    if style is not None:
+        _style(style)
+    if labels:
+        from matplotlib.mathtext import MathTextParser
+
+        parser: Any = MathTextParser("path")
+    for name, text in labels.items():
+        try:
+            parser.parse(f"${text}$")
+        except ValueError:
+            raise ConfigError(
+                f"labels.{name}: {shown(text)} is not mathematics that matplotlib can set; "
+                r"expected something like i_L, e_{0,1} or \theta_1"
+            ) from None
 
 
 def _style(name: str) -> dict[str, Any]:

@@ -1,0 +1,208 @@
+"""Runs and sweeps as one page: verdict, assumptions, tables, figures, configuration, versions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpebo_cli.errors import GpeboError
+from gpebo_cli.results import html
+from gpebo_cli.results.comparison import figures
+from gpebo_cli.results.finished import METRICS, Case, read_columns, read_summary
+from gpebo_cli.results.page import case_table
+from gpebo_cli.results.style import file_content
+from gpebo_cli.results.symbols import number_text
+
+if TYPE_CHECKING:
+    from gpebo_cli.results.provenance import Provenance
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_LARGEST = 20_000_000  # bytes of a picture
+_MOST_CASES = 50
+
+
+@dataclass(frozen=True)
+class Job:
+    """A row of a sweep: what became of a job."""
+
+    name: str
+    settings: str
+    status: str
+    error: str
+
+
+@dataclass(frozen=True)
+class Part:
+    """One folder that a person named: a run, or a sweep with its ``jobs``."""
+
+    name: str
+    runs: Sequence[tuple[str, Path]]  # what each is called, and where it is
+    jobs: Sequence[Job] = ()
+    cases: Sequence[Case] = ()  # of a sweep
+
+
+def document(parts: Sequence[Part], made_by: Provenance) -> str:
+    """The page, complete in itself.
+
+    Raises:
+        GpeboError: a file of a run is missing, or is not what a run writes.
+    """
+    title = f"gpebo: {', '.join(part.name for part in parts)}"
+    sections = "".join(map(_part, parts))
+    return html.document(title, sections + html.footer(made_by), embedded=True)
+
+
+def _part(part: Part) -> str:
+    runs = [_run(name, folder) for name, folder in part.runs]
+    if not part.jobs:
+        return "".join(runs)
+    failed = [number for number, job in enumerate(part.jobs) if job.status != "done"]
+    rows = [("job", "what was chosen", "status", "error"),
+            *((job.name, job.settings, job.status, job.error) for job in part.jobs)]
+    count = f"{len(part.jobs) - len(failed)} of {len(part.jobs)} jobs are done"
+    drawn = "".join(
+        html.embedded_figure(file_content(figure, "png"), name)
+        for name, figure in (figures(part.cases, METRICS[0]) if part.cases else ())
+    )
+    heading = (
+        f"<section>\n<h2>{escape(part.name)}</h2>\n{html.paragraph(count, 'verdict')}"
+        f'{html.table(rows, text=True, failed=failed)}<div class="figures">{drawn}</div>\n'
+    )
+    inside = "".join(
+        f"<details><summary>{escape(name)}</summary>\n{run}</details>\n"
+        for (name, _), run in zip(part.runs, runs, strict=True)
+    )
+    return f"{heading}{inside}</section>\n"
+
+
+def _run(name: str, folder: Path) -> str:
+    summary = read_summary(folder)
+    try:
+        words = _words(summary)
+        assumptions = _assumptions(summary)
+        facts = _facts(summary)
+        made_with = _pairs(summary.get("versions")), _pairs(summary.get("git"))
+        estimates, cases = _estimates(folder, summary), _cases(folder)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise GpeboError(f"{folder / 'summary.json'}: not the summary of a run") from error
+    pictures = "".join(
+        html.embedded_figure(content, path.stem)
+        for path in sorted((folder / "figures").glob("*.png"))
+        if (content := _picture(path))
+    )
+    versions = "; ".join(filter(None, made_with))
+    return (
+        f"<section>\n<h2>{escape(name)}</h2>\n{words}"
+        f"{_titled('Estimates at the end', html.table(estimates))}"
+        f"{_titled('Cases', html.table(cases))}"
+        f"{_titled('What the result rests on', assumptions)}"
+        f"{_titled('Facts', html.table(facts, text=True))}"
+        f'<div class="figures">{pictures}</div>\n'
+        f"{_configuration(folder)}{html.paragraph(f'Made with {versions}.' if versions else '')}"
+        "</section>\n"
+    )
+
+
+def _titled(title: str, content: str) -> str:
+    return f"<h3>{escape(title)}</h3>\n{content}" if content else ""
+
+
+def _words(summary: Mapping[str, Any]) -> str:
+    plant = " · ".join(
+        str(summary[key]) for key in ("plant", "title", "reference") if summary.get(key)
+    )
+    estimator = summary.get("estimator") or {}
+    how = f"observer {summary.get('observer')}"
+    if estimator:
+        how += f", estimator {estimator.get('name')}"
+    warnings = "".join(html.paragraph(f"Warning: {line}") for line in summary.get("warnings") or ())
+    verdict = html.paragraph(str(summary.get("verdict", "")), "verdict")
+    return html.paragraph(plant) + html.paragraph(how) + verdict + warnings
+
+
+def _assumptions(summary: Mapping[str, Any]) -> str:
+    found = summary.get("assumptions") or []
+    rows = [("", "assumption", "statement", "evidence")] + [
+        ("holds" if a["holds"] else "FAILS", str(a["name"]), str(a["statement"]),
+         _pairs(a["evidence"]))
+        for a in found
+    ]
+    failed = [number for number, a in enumerate(found) if not a["holds"]]
+    return html.table(rows, text=True, failed=failed) if found else ""
+
+
+def _facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The sections of the summary that are a few numbers each."""
+    keys = ("recording", "noise", "fit", "excitation", "error_estimate", "timings")
+    rows = [(key.replace("_", " "), _pairs(summary.get(key))) for key in keys]
+    return [("", ""), *(row for row in rows if row[1])]
+
+
+def _pairs(section: object) -> str:
+    if not isinstance(section, Mapping):
+        return ""
+    return ", ".join(f"{key} {_value(v)}" for key, v in section.items() if v is not None)
+
+
+def _value(value: object) -> str:
+    if isinstance(value, Mapping):
+        return f"({_pairs(value)})"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    return number_text(value)
+
+
+def _estimates(folder: Path, summary: Mapping[str, Any]) -> list[list[str]]:
+    """The last estimate of everything, with its deviation and the truth where they are known."""
+    if summary.get("estimator") is None or not (folder / "estimates.csv").is_file():
+        return []
+    columns = read_columns(folder / "estimates.csv", "case", "t")
+    signals = read_columns(folder / "signals.csv", "t")
+    truth = {name: values[-1] for name, values in signals.items() if name not in ("case", "t")}
+    truth |= summary.get("parameters") or {}
+    last = np.flatnonzero(np.diff(columns["case"], append=np.inf))[:_MOST_CASES]
+    rows = []
+    for hat in (name for name in columns if name.endswith("_hat")):
+        name = hat.removesuffix("_hat")
+        std = columns.get(f"{name}_std")
+        cells = [
+            number_text(columns[hat][k]) + (f" ± {number_text(std[k])}" if std is not None else "")
+            for k in last
+        ]
+        true = truth.get(name)
+        rows.append([name, *cells, "" if true is None else number_text(float(true))])
+    return [["", *(f"case {int(columns['case'][k])}" for k in last), "truth"], *rows]
+
+
+def _cases(folder: Path) -> list[list[str]]:
+    path = folder / "cases.csv"
+    if not path.is_file():
+        return []
+    columns = read_columns(path, "case")
+    metrics = {name: columns.get(name, np.full(len(columns["case"]), np.nan)) for name in METRICS}
+    gains = {name: values for name, values in columns.items()
+             if name != "case" and not name.startswith(("seconds_to_", "final_error_", "rms_"))}
+    count = min(len(columns["case"]), _MOST_CASES)
+    shown = gains | metrics
+    return case_table([("", {k: float(v[i]) for k, v in shown.items()}) for i in range(count)])
+
+
+def _picture(path: Path) -> bytes:
+    if not path.is_file() or path.stat().st_size > _LARGEST:
+        return b""
+    content = path.read_bytes()
+    return content if content.startswith(_PNG) else b""
+
+
+def _configuration(folder: Path) -> str:
+    path = folder / "config.yaml"
+    if not path.is_file():
+        return ""
+    return html.folded("Configuration", path.read_text(encoding="utf-8", errors="replace"))

@@ -1,0 +1,246 @@
+"""``gpebo report``: one page with everything in it; and what is compared with what."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from examples import gpebo
+
+from gpebo_cli.cli import compare, report
+from gpebo_cli.errors import ConfigError, GpeboError
+
+FAST = ("time.samples=51", "time.horizon=8")
+
+
+class Page(HTMLParser):
+    """Collects what a page is made of."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.sources: list[str] = []
+        self.text: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.sources += [str(value) for key, value in attrs if key in ("src", "href")]
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def done(*words, cwd):
+    made = gpebo(*words, cwd=cwd)
+    assert made.returncode == 0, made.stderr
+    return made
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A run, a recording, a sweep with a job that fails, and a run of another plant."""
+    path = tmp_path_factory.mktemp("report")
+    done("run", "estimator.gamma=[1e8,1e10]", "figures=[gram,states]", "figures.formats=[png,svg]",
+         *FAST, "hydra.run.dir=circuit", cwd=path)
+    done("run", "plant=descriptor", "estimator=ls_drem", "figures=none", *FAST,
+         "hydra.run.dir=other", cwd=path)
+    table = pd.read_csv(path / "circuit" / "signals.csv")
+    table[["t", "V", "y"]].to_csv(path / "r.csv", index=False)
+    done("run", "data.file=r.csv", "estimator=ls_drem", "figures=none", "hydra.run.dir=recorded",
+         cwd=path)
+    gpebo("run", "-m", "estimator.gamma=1e6,1e8,1e10", *FAST, "hydra.sweep.dir=sweep",
+          "plant=circuit", cwd=path)
+    return path
+
+
+@pytest.fixture
+def inside(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def page_of(*words: str) -> tuple[Page, str]:
+    assert report.main([*words, "--output", "page.html"]) == 0
+    text = Path("page.html").read_text(encoding="utf-8")
+    return Page(text), text
+
+
+def test_a_run_is_on_the_page_with_all_that_it_rests_on(inside):
+    page, _ = page_of("circuit")
+    summary = json.loads((inside / "circuit" / "summary.json").read_text())
+    words = " ".join(page.text)
+    assert summary["verdict"] in words
+    for assumption in summary["assumptions"]:
+        assert assumption["statement"] in words
+    assert (inside / "circuit" / "config.yaml").read_text() in words
+    assert f"numpy {summary['versions']['numpy']}" in words
+    assert f"{float(pd.read_csv('circuit/signals.csv')['il'].iloc[-1]):.4g}".lstrip("-") in words
+    pictures = [source for source in page.sources if source.startswith("data:image/png;base64,")]
+    files = sorted((inside / "circuit" / "figures").glob("*.png"))
+    assert [base64.b64decode(p.partition(",")[2]) for p in pictures] == [
+        path.read_bytes() for path in files
+    ]
+    assert len(files) == 2
+
+
+def test_the_page_needs_nothing_else(inside):
+    page, text = page_of("circuit", "sweep", "recorded")
+    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert all(source.startswith("data:") for source in page.sources)
+    assert "default-src 'none'" in text
+
+
+def test_a_recording_and_a_sweep_are_told(inside):
+    words = " ".join(page_of("recorded")[0].text)
+    assert "file r.csv" in words
+    assert "e0_il" in words
+    page, _ = page_of("sweep")
+    words = " ".join(page.text)
+    assert "3 of 3 jobs are done" in words
+    assert words.count("estimator.gamma=") >= 3
+    assert len([s for s in page.sources if s.startswith("data:image")]) >= 2
+
+
+def test_a_job_that_failed_is_named_with_its_error(inside, tmp_path):
+    shutil.copytree("sweep", tmp_path / "sweep")
+    path = tmp_path / "sweep" / "1" / "result.json"
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {"status": "failed", "error": "<b>no</b> & never"}))
+    page, _ = page_of(str(tmp_path / "sweep"))
+    assert "2 of 3 jobs are done" in " ".join(page.text)
+    assert "<b>no</b> & never" in " ".join(page.text)
+    assert "b" not in page.tags
+
+
+def test_the_same_page_every_time(inside):
+    assert page_of("circuit", "sweep")[1] == page_of("circuit", "sweep")[1]
+
+
+@pytest.mark.parametrize("content", [b"[]", b"{", b"\xff", b'{"assumptions": 3}',
+                                     b'{"estimator": {}, "versions": [1], "warnings": 3}',
+                                     b'{"assumptions": [{}]}'])
+def test_what_is_no_run_is_named(inside, tmp_path, content):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "summary.json").write_bytes(content)
+    with pytest.raises(GpeboError, match=r"summary\.json: not"):
+        page_of(str(tmp_path / "run"))
+
+
+def test_titles_from_strangers_are_text(inside, tmp_path):
+    shutil.copytree("other", tmp_path / "run")
+    path = tmp_path / "run" / "summary.json"
+    bad = "<img src=http://x onerror=alert(1)>"
+    summary = json.loads(path.read_text()) | {"title": bad, "verdict": bad}
+    path.write_text(json.dumps(summary))
+    page, _ = page_of(str(tmp_path / "run"))
+    assert not page.sources
+    assert " ".join(page.text).count(bad) == 2
+
+
+@pytest.mark.parametrize("words", [["nowhere"], ["--ouput=x", "circuit"], [], ["."]])
+def test_wrong_words_of_report(inside, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path if words == ["."] else inside)
+    with pytest.raises(ConfigError):
+        report.main(words)
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_a_browser_shows_it(inside, tmp_path):
+    page_of("circuit")
+    shot = tmp_path / "page.png"
+    subprocess.run(
+        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--screenshot={shot}",
+         "--window-size=1000,1400", f"--user-data-dir={tmp_path}", f"file://{inside}/page.html"],
+        check=True, capture_output=True, timeout=90, env={**os.environ, "HOME": str(tmp_path)},
+    )
+    from PIL import Image
+
+    with Image.open(shot) as image:
+        colours = image.convert("RGB").getcolors(1 << 24)
+    assert colours is not None
+    assert len(colours) > 50  # curves and text, and not an empty page
+
+
+# What is compared
+
+
+def test_plants_and_horizons_have_figures_of_their_own(inside):
+    done("run", "time.horizon=4", "time.samples=51", "figures=none", "hydra.run.dir=shorter",
+         cwd=inside)
+    assert compare.main(["circuit", "other", "shorter", "--output", "compared"]) == 0
+    names = {path.stem for path in (inside / "compared").glob("errors*.png")}
+    assert names == {"errors_circuit_1", "errors_descriptor", "errors_circuit_2"}
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "said"),
+    [
+        ("cases.csv", lambda text: text.replace("100000000,", "1.2x3,", 1), "line 2, column gamma"),
+        ("cases.csv", lambda text: text + "1,2\n", "line 4: 2 cells; the header has"),
+        ("cases.csv", lambda text: text.replace("case,", "csae,", 1), "there is no column case"),
+        ("cases.csv", lambda text: text.replace("\n0,", "\n,", 1), "line 2, column case"),
+        ("cases.csv", lambda text: "", "not a table with a header"),
+        ("estimates.csv", lambda text: text.replace("\n0,", "\n0,x", 1), "line 2, column t: 'x0'"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_named(inside, tmp_path, file, change, said):
+    shutil.copytree("circuit", tmp_path / "run")
+    path = tmp_path / "run" / file
+    path.write_text(change(path.read_text()))
+    with pytest.raises(GpeboError) as caught:
+        compare.main([str(tmp_path / "run"), "--output", str(tmp_path / "out")])
+    assert str(path) in str(caught.value)
+    assert said in str(caught.value)
+
+
+def test_bytes_that_are_no_text_are_named(inside, tmp_path):
+    shutil.copytree("circuit", tmp_path / "run")
+    path = tmp_path / "run" / "cases.csv"
+    path.write_bytes(path.read_bytes() + b"\xff\n")
+    with pytest.raises(GpeboError, match=r"cases\.csv, line 4: not UTF-8"):
+        compare.main([str(tmp_path / "run")])
+
+
+# Figures of a run
+
+
+def test_formats_are_written_and_text_in_a_pdf_is_text(inside):
+    assert {p.name for p in (inside / "circuit" / "figures").iterdir()} == {
+        "gram.png", "gram.svg", "states.png", "states.svg",
+    }
+    looks = ["formats=[pdf]", "width=page", "dpi=100", "style=ggplot", "error=linear"]
+    done("run", "figures=[states]", *(f"figures.{look}" for look in looks), *FAST,
+         "hydra.run.dir=styled", cwd=inside)
+    content = (inside / "styled" / "figures" / "states.pdf").read_bytes()
+    assert b"/Subtype /Type0" in content or b"/TrueType" in content
+    assert b"/Type3" not in content
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("figures.formats=[jpg]", "png or pdf or svg"),
+        ("figures.formats=[]", "figures.formats"),
+        ("figures.width=colum", "column or page"),
+        ("figures.width=0.1", "1.5 to 40 inches"),
+        ("figures.style=nope", "matplotlib has no style 'nope'"),
+        ("figures.error=lin", "log or linear"),
+        ("figures.dpi=1e9", "dpi"),
+        ("figures.colour=red", "colour"),
+        ("figures=[gains]", "this run has nothing for gains"),
+    ],
+)
+def test_what_figures_cannot_be_is_one_line(tmp_path, word, said):
+    made = gpebo("run", word, *FAST, "hydra.run.dir=refused", cwd=tmp_path)
+    assert made.returncode == 2, made.stderr
+    assert made.stderr.count("\n") == 1
+    assert said in made.stderr
+    assert not (tmp_path / "refused").exists()
