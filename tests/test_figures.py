@@ -296,7 +296,7 @@ def test_one_case_that_diverges_does_not_hide_the_others() -> None:
     assert high > 1e199
 
 
-@pytest.mark.parametrize("label", ["i_{", r"\\nosuch{x}", r"\\frac{1}", "_"])
+@pytest.mark.parametrize("label", ["i_{", r"\nosuch{x}", r"\frac{1}", "_"])
 def test_a_label_that_cannot_be_set_is_refused(label: str) -> None:
     result = make_result(samples=5)
     result = replace(result, system=replace(result.system, labels={"il": label}))
