@@ -6,6 +6,7 @@ first stage that cannot be carried out and reports that stage as the failed assu
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Protocol
 
 import numpy as np
@@ -96,6 +97,7 @@ def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assu
                 "smallest_singular_value": s.smallest_singular_value,
                 # Functions from Python are looked at between the nodes, but nothing bounds them.
                 "bounded_between_nodes": simulation.bounded,
+                **({} if simulation.effort is None else asdict(simulation.effort)),
             },
         ),
         Assumption(

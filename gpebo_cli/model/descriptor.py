@@ -84,6 +84,11 @@ class CoefficientSource(Protocol):
         """
         ...
 
+    @property
+    def of_time(self) -> CoefficientSource:
+        """The same with zero for what depends on outputs, to be evaluated without signals."""
+        ...
+
     def truth(self, t: Array) -> Array:
         """True values of the unknowns at the times ``t`` (N,), shape (N, q)."""
         ...

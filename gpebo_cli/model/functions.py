@@ -15,7 +15,8 @@ were rejected: they lose half the digits with every order.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from inspect import Parameter, signature
 from typing import Any
 
@@ -86,6 +87,18 @@ class FunctionCoefficients:
                 found[name] = self._values(name, t, order, along if depends else None)
         c = Coefficients(**found)
         return c if signals is None else c.along(signals)
+
+    @cached_property
+    def of_time(self) -> FunctionCoefficients:
+        """The same with zero for what is a function of outputs."""
+        m = self.shapes["u"][0]
+        gone = {name for name, depends in self.signals.items() if len(depends) > m}
+        return replace(
+            self,
+            fixed={**self.fixed, **{name: np.zeros(self.shapes[name]) for name in gone}},
+            functions={k: v for k, v in self.functions.items() if k not in gone},
+            signals={k: v for k, v in self.signals.items() if k not in gone},
+        )
 
     def truth(self, t: Array) -> Array:
         """True values of the unknowns at the times t (N,), shape (N, q)."""

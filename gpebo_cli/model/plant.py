@@ -106,6 +106,7 @@ class TextCoefficients:
     signals: Mapping[str, frozenset[str]]  # what a matrix depends on, by the same names
     outputs: frozenset[str]
     name: str
+    restricted: TextCoefficients | None = None  # ``of_time``, where that is something else
 
     @cached_property
     def constant(self) -> frozenset[str]:
@@ -140,6 +141,11 @@ class TextCoefficients:
             filled = tuple(self.layouts[k].assemble(values) for k in MATRIX_NAMES)
         found = Coefficients._make(filled)
         return found if signals is None else found.along(signals)
+
+    @property
+    def of_time(self) -> TextCoefficients:
+        """The same with zero for entries that depend on outputs."""
+        return self.restricted or self
 
     def truth(self, t: Array) -> Array:
         """True values of the unknowns at the times ``t`` (N,), shape (N, q)."""
@@ -246,15 +252,29 @@ def plant_from_mapping(
     sides = {
         "E": (rows, rows, _OF_TIME),
         "A": (rows, rows, _OF_ALL),
-        "B": (rows, driven, _OF_ALL),
         "F": (rows, sought, _OF_ALL),
         "C": (measured, rows, _OF_INPUTS),
         "D": (measured, driven, _OF_INPUTS),
         "H": (measured, sought, _OF_INPUTS),
+        "B": (rows, driven, _OF_ALL),
     }
-    entries: dict[str, tuple[tuple[int, ...], list[Expression]]] = {}
+    known = _known_term(plant, mapping.get("phi"), rows)
+    entries: dict[str, tuple[tuple[int, ...], list[Expression]]] = {
+        "phi": (
+            (len(states),),
+            [read(value, f"phi[{i}]", _OF_ALL) for i, value in enumerate(known)],
+        )
+    }
     for key, (down, across, allowed) in sides.items():
-        grid = _matrix(plant, key, mapping.get(key), down, across)
+        # Unknowns may be in the outputs only; inputs too, or in other matrices.
+        elsewhere_too = {"D", "H"}
+        if not _is_empty(mapping.get("H")):
+            elsewhere_too.add("F")
+        named = any(not e.node.signals.isdisjoint(inputs) for _, es in entries.values() for e in es)
+        if named or not _is_empty(mapping.get("D")):
+            elsewhere_too.add("B")
+        needed = key not in elsewhere_too
+        grid = _matrix(plant, key, mapping.get(key), down, across, needed=needed)
         shape = (len(down.names), len(across.names))
         entries[key] = (
             shape,
@@ -264,11 +284,6 @@ def plant_from_mapping(
                 for j, value in row
             ],
         )
-    known = _known_term(plant, mapping.get("phi"), rows)
-    entries["phi"] = (
-        (len(states),),
-        [read(value, f"phi[{i}]", _OF_ALL) for i, value in enumerate(known)],
-    )
     entries["u"] = (len(inputs),), u
 
     theta = [read(value, f"unknowns.{label}") for label, value in unknowns.items()]
@@ -311,7 +326,17 @@ def _coefficients(
     inputs: Sequence[Expression],
     outputs: frozenset[str],
     name: str,
+    restricted: TextCoefficients | None = None,
 ) -> TextCoefficients:
+    if restricted is None and any(
+        not e.node.signals.isdisjoint(outputs) for _, listed in entries.values() for e in listed
+    ):
+        nothing = parse(0, {}, name)
+        kept = {
+            key: (shape, [e if e.node.signals.isdisjoint(outputs) else nothing for e in listed])
+            for key, (shape, listed) in entries.items()
+        }
+        restricted = _coefficients(kept, inputs, outputs, name)
     varying: list[Expression] = []
     layouts: dict[str, _Layout] = {}
     for key, (shape, expressions) in entries.items():
@@ -329,7 +354,9 @@ def _coefficients(
     }
     depending = {key: names for key, names in signals.items() if names}
     truth = record(entries["theta"][1])
-    return TextCoefficients(record(varying, inputs), layouts, truth, depending, outputs, name)
+    return TextCoefficients(
+        record(varying, inputs), layouts, truth, depending, outputs, name, restricted
+    )
 
 
 @dataclass(frozen=True)
@@ -490,17 +517,20 @@ def read_parameters(
 
 
 def _matrix(
-    plant: str, key: str, value: object, down: _Side, across: _Side
+    plant: str, key: str, value: object, down: _Side, across: _Side, *, needed: bool
 ) -> list[list[tuple[int, object]]]:
-    """The entries of a matrix by row, each with its column; sizes checked."""
+    """The entries of a matrix by row, each with its column; sizes checked.
+
+    Zeros where there are none and none are ``needed``.
+    """
     n_rows, n_columns = len(down.names), len(across.names)
-    if (value is None or value == []) and key in ("D", "H"):
+    if _is_empty(value) and not needed:
         return [[(j, 0) for j in range(n_columns)] for _ in range(n_rows)]
-    if value is None or value == []:
+    if _is_empty(value):
         if n_rows and n_columns:
-            needed = across if down.noun == "state" else down
+            why = across if down.noun == "state" else down
             raise ConfigError(
-                f"{plant}: {key} is missing; {needed}, so it needs {_count(n_rows, 'row')} "
+                f"{plant}: {key} is missing; {why}, so it needs {_count(n_rows, 'row')} "
                 f"of {n_columns}"
             )
         return []
@@ -529,6 +559,10 @@ def _matrix(
     if widths[0] != n_columns:
         raise ConfigError(f"{plant}: {key} has {_count(widths[0], 'column')} but {across}")
     return grid
+
+
+def _is_empty(value: object) -> bool:
+    return value is None or value == []
 
 
 def _known_term(plant: str, value: object, rows: _Side) -> list[object]:

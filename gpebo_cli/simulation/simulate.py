@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import isfinite
 
@@ -38,6 +38,7 @@ from gpebo_cli.reduction.strangeness_free import (
 from gpebo_cli.reduction.structure import Structure, analyse
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
+from gpebo_cli.simulation.newton import Effort, follow
 
 _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
@@ -75,6 +76,7 @@ class Simulation:
     jumps: tuple[tuple[float, Array, Jump], ...]  # (time, limit from the left, jump)
     error_estimate: float
     bounded: bool  # known functions are bounded between the nodes: nothing narrow was missed
+    effort: Effort | None = None  # of Newton's method, where the plant is not linear
 
 
 def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Simulation:
@@ -82,8 +84,30 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
 
     Raises:
         ModelError: not uniquely solvable, index too high, or a rank changes within the horizon.
-        SolverError: the tolerance cannot be reached.
+        SolverError: the tolerance cannot be reached, or the solution ends within the horizon.
+        ConfigError: an entry without a finite value.
     """
+    if not system.depends_on_outputs:
+        return _simulate_linear(system, time, solver)
+    last: list[Simulation] = []
+
+    def solve_linear(
+        linear: DescriptorSystem, window: TimeSettings, settings: SolverSettings
+    ) -> tuple[Trajectory, float]:
+        last[:] = [_simulate_linear(linear, window, settings)]
+        return last[0].signals.states, last[0].structure.growth
+
+    effort = follow(system, time, solver, solve_linear)
+    found = last[0]
+    return replace(
+        found, effort=effort, error_estimate=max(found.error_estimate, effort.last_change)
+    )
+
+
+def _simulate_linear(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
+) -> Simulation:
+    """:func:`simulate` for a plant whose matrices depend on time and inputs only."""
     start, stop = time.start, time.start + time.horizon
     structure = analyse(
         system, start, stop, max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol

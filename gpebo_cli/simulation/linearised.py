@@ -1,0 +1,138 @@
+"""A plant whose matrices depend on its outputs, linearised along a guess of its solution.
+
+With F(t, x) = A x + B u + F θ + φ at (t, u, y), y = C x + D u + H θ, and a guess x̄ with outputs ȳ,
+
+    E x' = (A + G C) x + B u + F θ + φ − G C x̄,        G_j = ∂(A x̄ + B u + F θ + φ)/∂y_j,
+
+everything at (t, u, ȳ): one step of Newton's method for the whole trajectory (quasilinearisation;
+Bellman & Kalaba 1965). It is a plant of the paper's class, for which index, consistent start and
+solution are found as for any other. Where x = x̄, it says what the plant says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from math import factorial
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.radau import RadauRule
+
+# Share of an output by which it is moved to see what depends on it: G is wrong by the square of it
+# and by rounding over it, which costs Newton's method nothing that could be seen.
+_SHIFT = 6e-6
+_NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """The coefficients of the linearised plant; a ``CoefficientSource``."""
+
+    system: DescriptorSystem
+    guess: Trajectory  # x̄ (n,)
+
+    @cached_property
+    def constant(self) -> frozenset[str]:
+        """Those that do not depend on time."""
+        return self.system.coefficients.constant - {"A", "phi"}
+
+    @cached_property
+    def zero(self) -> frozenset[str]:
+        """Those that vanish."""
+        return self.system.coefficients.zero - {"A", "phi"}
+
+    @property
+    def signals(self) -> Mapping[str, frozenset[str]]:
+        """None: the guess says what u and y are."""
+        return {}
+
+    @property
+    def of_time(self) -> Linearised:
+        """All of it."""
+        return self
+
+    def truth(self, t: Array) -> Array:
+        """True values of the unknowns at the times t (N,), shape (N, q)."""
+        return self.system.coefficients.truth(t)
+
+    def breakpoints(self, start: float, stop: float) -> Array:
+        """Those of functions of time."""
+        return self.system.coefficients.breakpoints(start, stop)
+
+    def resolved(self, edges: Array) -> Array | None:
+        """Cells for what depends on time alone; the guess has been resolved by its own edges."""
+        found = self.system.coefficients.of_time.resolved(edges)
+        if found is None or len(self.guess.mesh.edges) == 2:
+            return found
+        inner = self.guess.mesh.edges[1:-1]
+        apart = np.abs(found[np.clip(np.searchsorted(found, inner), 0, len(found) - 1)] - inner)
+        before = np.abs(found[np.clip(np.searchsorted(found, inner) - 1, 0, None)] - inner)
+        close = 1e-9 * np.diff(self.guess.mesh.edges).min()
+        return np.union1d(found, inner[np.minimum(apart, before) > close])
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None  # noqa: ARG002
+    ) -> Coefficients:
+        """Taylor coefficients of the linearised plant at the times t (N,).
+
+        Raises:
+            ConfigError: an entry without a finite value along the guess.
+        """
+        source = self.system.coefficients
+        known = source.of_time.taylor(t, order, inside)
+        x = self._states(t, order, inside)
+        y = _product(known.C, x) + _product(known.D, known.u) + _product(known.H, known.theta)
+        along = np.concatenate([known.u, y], axis=2)
+        c = source.taylor(t, order, inside, along)
+        size = np.abs(y[0])
+        shift = _SHIFT * np.maximum(size, np.maximum(_NOT_ZERO * size.max(axis=0), 1e-300))
+        G = np.empty((*x.shape, self.system.r))
+        for j in range(self.system.r):
+            moved = []
+            for by in (shift[:, j], -shift[:, j]):
+                along[0, :, self.system.m + j] = y[0, :, j] + by
+                moved.append(_right_side(source.taylor(t, order, inside, along), known, x))
+            along[0, :, self.system.m + j] = y[0, :, j]
+            G[..., j] = (moved[0] - moved[1]) / (2.0 * shift[:, j, None])
+        GC = _product(G, c.C)
+        return c._replace(A=c.A + GC, phi=c.phi - _product(GC, x), u=known.u)
+
+    def _states(self, t: Array, order: int, inside: Array | None) -> Array:
+        """Taylor coefficients of the guess, (order + 1, N, n)."""
+        sampler = self.guess.mesh.sampler(t, inside)
+        values, steps = self.guess.values, self.guess.mesh.steps[:, None, None]
+        D = _derivative(self.guess.mesh.rule)
+        x = np.empty((order + 1, len(t), values.shape[2]))
+        for k in range(order + 1):
+            x[k] = sampler(values) / factorial(k)
+            values = (D @ values) / steps
+        return x
+
+
+def _right_side(c: Coefficients, known: Coefficients, x: Array) -> Array:
+    """A x + B u + F θ + φ, (K + 1, N, n)."""
+    return c.phi + _product(c.A, x) + _product(c.B, known.u) + _product(c.F, known.theta)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Taylor coefficients of a product of matrices (K + 1, N, i, j) and (K + 1, N, j[, k])."""
+    matrices = b if b.ndim == a.ndim else b[..., None]
+    out = np.zeros((*a.shape[:-1], matrices.shape[-1]))
+    for k in range(len(a)):
+        for i in range(k + 1):
+            out[k] += a[i] @ matrices[k - i]
+    return out if b.ndim == a.ndim else out[..., 0]
+
+
+@lru_cache(maxsize=16)
+def _derivative(rule: RadauRule) -> Array:
+    """From values at the points of the unit interval to those of the derivative there."""
+    derivative = legendre.legder(rule.to_legendre, axis=0)
+    return np.asarray(
+        2.0 * legendre.legvander(2.0 * rule.points - 1.0, rule.stages - 1) @ derivative
+    )

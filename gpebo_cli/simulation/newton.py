@@ -1,0 +1,156 @@
+"""Simulation of plants whose matrices depend on their outputs: Newton's method, window by window.
+
+Each iterate is one linear problem, the plant linearised along the iterate before. A trajectory
+that grows or is chaotic has no start for the whole horizon from which Newton's method converges, so
+the horizon is followed in windows, as long as convergence allows. At last the whole horizon is
+solved once, linearised along what was found: errors of the windows are seen to grow with the
+solution there, and the estimate is that of the whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpebo_cli.errors import GpeboError, SolverError
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, signal_scale
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.linearised import Linearised
+
+_MOST_ITERATES = 12
+_FAST = 6  # iterates: a window that needs no more may be followed by a longer one
+_LOOSE = 1e-4  # tolerance of iterates that are far from the solution
+_NEAR = 1e-2  # change from which on iterates are worth the full tolerance
+_SHRINKS = 0.5  # changes that do not fall to this share do not converge
+_MOST_GROWTH = 12.0  # of the logarithm of a small error within one window
+_SHORTEST = 1e-8  # of the horizon; where shorter windows are needed the solution ends
+_SAFETY = 10.0
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What Newton's method took."""
+
+    windows: int
+    iterates: int  # linear problems, each over its window
+    linear_solves: float  # the same in linear problems over the whole horizon
+    last_change: float  # of the states, relative to their size, that the last iterate is expected
+
+
+# Solves a linear plant: (system, time, solver) -> its states, and how fast they may grow in 1/s.
+Solve = Callable[[DescriptorSystem, TimeSettings, SolverSettings], tuple[Trajectory, float]]
+
+
+def follow(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings, solve: Solve
+) -> Effort:
+    """Follow the solution from ``system.initial_state``; the last thing solved is all of it.
+
+    Args:
+        system: the plant.
+        time: the horizon.
+        solver: tolerance of the states.
+        solve: for linear plants.
+
+    Raises:
+        SolverError: the solution ends within the horizon; names the time and the reason.
+        ConfigError: an entry that has no finite value at the start.
+    """
+    t, stop = time.start, time.start + time.horizon
+    length, x = time.horizon, system.initial_state
+    pieces: list[Trajectory] = []
+    iterates, work, change = 0, 0.0, 0.0
+    at_start = np.array([t])
+    Linearised(system, _at_rest(x, t, length, solver)).taylor(at_start, 0)  # refuses by name
+    while t < stop - 1e-12 * time.horizon:
+        length = min(length, stop - t)
+        if stop - t < 1.25 * length:
+            length = stop - t
+        window = replace(time, start=t, horizon=length)
+        start = replace(system, initial_state=x)
+        try:
+            piece, count, spent, last = _window(start, window, solver, solve)
+        except GpeboError as error:
+            length *= 0.25
+            if length < _SHORTEST * time.horizon:
+                raise _ends(system, t, x, error) from None
+            continue
+        pieces.append(piece)
+        iterates, work = iterates + count, work + spent * length / time.horizon
+        change = max(change, last)
+        t, x = t + length, piece.final
+        length *= 2.0 if count <= _FAST else 1.0
+    if len(pieces) > 1:
+        whole = joined(pieces)
+        linear = replace(system, coefficients=Linearised(system, whole))
+        solve(linear, time, solver)
+        iterates, work = iterates + 1, work + 1.0
+    return Effort(len(pieces), iterates, work, change)
+
+
+def _window(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings, solve: Solve
+) -> tuple[Trajectory, int, float, float]:
+    """Newton's method over one window, from a state that does not move.
+
+    Returns:
+        the last iterate, how many there were, what they cost in solutions to the full tolerance,
+        and the change that one more is expected to make.
+
+    Raises:
+        SolverError: it does not converge.
+    """
+    guess = _at_rest(system.initial_state, time.start, time.horizon, solver)
+    before, work = np.inf, 0.0
+    for count in range(1, _MOST_ITERATES + 1):
+        full = before <= _NEAR or solver.tol >= _LOOSE
+        linear = replace(system, coefficients=Linearised(system, guess))
+        found, rate = solve(linear, time, solver if full else replace(solver, tol=_LOOSE))
+        if rate * time.horizon > _MOST_GROWTH:
+            break
+        work += 1.0 if full else np.log(_LOOSE) / np.log(solver.tol)
+        values = found.values
+        moved = values - guess.mesh.sampler(found.mesh.points.ravel(), found.mesh.inside.ravel())(
+            guess.values
+        ).reshape(values.shape)
+        change = float((np.abs(moved).max(axis=(0, 1)) / signal_scale(values)).max())
+        # Each change is about the square of the one before times a constant.
+        growth = max(1.0, change / before**2) if np.isfinite(before) and before > 0 else np.inf
+        expected = min(change, _SAFETY * growth * change**2)
+        if full and expected <= solver.tol:
+            return found, count, work, expected
+        if not np.isfinite(change) or (count > 2 and change > _SHRINKS * before):
+            break
+        guess, before = found, change
+    raise SolverError(
+        f"Newton's method does not converge between t = {time.start:.9g} and "
+        f"t = {time.start + time.horizon:.9g}"
+    )
+
+
+def _at_rest(x: Array, start: float, length: float, solver: SolverSettings) -> Trajectory:
+    """A state that does not move."""
+    rule = radau_rule(solver.stages)
+    mesh = Mesh(np.array([start, start + length]), rule)
+    return Trajectory(mesh, np.tile(x, (1, rule.stages + 1, 1)))
+
+
+def _ends(system: DescriptorSystem, t: float, x: Array, error: GpeboError) -> GpeboError:
+    """Why no window, however short, leads on from here."""
+    large = int(np.argmax(np.abs(x)))
+    said = str(error).removeprefix(f"plant {system.name}: ")
+    return type(error)(
+        f"plant {system.name}: the solution cannot be followed beyond t = {t:.9g} "
+        f"({system.states[large]} = {x[large]:.3g} there): {said}"
+    )
+
+
+def joined(pieces: list[Trajectory]) -> Trajectory:
+    """Trajectories one after the other as one."""
+    edges = [pieces[0].mesh.edges[:1], *(piece.mesh.edges[1:] for piece in pieces)]
+    mesh = Mesh(np.concatenate(edges), pieces[0].mesh.rule)
+    return Trajectory(mesh, np.concatenate([piece.values for piece in pieces]))

@@ -1,0 +1,242 @@
+"""Plants whose matrices depend on their outputs: simulated by Newton's method, window by window."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
+from gpebo_cli.model.functions import Names, system_from_functions
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.linearised import Linearised
+from gpebo_cli.simulation.simulate import simulate
+
+SOLVER = SolverSettings()
+
+
+def lorenz(**entries):
+    data = {
+        "name": "lorenz", "states": ["x1", "x2", "x3"], "outputs": ["y"], "unknowns": {"rho": 28},
+        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "F": [[0], ["y"], [0]],
+        "A": [[-10, 10, 0], [0, -1, "-y"], [0, "y", "-8/3"]], "C": [[1, 0, 0]],
+        "initial_state": [1, 1, 20],
+    }  # fmt: skip
+    return plant_from_mapping({**data, **entries})
+
+
+def boost(**entries):
+    data = {
+        "name": "boost", "states": ["i", "v"], "inputs": {"duty": "0.5 + 0.1*sin(3*t)"},
+        "outputs": ["y"], "unknowns": {"power": 8}, "E": [["0.5", 0], [0, "0.2"]],
+        "A": [["-0.1", "-(1-duty)"], ["1-duty", "-0.05"]], "F": [[0], ["-1/y"]],
+        "phi": ["10", 0], "C": [[0, 1]], "initial_state": [3, 18],
+    }  # fmt: skip
+    return plant_from_mapping({**data, **entries})
+
+
+def integrated(right_side, start, t):
+    """Another method: DOP853 on the equations as they stand."""
+    found = solve_ivp(
+        right_side, (0, t[-1]), start, method="DOP853", t_eval=t, rtol=1e-13, atol=1e-13
+    )
+    return found.y.T
+
+
+def of_lorenz(_, x):
+    return [10 * (x[1] - x[0]), x[0] * (28 - x[2]) - x[1], x[0] * x[1] - 8 / 3 * x[2]]
+
+
+def of_boost(t, x):
+    off = 0.5 - 0.1 * np.sin(3 * t)
+    return [(-0.1 * x[0] - off * x[1] + 10) / 0.5, (off * x[0] - 0.05 * x[1] - 8 / x[1]) / 0.2]
+
+
+@pytest.mark.parametrize(
+    ("plant", "right_side", "horizon"), [(lorenz, of_lorenz, 3.0), (boost, of_boost, 3.0)]
+)
+def test_the_solution_is_that_of_another_method(plant, right_side, horizon):
+    system, t = plant(), np.linspace(0, horizon, 31)
+    found = simulate(system, TimeSettings(horizon=horizon), SOLVER)
+    expected = integrated(right_side, system.initial_state, t)
+    np.testing.assert_allclose(found.signals.states(t), expected, rtol=1e-9, atol=1e-9)
+    y = found.signals.outputs(t)[:, 0]
+    np.testing.assert_allclose(y, expected[:, system.states.index("v")] if plant is boost
+                               else expected[:, 0], rtol=1e-9, atol=1e-9)
+    assert found.error_estimate < 1e-9
+
+
+def test_a_mildly_nonlinear_plant_costs_few_linear_solves():
+    effort = simulate(boost(), TimeSettings(horizon=3.0), SOLVER).effort
+    assert effort.windows == 1
+    assert effort.linear_solves <= 4
+
+
+def test_a_chaotic_plant_says_how_accurate_it_is():
+    t = np.array([10.0])
+    found = simulate(lorenz(), TimeSettings(horizon=10.0), SOLVER)
+    error = np.abs(found.signals.states(t) - integrated(of_lorenz, [1, 1, 20], t)).max()
+    size = np.abs(found.signals.states.values).max()
+    assert found.effort.windows > 1
+    assert error / size < 10 * found.error_estimate < 1e-4
+
+
+def test_the_independent_path_agrees():
+    by_ivp = simulate(boost(), TimeSettings(horizon=1.0), SolverSettings(name="ivp", tol=1e-9))
+    ours = simulate(boost(), TimeSettings(horizon=1.0), SOLVER)
+    t = np.linspace(0, 1, 11)
+    np.testing.assert_allclose(by_ivp.signals.states(t), ours.signals.states(t), rtol=1e-7)
+
+
+# Solutions x1 = 2 + sin(t), x2 = cos(2 t), and z as the last equation has it.
+X1, X2 = "(2 + sin(t))", "cos(2*t)"
+DX1, DX2 = "cos(t)", "(-2*sin(2*t))"
+MANUFACTURED = {
+    "index 1": {
+        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "outputs": ["y"], "C": [[1, 0, 0]],
+        "A": [["-y", 1, 1], [0, "-y**2", "sin(y)"], ["y", 0, -1]],
+        "phi": [f"{DX1} + {X1}**2 - {X2} - {X1}**2",
+                f"{DX2} + {X1}**2*{X2} - sin({X1})*{X1}**2", 0],
+        "z": f"{X1}**2",
+    },
+    "index 1, two outputs, one of the algebraic state": {
+        "E": [[1, 0, 0], [0, "2 + cos(t)", 0], [0, 0, 0]], "outputs": ["y", "w"],
+        "C": [[1, 1, 0], [0, 0, 1]],
+        "A": [["-w", 0, 0], [0, "-exp(y/4)", 1], [0, "y", "-2 - w**2"]],
+        "phi": [f"{DX1} + sin(t)*{X1}", f"(2 + cos(t))*{DX2} + exp(({X1} + {X2})/4)*{X2} - sin(t)",
+                f"(2 + sin(t)**2)*sin(t) - ({X1} + {X2})*{X2}"],
+        "z": "sin(t)",
+    },
+    "index 2": {
+        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "outputs": ["y"], "C": [[0, 1, 0]],
+        "A": [["-y", 0, 1], ["y", -1, 0], [1, 0, 0]],
+        "phi": [f"{DX1} + {X2}*{X1} - cos(3*t)", f"{DX2} - {X2}*{X1} + {X2}", f"-{X1}"],
+        "z": "cos(3*t)",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MANUFACTURED)
+def test_manufactured_solutions_of_higher_index(name):
+    entries = dict(MANUFACTURED[name])
+    z = entries.pop("z")
+    system = plant_from_mapping({
+        "name": "p", "states": ["a", "b", "z"], "initial_state": [2, 1, 0.3], **entries
+    })  # fmt: skip
+    t = np.linspace(0, 5, 41)
+    found = simulate(system, TimeSettings(horizon=5.0), SOLVER)
+    value = {"t": t, "sin": np.sin, "cos": np.cos}
+    expected = [eval(text, value) for text in (X1, X2, z)]  # noqa: S307  our own text
+    np.testing.assert_allclose(found.signals.states(t), np.transpose(expected), atol=1e-9)
+    assert found.structure.index == int(name[6])
+
+
+@given(st.floats(-2, 2), st.floats(0.1, 0.9), st.floats(0.2, 5))
+@settings(max_examples=15, deadline=None)
+def test_logistic_growth_with_any_numbers(growth, share, capacity):
+    """x' = r x (1 − x/K), solved by x = K/(1 + (K/x0 − 1) e^{−r t})."""
+    start = share * capacity
+    system = plant_from_mapping({
+        "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "C": [[1]],
+        "A": [[f"{growth}*(1 - y/{capacity})"]], "initial_state": [start],
+    })  # fmt: skip
+    t = np.linspace(0, 5, 21)
+    found = simulate(system, TimeSettings(horizon=5.0), SOLVER)
+    expected = capacity / (1 + (capacity / start - 1) * np.exp(-growth * t))
+    np.testing.assert_allclose(found.signals.states(t)[:, 0], expected, rtol=1e-8, atol=1e-11)
+
+
+def test_jumps_of_inputs_are_followed():
+    """x' = −x² + u with a step of u: both pieces have closed forms."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x"], "outputs": ["y"], "inputs": {"u": "step(t - 1)"},
+        "E": [[1]], "A": [["-y"]], "B": [[1]], "C": [[1]], "initial_state": [2],
+    })  # fmt: skip
+    t = np.linspace(0, 3, 31)
+    found = simulate(system, TimeSettings(horizon=3.0), SOLVER)
+    before = 1 / (t + 0.5)
+    after = np.tanh(t - 1 + np.arctanh(1 / 1.5))
+    np.testing.assert_allclose(
+        found.signals.states(t)[:, 0], np.where(t < 1, before, after), rtol=1e-9
+    )
+
+
+def test_functions_of_outputs_from_python():
+    def A(t, u, y):
+        out = np.zeros((len(t), 3, 3), dtype=y.dtype)
+        out[:, 0, :2], out[:, 1, 1], out[:, 2, 2] = [-10, 10], -1, -8 / 3
+        out[:, 1, 2], out[:, 2, 1] = -y[:, 0], y[:, 0]
+        return out
+
+    def F(t, u, y):
+        out = np.zeros((len(t), 3, 1), dtype=y.dtype)
+        out[:, 1, 0] = y[:, 0]
+        return out
+
+    system = system_from_functions(
+        "lorenz", np.eye(3), A, F=F, theta=[28.0], C=[[1.0, 0, 0]], initial_state=[1, 1, 20],
+        names=Names(outputs=["y"]),
+    )
+    t = np.linspace(0, 1, 11)
+    one, two = (simulate(s, TimeSettings(horizon=1.0), SOLVER) for s in (system, lorenz()))
+    np.testing.assert_allclose(one.signals.states(t), two.signals.states(t), atol=1e-10)
+    assert two.bounded
+    assert not one.bounded
+
+
+def test_the_linearisation_is_the_derivative():
+    """Against differences of the right side, with derivatives in time along a polynomial guess."""
+    found = simulate(boost(), TimeSettings(horizon=1.0), SOLVER)
+    linear = Linearised(boost(), found.signals.states)
+    t = np.linspace(0.05, 0.95, 7)
+    c = linear.taylor(t, 1)
+    x = found.signals.states(t)
+    exact = np.array([[-0.1 + 0 * t, -(0.5 - 0.1 * np.sin(3 * t))],
+                      [0.5 - 0.1 * np.sin(3 * t), -0.05 + 8 / x[:, 1] ** 2]])  # fmt: skip
+    np.testing.assert_allclose(c.A[0], np.moveaxis(exact, 2, 0), rtol=1e-9)
+    slope = (linear.taylor(t + 1e-5, 0).A[0] - linear.taylor(t - 1e-5, 0).A[0]) / 2e-5
+    np.testing.assert_allclose(c.A[1], slope, atol=1e-5)
+
+
+def test_finite_escape_is_named_with_its_time():
+    """x' = x² from 1 ends at t = 1."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [["y"]], "C": [[1]],
+        "initial_state": [1],
+    })  # fmt: skip
+    with pytest.raises(SolverError, match="cannot be followed beyond t = ") as caught:
+        simulate(system, TimeSettings(horizon=3.0), SOLVER)
+    said = float(str(caught.value).split("beyond t = ")[1].split()[0])
+    assert abs(said - 1.0) < 1e-6
+
+
+def test_division_by_an_output_that_reaches_zero_is_named_with_its_time():
+    """x' = −1/(2 x): x = sqrt(1 − t)."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[0]], "C": [[1]],
+        "phi": ["-1/(2*y)"], "initial_state": [1],
+    })  # fmt: skip
+    with pytest.raises(GpeboError, match="cannot be followed beyond t = ") as caught:
+        simulate(system, TimeSettings(horizon=3.0), SOLVER)
+    said = float(str(caught.value).split("beyond t = ")[1].split()[0])
+    assert abs(said - 1.0) < 1e-6
+
+
+def test_zero_output_at_the_start_of_a_division_is_refused():
+    with pytest.raises(ConfigError, match=r"F\[1\]\[0\] = '-1/y' has no finite value at t = 0"):
+        simulate(boost(initial_state=[3, 0]), TimeSettings(horizon=1.0), SOLVER)
+
+
+def test_loss_of_index_is_named_with_its_time():
+    """0 = y z − 1 with y = x = 1 − t: at t = 1 nothing determines z."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x", "z"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "A": [[0, 0], [0, "y"]], "phi": [-1, -1], "C": [[1, 0]], "initial_state": [1, 1],
+    })  # fmt: skip
+    with pytest.raises((ModelError, SolverError), match="beyond t = ") as caught:
+        simulate(system, TimeSettings(horizon=3.0), SOLVER)
+    said = float(str(caught.value).split("beyond t = ")[1].split()[0])
+    assert abs(said - 1.0) < 1e-3
