@@ -352,7 +352,7 @@ def _coefficients(
         key: frozenset[str]().union(*(e.node.signals for e in expressions))
         for key, (_, expressions) in entries.items()
     }
-    depending = {key: names for key, names in signals.items() if names}
+    depending = {key: signals[key] for key in MATRIX_NAMES if signals[key]}
     truth = record(entries["theta"][1])
     return TextCoefficients(
         record(varying, inputs), layouts, truth, depending, outputs, name, restricted
