@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.evidence.excitation import Excitation
+from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment.result import (
     EstimationResult,
@@ -109,6 +110,7 @@ def make_result(
         condition=1e3,
         weakest_direction=Direction({name: 1 / np.sqrt(p) for name in parameters}),
         determined_at=dict.fromkeys(parameters, 0.5),
+        known=knowledge(np.tile(np.eye(p), (len(t), 1, 1)), np.ones(p), t + 1.0),
     )
     coarse = t[::thin]
     delta = 1e-3 * (1 - np.exp(-0.02 * coarse**2)) ** 4 if mixing else None

@@ -45,7 +45,7 @@ def main(words: list[str]) -> int:
 
     from gpebo_cli.results import comparison
     from gpebo_cli.results.files import make_folder, write_text
-    from gpebo_cli.results.finished import METRICS
+    from gpebo_cli.results.names import METRICS
 
     cases = [case for name in arguments.words for case in _cases(name)]
     if not cases:

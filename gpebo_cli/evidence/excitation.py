@@ -50,6 +50,7 @@ class Excitation:
     condition: float  # largest over smallest eigenvalue of G with unit diagonal, at the horizon
     weakest_direction: Direction  # in units of each parameter's own size
     determined_at: Mapping[str, float | None]  # from when on each parameter is well determined
+    known: Knowledge  # at the same times
 
     @property
     def level(self) -> float:
@@ -107,8 +108,24 @@ def excitation(
         lambda_min=float(gram_eigenvalues[-1, 0]) if len(parameters) else 0.0,
         condition=float(spectrum[-1]) / smallest if smallest > 0.0 else float("inf"),
         weakest_direction=Direction(dict(zip(parameters, (sign * v).tolist(), strict=True))),
-        determined_at=dict(zip(parameters, since(t, well), strict=True)),
+        determined_at=dict(zip(parameters, since(t, well), strict=True)), known=known,
     )
+
+
+def estimable(
+    excitation: Excitation, parameters: Sequence[str], states: Sequence[str], seen: BoolArray
+) -> dict[str, float | None]:
+    """From when on each parameter and state can be known; None: not even at the end.
+
+    Args:
+        excitation: the evidence.
+        parameters: their names.
+        states: their names; a parameter of the same name comes first.
+        seen: which states are determined at the times of the evidence, (N, n).
+    """
+    times = since(excitation.t, np.concatenate([excitation.known.parameters, seen], axis=1))
+    of_states = dict(zip(states, times[len(parameters) :], strict=True))
+    return of_states | dict(zip(parameters, times, strict=False))
 
 
 def since(t: Array, holds: BoolArray) -> list[float | None]:

@@ -75,6 +75,22 @@ class Knowledge:
         kernel, slack = self._kernel
         return np.asarray(np.linalg.norm(kernel, axis=2) <= slack[:, None])
 
+    @property
+    def independent(self) -> IntArray:
+        """Parameters that can be estimated together at the last time, the determined ones included.
+
+        The others, set to zero, change nothing that is determined: along the kernel of N the
+        regression is the same.
+        """
+        V, spectrum, level = self.vectors[-1], self.eigenvalues[-1], self.level[-1].max(initial=0.0)
+        normalised = (V * np.maximum(spectrum, 0.0)) @ V.T
+        chosen = np.flatnonzero(self.parameters[-1]).tolist()
+        for j in np.flatnonzero(~self.parameters[-1]).tolist():
+            more = [*chosen, j]
+            if np.linalg.eigvalsh(normalised[np.ix_(more, more)])[0] >= level:
+                chosen = more
+        return np.sort(np.array(chosen, dtype=np.intp))
+
     def states(self, gain: Array) -> BoolArray:
         """Which states x = offset + gain η are, for gain (M, n, p): shape (M, n)."""
         kernel, slack = self._kernel

@@ -6,13 +6,15 @@ root mean square over time is √(∫e² dt / horizon).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
 
 SETTLED = 0.01  # share of an error at the start, below which it has settled
+_NOTHING = 1e-6  # of a quantity's size: an error that starts below this is none
 DECAY = -float(np.log(SETTLED))  # exponent of an exponential that has settled
 
 
@@ -25,20 +27,24 @@ class Metrics:
     final_error_parameters: Array  # (G,) max abs
     final_error_states: Array  # (G,) max abs
     rms_error_states: Array  # (G,)
+    seconds_to_1pct: Mapping[str, Array] = field(default_factory=dict)  # of each quantity, (G,)
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """Everything by the name it has in ``cases.csv``."""
+        return {
+            **{name: getattr(self, name) for name in NAMES},
+            **{f"{SECONDS}{name}": times for name, times in self.seconds_to_1pct.items()},
+        }
 
 
-def measure(t: Array, parameter_error: Array, state_error: Array) -> Metrics:
-    """Metrics of errors (G, M, p) and (G, M, n) at the times t (M,).
+NAMES = tuple(f.name for f in fields(Metrics) if f.name != "seconds_to_1pct")
+SECONDS = "seconds_to_1pct_"
 
-    Over what the observer sees and what is known of the truth; NaN where that is nothing.
-    """
-    known = ~np.isnan(parameter_error[0, -1])
-    seen = ~np.isnan(state_error[0, -1])
-    parameters, states = parameter_error[..., known], state_error[..., seen]
-    return measure_squares(
-        t, (parameters**2).sum(axis=2) if known.any() or not known.size else None,
-        parameters[:, -1], (states**2).sum(axis=2) if seen.any() else None, states[:, -1],
-    )
+
+def is_metric(name: str) -> bool:
+    """Whether a column of ``cases.csv`` is a metric, and no gain."""
+    return name in NAMES or name.startswith(SECONDS)
 
 
 def measure_squares(
@@ -47,7 +53,7 @@ def measure_squares(
 ) -> Metrics:
     """Metrics from squared norms (G, M) and from errors at the end, (G, p) and (G, n).
 
-    NaN where the norms are None.
+    NaN where the norms are None. Norms are of quantities in units of their own size.
     """
     out = np.full((5, len(last_parameters)), np.nan)
     if of_parameters is not None:
@@ -59,7 +65,24 @@ def measure_squares(
     return Metrics(*out)
 
 
-def settling_time(t: Array, error: Array, fraction: float = SETTLED) -> Array:
+def settling_times(t: Array, error: Array, size: Array) -> Array:
+    """:func:`settling_time` of each of c errors (g, M, c), shape (g, c).
+
+    An error that starts at less than a millionth of its quantity's size (c,) is to stay below 1 %
+    of that.
+    """
+    absolute = np.abs(np.moveaxis(error, 2, 1))  # (g, c, M)
+    first = absolute[..., 0]
+    reference = np.where(first > _NOTHING * size, first, size)
+    flat = absolute.reshape(-1, len(t))
+    out = settling_time(t, flat, level=SETTLED * reference.ravel()).reshape(first.shape)
+    out[np.isnan(absolute[..., -1])] = np.nan
+    return out
+
+
+def settling_time(
+    t: Array, error: Array, fraction: float = SETTLED, level: Array | None = None
+) -> Array:
     """Time after which a nonnegative error stays below a fraction of its initial value.
 
     Between two times the logarithm of the error is taken as linear, which is exact where it
@@ -69,11 +92,12 @@ def settling_time(t: Array, error: Array, fraction: float = SETTLED) -> Array:
         t: times (M,), ascending; the result counts from t[0].
         error: (g, M).
         fraction: of the first value.
+        level: instead of that (g,).
 
     Returns:
         (g,), NaN if it is never reached; 0 if the error is zero from the start.
     """
-    level = fraction * error[:, :1]
+    level = fraction * error[:, :1] if level is None else level[:, None]
     above = error > level
     last = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
     out = np.where(above.any(axis=1), np.nan, 0.0)

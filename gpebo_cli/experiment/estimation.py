@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gpebo_cli import estimators, kernels
-from gpebo_cli.errors import SolverError
-from gpebo_cli.evidence.excitation import WINDOWS, Excitation, assess, sampled_window_level
-from gpebo_cli.evidence.metrics import Metrics, measure, measure_squares
+from gpebo_cli.errors import ConfigError, SolverError
+from gpebo_cli.evidence.excitation import (
+    WINDOWS,
+    Excitation,
+    assess,
+    estimable,
+    sampled_window_level,
+)
+from gpebo_cli.evidence.knowledge import Knowledge
+from gpebo_cli.evidence.metrics import NAMES as METRICS
+from gpebo_cli.evidence.metrics import Metrics, measure_squares, settling_times
 from gpebo_cli.experiment.assumptions import Observed, warnings
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.experiment.online import Online, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
 from gpebo_cli.experiment.seeds import check_response, over_seeds
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
-from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, StateMap
 from gpebo_cli.observers._observation import AffineStateMap
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
 
 _SAMPLES_AT_ONCE = 2048
+_PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
+_LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that counts as this large
 _BATCH = 1 << 19  # numbers held at once while cases are evaluated: what fits the cache
 
 # name of a stage of the run -> what measures it
@@ -41,6 +52,7 @@ class Estimated:
     estimation: EstimationResult
     metrics: Metrics
     fit: Fit | None  # of a recording
+    estimable: Mapping[str, float | None]  # from when on; None: never
     noise: NoiseStatistics | None = None
     by_observer: bool = False  # the observer estimates by itself
     note: str = ""  # what the last line of a run has to say of it, from "; " on
@@ -74,9 +86,16 @@ def continuous(
     with stage("excitation"):
         excitation = assess(regression, t, settings.excitation, settings.solver.tol)
     with stage("estimate"):
+        known, state_map = excitation.known, observation.state_map
+        if isinstance(state_map, AffineStateMap) and observation.names is None:
+            visible = known.states(state_map.gain(t))
+        else:  # what it needs of the parameters is not known
+            visible = np.repeat(known.parameters.all(axis=1, keepdims=True), system.n, axis=1)
+        times = estimable(excitation, regression.parameters, system.states, visible)
         try:
             estimation, metrics = _estimate(
-                settings, observation.estimator or estimator, observation, source
+                settings, system, observation.estimator or estimator, observation, source, known,
+                visible[-1],
             )
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
@@ -87,7 +106,7 @@ def continuous(
             noise = over_seeds(observation, source.true, estimator, truth, settings.noise, levels)
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
-        _fit(observation, estimation) if source.recording else None, noise,
+        _fit(observation, estimation) if source.recording else None, times, noise,
         observation.estimator is not None, observation.note,
     )
 
@@ -112,8 +131,12 @@ def at_samples(
         parts = [slice(i, i + _SAMPLES_AT_ONCE) for i in range(0, len(t), _SAMPLES_AT_ONCE)]
         made = joined([online.feed(t[part], u[part], y[part]) for part in parts])
         truth = online.truth(made.extension)(t, source.theta(t), source.states)
-        metrics = measure(
-            t, (made.parameters - truth)[..., source.judged], made.states - source.states(t)
+        x = source.states(t)
+        parameters = made.parameters * _told(made.known.parameters[-1])
+        states = made.states * _told(made.seen[-1])
+        sizes = _sizes(truth, online.natural_sizes, x)
+        numbers = _numbers(
+            t, parameters - truth, states - x, sizes, _judged(source, truth.shape[1])
         )
     chosen = kept_samples(1, len(t), settings.time.samples)
     kept = chosen[kept_samples(len(online.cases), len(chosen), settings.output.max_rows)]
@@ -121,9 +144,9 @@ def at_samples(
         cases=online.cases,
         t=t[kept],
         names=online.parameters,
-        parameters=made.parameters[:, kept],
+        parameters=parameters[:, kept],
         true_parameters=truth[kept],
-        states=made.states[:, kept],
+        states=states[:, kept],
         delta=None if made.delta is None else made.delta[:, kept],
         checks={},
         requirement=online.requirement,
@@ -138,85 +161,191 @@ def at_samples(
         RegressionResult(
             t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
         ),
-        excitation, estimation, metrics,
+        excitation, estimation, _metrics(numbers, online.parameters, system),
         online.fit() if source.recording else None,
+        estimable(excitation, online.parameters, system.states, made.seen[chosen]),
     )
 
 
 def _estimate(
-    settings: Settings, estimator: estimators.Estimator, observation: Observation, source: Source,
+    settings: Settings, system: DescriptorSystem, estimator: estimators.Estimator,
+    observation: Observation, source: Source, known: Knowledge, seen: BoolArray,
 ) -> tuple[EstimationResult, Metrics]:
-    """Run every case on the mesh and the samples that are kept; measure on both."""
+    """Run every case on the mesh and the samples that are kept; measure on both.
+
+    What is not determined at the end is NaN. If the estimator is not the observer's own and has
+    nothing to carry over resets, the parameters that others can stand for are left out.
+    """
     regression, state_map = observation.regression, observation.state_map
     cases, t = estimator.cases, source.t
     kept = t[kept_samples(len(cases), len(t), settings.output.max_rows)]
     grid = np.unique(np.concatenate([regression.mesh.points.ravel(), state_map.times, kept]))
-    estimates = estimators.estimate(estimator, regression, grid)
     chosen = np.searchsorted(grid, kept)
 
     x = source.states(grid)
     truth = observation.truth(grid, source.theta(grid), source.states)
-    evaluate = _evaluation(state_map, grid, truth, x, source.judged, chosen)
     size, p, n = len(cases), truth.shape[1], x.shape[1]
+    each = size <= _PER_QUANTITY
+    determined = np.ones(p, dtype=bool)
+    if observation.names is None and observation.estimator is None:
+        determined = known.parameters[-1]
+        estimates, columns = _estimates(estimator, regression, grid, known.independent)
+    else:
+        seen = np.ones(n, dtype=bool)
+        estimates, columns = estimators.estimate(estimator, regression, grid), np.arange(p)
+    told = _told(determined), _told(seen)
+    sizes = _sizes(truth, _natural_sizes(regression, p), x)
+    evaluate = _evaluation(
+        state_map, grid, truth * told[0], x * told[1], sizes, _judged(source, p), chosen,
+        each=each,
+    )
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
-    numbers = np.empty((5, size))
+    numbers = np.empty((len(METRICS) + each * (p + n), size))
     batch = max(1, _BATCH // (len(grid) * (2 * p + n)))
     for first in range(0, size, batch):
         part = slice(first, min(first + batch, size))
-        numbers[:, part], parameters[part], estimated[part] = evaluate(estimates.parameters(part))
+        eta = estimates.parameters(part)
+        if len(columns) < p:
+            whole = np.zeros((*eta.shape[:2], p))
+            whole[..., columns] = eta
+            eta = whole
+        found, parameters[part], estimated[part] = evaluate(eta)
+        numbers[:, part] = found[: len(numbers)]
     result = EstimationResult(
         cases=cases,
         t=kept,
         names=observation.parameters,
-        parameters=parameters,
+        parameters=parameters * told[0],
         true_parameters=truth[chosen],
-        states=estimated,
+        states=estimated * told[1],
         delta=estimates.delta(kept),
         checks=state_map.checks(kept, estimated),
         requirement=estimates.requirement,
     )
-    return result, Metrics(*numbers)
+    return result, _metrics(numbers, observation.parameters, system)
 
 
-# η̂ (g, M, p) on the grid -> the five columns of ``cases.csv`` (5, g), and η̂ (g, k, p) and
+def _estimates(
+    estimator: estimators.Estimator, regression: LinearRegression, grid: Array, columns: IntArray
+) -> tuple[estimators.Estimates, IntArray]:
+    """The estimates of some of the parameters, and of which: all, where settings are one each."""
+    everything = np.arange(regression.p)
+    plain = not regression.resets and regression.dynamics is None
+    if len(columns) in (0, regression.p) or not plain:
+        return estimators.estimate(estimator, regression, grid), everything
+    some = replace(
+        regression, psi=Trajectory(regression.mesh, regression.psi.values[..., columns]),
+        parameters=tuple(regression.parameters[j] for j in columns),
+        scale=np.broadcast_to(regression.scale, (regression.mesh.size, regression.p))[:, columns],
+    )
+    try:
+        return estimators.estimate(estimator, some, grid), columns
+    except ConfigError:  # as many numbers in its settings as parameters
+        return estimators.estimate(estimator, regression, grid), everything
+
+
+def _natural_sizes(regression: LinearRegression, p: int) -> Array:
+    """√(∫Y²/∫ψ_j²) (p,): the size of a parameter that alone would explain Y; zeros for others."""
+    energy = np.einsum("jj->j", regression.gram.final[:, : regression.p])
+    if len(energy) != p:
+        return np.zeros(p)
+    square = Trajectory(regression.mesh, (regression.Y.values**2).sum(axis=-1)).integral().final
+    return np.asarray(np.sqrt(np.divide(square, energy, out=np.zeros(p), where=energy > 0.0)))
+
+
+def _sizes(truth: Array, natural: Array, x: Array) -> tuple[Array, Array]:
+    """Sizes of the parameters (p,) and states (n,): by these, errors of all kinds are compared."""
+    with np.errstate(invalid="ignore"):
+        of_eta = np.fmax(np.fmax.reduce(np.abs(truth), axis=0), _LEAST * natural)
+        return of_eta, np.fmax.reduce(np.abs(x), axis=0)
+
+
+def _judged(source: Source, p: int) -> BoolArray:
+    judged = np.zeros(p, dtype=bool)
+    judged[source.judged] = True
+    return judged
+
+
+def _weights(sizes: Array, counted: BoolArray) -> Array:
+    """1/size², and 0 for what does not count or has no size."""
+    counted = counted & (sizes > 0.0)
+    return np.divide(1.0, sizes**2, out=np.zeros(len(sizes)), where=counted)
+
+
+def _told(determined: BoolArray) -> Array:
+    """Factors (c,) that make NaN of what is not determined.
+
+    Where nothing is, there is nothing to tell apart, and what an estimator does then is shown.
+    """
+    return np.where(determined | ~determined.any(), 1.0, np.nan)
+
+
+def _numbers(
+    t: Array, of_eta: Array, of_x: Array, sizes: tuple[Array, Array], judged: BoolArray
+) -> Array:
+    """What ``Metrics`` are made of, (5 + p + n, g), of errors (g, M, p) and (g, M, n)."""
+    seen, known = judged & ~np.isnan(of_eta[0, -1]), ~np.isnan(of_x[0, -1])
+    squares = [
+        np.einsum("gmj,j->gm", error[..., some] ** 2, _weights(size, some)[some])
+        for error, size, some in ((of_eta, sizes[0], seen), (of_x, sizes[1], known))
+    ]
+    times = [settling_times(t, of_eta, sizes[0]), settling_times(t, of_x, sizes[1])]
+    times[0][:, ~judged] = np.nan
+    of_all = _of_all(t, squares, of_eta[:, -1], of_x[:, -1], judged)
+    return np.concatenate([of_all, times[0].T, times[1].T])
+
+
+def _of_all(
+    t: Array, squares: Sequence[Array], of_eta: Array, of_x: Array, judged: BoolArray
+) -> Array:
+    """The first five of them from squared norms (g, M) and errors at the end (g, p) and (g, n)."""
+    seen, known = judged & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
+    metrics = measure_squares(
+        t, squares[0] if seen.any() or not judged.any() else None, of_eta[:, seen],
+        squares[1] if known.any() else None, of_x[:, known],
+    )
+    return np.array([getattr(metrics, name) for name in METRICS])
+
+
+def _metrics(numbers: Array, parameters: Sequence[str], system: DescriptorSystem) -> Metrics:
+    """From (5, g), or (5 + p + n, g) with the time of each quantity."""
+    names = [*parameters, *system.states]
+    each = dict(zip(names, numbers[5:], strict=True)) if len(numbers) > len(METRICS) else {}
+    return replace(Metrics(*numbers[: len(METRICS)]), seconds_to_1pct=each)
+
+
+# η̂ (g, M, p) on the grid -> the numbers that ``Metrics`` are made of (c, g), and η̂ (g, k, p) and
 # x̂ (g, k, n) at the samples that are kept
 _Evaluation = Callable[[Array], tuple[Array, Array, Array]]
 
 
 def _evaluation(
-    state_map: StateMap, grid: Array, truth: Array, x: Array, judged: slice, chosen: IntArray
+    state_map: StateMap, grid: Array, truth: Array, x: Array, sizes: tuple[Array, Array],
+    judged: BoolArray, chosen: IntArray, *, each: bool,
 ) -> _Evaluation:
     """How a batch of cases is measured on the grid (M,) against η (M, p) and x (M, n)."""
     reconstruct = state_map.at(grid)
-    if not isinstance(state_map, AffineStateMap):
-        def evaluate(eta: Array) -> tuple[Array, Array, Array]:
-            x_hat = reconstruct(eta)
-            metrics = measure(grid, (eta - truth)[..., judged], x_hat - x)
-            return np.array(list(vars(metrics).values())), eta[:, chosen], x_hat[:, chosen]
 
+    def evaluate(eta: Array) -> tuple[Array, Array, Array]:
+        x_hat = reconstruct(eta)
+        numbers = _numbers(grid, eta - truth, x_hat - x, sizes, judged)
+        return numbers, eta[:, chosen], x_hat[:, chosen]
+
+    if each or not isinstance(state_map, AffineStateMap):
         return evaluate
-
     sampler = state_map.offset.mesh.sampler(grid)
     offset, gain = sampler(state_map.offset.values), sampler(state_map.gain.values)
-    in_eta = np.zeros(truth.shape[1], dtype=bool)
-    in_eta[judged] = True
 
     def evaluate_affine(eta: Array) -> tuple[Array, Array, Array]:
-        """The same, with x̂ only where it is needed: on the grid its errors are numbers."""
+        """The norms, with x̂ only where it is needed: on the grid its errors are numbers."""
         eta = np.asarray(eta, dtype=np.float64)
         of_eta = eta[:, -1] - truth[-1]
         of_x = offset[-1] + eta[:, -1] @ gain[-1].T - x[-1]
-        seen, known = in_eta & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
-        squares = kernels.laws.squared_errors(
-            eta, truth, seen.astype(float), offset, gain, x, known.astype(float)
-        )
-        judges = seen.any() or not in_eta.any()
-        metrics = measure_squares(
-            grid, squares[0] if judges else None, of_eta[:, seen],
-            squares[1] if known.any() else None, of_x[:, known],
-        )
+        in_eta = _weights(sizes[0], judged & ~np.isnan(of_eta[0]))
+        in_x = _weights(sizes[1], ~np.isnan(of_x[0]))
+        squares = kernels.laws.squared_errors(eta, truth, in_eta, offset, gain, x, in_x)
         x_hat = offset[chosen] + np.matmul(gain[chosen], eta[:, chosen, :, None])[..., 0]
-        return np.array(list(vars(metrics).values())), eta[:, chosen], x_hat
+        return _of_all(grid, squares, of_eta, of_x, judged), eta[:, chosen], x_hat
 
     return evaluate_affine
 

@@ -195,6 +195,14 @@ class Online:
             self._t_c, self._rho,
         )
 
+    @property
+    def natural_sizes(self) -> Array:
+        """√(∫Y²/∫ψ_j²) so far, (p,): the size of a parameter that alone would explain Y."""
+        size = np.linalg.norm(self._root, axis=0)
+        return np.asarray(np.divide(
+            size[-1], size[:-1], out=np.zeros(len(size) - 1), where=size[:-1] > 0.0
+        ))
+
     def fit(self) -> Fit:
         """How the last estimates explain all data, from S alone: |Y − ψη̂|² = |S[−η̂; 1]|²."""
         final, root = self._final, self._root

@@ -88,11 +88,12 @@ def run_experiment(
     warned = warnings(found.observed)
     told = verdict(
         found.excitation, found.estimation.cases, found.estimation.requirement, found.metrics,
-        found.fit,
+        found.fit, found.estimable,
     )
     return replace(
         result, regression=found.regression, excitation=found.excitation,
         estimation=found.estimation, metrics=found.metrics, noise=found.noise, fit=found.fit,
+        estimable=found.estimable,
         assumptions=(*source.assumptions, *of_observation(found.observed, found.excitation)),
         verdict="; ".join([told + found.note, *warned]), warnings=warned,
         # What the result is labelled with is what estimated.

@@ -7,7 +7,7 @@ figures and ``summary.json``; nothing in here knows about files, pandas or matpl
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from gpebo_cli.evidence.excitation import Excitation
@@ -127,6 +127,8 @@ class EstimationResult:
     delta: Array | None  # (D, M), D = 1 if it is the same for every case, else G; None: no mixing
     checks: Mapping[str, Array]  # further estimates by column name, (G, M) each
     requirement: Requirement
+    parameters_std: Array | None = None  # (G, M, p) standard deviations; None: nobody knows
+    states_std: Array | None = None  # (G, M, n)
 
 
 @dataclass(frozen=True)
@@ -170,6 +172,8 @@ class RunResult:
     noise: NoiseStatistics | None = None  # where more than one seed was asked for
     recording: RecordingResult | None = None
     fit: Fit | None = None  # of a recording
+    # From when on each parameter and state is determined by the data, None: never.
+    estimable: Mapping[str, float | None] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()  # what does not stop a run and spoils its result, one line each
 
     @property

@@ -17,6 +17,7 @@ from gpebo_cli.model.descriptor import Array
 def verdict(
     excitation: Excitation, cases: Sequence[Mapping[str, float]], requirement: Requirement,
     metrics: Metrics | None = None, fit: Fit | None = None,
+    estimable: Mapping[str, float | None] | None = None,
 ) -> str:
     """The last line: exciting or not and from when on, and how well the state is known.
 
@@ -33,6 +34,9 @@ def verdict(
     else:
         first = f"NOT interval-exciting: {level}; not excited: {excitation.weakest_direction}"
     parts = [first]
+    unknown = [name for name, since in (estimable or {}).items() if since is None]
+    if unknown:
+        parts.append(f"not determined by the data: {', '.join(unknown)}")
     best = None if metrics is None else _best_case(metrics)
     if metrics is not None and best is not None:
         seconds = metrics.seconds_to_1pct_states[best]

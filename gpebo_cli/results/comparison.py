@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
-from gpebo_cli.results.finished import METRICS, Case, read_errors, span
+from gpebo_cli.results.finished import Case, read_errors, span
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line
 from gpebo_cli.results.symbols import number_text, symbol
 

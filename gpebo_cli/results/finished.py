@@ -5,20 +5,19 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gpebo_cli.errors import GpeboError
-from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.evidence.metrics import NAMES as METRICS
+from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.schema import shown
 
 _TAIL = 1 << 16  # bytes in which the last row of a table is
-
-METRICS = tuple(field.name for field in fields(Metrics))
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
         return []
     chosen = {"plant": str(summary.get("plant")), "estimator": _estimator(summary)}
     columns = read_columns(folder / "cases.csv", "case")
-    gains = [name for name in columns if name not in ("case", *METRICS)]
+    gains = [name for name in columns if name != "case" and not is_metric(name)]
     # estimator.gamma=… is in the table already, as the gain.
     told = {k: v for k, v in overrides.items() if k.removeprefix("estimator.") not in gains}
     return [

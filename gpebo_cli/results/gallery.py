@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.results import circuit
 from gpebo_cli.results.figures import describe, overlay
@@ -142,8 +142,7 @@ def _cases(run: RunResult) -> list[dict[str, float]]:
     estimation, metrics = run.estimation, run.metrics
     if estimation is None or metrics is None:
         return []
-    names = [field.name for field in fields(Metrics)]
     return [
-        {**case, **{name: float(getattr(metrics, name)[i]) for name in names}}
+        {**case, **{name: float(getattr(metrics, name)[i]) for name in METRICS}}
         for i, case in enumerate(estimation.cases)
     ]

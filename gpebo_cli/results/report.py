@@ -17,7 +17,7 @@ def case_rows(result: RunResult) -> list[dict[str, float]]:
     estimation, metrics = result.estimation, result.metrics
     if estimation is None or metrics is None:
         return []
-    columns = {name: [float(v) for v in values] for name, values in vars(metrics).items()}
+    columns = {name: [float(v) for v in values] for name, values in metrics.columns.items()}
     return [
         {**case, **{name: values[i] for name, values in columns.items()}}
         for i, case in enumerate(estimation.cases)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,8 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         **_simulation(system, simulation),
         "recording": _recording(result.recording),
         "parameters": _parameters(result.estimation),
+        "estimates": _estimates(result),
+        "estimable": {name: since is not None for name, since in result.estimable.items()},
         "assumptions": [
             {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
             for a in result.assumptions
@@ -144,6 +146,42 @@ def _parameters(estimation: EstimationResult | None) -> dict[str, float] | None:
     return dict(zip(estimation.names, estimation.true_parameters[-1], strict=True))
 
 
+def _estimates(result: RunResult) -> object:
+    """Every estimate at the end with its truth: of the one case, or of several by number."""
+    estimation = result.estimation
+    if estimation is None:
+        return None
+    count = min(len(estimation.cases), MAX_LISTED_CASES)
+    cases = [estimates_at_end(result, k) for k in range(count)]
+    return cases[0] if len(cases) == 1 else {str(k): case for k, case in enumerate(cases)}
+
+
+def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
+    """By name: value, standard deviation, unit and truth at the end; what is unknown is None."""
+    estimation = result.estimation
+    if estimation is None:
+        return {}
+    signals, units = result.signals, result.system.units
+    nothing = np.full(len(result.system.states), np.nan)
+    last = signals.states[-1] if len(signals.states) else nothing
+    kinds = (
+        (result.system.states, estimation.states, estimation.states_std, last),
+        (estimation.names, estimation.parameters, estimation.parameters_std,
+         estimation.true_parameters[-1]),
+    )
+    out = {
+        name: {
+            "value": values[case, -1, i],
+            "std": None if std is None else std[case, -1, i],
+            "unit": units.get(name.removeprefix("e0_")),
+            "true": truth[i],
+        }
+        for names, values, std, truth in kinds
+        for i, name in enumerate(names)
+    }
+    return {name: out[name] for name in (*estimation.names, *result.system.states)}
+
+
 def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:
     if excitation is None:
         return None
@@ -180,7 +218,7 @@ def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> obje
     """List the cases with gains and metrics; ranges of the metrics when they are many."""
     if estimation is None or metrics is None:
         return None
-    columns = {field.name: np.asarray(getattr(metrics, field.name)) for field in fields(Metrics)}
+    columns = metrics.columns
     if len(estimation.cases) <= MAX_LISTED_CASES:
         return [
             {"case": case, "gains": gains, **{name: col[case] for name, col in columns.items()}}

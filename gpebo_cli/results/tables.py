@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -134,12 +134,12 @@ def write_cases(path: Path, estimation: EstimationResult, metrics: Metrics) -> N
 def cases_table(estimation: EstimationResult, metrics: Metrics) -> Table:
     """One row per case: its gains (NaN: it has no such gain), its metrics."""
     gains = gain_names(estimation)
-    names = [field.name for field in fields(Metrics)]
-    columns = [
+    measured = metrics.columns
+    columns: list[Sequence[float] | Array] = [
         *([case.get(gain, np.nan) for case in estimation.cases] for gain in gains),
-        *(getattr(metrics, name) for name in names),
+        *measured.values(),
     ]
-    return Table([*gains, *names], np.column_stack(columns))
+    return Table([*gains, *measured], np.column_stack(columns))
 
 
 def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics) -> None:

@@ -14,6 +14,7 @@ from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.regression.linear import outer_products
 
 _SMALL = 24  # states, up to which NumPy's calls cost more than the kernels' plain loops
+_ROUNDING = 1e-3  # of a projection, in terms of what is resolved
 _VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
 
 
@@ -107,7 +108,8 @@ def regression_signals(
 def term_sizes(z: Array, q: int, equations: AlgebraicEquations) -> Array:
     """Size of the terms that each column of ψ is made of, at N times, (N, p).
 
-    Of the projection too: an equation of large numbers counts as much as it can add to a residual.
+    An equation of large numbers counts as much as its projection can add to a residual, or as
+    much as the rounding of the projection does.
 
     Args:
         z: [ξ_a | ξ_b | Φ] in the coordinates of the basis, (N, k, 1 + q + n_a).
@@ -116,7 +118,8 @@ def term_sizes(z: Array, q: int, equations: AlgebraicEquations) -> Array:
     """
     terms = np.abs(equations.on_basis @ z[:, :, 1:])
     terms[:, :, :q] += np.abs(equations.G)
-    return np.asarray((np.abs(orthonormal_complement(equations.range)) @ terms).max(axis=1))
+    projected = np.abs(orthonormal_complement(equations.range)) @ terms
+    return np.asarray(np.maximum(projected, _ROUNDING * terms).max(axis=1))
 
 
 def on_mesh(mesh: Mesh, signal: Array) -> Trajectory:
