@@ -27,7 +27,7 @@ _TINY = 1e-100  # squares of its reciprocal are numbers
 class Knowledge:
     """Spectra of N at M times: λ ascending and V."""
 
-    sizes: Array  # (M, p) √G_jj, at least the rounding of the column
+    sizes: Array  # (M, p) √G_jj, or the size of its terms for a column that is rounding
     eigenvalues: Array  # (M, p)
     vectors: Array  # (M, p, p) columns
     level: Array  # (M, p) share below which each parameter is rounding
@@ -131,8 +131,12 @@ def knowledge_of_roots(
 
 
 def _sizes(sizes: Array, terms: Array, elapsed: Array, tol: float) -> tuple[Array, Array]:
-    """√G_jj and the levels of columns, from what their rounding would amount to."""
-    rounding = _UNRESOLVED * tol * terms * np.sqrt(np.maximum(elapsed, 0.0))[:, None]
-    at_least = np.maximum(np.maximum(sizes, rounding), _TINY)
-    level = np.where(sizes > rounding, (rounding / at_least) ** 2, 1.0)
-    return at_least, np.maximum(level, _SINGULAR)
+    """√G_jj and the levels of columns, from what their rounding would amount to.
+
+    A column that is rounding has the size of its terms: what is small beside those is so in x, too.
+    """
+    whole = terms * np.sqrt(np.maximum(elapsed, 0.0))[:, None]
+    rounding = _UNRESOLVED * tol * whole
+    seen = sizes > rounding
+    level = np.divide(rounding, sizes, out=np.ones_like(sizes), where=seen) ** 2
+    return np.maximum(np.where(seen, sizes, whole), _TINY), np.maximum(level, _SINGULAR)

@@ -13,7 +13,8 @@ import numpy as np
 from gpebo_cli.errors import GpeboError
 from gpebo_cli.results import html
 from gpebo_cli.results.comparison import figures
-from gpebo_cli.results.finished import METRICS, Case, read_columns, read_summary
+from gpebo_cli.results.finished import Case, read_columns, read_summary
+from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.page import case_table
 from gpebo_cli.results.style import file_content
 from gpebo_cli.results.symbols import number_text
