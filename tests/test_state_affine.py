@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plants import shipped
 from scipy.integrate import solve_ivp
 
 from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
@@ -240,3 +241,56 @@ def test_loss_of_index_is_named_with_its_time():
         simulate(system, TimeSettings(horizon=3.0), SOLVER)
     said = float(str(caught.value).split("beyond t = ")[1].split()[0])
     assert abs(said - 1.0) < 1e-3
+
+
+def of_motor(t, x):
+    i_d, i_q, w = x
+    L, flux, pairs, R, load = 0.005, 0.1, 4, 0.6, 1.2
+    back = pairs * w * (L * i_d + flux)
+    return [
+        (-R * i_d + pairs * w * L * i_q + 2 * np.sin(13 * t)) / L,
+        (-R * i_q - back + 14 + 4 * np.sin(20 * t)) / L,
+        (1.5 * pairs * flux * i_q - 0.002 * w - load) / 0.002,
+    ]
+
+
+def of_battery(t, x):
+    current = 2.5 + 1.5 * np.sin(t / 20) + np.sin(t / 7)
+    return [-6.67e-5 * current, (current - x[1] / 0.015) / 2000]
+
+
+def of_bioreactor(t, x):
+    biomass, s = x
+    grown = 0.4 / 3600 * s / (0.5 + s) * biomass
+    dilution = (0.2 + 0.1 * np.sin(t / 5000)) / 3600
+    return [grown - dilution * biomass, -grown / 0.5 + dilution * (10 - s)]
+
+
+def of_generator(_, x):
+    return [x[1], (0.8 - 1.8 * np.sin(x[0]) - 0.01 * x[1]) * 2 * np.pi * 50 / 10]
+
+
+def of_duffing(t, x):
+    return [x[1], -0.3 * x[1] + x[0] - x[0] ** 3 + 0.5 * np.cos(1.2 * t)]
+
+
+@pytest.mark.parametrize(
+    ("name", "right_side", "horizon"),
+    [("lorenz", of_lorenz, 2), ("boost", of_boost, 3), ("motor", of_motor, 0.5),
+     ("battery", of_battery, 600), ("bioreactor", of_bioreactor, 1e5),
+     ("generator", of_generator, 5), ("duffing", of_duffing, 10)],
+)  # fmt: skip
+def test_shipped_plants_are_the_published_equations(name, right_side, horizon):
+    system, t = shipped(name), np.linspace(0, horizon, 21)
+    found = simulate(system, TimeSettings(horizon=horizon), SOLVER)
+    expected = integrated(right_side, system.initial_state, t)
+    size = np.abs(expected).max(axis=0)
+    np.testing.assert_allclose(found.signals.states(t) / size, expected / size, atol=1e-8)
+
+
+def test_the_series_resistance_of_a_battery_is_seen_in_its_output():
+    found = simulate(shipped("battery"), TimeSettings(horizon=60.0), SOLVER).signals
+    t = np.linspace(0, 60, 13)
+    ocv, v1 = found.states(t).T
+    current = found.inputs(t)[:, 0]
+    np.testing.assert_allclose(found.outputs(t)[:, 0], ocv - v1 - 0.03 * current, rtol=1e-12)
