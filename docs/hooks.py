@@ -60,6 +60,7 @@ def commands_page() -> str:
         "gpebo check": usage.CHECK_HELP,
         "gpebo compare": usage.COMPARE_HELP,
         "gpebo figures": usage.FIGURES_HELP,
+        "gpebo reproduce": usage.REPRODUCE_HELP,
         "gpebo list": usage.LIST_HELP,
         "gpebo new": usage.NEW_HELP,
         "gpebo completion": usage.COMPLETION_HELP,

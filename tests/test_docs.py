@@ -26,7 +26,7 @@ HELP = {
     "": usage.HELP, "check": usage.CHECK_HELP, "compare": usage.COMPARE_HELP,
     "report": usage.REPORT_HELP,
     "figures": usage.FIGURES_HELP, "list": usage.LIST_HELP, "new": usage.NEW_HELP,
-    "run": usage.run_help(),
+    "reproduce": usage.REPRODUCE_HELP, "run": usage.run_help(),
 }
 
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")

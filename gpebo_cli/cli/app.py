@@ -18,6 +18,7 @@ COMMANDS = {
     "compare": "compare",
     "report": "report",
     "figures": "figures",
+    "reproduce": "reproduce",
     "list": "listing",
     "new": "new",
     "completion": "completion",

@@ -146,10 +146,10 @@ def run_recipes(names: list[str]) -> Iterator[Recipe]:
     for name in names:
         runs: dict[str, RunResult] = {}
         with session(Arguments()) as hydra:
-            jobs = list(_jobs(name, hydra.config_loader))
+            jobs = list(recipe_jobs(name, hydra.config_loader))
         for label, cfg in jobs:
             try:
-                runs[label] = _run_job(cfg)
+                runs[label] = run_recipe_job(cfg)
             except GpeboError as error:
                 where = f"experiment {name}" + (f", {label}" if label else "")
                 raise type(error)(f"{where}: {error}") from error
@@ -157,7 +157,7 @@ def run_recipes(names: list[str]) -> Iterator[Recipe]:
         yield Recipe(name, runs=runs, **words)
 
 
-def _jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConfig]]:
+def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConfig]]:
     """Configurations of a recipe: one, or those of its ``hydra.sweeper.params`` by their values."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.types import RunMode
@@ -181,7 +181,12 @@ def _jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConfig]]:
         yield ", ".join(chosen), loader.load_configuration(PRIMARY, words, RunMode.RUN)
 
 
-def _run_job(cfg: DictConfig) -> RunResult:
+def run_recipe_job(cfg: DictConfig) -> RunResult:
+    """Run one composed configuration; nothing is written.
+
+    Raises:
+        GpeboError: it fails.
+    """
     from gpebo_cli.cli import composition
     from gpebo_cli.cli.progress import Progress
     from gpebo_cli.experiment.pipeline import run_experiment

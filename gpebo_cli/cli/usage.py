@@ -15,6 +15,7 @@ commands:
   compare DIR …       one table and figures over finished runs and sweeps
   report DIR …        runs and sweeps as one page that stands alone, report.html
   figures [NAME …]    the paper's figures and tables, in outputs/paper
+  reproduce [NAME …]  published numbers beside ours, from experiments/published
   list [KIND]         what there is: plants, regressions, observers, estimators, …
   new KIND NAME       a plant or an estimator of your own, commented, which works as it stands
   completion SHELL    completion of commands, groups and names for bash, zsh or fish
@@ -115,6 +116,19 @@ examples:
   gpebo check plant=canonical observer=canonical --json
   gpebo new plant tank
   gpebo check --config-dir . plant=tank
+"""
+
+REPRODUCE_HELP = """\
+usage: gpebo reproduce [NAME …] [--page FILE]
+
+Runs the recipes of experiments/published, by default all of them, and prints every published
+number beside ours. Exit code 1 if one is off by more than its tolerance. --page writes the table
+as a page of Markdown.
+
+examples:
+  gpebo reproduce gear_petzold
+  gpebo reproduce fct_agent1 circuit
+  gpebo reproduce brenan --page atlas.md
 """
 
 NEW_HELP = """\

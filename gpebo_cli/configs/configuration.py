@@ -33,6 +33,7 @@ KEYS = (
     "output",
     "title",
     "reference",
+    "expected",
 )
 """Keys of a configuration, from which everything about a run follows."""
 

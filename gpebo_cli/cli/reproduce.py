@@ -1,0 +1,195 @@
+"""``gpebo reproduce``: published numbers beside ours, with a verdict for each."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from gpebo_cli.cli.options import Options, parse
+from gpebo_cli.configs.locations import choices, conf_folder
+from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.schema import nearest, read, shown
+
+if TYPE_CHECKING:
+    from gpebo_cli.experiment.result import RunResult
+
+FOLDER = "experiment/published"
+_PAGE = {"--page": "a Markdown file"}
+_KINDS = ("case", "final", "last", "first", "max", "min")
+
+
+@dataclass(frozen=True)
+class Expected:
+    """One number of a publication, as a recipe's ``expected`` has it."""
+
+    quantity: str  # case.COLUMN of cases.csv, final.PARAMETER; last., first., max. or min.SIGNAL
+    value: float | list[float]  # a list has one for each case
+    tolerance: float  # absolute
+    where: str  # it is printed
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A published number beside ours."""
+
+    recipe: str
+    title: str
+    reference: str
+    quantity: str
+    published: float
+    ours: float
+    tolerance: float
+    where: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether they agree."""
+        return abs(self.ours - self.published) <= self.tolerance
+
+
+def main(words: list[str]) -> int:
+    """Run the recipes; the exit code: 1 if a number is off.
+
+    Raises:
+        ConfigError: there is no such recipe, or one is wrong.
+        GpeboError: a run failed, or the page cannot be written.
+    """
+    options = parse("reproduce", words, _PAGE)
+    if options.help:
+        from gpebo_cli.cli.usage import REPRODUCE_HELP
+
+        sys.stdout.write(REPRODUCE_HELP)
+        return 0
+    findings = [finding for name in _names(options) for finding in reproduced(name)]
+    sys.stdout.writelines(f"{line}\n" for line in table(findings))
+    page = options.values.get("--page")
+    if page is not None:
+        from pathlib import Path
+
+        from gpebo_cli.results.files import write_text
+
+        write_text(Path(page), atlas(findings))
+    off = [finding for finding in findings if not finding.holds]
+    count = len({finding.recipe for finding in findings})
+    sys.stdout.write(f"{count} recipes, {len(findings)} numbers, {len(off)} off\n")
+    return 1 if off else 0
+
+
+def _names(options: Options) -> list[str]:
+    known = choices(conf_folder(), FOLDER)
+    for name in options.words:
+        if name not in known:
+            raise ConfigError(
+                f"gpebo reproduce: there is no recipe {shown(name)}; known: {', '.join(known)}"
+                + nearest(name, known)
+            )
+    return list(options.words) or known
+
+
+def reproduced(name: str) -> Iterator[Finding]:
+    """Run a recipe of ``experiments/published`` and compare.
+
+    Raises:
+        ConfigError: its ``expected`` names no quantity of the run.
+        GpeboError: the run failed; the recipe is named.
+    """
+    from omegaconf import OmegaConf
+
+    from gpebo_cli.cli.arguments import Arguments
+    from gpebo_cli.cli.composition import session
+    from gpebo_cli.cli.figures import recipe_jobs, run_recipe_job
+
+    where = f"experiment published/{name}"
+    with session(Arguments()) as hydra:
+        ((_, config),) = recipe_jobs(f"published/{name}", hydra.config_loader)
+    try:
+        result = run_recipe_job(config)
+    except GpeboError as error:
+        raise type(error)(f"{where}: {error}") from error
+    title, reference = (str(OmegaConf.select(config, key) or "") for key in ("title", "reference"))
+    entries = OmegaConf.to_container(config.expected)
+    for entry in entries if isinstance(entries, list) else []:
+        expected = read(Expected, entry, f"{where}: expected")
+        ours = quantity(result, expected.quantity, where)
+        values = expected.value if isinstance(expected.value, list) else [expected.value]
+        if not isinstance(expected.value, list):
+            values *= len(ours)  # the same of every case
+        if len(values) != len(ours):
+            raise ConfigError(
+                f"{where}: {expected.quantity} has {len(ours)} values, one for each case, and "
+                f"{len(values)} are expected"
+            )
+        for value, own in zip(values, ours, strict=True):
+            yield Finding(
+                name, title, reference, expected.quantity, value, own, expected.tolerance,
+                expected.where,
+            )
+
+
+def quantity(result: RunResult, name: str, where: str) -> list[float]:
+    """What a run says of a quantity: one value, or of ``case.`` and ``final.`` one for each case.
+
+    Raises:
+        ConfigError: there is no such quantity; says which there are.
+    """
+    import numpy as np
+
+    kind, _, of = name.partition(".")
+    signals, system = result.signals, result.system
+    columns = {
+        "case": {} if result.metrics is None else vars(result.metrics),
+        "final": {} if result.estimation is None else dict(
+            zip(result.estimation.names, result.estimation.parameters[:, -1].T, strict=True)
+        ),
+    }
+    every = np.column_stack([signals.inputs, signals.outputs, signals.states])
+    named = dict(zip((*system.inputs, *system.outputs, *system.states), every.T, strict=True))
+    known = columns.get(kind, named if kind in _KINDS else {})
+    if of not in known:
+        raise ConfigError(
+            f"{where}: there is no quantity {shown(name)}; there are "
+            f"{', '.join(f'{k}.NAME' for k in _KINDS)}, and of {kind} the names {', '.join(known)}"
+        )
+    if kind in columns:
+        return [float(value) for value in np.atleast_1d(known[of])]
+    values = known[of]
+    pick = {"last": values[-1], "first": values[0], "max": values.max(), "min": values.min()}
+    return [float(pick[kind])]
+
+
+def table(findings: Sequence[Finding]) -> list[str]:
+    """One line for each number."""
+    rows = [("recipe", "quantity", "published", "ours", "tolerance", "")]
+    rows += [
+        (f.recipe, f.quantity, f"{f.published:.7g}", f"{f.ours:.7g}", f"{f.tolerance:.1g}",
+         "agrees" if f.holds else f"OFF by {abs(f.ours - f.published):.3g}")
+        for f in findings
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def atlas(findings: Sequence[Finding]) -> str:
+    """The page of published results."""
+    lines = [
+        "# Published results, reproduced", "",
+        "Made by `gpebo reproduce --page docs/atlas.md`. Each recipe is a file of",
+        "`experiments/published`, and runs alone as `gpebo run experiment=published/NAME`.", "",
+        "| recipe | source | quantity | published | ours | tolerance | where it is from |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    previous = ""
+    for f in findings:
+        first = f.recipe != previous
+        previous = f.recipe
+        lines.append(
+            f"| {f'`{f.recipe}`: {f.title}' if first else ''} | {f.reference if first else ''} | "
+            f"{f.quantity} | {f.published:.7g} | {f.ours:.7g}{'' if f.holds else ' **off**'} | "
+            f"{f.tolerance:.1g} | {f.where} |"
+        )
+    return "\n".join([*lines, ""])

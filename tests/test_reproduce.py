@@ -1,0 +1,63 @@
+"""`gpebo reproduce`: published numbers, and what is said where one is off."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+from examples import ROOT, gpebo
+
+from gpebo_cli import ConfigError
+from gpebo_cli.cli import reproduce
+from gpebo_cli.configs.locations import choices, conf_folder
+
+NAMES = choices(conf_folder(), reproduce.FOLDER)
+
+
+def test_every_recipe_says_what_it_reproduces_and_from_where():
+    assert len(NAMES) >= 10
+    for name in NAMES:
+        path = ROOT / "experiments" / "published" / f"{name}.yaml"
+        recipe = yaml.safe_load(path.read_text())
+        assert recipe["title"]
+        assert recipe["reference"]
+        assert all(entry["where"] for entry in recipe["expected"])
+        assert len(path.read_text().splitlines()) <= 40
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_published_numbers_are_ours(name):
+    found = list(reproduce.reproduced(name))
+    assert found
+    assert [f for f in found if not f.holds] == []
+
+
+def test_the_page_is_that_of_the_recipes():
+    page = (ROOT / "docs" / "atlas.md").read_text()
+    assert all(f"`{name}`" in page for name in NAMES)
+    assert "**off**" not in page
+
+
+def test_a_number_that_is_off_is_an_exit_code(tmp_path, monkeypatch, capsys):
+    found = reproduce.Finding("r", "t", "s", "last.x", 1.0, 1.1, 0.05, "page 3")
+    monkeypatch.setattr(reproduce, "reproduced", lambda name: [found])
+    assert reproduce.main(["gelda"]) == 1
+    out = capsys.readouterr().out
+    assert "OFF by 0.1" in out
+    assert out.endswith("1 recipes, 1 numbers, 1 off\n")
+    done = gpebo("reproduce", "geldaa", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "did you mean gelda?" in done.stderr
+
+
+def test_a_quantity_that_is_none_names_those_there_are():
+    from gpebo_cli import run
+
+    result = run("circuit", observer="none", time={"horizon": 1}).details
+    with pytest.raises(ConfigError, match="of last the names V, y, e1"):
+        reproduce.quantity(result, "last.q", "recipe")
+
+
+def test_a_recipe_runs_alone(tmp_path):
+    done = gpebo("run", "experiment=published/fct_agent1", "figures=none", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "interval-exciting" in done.stdout
