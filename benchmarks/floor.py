@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import circuit, gains, problems
+from benchmarks.kernels import without
 from benchmarks.measure import alternate, decades, loosest, say, seconds
-from gpebo_cli import kernels
 
 LAPACK = (
     "cholesky", "cond", "det", "eig", "eigh", "eigvals", "eigvalsh", "inv", "lstsq", "lu_factor",
@@ -71,22 +71,12 @@ def _hashable(value: object) -> bool:
     return type(value).__hash__ is not None
 
 
-@contextmanager
-def without_kernels() -> Iterator[None]:
-    """NumPy only, as where nothing could be compiled."""
-    compiled, kernels.compiled = kernels.compiled, None
-    try:
-        yield
-    finally:
-        kernels.compiled = compiled
-
-
 def measure(name: str, solve: Callable[[], object]) -> dict[str, Any]:
     """Times of a solve, of one without kernels, of the LAPACK calls of that; and which they are."""
     say(f"{name}: floor")
 
     def in_numpy() -> None:
-        with without_kernels():
+        with without():
             solve()
 
     in_numpy()

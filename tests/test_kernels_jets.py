@@ -235,14 +235,6 @@ def test_a_pulse_between_the_nodes_is_far_from_the_polynomial():
     np.testing.assert_allclose(far[0], [0.0, 4.0 / seen.max(), 0.0], atol=1e-6)
 
 
-@given(known_functions())
-def test_known_kinds(known):
-    system, mesh, c, _ = known
-    one, other = by_both(lambda: simulate._known_kinds(system, c, mesh))
-    np.testing.assert_array_equal(one[0], other[0])
-    np.testing.assert_array_equal(one[1], other[1])
-
-
 def test_noise_is_not_joined_and_nothing_is_where_no_number_is():
     mesh = initial_mesh(0.0, 1.0, [], 8, radau_rule(4))
     noise = np.random.default_rng(0).normal(size=(8, 5, 1))
@@ -291,10 +283,6 @@ def test_kernels_of_the_mesh_refuse_arrays_that_do_not_fit():
             COMPILED.missed_between(*bad)
     with pytest.raises(TypeError, match="arguments, expected"):
         COMPILED.missed_between(between, nodal)
-    with pytest.raises(ValueError, match="times of the matrices: 10 and 8"):
-        COMPILED.known_kinds(0, 0.1, nodal, seen)
-    with pytest.raises(TypeError, match="real number"):
-        COMPILED.known_kinds("E", 0.1, nodal)
 
 
 def test_a_mesh_without_breakpoints_has_the_edges_of_one_with_them():

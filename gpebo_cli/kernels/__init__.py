@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 from importlib import import_module
 from importlib.util import find_spec
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 _ASKED = os.environ.get("GPEBO_KERNELS")
@@ -22,8 +21,7 @@ _COMPILED = _ASKED != "numpy" and find_spec(f"{__name__}._compiled") is not None
 if _ASKED == "compiled" and not _COMPILED:
     raise ImportError("GPEBO_KERNELS=compiled, but nothing was compiled when gpebo was installed")
 
-SUBJECTS = ("elements", "laws", "signals", "spectra", "structure")
-compiled: ModuleType | None = import_module(f"{__name__}._compiled") if _COMPILED else None
+SUBJECTS = ("elements", "expressions", "laws", "observer", "signals", "spectra", "structure")
 
 
 def kind() -> str:
@@ -33,12 +31,17 @@ def kind() -> str:
 
 if TYPE_CHECKING:
     from gpebo_cli.kernels import elements_numpy as elements
+    from gpebo_cli.kernels import expressions_numpy as expressions
     from gpebo_cli.kernels import laws_numpy as laws
+    from gpebo_cli.kernels import observer_numpy as observer
     from gpebo_cli.kernels import signals_numpy as signals
     from gpebo_cli.kernels import spectra_numpy as spectra
     from gpebo_cli.kernels import structure_numpy as structure
 
-    __all__ = ["SUBJECTS", "elements", "kind", "laws", "signals", "spectra", "structure"]
+    __all__ = [
+        "SUBJECTS", "elements", "expressions", "kind", "laws", "observer", "signals", "spectra",
+        "structure",
+    ]
 else:
     for _subject in SUBJECTS:
         globals()[_subject] = import_module(f"{__name__}.{_subject}_{kind()}")

@@ -100,6 +100,6 @@ static inline void multiply(double *restrict C, const double *restrict A, const 
 
 /* An entry in the table of a file; each file is added to the module in module.c. */
 #define KERNEL(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, NULL}
-extern PyMethodDef jets_kernels[], intervals_kernels[], observer_kernels[];
+extern PyMethodDef jets_kernels[], intervals_kernels[];
 
 #endif

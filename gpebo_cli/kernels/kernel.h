@@ -84,6 +84,6 @@ static inline double larger(double a, double b) { return a >= b || a != a ? a : 
 
 /* Each file of kernels has a table, which ends with an entry without a name. */
 extern const Kernel law_kernels[], spectrum_kernels[], element_kernels[], signal_kernels[],
-    structure_kernels[], reduction_kernels[];
+    structure_kernels[], reduction_kernels[], observer_kernels[];
 
 #endif

@@ -16,7 +16,6 @@ PyMODINIT_FUNC PyInit__compiled(void)
         return NULL;
     PyMethodDef *subjects[] = {
         jets_kernels, intervals_kernels,
-        observer_kernels,  
     };
     for (size_t i = 0; i < sizeof(subjects) / sizeof(subjects[0]); i++)
         if (PyModule_AddFunctions(module, subjects[i]) < 0) {

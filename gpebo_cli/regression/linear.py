@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
@@ -123,12 +122,6 @@ class LinearRegression:
 def outer_products(psi: Array, Y: Array) -> Array:
     """[ψᵀψ | ψᵀY] of shape (..., p, p + c) from ψ (..., rows, p) and Y (..., rows[, c])."""
     Y = with_realisations(psi, Y)
-    if (
-        kernels.compiled is not None and psi.ndim == 4  # on a mesh
-        and psi.shape[3] + Y.shape[3] <= _FEW_COLUMNS
-    ):
-        products: Array = kernels.compiled.outer_products(psi, Y)
-        return products
     both = np.concatenate([psi, Y], axis=-1)
     return np.asarray(np.swapaxes(psi, -1, -2) @ both)
 

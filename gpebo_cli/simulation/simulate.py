@@ -236,25 +236,14 @@ def _overlooked(
     t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
     seen = system.coefficients.taylor(t.ravel(), 0)
     least = max(tol, 1e-12)
-    if kernels.compiled is not None:
-        pairs = [array for name in names for array in (getattr(c, name), getattr(seen, name))]
-        missed = kernels.compiled.missed_between(between, *pairs)
-        suspected = [name for name, far in zip(names, missed, strict=True)
-                     if far.max() > _SURPRISE * least]
-        if not suspected:
-            return found
-        names = suspected
-    for name in names:
-        nodal = getattr(c, name)[0].reshape(*mesh.points.shape, -1)
-        actual = getattr(seen, name)[0].reshape(mesh.size, looks, -1)
-        moving = (np.ptp(nodal, axis=(0, 1)) > 0.0) | (np.ptp(actual, axis=(0, 1)) > 0.0)
-        nodal, actual = nodal[..., moving], actual[..., moving]
-        if not nodal.size:
+    pairs = [array for name in names for array in (getattr(c, name), getattr(seen, name))]
+    missed = kernels.expressions.missed_between(between, *pairs)
+    for name, far in zip(names, missed, strict=True):
+        if far.max(initial=0.0) <= _SURPRISE * least:
             continue
-        size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodal).max(axis=(0, 1)))
-        missed = (np.abs(between.T @ nodal - actual).max(axis=1) / size).max(axis=1)
-        expected = np.maximum(unresolved(nodal, mesh.rule), least)
-        found |= missed > _SURPRISE * expected
+        nodal = getattr(c, name)[0].reshape(*mesh.points.shape, -1)
+        nodal = nodal[..., np.ptp(nodal, axis=(0, 1)) > 0.0]
+        found |= far > _SURPRISE * np.maximum(unresolved(nodal, mesh.rule), least)
     return found
 
 
@@ -289,12 +278,6 @@ def _known_kinds(
     resolve by far.
     """
     names = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
-    if kernels.compiled is not None and names:
-        E = names.index("E") if "E" in names else -1
-        values, counts = kernels.compiled.known_kinds(
-            E, _NEAR_ZERO, *(getattr(c, name) for name in names)
-        )
-        return values.reshape(*mesh.points.shape, counts.sum()), counts
     kinds: list[Array] = []
     for name in names:
         values = getattr(c, name)

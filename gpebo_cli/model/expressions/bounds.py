@@ -50,16 +50,15 @@ class Bounds:
             least and largest values, (order + 1, N, number of outputs).
         """
         key = order, inside is not None
-        if kernels.compiled is not None:
+        if kernels.expressions.RUNS_PROGRAMS:
             if key not in self._programs:
                 self._programs[key] = self.tape.program(*key)
             program = self._programs[key]
             if program is not None:
                 decided = low if inside is None else inside
-                found: tuple[Array, Array] = kernels.compiled.intervals(
-                    low, high, decided, *program
-                )
-                return found
+                found = kernels.expressions.intervals(low, high, decided, *program)
+                if found is not None:
+                    return found
         cell = Interval(low, high)
         with np.errstate(all="ignore"):
             places: list[Any] = self.tape.run(cell, order, cell if inside is None else inside)

@@ -296,7 +296,7 @@ class Assembly:
             no kernel for it, or where it met an operation that may have to be refused:
             :meth:`Tape.taylor` has to decide.
         """
-        if kernels.compiled is None:
+        if not kernels.expressions.RUNS_PROGRAMS:
             return None
         apart = inside is not None and inside is not t and self.tape.jumps
         given = None if signals is None else (len(signals), signals.shape[2])
@@ -310,18 +310,16 @@ class Assembly:
             rows = np.empty((0, len(t)))
         else:
             rows = np.swapaxes(signals, 1, 2).reshape(-1, len(t)) if len(t) else signals[:, :, 0]
-        return kernels.compiled.jets(  # type: ignore[no-any-return]
-            t, inside if apart else t, rows, *plan
-        )
+        return kernels.expressions.jets(t, inside if apart else t, rows, *plan)
 
     @cached_property
-    def _plans(self) -> dict[_Key, tuple[Array | IntArray, ...] | None]:
+    def _plans(self) -> dict[_Key, tuple[Any, ...] | None]:
         """What the kernel is given besides times and signals."""
         return {}
 
     def _plan(
         self, order: int, apart: bool, signals: tuple[int, int] | None = None
-    ) -> tuple[Array | IntArray, ...] | None:
+    ) -> tuple[Any, ...] | None:
         program = self.tape.program(order, apart, signals)
         if program is None:
             return None

@@ -152,11 +152,10 @@ def observer_matrices(
         scale = np.ones(system.r)
     if output_scale is not None:
         scale = output_scale
-    if kernels.compiled is not None and system.n <= _SMALL:
-        frame = axes_frame(entries) if like is None else like.split.frame
-        found = None if frame is None else _in_frame(model, rows, scale, frame, rank_tol)
-        if found is not None:
-            return found
+    frame = axes_frame(entries) if like is None else like.split.frame
+    found = None if frame is None else _in_frame(model, rows, scale, frame, rank_tol)
+    if found is not None:
+        return found
 
     def slope() -> Array:
         known = c if turning else system.coefficients.taylor(t, 1, inside)
@@ -183,12 +182,15 @@ def _in_frame(
     None where it is not, and where singular values have to tell.
     """
     (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
-     from_signals) = kernels.compiled.in_frame(  # type: ignore[union-attr]
+     from_signals) = kernels.observer.in_frame(
         *model, rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
     )
-    rank = frame.domain.shape[1]
-    outside, size, inner, inverse, weakest = sizes.tolist()
-    if not (fits(outside, size, rank, inner, inverse, rank_tol) and weakest > rank_tol):
+    outside, inner, inverse = sizes.tolist()
+    size = 0.0 if outside == 0.0 else float(np.abs(model.E / rows[:, None]).max(initial=0.0))
+    weakest = float(injectivity.min(initial=np.inf))
+    if not (
+        fits(outside, size, frame.domain.shape[1], inner, inverse, rank_tol) and weakest > rank_tol
+    ):
         return None
     return ObserverMatrices(
         within_frame(frame, pinv), rows, scale, dynamics, from_unknowns, from_signals, algebraic,

@@ -8,7 +8,7 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import orthonormal_complement, transpose
+from gpebo_cli.numerics.linalg import orthonormal_complement
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.regression.linear import outer_products
@@ -78,31 +78,10 @@ def regression_signals(
         equations: at the same times.
     """
     algebraic, g_y, G, Q1, H, injectivity = equations
-    if kernels.compiled is not None and len(basis) <= _SMALL:
-        Y, psi, offset, gain, sizes = kernels.compiled.regression_signals(
-            z, q, basis, algebraic, g_y, G, Q1, H
-        )
-        return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity)
-    signs = np.ones(z.shape[2])
-    signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
-    signed = z * signs
-    terms = algebraic @ signed  # [𝒜 ξ_a + g_y | −𝒜 ξ_b − G | 𝒜 Φ]
-    Y_scale = max(float(np.abs(part).max(initial=0.0)) for part in (terms[:, :, 0], g_y))
-    terms[:, :, 0] += g_y
-    terms[:, :, 1 : 1 + q] -= G
-    seen = transpose(Q1) @ terms
-    left = terms - Q1 @ seen  # R (…)
-    state = basis @ signed - H @ seen  # w − K (…): the state, signed likewise
-    return Assembled(
-        Y=left[:, :, 0],
-        psi=left[:, :, 1:],
-        offset=state[:, :, 0],
-        gain=-state[:, :, 1:],  # [X_w ξ_b + X_θ | −X_w Φ]
-        Y_scale=Y_scale,
-        column_scale=np.abs(terms[:, :, 1:]).max(axis=(0, 1), initial=0.0),
-        elimination=H,
-        injectivity=injectivity,
+    Y, psi, offset, gain, sizes = kernels.observer.regression_signals(
+        z, q, basis, algebraic, g_y, G, Q1, H
     )
+    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity)
 
 
 def term_sizes(z: Array, q: int, equations: AlgebraicEquations) -> Array:

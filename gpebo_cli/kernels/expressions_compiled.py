@@ -1,0 +1,10 @@
+"""As :mod:`expressions_numpy`, in C."""
+
+from __future__ import annotations
+
+from gpebo_cli.kernels import _compiled
+
+RUNS_PROGRAMS = True
+jets = _compiled.jets
+intervals = _compiled.intervals
+missed_between = _compiled.missed_between

@@ -1,0 +1,125 @@
+"""The observer's matrices where kernel and range of E do not turn, and its regression."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpebo_cli.kernels.arrays import Array
+
+_TINY = float(np.finfo(float).tiny)
+
+
+def in_frame(
+    E: Array, A: Array, B: Array, F: Array, C: Array, rows: Array, scale: Array, domain: Array,
+    range_: Array, kernel: Array, equations: Array,
+) -> tuple[Array, ...]:
+    """The matrices of the observer at N times, those of the plant being (N or 1, ...).
+
+    Args:
+        E: (n, n).
+        A: (n, n).
+        B: (n, m).
+        F: (n, q).
+        C: (r, n).
+        rows: by which the equations are divided (n,).
+        scale: by which the outputs are multiplied (r,).
+        domain: orthonormal basis of range E⁺E (n, d).
+        range_: of range E (n, d).
+        kernel: of the kernel of E (n, b).
+        equations: those without derivatives, as rows (e, n).
+
+    Returns:
+        the largest entry of E outside the frame, the largest norm of UᵀE B and of its inverse (3,);
+        then BᵀE⁺ (d, n), 𝒜 (e + r, n), 𝒜 B, g_signals (e + r, m + r), G (e + r, q), Q1 (e + r, b)
+        and H (n, b) of (𝒜 Q)⁺ = H Q1ᵀ, at most the smallest singular value of 𝒜 on the kernel
+        relative to ‖𝒜‖, BᵀA_0 B (d, d), BᵀD_0 (d, q) and Bᵀb_0's from_signals (d, m + r): with a
+        leading axis of N, or 1 where all that they are made of is constant, but for the last two.
+        What is singular is not finite.
+    """
+    E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
+    C = scale[:, None] * C
+    m, q, d, e, r = B.shape[2], F.shape[2], domain.shape[1], len(equations), len(scale)
+    inner = range_.T @ E @ domain
+    inverse = _inverse(inner)
+    sizes = np.array([
+        max(float(np.abs(part).max(initial=0.0)) for part in (E @ kernel, equations @ E)),
+        *(float(np.sqrt((x**2).sum(axis=(1, 2)).max())) for x in (inner, inverse)),
+    ])
+    pinv = inverse @ range_.T
+    algebraic = joined(equations @ A, C, axis=1)  # 𝒜 = [Π A; C]
+    of_y = np.zeros((1, e + r, r))
+    of_y[0, e:] = -np.diag(scale)
+    below = np.zeros((1, r, m + q))
+    of_u_theta = joined(joined(equations @ B, equations @ F, axis=2), below, axis=1)
+    g_signals, G = joined(of_u_theta[:, :, :m], of_y, axis=2), of_u_theta[:, :, m:]
+    Q1, R1 = np.linalg.qr(algebraic @ kernel)
+    X1 = _inverse(R1)
+    size = np.maximum(np.sqrt((algebraic**2).sum(axis=(1, 2))), _TINY)
+    with np.errstate(divide="ignore"):
+        injectivity = 1.0 / (np.sqrt((X1**2).sum(axis=(1, 2))) * size)
+    H = kernel @ X1
+    Lambda = pinv @ A
+    # [A_0 | D_0 | of u and y] = [Λ B | E⁺F | E⁺B, 0] − Λ H Q1ᵀ [𝒜 B | G | g_signals]
+    direct = joined(Lambda @ domain, pinv @ F, pinv @ B, np.zeros((1, d, r)), axis=2)
+    through = joined(algebraic @ domain, G, g_signals, axis=2)
+    whole = direct - (Lambda @ H) @ (np.swapaxes(Q1, 1, 2) @ through)
+    times = max(map(len, (E, A, B, F, C)))
+    whole = np.broadcast_to(whole, (times, *whole.shape[1:]))
+    of_dynamics = slice(1 if len(E) == len(A) == len(C) == 1 else times)
+    return (
+        sizes, pinv, algebraic, algebraic @ domain, g_signals, G, Q1, H, injectivity,
+        whole[of_dynamics, :, :d], whole[:, :, d : d + q], whole[:, :, d + q :],
+    )
+
+
+def joined(*parts: Array, axis: int) -> Array:
+    """Blocks (N or 1, a, b) side by side (axis 2) or stacked (axis 1); those of one time repeat."""
+    count = max(map(len, parts))
+    return np.concatenate(
+        [p if len(p) == count else np.broadcast_to(p, (count, *p.shape[1:])) for p in parts],
+        axis=axis,
+    )
+
+
+def _inverse(matrices: Array) -> Array:
+    """Inverses (N, n, n); infinite everywhere if one is singular."""
+    try:
+        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrices, np.inf)
+
+
+def regression_signals(
+    z: Array, q: int, basis: Array, algebraic: Array, g_y: Array, G: Array, range_: Array,
+    elimination: Array,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """All rows of Y and ψ, and the state's offset and gain, at N times.
+
+    Args:
+        z: [ξ_a | ξ_b | Φ] in the coordinates of the basis (N, k, 1 + p).
+        q: number of unknown parameters.
+        basis: B (n, k).
+        algebraic: 𝒜 B (N or 1, rows, k).
+        g_y: of the signals (N, rows).
+        G: of θ (N or 1, rows, q).
+        range_: Q1 of K = H Q1ᵀ and R = I − Q1 Q1ᵀ (N or 1, rows, b).
+        elimination: H (N or 1, n, b).
+
+    Returns:
+        Y (N, rows), ψ (N, rows, p), offset (N, n), gain (N, n, p), and the size of the terms of Y
+        and of each column of ψ before they cancel (1 + p,).
+    """
+    signs = np.ones(z.shape[2])
+    signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
+    signed = z * signs
+    terms = algebraic @ signed  # [𝒜 ξ_a + g_y | −𝒜 ξ_b − G | 𝒜 Φ]
+    sizes = np.empty(z.shape[2])
+    sizes[0] = max(float(np.abs(part).max(initial=0.0)) for part in (terms[:, :, 0], g_y))
+    terms[:, :, 0] += g_y
+    terms[:, :, 1 : 1 + q] -= G
+    sizes[1:] = np.abs(terms[:, :, 1:]).max(axis=(0, 1), initial=0.0)
+    seen = np.swapaxes(range_, 1, 2) @ terms
+    left = terms - range_ @ seen  # R (…)
+    state = basis @ signed - elimination @ seen  # w − K (…): the state, signed likewise
+    # the gain is [X_w ξ_b + X_θ | −X_w Φ]
+    return left[:, :, 0], left[:, :, 1:], state[:, :, 0], -state[:, :, 1:], sizes
