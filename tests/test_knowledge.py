@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import csv
+import json
+
 import numpy as np
 import pytest
+from test_cli import gpebo
 
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.pipeline import run_experiment
@@ -85,3 +89,65 @@ def test_units_of_parameters_do_not_matter():
     np.testing.assert_array_equal(one.parameters, np.tile([False, False, True, False], (40, 1)))
     assert one.states(gain)[:, 1].all()
     assert not one.states(gain)[:, 2:].any()
+
+
+HALF_SEEN = """
+name: half_seen
+title: one unknown and one state that the output does not see
+states: [a, b, c]
+inputs: {u: sin(t)}
+unknowns: {k1: 2.0, k2: -1.5}
+outputs: [y]
+E: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+A: [[-1, 1, 0], [0, -0.5, 0], [0, 0, -2]]
+B: [[1], [0], [1]]
+F: [[1, 0], [0, 0], [0, 1]]
+C: [[1, 0, 0]]
+initial_state: {a: 1, b: 0.5, c: 2}
+"""
+SEEN, UNSEEN = {"a", "b", "k1", "e0_a", "e0_b"}, {"c", "k2", "e0_c"}
+
+
+@pytest.fixture
+def half_seen(tmp_path):
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "half_seen.yaml").write_text(HALF_SEEN)
+    return tmp_path
+
+
+def test_a_run_goes_on_without_what_is_not_determined(half_seen):
+    done = gpebo("run", "--config-dir", ".", "plant=half_seen", "estimator=ls_drem",
+                 "hydra.run.dir=out", cwd=half_seen)
+    assert done.returncode == 0, done.stderr
+    assert "not determined by the data: c, k2, e0_c" in done.stdout.splitlines()[-1]
+    summary = json.loads((half_seen / "out" / "summary.json").read_text())
+    assert {name for name, known in summary["estimable"].items() if known} == SEEN
+    for name, told in summary["estimates"].items():
+        if name in UNSEEN:
+            assert told["value"] is None
+        else:
+            assert told["value"] == pytest.approx(told["true"], rel=1e-9)
+    rows = list(csv.DictReader((half_seen / "out" / "cases.csv").read_text().splitlines()))
+    times = {name: rows[0][f"seconds_to_1pct_{name}"] for name in SEEN | UNSEEN}
+    assert {name for name, time in times.items() if time} == SEEN
+
+
+def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):
+    words = ("check", "--config-dir", ".", "plant=half_seen", "sensors=all")
+    done = gpebo(*words, cwd=half_seen)
+    assert done.returncode == 1
+    assert "k2    cannot be known" in done.stdout
+    assert "k1    estimable from" in done.stdout
+    content = json.loads(gpebo(*words, "--json", cwd=half_seen).stdout)
+    assert {name for name, since in content["estimable"].items() if since is None} == UNSEEN
+    first = content["sensors"][0]
+    assert first["state"] == "c"
+    assert set(first["gained"]) == UNSEEN
+    assert all(not sensor["gained"] for sensor in content["sensors"][1:])
+    assert all(sensor["fall"] >= 1.0 for sensor in content["sensors"])
+
+
+def test_only_all_sensors_can_be_asked_for(half_seen):
+    done = gpebo("check", "plant=circuit", "sensors=il", cwd=half_seen)
+    assert done.returncode == 2
+    assert "sensors=il: the only choice is sensors=all" in done.stderr

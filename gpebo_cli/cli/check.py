@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from gpebo_cli.cli import arguments as command_line
 from gpebo_cli.errors import ConfigError
 
 if TYPE_CHECKING:
+    from gpebo_cli.experiment.sensors import Sensor
     from gpebo_cli.findings import Assumption
 
 _WIDTH = 100
@@ -28,12 +29,12 @@ _ADVICE = {
     "zeros is fine as long as it stays one",
     "Observer": "change the plant as said above, or use observer=gpebo",
     "Assumption 1": "add an output (a row of C) that sees the algebraic states",
-    "Assumption 2": "the direction named is not visible in the outputs: change the input, so that "
-    "the regressor's columns differ, measure more, or lengthen time.horizon; an unknown that no "
-    "output depends on cannot be estimated",
+    "Assumption 2": "the direction named is not visible in the outputs, and no input changes that: "
+    "measure more (sensors=all tries every state), lengthen time.horizon, start at another time, "
+    "or leave an unknown out; one that no output depends on cannot be estimated",
     "Assumption 3": "measure z_a alone with one output, or use observer=gpebo",
     "Assumption 4": "choose a horizon without that zero, or use observer=gpebo",
-    "Assumption 5": "as for Assumption 2: change the input, measure more, or lengthen time.horizon",
+    "Assumption 5": "as for Assumption 2: measure more, or lengthen time.horizon",
     "Assumption 6": "name an output that fits (observer.output), or use observer=gpebo",
     "Assumption 7": "choose another gain (observer.L_w), or use observer=gpebo",
     "uniform observability": "what was learnt before lasts only as long as observer.process is 0; "
@@ -56,9 +57,13 @@ def main(words: list[str]) -> int:
 
         sys.stdout.write(CHECK_HELP)
         return 0
-    as_json = "--json" in words
+    as_json, sensors = "--json" in words, "sensors=all" in words
+    wrong = [word for word in words if word.startswith("sensors=") and word != "sensors=all"]
+    if wrong:
+        raise ConfigError(f"{wrong[0]}: the only choice is sensors=all, every state in turn")
     arguments = command_line.parse(
-        [word for word in words if word != "--json"], "check", ("--json", "--help")
+        [word for word in words if word not in ("--json", "sensors=all")], "check",
+        ("--json", "--help"),
     )
     word = "-m" if "--multirun" in arguments.switches else arguments.of_a_sweep
     if word:
@@ -73,15 +78,47 @@ def main(words: list[str]) -> int:
         from gpebo_cli.cli.job import read_job
 
         job = read_job(config, arguments, draw=False)
-        from gpebo_cli.experiment.assumptions import check
+        from gpebo_cli.experiment.assumptions import examine
+        from gpebo_cli.experiment.sensors import candidates
 
-        found = check(job.settings, job.system)
+        examined = examine(job.settings, job.system)
+        tried = candidates(job.settings, job.system) if sensors else []
+    found = examined.assumptions
     title = f"plant {job.system.name}, observer {job.settings.observer['name']}"
-    sys.stdout.write(_json(found) if as_json else _table(title, found))
+    sys.stdout.write(
+        _json(found, examined.estimable, tried) if as_json
+        else _table(title, found, [*_knowledge(examined.estimable), *_sensors(tried)])
+    )
     return 0 if all(a.holds for a in found) else 1
 
 
-def _json(found: Sequence[Assumption]) -> str:
+def _knowledge(estimable: Mapping[str, float | None]) -> list[str]:
+    """What can be known, and from when on."""
+    rows = [
+        [name, "cannot be known" if since is None else f"estimable from t = {since:.4g} s on"]
+        for name, since in estimable.items()
+    ]
+    return [f"  {name:<{max(len(row[0]) for row in rows)}}  {text}" for name, text in rows]
+
+
+def _sensors(tried: Sequence[Sensor]) -> list[str]:
+    """A row for each state as a further output, the best first."""
+    if not tried:
+        return []
+    from gpebo_cli.results.report import columns
+
+    rows = [["measure too", "estimable", "gained", "deviations fall by"]]
+    rows += [
+        [s.state, str(len(s.estimable)), ", ".join(s.gained) or "nothing", f"{s.fall:.3g}"]
+        if not s.problem else [s.state, "none", s.problem, ""]
+        for s in tried
+    ]
+    return columns(rows)
+
+
+def _json(
+    found: Sequence[Assumption], estimable: Mapping[str, float | None], tried: Sequence[Sensor]
+) -> str:
     from gpebo_cli.results.summary import plain
 
     rows = [
@@ -89,11 +126,14 @@ def _json(found: Sequence[Assumption]) -> str:
         for a in found
     ]
     holds = all(a.holds for a in found)
-    text = json.dumps(plain({"holds": holds, "assumptions": rows}), indent=2, ensure_ascii=False)
+    content = {"holds": holds, "assumptions": rows, "estimable": estimable}
+    if tried:
+        content["sensors"] = [vars(sensor) for sensor in tried]
+    text = json.dumps(plain(content), indent=2, ensure_ascii=False)
     return text + "\n"
 
 
-def _table(title: str, found: Sequence[Assumption]) -> str:
+def _table(title: str, found: Sequence[Assumption], more: Sequence[str]) -> str:
     width = max(len(a.name) for a in found)
     lines = [title]
     for a in found:
@@ -104,7 +144,7 @@ def _table(title: str, found: Sequence[Assumption]) -> str:
             lines += _wrapped(f"to do: {_ADVICE[a.name]}", " " * (width + 11))
     failed = [a.name for a in found if not a.holds]
     verdict = f"{', '.join(failed)} failed" if failed else "everything that is needed holds"
-    return "\n".join([*lines, verdict]) + "\n"
+    return "\n".join([*lines, *more, verdict]) + "\n"
 
 
 def _value(value: float | str | None) -> str:

@@ -103,9 +103,11 @@ usage: gpebo check [OVERRIDES] [OPTIONS]
 Checks every assumption that a run with these OVERRIDES (those of gpebo run) would rest on:
 solvability and index, a consistent start, the rank of E, impulse observability, excitation, and
 those of the canonical form. What fails comes with what to do about it. Nothing is estimated or
-written. Exit code 1 if something that is needed does not hold.
+written. Exit code 1 if something that is needed does not hold. Below the assumptions stands, for
+each parameter and state, from when on the outputs determine it.
 
 options:
+  sensors=all         tries every state as a further output: what becomes estimable, the best first
   --json              for a program instead of a person
   --config-dir DIR    a folder of yours with plant/NAME.yaml
   -h, --help          this text

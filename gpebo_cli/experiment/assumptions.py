@@ -6,17 +6,20 @@ first stage that cannot be carried out and reports that stage as the failed assu
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from gpebo_cli.errors import GpeboError, ModelError
-from gpebo_cli.evidence.excitation import Excitation, assess
+from gpebo_cli.evidence.excitation import Excitation, assess, estimable
+from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.observers import Measurements, Observer, build
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
+from gpebo_cli.observers import Measurements, Observation, Observer, build
+from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.recordings.load import load
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
@@ -25,46 +28,82 @@ from gpebo_cli.simulation.simulate import Simulation
 _GROWTH = 1e6  # of Φ: above it, the state loses six digits of what the parameters know
 
 
+@dataclass(frozen=True)
+class Examination:
+    """Assumptions with their evidence, and what can be known if the observer gets that far."""
+
+    assumptions: tuple[Assumption, ...]
+    estimable: Mapping[str, float | None] = field(default_factory=dict)  # since when; None: never
+    excitation: Excitation | None = None
+
+
 def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...]:
     """All assumptions of the plant and the observer of ``settings``; never raises ModelError.
 
     They are about ψ, which noise does not reach: signals are taken without it.
     """
+    return examine(settings, system).assumptions
+
+
+def examine(
+    settings: Settings, system: DescriptorSystem, seen: Measurements | None = None
+) -> Examination:
+    """:func:`check`, with what can be known; of given signals the observer's part only."""
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
-    if settings.data.name == "csv":
+    if seen is None and settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
         seen = Measurements(recording.inputs, recording.outputs)
-        return () if observer is None else tuple(_of_observer(observer, settings, system, seen))
+    if seen is not None:
+        return Examination(()) if observer is None else _of_observer(
+            observer, settings, system, seen, []
+        )
     found: list[Assumption] = []
     try:
         simulation = simulation_of(system, settings.time, settings.solver)
     except ModelError as error:
-        return (Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),)
+        return Examination(
+            (Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),)
+        )
     found += of_simulation(system, simulation)
     if observer is None:
-        return tuple(found)
+        return Examination(tuple(found))
     if any(jump.impulses.any() for _, _, jump in simulation.jumps):
         found.append(
             Assumption("No impulses", "jumps of the input put no impulse into the state", False, {})
         )
-        return tuple(found)
+        return Examination(tuple(found))
     signals = simulation.signals
     noise = signal_noise(settings.noise, levels)
     seen = Measurements(signals.inputs, signals.outputs, noise)
-    return (*found, *_of_observer(observer, settings, system, seen))
+    return _of_observer(observer, settings, system, seen, found)
 
 
 def _of_observer(
-    observer: Observer, settings: Settings, system: DescriptorSystem, seen: Measurements
-) -> list[Assumption]:
+    observer: Observer, settings: Settings, system: DescriptorSystem, seen: Measurements,
+    found: list[Assumption],
+) -> Examination:
     """What the observer needs of the plant, and of the signals it gets to see."""
     try:
         observation = observer.observe(system, seen, settings.solver)
     except ModelError as error:
-        return [Assumption(_named(error), "needed by the observer", False, {"found": str(error)})]
+        failed = Assumption(_named(error), "needed by the observer", False, {"found": str(error)})
+        return Examination((*found, failed))
     t = np.linspace(*seen.span, 101)
     excitation = assess(observation.regression, t, settings.excitation, settings.solver.tol)
-    return of_observation(observation, excitation)
+    times = estimable(
+        excitation, observation.regression.parameters, system.states,
+        visible(observation, excitation.known, t, system.n),
+    )
+    return Examination((*found, *of_observation(observation, excitation)), times, excitation)
+
+
+def visible(observation: Observation, known: Knowledge, t: Array, n: int) -> BoolArray:
+    """Which of the n states are determined at the times t (N,), shape (N, n)."""
+    state_map = observation.state_map
+    if isinstance(state_map, AffineStateMap) and observation.names is None:
+        return known.states(state_map.gain(t))
+    # What it needs of the parameters is not known: all of them.
+    return np.repeat(known.parameters.all(axis=1, keepdims=True), n, axis=1)
 
 
 def _named(error: GpeboError) -> str:

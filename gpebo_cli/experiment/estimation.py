@@ -20,7 +20,7 @@ from gpebo_cli.evidence.excitation import (
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import Metrics, measure_squares, settling_times
-from gpebo_cli.experiment.assumptions import Observed, warnings
+from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.experiment.online import Online, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
@@ -86,16 +86,13 @@ def continuous(
     with stage("excitation"):
         excitation = assess(regression, t, settings.excitation, settings.solver.tol)
     with stage("estimate"):
-        known, state_map = excitation.known, observation.state_map
-        if isinstance(state_map, AffineStateMap) and observation.names is None:
-            visible = known.states(state_map.gain(t))
-        else:  # what it needs of the parameters is not known
-            visible = np.repeat(known.parameters.all(axis=1, keepdims=True), system.n, axis=1)
-        times = estimable(excitation, regression.parameters, system.states, visible)
+        known = excitation.known
+        determined = visible(observation, known, t, system.n)
+        times = estimable(excitation, regression.parameters, system.states, determined)
         try:
             estimation, metrics = _estimate(
                 settings, system, observation.estimator or estimator, observation, source, known,
-                visible[-1],
+                determined[-1],
             )
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
