@@ -43,7 +43,7 @@ def element_maps(
     k, s = len(h), len(D)
     d, n = A.shape[1:]
     columns = f.shape[2]
-    first = np.unique(group, return_index=True)[1]
+    first = slice(None) if groups == k else np.unique(group, return_index=True)[1]
     step = h[first]
     E_first = None if E is None else at_nodes(E, k, s)[first]
     A_first = at_nodes(A, k, s)[first]
@@ -65,23 +65,28 @@ def element_maps(
         from_left = start * E_first
     stage = np.arange(s)
     system[:, stage, :, stage, :] -= np.swapaxes(A_first, 0, 1)
+    forcing = forcing_at_nodes(D, h, E, A, f, offset)
     most = int(np.bincount(group, minlength=groups).max(initial=1))
-    place = np.empty(k, dtype=np.intp)  # of each element among those of its group
-    for g in range(groups if groups < k else 0):
-        place[group == g] = np.arange(np.count_nonzero(group == g))
-    if groups == k:
-        place[:] = 0
     right = np.zeros((groups, s, d, n + most * columns))
     right[..., :n] = from_left
-    by_member = right[..., n:].reshape(groups, s, d, most, columns)
-    by_member[group, :, :, place] = forcing_at_nodes(D, h, E, A, f, offset)
-    right[..., n:] = by_member.reshape(groups, s, d, most * columns)
+    place = np.zeros(k, dtype=np.intp)  # of each element among those of its group
+    if groups == k:
+        right[..., n:] = forcing
+    else:
+        for g in range(groups):
+            same = np.flatnonzero(group == g)
+            place[same] = np.arange(len(same))
+            sides = np.moveaxis(forcing[same], 0, 2).reshape(s, d, len(same) * columns)
+            right[g, :, :, n : n + len(same) * columns] = sides
     solved = np.asarray(np.linalg.solve(
         system.reshape(groups, s * d, s * d), right.reshape(groups, s * d, n + most * columns)
     ), dtype=np.float64).reshape(right.shape)
     if T_first is not None:
         solved = T_first @ solved
-    particular = solved[..., n:].reshape(groups, s, n, most, columns)[group, :, :, place]
+    particular = solved[..., n:]
+    if groups < k:
+        apart = np.moveaxis(particular.reshape(groups, s, n, most, columns), 3, 1)
+        particular = apart[group, place]
     if offset is not None:
         particular = particular + at_nodes(offset, k, s)
     return np.ascontiguousarray(solved[..., :n]), np.ascontiguousarray(particular)

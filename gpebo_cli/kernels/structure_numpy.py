@@ -79,9 +79,27 @@ def levels(
         constraints: how many of M belong to constraints, whatever they are; −1: as many as are 0.
     """
     e, a = scaled(E, A, rows, columns, time, orders)
-    times = range(max(e.shape[1], a.shape[1]))
-    found = [_levels_at(_at(e, k), _at(a, k), rank_tol, constraints) for k in times]
-    return np.array([float(one[0]) for one in found]), np.array([one[1] for one in found])
+    n = E.shape[2]
+    M, N = derivative_array(e, a, orders - 1)
+    U, sigma, _ = np.linalg.svd(M)
+    relative = sigma / array_size(sigma[:, 0], a)[:, None]
+    counts = np.full(len(M), constraints)
+    if constraints < 0:
+        counts = M.shape[1] - (relative > rank_tol).sum(axis=1)
+    smallest = np.full((len(M), 3), np.inf)
+    for count in np.unique(counts[counts <= n]):
+        same, r = counts == count, M.shape[1] - int(count)
+        if r:
+            smallest[same, 0] = relative[same, r - 1]
+        of_N = N if len(N) == 1 else N[same]
+        _, s2, V2 = np.linalg.svd(np.swapaxes(U[same, :, r:], 1, 2) @ of_N)
+        if count:
+            smallest[same, 1] = s2[:, -1] / frobenius_norm(of_N)
+        if count < n:
+            of_E = e[0] if e.shape[1] == 1 else e[0, same]
+            s3 = np.linalg.svd(of_E @ np.swapaxes(V2, 1, 2)[:, :, count:], compute_uv=False)
+            smallest[same, 2] = s3[:, -1] / frobenius_norm(of_E)
+    return counts.astype(np.float64), smallest
 
 
 def _at(coefficients: Array, k: int) -> Array:

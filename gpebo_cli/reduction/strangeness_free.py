@@ -78,7 +78,7 @@ def strangeness_free_form(
     model = (scaling.rows, scaling.columns, scaling.time, mu + 1)
     every = max(1, len(t) // _LOOKS)
     found = kernels.structure.eliminated(
-        c.E, c.A, *model, c.B, F, c.u, theta, *pivots, every, _MAX_GROWTH, RESIDUAL
+        E, A, *model, c.B, F, c.u, theta, *pivots, every, _MAX_GROWTH, RESIDUAL
     )
     if found is None:
         found = _with_singular_vectors(system, structure, E, A, forcing(c), t, every)
