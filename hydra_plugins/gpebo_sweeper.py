@@ -50,7 +50,7 @@ class GpeboSweeper(BasicSweeper):
             GpeboError: a job failed or has no result; the table has been written then.
         """
         from gpebo_cli.cli.arguments import logspace
-        from gpebo_cli.cli.sweep import Orders, run_sweep
+        from gpebo_cli.cli.sweep import Orders, check_number, run_sweep
 
         if self.config is None or self.launcher is None or self.hydra_context is None:
             raise RuntimeError("sweep() before setup()")  # Hydra never does
@@ -60,6 +60,7 @@ class GpeboSweeper(BasicSweeper):
         ]
         parser = OverridesParser.create(config_loader=loader)
         parsed = parser.parse_overrides([*stored, *arguments])
+        check_number(parsed)
         (jobs,) = self.split_arguments(parsed, None)
         orders = Orders(self._resume, self._fail_fast, self._dry_run, self.max_batch_size)
         run_sweep(jobs, orders, self.config, self.launcher, loader)

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 import yaml
 
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.descriptor import MATRIX_NAMES, CoefficientSource, DescriptorSystem
 from gpebo_cli.model.plant import KEYS, plant_from_mapping
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
 
 PLANTS = Path(__file__).parents[1] / "conf" / "plant"
 TIMES = np.array([0.0, 0.4, 1.7, 6.3, 19.5])
@@ -409,3 +411,17 @@ def test_an_expanding_yaml_file_is_refused_with_a_short_message() -> None:
         with pytest.raises(ConfigError) as caught:
             plant_from_mapping(mine(**changes))
         assert len(str(caught.value)) < 400
+
+
+def test_a_chain_of_parameters_is_read_in_proportion_to_its_length() -> None:
+    names = {"k": "1", "p0": "t"} | {f"p{i}": f"p{i - 1} + 1" for i in range(1, 4000)}
+    system = plant_from_mapping(mine(parameters=names, A=[["p3999", 0], [0, 1]]))
+    assert system.coefficients.taylor(np.array([2.0]), 0).A[0, 0, 0, 0] == 4001.0
+    with pytest.raises(ConfigError, match="10001 parameters; at most 10000 are read"):
+        plant_from_mapping(mine(parameters={f"p{i}": 1 for i in range(10_001)}))
+
+
+def test_entries_beyond_all_numbers_are_an_error_and_no_endless_decomposition() -> None:
+    system = plant_from_mapping(mine(E=[["exp(20*t)", 0], [0, 1]]))
+    with pytest.raises(ModelError, match="more powers of ten than numbers hold"):
+        simulate(system, TimeSettings(horizon=20.0), SolverSettings())

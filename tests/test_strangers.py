@@ -29,6 +29,7 @@ A: [[-1]]
 C: [[1]]
 initial_state: {x: 1}
 """
+REGRESSION = "name: mine\nunknowns: {a: 1}\nsignals: {u: sin(t), y: sin(t)}\nY: [y]\npsi: [[u]]\n"
 RECIPE = "time: {horizon: 0.1, samples: 3}\nfigures: none\n"
 SHORT = ["observer=none", "figures=none", "time.horizon=0.1", "time.samples=3"]
 
@@ -79,6 +80,7 @@ FORMS = {
 }
 KINDS = {
     "plant": ("plant/x.yaml", PLANT, ["plant=x", *SHORT]),
+    "regression": ("regression/x.yaml", REGRESSION, ["regression=x", "figures=none"]),
     "estimator": ("estimator/x.yaml", "name: drem\n", ["estimator=x", *SHORT]),
     "experiment": ("experiment/x.yaml", RECIPE, ["experiment=x", *SHORT]),
     "primary": ("x.yaml", RECIPE + "observer: {name: none}\n", ["--config-name", "x"]),

@@ -28,6 +28,11 @@ COMMANDS = {
 
 def entry() -> None:
     """The process ``gpebo``: :func:`main`, and a Ctrl-C that comes when all is done is too late."""
+    if not sys.warnoptions:  # of libraries, for whoever writes programs; -W shows them
+        import warnings
+
+        warnings.simplefilter("ignore")
+        os.environ["PYTHONWARNINGS"] = "ignore"  # of workers, too
     try:
         code = main()
         import signal

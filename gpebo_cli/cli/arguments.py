@@ -118,6 +118,8 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
     sweep: dict[str, str] = {}
     rest = iter(words)
     for word in rest:
+        if any("\ud800" <= character <= "\udfff" for character in word):
+            raise ConfigError(f"{shown(word)} is not text in UTF-8")
         if not word.startswith("-"):
             key, _, text = word.partition("=")
             if key in _SWEEP_WORDS:
@@ -224,6 +226,9 @@ def _override(word: str, *, multirun: bool) -> str:
         key, equals, value = word.partition("=")
         if key.lstrip("+") == "hydra/sweeper" and equals:
             raise ConfigError(f"{word}: gpebo has a sweeper of its own; leave this away")
+        if key.lstrip("+") in GROUPS and value.startswith("["):
+            names = ",".join(name.strip() for name in value.strip("[]").split(","))
+            raise ConfigError(f"{word}: one {key} for a run; for a run for each: -m {key}={names}")
         if key.lstrip("+") in GROUPS and equals and (multirun or "," not in value):
             return f"{key}={_names(value)}"
         return word

@@ -129,6 +129,8 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
         known += [group for group in GROUPS if group not in known]
     missing = key.removeprefix(path).lstrip(".").partition(".")[0]
     full = f"{path}.{missing}" if path else missing
+    if not known:
+        return f"{full}: {path} is empty; give it as a whole, as in '{path}={{{missing}: VALUE}}'"
     inside = path or "the configuration"
     deeper = [
         f"{section}.{missing}"

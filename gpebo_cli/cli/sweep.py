@@ -15,6 +15,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.core.utils import JobStatus
 from omegaconf import DictConfig, OmegaConf
 
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 
 _NAMED_FAILURES = 5  # in the last line; results.csv has all
 _SHOWN_ROWS = 20
+_MAX_JOBS = 100_000
 _SUBDIR = "${hydra:job.num}"
 
 
@@ -152,6 +154,27 @@ def run_sweep(
         write_table(folder, records)
         _print_table(records, folder, rows=finished)
     _raise_failures(records, folder, trouble, stopped=(folder / STOP).exists())
+
+
+def check_number(overrides: Sequence[Override]) -> None:
+    """Refuse more jobs than anybody can wait for, before there is a list of them.
+
+    Raises:
+        ConfigError: the sweep has too many jobs.
+    """
+    jobs = 1
+    for override in overrides:
+        swept = override.value()
+        if isinstance(swept, RangeSweep):
+            span = (swept.stop or 0) - (swept.start or 0)
+            jobs *= max(1, math.ceil(span / swept.step))
+        elif isinstance(swept, ChoiceSweep):
+            jobs *= len(swept.list)
+    if jobs > _MAX_JOBS:
+        raise ConfigError(
+            f"a sweep of {jobs} jobs; at most {_MAX_JOBS}: gains are an axis of one run, as in "
+            "'estimator.gamma=logspace(1,9,1000)' without -m"
+        )
 
 
 def _launch(

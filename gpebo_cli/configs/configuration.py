@@ -51,7 +51,7 @@ _RANGES = {
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),
     "noise.seed": (0, math.inf),
-    "noise.seeds": (1, 1_000_000),
+    "noise.seeds": (1, 10_000),
 }
 _INCHES = (1.5, 40.0)  # how wide a figure may be
 _OPEN = ("start", "horizon")  # of time: null where the data, or a default, decides
@@ -120,7 +120,7 @@ def complete(config: Mapping[str, Any], built: Settings) -> dict[str, Any]:
     """The configuration with the span of time that ``null`` stands for, where a default decides."""
     decided = {key: getattr(built.time, key) for key in _OPEN}
     span = {key: value for key, value in decided.items() if math.isfinite(value)}
-    return {**config, "time": {**config.get("time", {}), **span}}
+    return {**config, "time": {**(config.get("time") or {}), **span}}
 
 
 def _time(config: Mapping[str, Any], *, recorded: bool) -> TimeSettings:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import keyword
 import re
 import reprlib
+from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -63,6 +64,7 @@ _OF_TIME = dict.fromkeys(("an input", "an output"), ": its derivative would be n
 
 _PLANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,79}")  # it becomes part of a folder's name
 _LONGEST_LABEL = 80
+_MAX_PARAMETERS = 10_000  # a few seconds' work
 _YAML_BOOLEAN = "YAML reads on, off, yes and no as booleans"
 
 
@@ -501,8 +503,12 @@ def read_parameters(
         ConfigError: a value that is no expression of the language, or a name that cannot be one.
     """
     given = _named_values(plant, "parameters", value, "{R: 2 + sin(t)}")
+    if len(given) > _MAX_PARAMETERS:
+        raise ConfigError(f"{plant}: {len(given)} parameters; at most {_MAX_PARAMETERS} are read")
     parameters: dict[str, Expression] = {}
+    known = dict(signals)
     later = dict.fromkeys(given, "a parameter defined further down")
+    refused = ChainMap(later, dict(elsewhere))
     for label, item in given.items():
         if keyword.iskeyword(label):
             raise ConfigError(
@@ -511,8 +517,7 @@ def read_parameters(
             )
         where = f"{plant}: parameters.{label}"
         later[label] = "this parameter itself"
-        known = {**signals, **parameters}
-        parameters[label] = parse(item, known, where, {**elsewhere, **later})
+        known[label] = parameters[label] = parse(item, known, where, refused)
     return parameters
 
 

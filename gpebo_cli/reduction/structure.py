@@ -119,6 +119,7 @@ def analyse(
     for mu in range(max_mu + 1):
         if mu:
             c = system.coefficients.taylor(t, mu)
+        _refuse_overflow(system, c, scaling, mu)
         levels, reference = _judged(t, c, mu, scaling, rank_tol, invariant)
         if reference is None:
             reason = levels.failure
@@ -137,6 +138,24 @@ def analyse(
         f"{who(system)} is not uniquely solvable, or its index is above {max_mu + 1}: with "
         f"{max_mu} differentiations {reason}; is an equation missing, or there twice?"
     )
+
+
+def _refuse_overflow(
+    system: DescriptorSystem, c: Coefficients, scaling: Scaling, mu: int
+) -> None:
+    """LAPACK's singular values of what is not finite may take for ever.
+
+    Raises:
+        ModelError: entries or their derivatives, scaled, are beyond all numbers.
+    """
+    with np.errstate(all="ignore"):
+        weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
+        finite = all(np.isfinite(matrix * weight).all() for matrix in (c.E, c.A))
+    if not finite:
+        raise ModelError(
+            f"{who(system)}: E and A change by more powers of ten than numbers hold; shorten "
+            "time.horizon, or is a sign or a unit wrong?"
+        )
 
 
 _BISECTIONS = 60
