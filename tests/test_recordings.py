@@ -24,6 +24,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.recordings.guess import guess
 from gpebo_cli.recordings.hold import edges, held, on_mesh, recording_mesh
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import LineReader, read_table
@@ -588,3 +589,80 @@ def test_a_recording_from_python(tmp_path):
     assert all(assumption.holds for assumption in found)
     saved = cubic.save(tmp_path / "out", figures=False)
     assert json.loads((saved / "summary.json").read_text())["recording"]["hold"] == "cubic"
+
+
+# gpebo new recording -------------------------------------------------------------------------
+
+FOUND = {
+    "as it stands": ("t,V,y\n0,1,2\n1,2,3\n", {"t": "t", "V": "V", "y": "y"}, {}),
+    "capitals, units": (
+        "Time [ms];U in (mV);Y_measured\n0;1,5;2\n500;2,5;3\n",
+        {"t": "Time [ms]", "V": "U in (mV)", "y": "Y_measured"},
+        {"separator": ";", "decimal": ",", "time_unit": "ms", "scale": {"V": 1e-3}},
+    ),
+    "tabs, dates, a gap": (
+        "stamp\tV (kV)\ty\n2024-01-01 00:00:00\t1\t2\n2024-01-01 00:00:01\t\t3\n"  # noqa: ISC004
+        "2024-01-01 00:00:02\t1\t4\n",
+        {"t": "stamp", "V": "V (kV)", "y": "y"},
+        {"separator": "\t", "time_unit": "datetime", "scale": {"V": 1e3}, "missing": 1},
+    ),
+    "by elimination": ("zeit,a,y\n0,1,2\n1,2,3\n", {"t": "zeit", "V": "a", "y": "y"}, {}),
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_a_look_at_a_file_finds_its_columns(tmp_path, name):
+    text, columns, more = FOUND[name]
+    path = tmp_path / "lab.csv"
+    path.write_text(text, encoding="utf-8")
+    found = guess(str(path), shipped("circuit"))
+    assert found.columns == columns
+    assert not found.lacking
+    expected = {"separator": ",", "decimal": ".", "time_unit": "s", "scale": {}, "missing": 0}
+    assert {key: getattr(found, key) for key in expected} == expected | more
+
+
+def test_what_is_guessed_runs_as_it_stands(tmp_path):
+    columns = signals_of(simulated(samples=201))
+    lines = ["Time / ms;U (mV);I measured;note"]
+    rows = zip(columns["t"], columns["V"], columns["y"], strict=True)
+    for k, (t, V, y) in enumerate(rows):
+        voltage = "" if k == 7 else f"{1e3 * V:.17g}"
+        lines.append(f"{1e3 * t:.17g};{voltage};{y:.17g};".replace(".", ","))
+    (tmp_path / "lab 1.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    made = gpebo("new", "recording", "lab 1.csv", "--plant", "circuit", cwd=tmp_path)
+    assert (made.returncode, made.stderr) == (0, "")
+    assert "not understood: not read: note" in made.stdout
+    assert "by elimination" in made.stdout
+    words = ["plant=circuit", "data=lab_1", "estimator=ls_drem", "figures=none"]
+    done = gpebo("run", "--config-dir", ".", *words, "hydra.run.dir=out", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["recording"]["last"] == 20.0
+    again = gpebo("new", "recording", "lab 1.csv", "--plant", "circuit", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "exists already" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["lab.csv"], "--plant NAME"),
+        (["lab.csv", "--plant", "circut"], "did you mean circuit?"),
+        (["none.csv", "--plant", "circuit"], "none.csv cannot be read"),
+        (["one.csv", "--plant", "circuit"], "the same number of cells"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_one_line(tmp_path, words, part):
+    (tmp_path / "lab.csv").write_text(GOOD)
+    (tmp_path / "one.csv").write_text("a\n1\n2\n")
+    done = gpebo("new", "recording", *words, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert part in done.stderr
+
+
+def test_signals_that_are_not_found_are_said(tmp_path):
+    path = tmp_path / "lab.csv"
+    path.write_text("t,a,b,c\n0,1,2,3\n1,2,3,x\n")
+    found = guess(str(path), shipped("circuit"))
+    assert found.lacking == ["V", "y"]
+    assert any("no column was found for V" in doubt for doubt in found.doubts)

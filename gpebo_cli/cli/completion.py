@@ -170,8 +170,8 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
         "compare": ["--sort", "--reverse", "--csv", "--output", "--no-figures", "--help"],
         "report": ["--output", "--help"],
         "new": [
-            "--config-dir", "--from", "--measure", "--unknown", "--help",
-            *(["plant", "estimator"] if not before else []),
+            "--config-dir", "--from", "--measure", "--unknown", "--plant", "--help",
+            *(["plant", "estimator", "recording"] if not before else []),
         ],
         "completion": [*SCRIPTS, "--help"],
     }

@@ -18,6 +18,9 @@ _PACKAGE = {"{name}.py": "{kind}.py", "{kind}/{name}.yaml": "{kind}.yaml",
             "test_{name}.py": "test_{kind}.py", "pyproject.toml": "pyproject.toml"}
 KINDS = {"plant": {"plant/{name}.yaml": "plant.yaml"}, "estimator": _PACKAGE}
 """For each kind the files that are written, and the template of each."""
+RECORDING = "recording"
+"""The kind that is made from a look at a file, and has no template."""
+_KINDS = (*KINDS, RECORDING)
 FROM_FILE = {
     "--from": "a netlist, a mechanical model or matrices",
     "--measure": "what is measured, as v(out),y=i(L1)+i(V)",
@@ -51,6 +54,10 @@ def main(words: list[str]) -> int:
         return 0
     kind, name, options = _parse(words)
     folder = os.path.expanduser(options.config_dir or ".")
+    if kind == RECORDING:
+        from gpebo_cli.cli.new_recording import write
+
+        return write(name, options.values["--plant"], folder)
     paths = {Path(folder, path): text for path, text in files(kind, name, folder).items()}
     _check_name(kind, name, list(paths))
     told = ""
@@ -106,19 +113,26 @@ def _from_file(name: str, options: Options) -> tuple[str, str]:
 
 def _parse(words: list[str]) -> tuple[str, str, Options]:
     """Kind, name and options."""
-    options = parse("new", words, {**CONFIG_DIR, **FROM_FILE})
+    options = parse("new", words, {**CONFIG_DIR, **FROM_FILE, "--plant": "the name of one"})
     given = options.words
-    if not given or given[0] not in KINDS:
+    if not given or given[0] not in _KINDS:
         what = f"gpebo new: {shown(given[0])} cannot be made" if given else "gpebo new needs a kind"
         raise ConfigError(
-            f"{what}; known: {', '.join(KINDS)}, as in gpebo new plant tank"
-            + (nearest(given[0], KINDS) if given else "")
+            f"{what}; known: {', '.join(_KINDS)}, as in gpebo new plant tank"
+            + (nearest(given[0], _KINDS) if given else "")
         )
     if len(given) != 2:
         got = "none" if len(given) == 1 else ", ".join(map(shown, given[1:]))
         raise ConfigError(
             f"gpebo new {given[0]} needs one name, as in gpebo new {given[0]} tank; got {got}"
         )
+    if (given[0] == RECORDING) != ("--plant" in options.values):
+        raise ConfigError(
+            "gpebo new recording FILE.csv --plant NAME looks for the signals of that plant; other "
+            "kinds have no --plant"
+        )
+    if given[0] == RECORDING:
+        return given[0], given[1], options
     if given[0] != "plant" and "--from" in options.values:
         raise ConfigError(f"--from makes a plant; gpebo new {given[0]} has a template of its own")
     for option in ("--measure", "--unknown"):

@@ -135,12 +135,16 @@ examples:
 
 NEW_HELP = """\
 usage: gpebo new {plant|estimator} NAME [--config-dir DIR] [--from FILE …]
+       gpebo new recording FILE.csv --plant NAME [--config-dir DIR]
 
 Writes below DIR, by default the current folder; nothing that exists is overwritten.
 
   plant      DIR/plant/NAME.yaml: every key explained; it runs as it stands
   estimator  DIR/NAME.py, its settings DIR/estimator/NAME.yaml, its test DIR/test_NAME.py, and
              DIR/pyproject.toml, by which gpebo finds it once it is installed; the test passes
+
+  recording  DIR/data/FILE.yaml: which column of FILE.csv is which signal of the plant, separators,
+             units, gaps, as far as they can be guessed; and what was not understood
 
 With --from FILE a plant is made from a SPICE netlist (.cir .net .sp), a mechanical model (.yaml
 with M, D, K, G), or matrices (.mat, a folder of Matrix Market files, an OpenModelica linearisation

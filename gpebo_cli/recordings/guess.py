@@ -1,0 +1,199 @@
+"""A look at a file of measurements: how it is written, and which column may be which signal.
+
+What is found is a guess, for a person to read; nothing here decides anything in a run.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.recordings.table import TIME, check_text, read_file
+
+_SEPARATORS = (",", ";", "\t", " ")
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6}
+_TIMES = ("t", "time", "zeit", "timestamp", "datetime", "date", "temps", "tiempo")
+_UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "minutes": "min",
+          "h": "h", "hours": "h"}
+_LOOKED_AT = 50  # rows below the header
+
+
+@dataclass
+class Guess:
+    """How a file is written, and what is said about it.
+
+    Attributes:
+        separator: between cells.
+        decimal: ``.`` or ``,``.
+        time_unit: as ``data.time_unit`` has it.
+        columns: what each signal is called in the file.
+        scale: factors from the file's units to the plant's.
+        missing: cells that are empty in the columns that are read.
+        reasons: why, by key or signal.
+        doubts: what was not understood, a line each.
+        lacking: signals without a column.
+    """
+
+    separator: str = ","
+    decimal: str = "."
+    time_unit: str = "s"
+    columns: dict[str, str] = field(default_factory=dict)
+    scale: dict[str, float] = field(default_factory=dict)
+    missing: int = 0
+    reasons: dict[str, str] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)
+    lacking: list[str] = field(default_factory=list)
+
+
+def guess(path: str, system: DescriptorSystem) -> Guess:
+    """Look at the CSV file ``path`` for the signals of ``system``.
+
+    Raises:
+        ConfigError: it cannot be read, is no text, or has no two columns.
+    """
+    content = read_file(path)
+    check_text(path, content)
+    lines = content.decode("utf-8-sig").rstrip().splitlines()
+    found = Guess()
+    table = _table(path, lines[: _LOOKED_AT + 1], found)
+    header, rows = [name.strip() for name in table[0]], table[1:]
+    if not rows:
+        raise ConfigError(f"{path} has no rows below its header")
+    cells = [[row[k] for row in rows] for k in range(len(header))]
+    commas = re.compile(r"\s*[+-]?\d*,\d+\s*")
+    if found.separator != "," and any(commas.fullmatch(cell) for row in rows for cell in row):
+        found.decimal = ","
+        found.reasons["decimal"] = "numbers such as 1,5"
+    _find_time(header, cells, found)
+    _find_signals(header, cells, system, found)
+    taken = [header.index(name) for name in found.columns.values()]
+    every = csv.reader(lines[1:], delimiter=found.separator)
+    found.missing = sum(not row[k].strip() for row in every for k in taken if k < len(row))
+    unused = [name for name in header if name not in found.columns.values()]
+    if unused:
+        found.doubts.append(f"not read: {', '.join(unused)}")
+    return found
+
+
+def _table(path: str, lines: Sequence[str], found: Guess) -> list[list[str]]:
+    """Header and rows, split by the character that gives all of them most cells, and as many."""
+    best: list[list[str]] = []
+    for separator in _SEPARATORS:
+        rows = list(csv.reader(lines, delimiter=separator))
+        widths = {len(row) for row in rows}
+        if len(widths) == 1 and len(rows[0]) > max(1, len(best[0]) if best else 1):
+            best, found.separator = rows, separator
+    if not best:
+        raise ConfigError(
+            f"{path}: no character of comma, semicolon, tab and space cuts its first lines into "
+            "the same number of cells, two at least; is the first line the header?"
+        )
+    return best
+
+
+def _number(cell: str, decimal: str) -> float | None:
+    try:
+        return float(cell.replace(decimal, "."))
+    except ValueError:
+        return None
+
+
+def _find_time(header: Sequence[str], cells: Sequence[Sequence[str]], found: Guess) -> None:
+    named = [k for k, name in enumerate(header) if _words(name)[:1] and
+             _words(name)[0].casefold() in _TIMES]
+    k = named[0] if named else 0
+    found.columns[TIME] = header[k]
+    found.reasons[TIME] = "by its name" if named else "the first column"
+    numbers = [_number(cell, found.decimal) for cell in cells[k]]
+    if any(number is None for number in numbers):
+        found.time_unit = "datetime"
+        try:
+            datetime.fromisoformat(cells[k][0].strip())
+            found.reasons["time_unit"] = f"dates such as {cells[k][0].strip()}"
+        except ValueError:
+            found.doubts.append(
+                f"column {header[k]}: {cells[k][0]!r} is neither a number nor a date and time as "
+                "in 2024-05-31T12:00:00"
+            )
+        return
+    units = [_UNITS[word] for word in _words(header[k])[1:] if word in _UNITS]
+    found.time_unit = units[0] if units else "s"
+    found.reasons["time_unit"] = "from the header" if units else "not said in the file"
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[^\W_]+", name)
+
+
+def _likeness(signal: str, unit: str, name: str) -> tuple[float, str]:
+    """How much a column's name speaks for a signal, from 0 to 4, and why."""
+    if name in (signal, f"{signal}_measured"):
+        return 4.0, "the same name"
+    if name.casefold() == signal.casefold():
+        return 3.0, "the same name but for capitals"
+    if signal in re.findall(r"\w+", re.sub(r"[(\[].*?[)\]]", "", name)):
+        return 2.5, "the name is in the header"
+    if signal in re.findall(r"\w+", name):
+        return 2.0, "the name is in the header"
+    if unit and any(_factor(written, unit) is not None for written in _units(name)):
+        return 1.5, "its unit"
+    ratio = difflib.SequenceMatcher(None, signal.casefold(), name.casefold()).ratio()
+    return (ratio, "a similar name") if ratio > 0.6 else (0.0, "")
+
+
+def _find_signals(
+    header: Sequence[str], cells: Sequence[Sequence[str]], system: DescriptorSystem, found: Guess
+) -> None:
+    signals = (*system.inputs, *system.outputs)
+    free = [
+        k for k, name in enumerate(header)
+        if name != found.columns[TIME]
+        and any(_number(cell, found.decimal) is not None for cell in cells[k])
+    ]
+    pairs = sorted(
+        ((_likeness(s, system.units.get(s, ""), header[k]), s, k) for s in signals for k in free),
+        key=lambda pair: -pair[0][0],
+    )
+    for (points, why), signal, k in pairs:
+        if points > 0 and signal not in found.columns and k in free:
+            found.columns[signal], found.reasons[signal] = header[k], why
+            free.remove(k)
+    left = [signal for signal in signals if signal not in found.columns]
+    if left and len(left) == len(free):
+        for signal, k in zip(left, free, strict=True):
+            found.columns[signal], found.reasons[signal] = header[k], "by elimination: LOOK AT IT"
+        left = []
+    found.lacking = left
+    for signal in left:
+        found.doubts.append(f"no column was found for {signal}: write it to data.columns.{signal}")
+    for signal, name in found.columns.items():
+        unit = system.units.get(signal, "")
+        for written in _units(name) if signal != TIME and unit else ():
+            factor = _factor(written, unit)
+            if factor is None:
+                found.doubts.append(
+                    f"column {name} may be in {written}, {signal} is in {unit}: "
+                    f"data.scale.{signal} is the factor between them"
+                )
+            elif factor != 1.0:
+                found.scale[signal] = factor
+                found.reasons[f"scale.{signal}"] = f"{written} in the header, {unit} here"
+
+
+def _units(name: str) -> list[str]:
+    """What may be a unit in a column's name: ``U (mV)``, ``U [mV]``, ``U / mV``, ``U in mV``."""
+    given = re.findall(r"[(\[]\s*([^\s)\]]+)\s*[)\]]|/\s*(\S+)$|\bin\s+([^\s(]+)$", name)
+    return [part for groups in given for part in groups if part]
+
+
+def _factor(written: str, unit: str) -> float | None:
+    """From a unit with a prefix to the unit; None: it is another one."""
+    if written == unit:
+        return 1.0
+    return _PREFIXES.get(written.removesuffix(unit)) if written.endswith(unit) else None
