@@ -71,7 +71,7 @@ def test_every_key_is_explained():
         (["plant"], "needs one name, as in gpebo new plant tank; got none"),
         (["plant", "a", "b"], "got 'a', 'b'"),
         (["plnt", "a"], "did you mean plant?"),
-        ([], "known: plant, estimator, as in gpebo new plant tank"),
+        ([], "known: plant, estimator, recording, as in gpebo new plant tank"),
         (["plant", "a", "--confg-dir", "b"], "did you mean --config-dir?"),
         (["plant", "a", "--config-dir"], "--config-dir needs a folder"),
         (["estimator", "ls_drem"], "ls_drem comes with gpebo"),
