@@ -103,3 +103,4 @@ class Settings:
     output: OutputSettings = field(default_factory=OutputSettings)
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     data: DataSettings = field(default_factory=DataSettings)
+    uncertainty: bool = True  # one standard deviation of every estimate, where noise is known

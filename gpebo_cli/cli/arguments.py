@@ -52,7 +52,9 @@ _NOT_TEXT = re.compile(
 
 _SWEEPER = "gpebo"
 _SWEEP_WORDS = ("resume", "fail_fast")  # of a sweep, not of the configuration
-_KEYS = (*GROUPS, "launcher", "time", "excitation", "figures", "output", *_SWEEP_WORDS)
+_KEYS = (
+    *GROUPS, "launcher", "time", "excitation", "figures", "output", "uncertainty", *_SWEEP_WORDS,
+)
 
 
 @dataclass(frozen=True)

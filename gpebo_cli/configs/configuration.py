@@ -31,6 +31,7 @@ KEYS = (
     "excitation",
     "figures",
     "output",
+    "uncertainty",
     "title",
     "reference",
     "expected",
@@ -88,6 +89,7 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         excitation=read(ExcitationSettings, _group(config, "excitation"), "excitation"),
         output=_output(config, draw=draw),
         noise=read(NoiseSettings, _group(config, "noise"), "noise"),
+        uncertainty=convert(config.get("uncertainty", True), bool, "uncertainty"),
     )
     _check_ranges(built)
     _check_no_noise(built.noise)

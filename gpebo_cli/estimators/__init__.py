@@ -25,7 +25,9 @@ from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import (
+    Affine,
     Estimates,
     Estimator,
     Moving,
@@ -42,7 +44,10 @@ from gpebo_cli.schema import number, per_name
 
 __all__ = [
     "GROUP",
+    "Affine",
     "Array",
+    "ErrorSystem",
+    "ErrorsAt",
     "Estimates",
     "Estimator",
     "ExtensionState",

@@ -19,6 +19,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.errors import ErrorSystem
 from gpebo_cli.regression.estimator import Estimates, ResumableEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
@@ -119,6 +120,28 @@ class ResumableEstimator(GainEstimator):
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> ResumableEstimates:
         """The same at the times t (M,), from the extensions that are known at the start."""
+
+
+def filtered_errors(
+    filters: Array, into: Array, law: Array, forcing: Array
+) -> ErrorSystem:
+    """Errors of a filter 𝒴 behind Y and of a law behind the filter.
+
+        δ𝒴' = −filters δ𝒴 + into δY,      δη̂' = −law δη̂ + forcing δ𝒴
+
+    Args:
+        filters: rates (p,), or (N, p).
+        into: (N, p, rows).
+        law: (N, p, p).
+        forcing: (N, p, p).
+    """
+    count, p, rows = into.shape
+    A = np.zeros((count, 2 * p, 2 * p))
+    A[:, :p, :p] = -(filters[..., None] * np.eye(p))
+    A[:, p:, :p], A[:, p:, p:] = forcing, -law
+    B = np.concatenate([into, np.zeros_like(into)], axis=1)
+    C = np.concatenate([np.zeros((p, p)), np.eye(p)], axis=1)[None]
+    return ErrorSystem(A, B, C, np.zeros((1, p, rows)))
 
 
 def axis(value: object, where: str, accept: Accepted = "positive") -> tuple[float, ...]:

@@ -66,6 +66,19 @@ class Spectrum:
         return np.divide(smallest, largest, out=np.zeros_like(largest), where=largest > 0.0)
 
 
+    def covariance(self, alpha: float, f0: float) -> Array:
+        """αF = α (z f₀ I + α G_z)⁻¹, (M, p, p)."""
+        share = alpha / (alpha * self.eigenvalues + (self.memory * f0)[:, None])
+        return np.asarray((self.vectors * share[:, None]) @ transpose(self.vectors))
+
+    def forgetting(self, alpha: float, f0: float, beta: float, bound: float | None) -> Array:
+        """β, or β (1 − ‖F‖/M) with a bound M, (M,)."""
+        if bound is None:
+            return np.full(len(self.memory), beta)
+        smallest = alpha * self.eigenvalues[:, 0] + self.memory * f0
+        return np.asarray(beta * (1.0 - 1.0 / (smallest * bound)))
+
+
 def information(
     regression: LinearRegression, alpha: float, f0: float, beta: float, bound: float | None,
     known: ExtensionState | None = None,

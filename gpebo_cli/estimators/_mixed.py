@@ -9,13 +9,15 @@ from functools import cached_property
 
 import numpy as np
 
-from gpebo_cli.estimators._base import ResumableEstimator, gain
+from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.schema import per_name
@@ -59,6 +61,29 @@ class FilteredEstimator(ResumableEstimator):
             realisations=regression.realisations,
         )
 
+    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+        """δ𝒴 behind the filters, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂), of every case."""
+        names, p = regression.parameters, regression.p
+        rates = filter_rates(self.rates, names)
+        extended = self.extend(regression, rates, None)
+
+        def of_case(gain: Array) -> ErrorsAt:
+            def at(t: Array, inside: Array) -> ErrorSystem:
+                omega = extended(t, inside)[..., :p]
+                delta, adjugate, _ = determinant_and_adjugate_action(
+                    omega, np.broadcast_to(np.eye(p), omega.shape)
+                )
+                into = rates[:, None] * self.seen(regression.psi(t, inside))
+                return scalar_errors(rates, into, delta, adjugate, gain)
+
+            return at
+
+        return tuple(map(of_case, self.gains("gamma", names)))
+
+    @abstractmethod
+    def seen(self, psi: Array) -> Array:
+        """What the filters of 𝒴 take of Y, (N, p, rows), for ψ (N, rows, p)."""
+
     @abstractmethod
     def extend(self, regression: LinearRegression, rates: Array, start: Array | None) -> Trajectory:
         """[Ω | 𝒴] (p, p + c) with filters of the ``rates`` (p,), from ``start`` or 0."""
@@ -66,6 +91,24 @@ class FilteredEstimator(ResumableEstimator):
     @abstractmethod
     def size(self, regression: LinearRegression) -> float:
         """What no filter exceeds."""
+
+
+def scalar_errors(
+    filters: Array, into: Array, delta: Array, adjugate: Array, gain: Array
+) -> ErrorSystem:
+    """Errors of 𝒴 and of the scalar law behind it, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂).
+
+    Args:
+        filters: rates of 𝒴, (p,) or (N, p).
+        into: what 𝒴' takes of Y, (N, p, rows).
+        delta: Δ (N,).
+        adjugate: adj(Ω) (N, p, p).
+        gain: γ, (1,) or (p,).
+    """
+    eye = np.eye(into.shape[1])
+    weighted = delta[:, None, None] * gain[:, None]
+    law = weighted * delta[:, None, None] * eye
+    return filtered_errors(filters, into, law, weighted * adjugate)
 
 
 def reached(

@@ -13,7 +13,7 @@ from gpebo_cli.estimators._mixed import FilteredEstimator, energy_requirement, f
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, mix_sampled
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import largest
+from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.estimator import SampledEstimates
@@ -32,6 +32,10 @@ class Drem(FilteredEstimator):
     def extend(self, regression: LinearRegression, rates: Array, start: Array | None) -> Trajectory:
         """Filtered [ψᵀψ | ψᵀY], shape (p, p + c)."""
         return kreisselmeier(regression, rates, start)
+
+    def seen(self, psi: Array) -> Array:
+        """ψᵀ."""
+        return transpose(psi)
 
     def size(self, regression: LinearRegression) -> float:
         """Of ψᵀψ."""

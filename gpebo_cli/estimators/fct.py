@@ -11,9 +11,11 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._mixed import MixedEstimates
+from gpebo_cli.estimators._scalar import ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.estimators.ls_drem import LsDrem
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.schema import number
@@ -60,6 +62,25 @@ class FiniteTime(ResumableEstimator):
         if not mu < 1:
             raise ConfigError(f"estimator.mu must lie between 0 and 1, got {mu:g}")
         return self.inner.axes()
+
+    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+        """δη̂_f = δη̂/(1 − w_c), of every case."""
+        inner = self.inner.resume(regression, regression.mesh.edges[-1:], ())
+        mu, gains = float(self.mu), inner.gains
+
+        def of_case(errors: ErrorsAt, path: ScalarPath, gain: Array) -> ErrorsAt:
+            def at(t: Array, inside: Array) -> ErrorSystem:
+                energy = np.maximum(path.mesh.sampler(t, inside)(path.energy), 0.0)
+                w_c = np.minimum(np.exp(-energy[:, None] * gain), 1.0 - mu)
+                found = errors(t, inside)
+                return found._replace(C=found.C / (1.0 - w_c)[..., None])
+
+            return at
+
+        return tuple(
+            of_case(errors, inner.groups[i // len(gains)], gains[i % len(gains)])
+            for i, errors in enumerate(self.inner.errors(regression))
+        )
 
     def resume(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]

@@ -11,8 +11,10 @@ from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 
@@ -34,7 +36,7 @@ class Gradient(ResumableEstimator):
     ) -> VectorEstimates:
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         information = Trajectory(regression.mesh, regression.outer.values[..., : regression.p])
-        gains = self.gains("gamma", regression.parameters)
+        gains = self._gains(regression)
         return VectorEstimates(
             law=VectorLaw(regression.psi, regression.psi, regression.Y, regression.floor),
             start=self.start(regression.parameters),
@@ -43,6 +45,25 @@ class Gradient(ResumableEstimator):
             realisations=regression.realisations,
             requirement=persistent(information, float(gains.min())),
         )
+
+    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+        """δη̂' = Γψᵀ(δY − ψ δη̂), of every case."""
+        p = regression.p
+
+        def of_case(gain: Array) -> ErrorsAt:
+            def at(t: Array, inside: Array) -> ErrorSystem:
+                psi = regression.psi(t, inside)
+                into = gain[:, None] * transpose(psi)
+                return ErrorSystem(
+                    -into @ psi, into, np.eye(p)[None], np.zeros((1, p, psi.shape[1]))
+                )
+
+            return at
+
+        return tuple(of_case(np.broadcast_to(gain, p)) for gain in self._gains(regression))
+
+    def _gains(self, regression: LinearRegression) -> Array:
+        return self.gains("gamma", regression.parameters)
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array

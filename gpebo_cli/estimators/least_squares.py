@@ -14,7 +14,9 @@ from gpebo_cli.estimators._information import Spectrum, information
 from gpebo_cli.estimators._recursive import InformationRoot, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
@@ -80,6 +82,26 @@ class LeastSquares(ResumableEstimator):
                 made[key] = info.spectrum(t), info.reached
             out.append(made[key])
         return out
+
+    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+        """δh_z' = −β δh_z + ψᵀδY, δη̂ = α (z f₀ I + α G_z)⁻¹ δh_z, of every case."""
+        bound = self.covariance_bound
+
+        def of_case(case: Mapping[str, float]) -> ErrorsAt:
+            alpha, f0 = case["alpha"], case["f0"]
+            info = information(regression, alpha, f0, case["beta"], bound)
+
+            def at(t: Array, inside: Array) -> ErrorSystem:
+                s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
+                rate = s.forgetting(alpha, f0, case["beta"], bound)
+                A = -rate[:, None, None] * np.eye(regression.p)
+                return ErrorSystem(
+                    A, into, s.covariance(alpha, f0), np.zeros((1, *into.shape[1:]))
+                )
+
+            return at
+
+        return tuple(map(of_case, self.cases))
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLeastSquares:
         """The same at samples.

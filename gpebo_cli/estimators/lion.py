@@ -25,6 +25,11 @@ class Lion(FilteredEstimator):
         """Filtered rows of [ψ | Y], shape (p, p + c)."""
         return lion(regression, rates, start)
 
+    def seen(self, psi: Array) -> Array:
+        """Row i takes row i mod r of the regression."""
+        rows, p = psi.shape[1:]
+        return np.broadcast_to(np.eye(rows)[np.arange(p) % rows], (len(psi), p, rows))
+
     def size(self, regression: LinearRegression) -> float:
         """Of p rows of ψ."""
         return float(np.sqrt(regression.p * largest(regression.outer.values)))

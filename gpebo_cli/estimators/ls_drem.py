@@ -6,20 +6,22 @@ estimator that Proposition 1 needs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._information import Information, Spectrum, information
-from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement
+from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement, scalar_errors
 from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import ScalarLaw, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
@@ -57,6 +59,28 @@ class LsDrem(ResumableEstimator):
         """α, f₀, β and γ, checked as the least-squares part checks them."""
         self.least_squares.axes()
         return super().axes()
+
+    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+        """δh_z as of least squares, δη̂' = γΔ(adj(H) αF δh_z − Δ δη̂), of every case."""
+        part = self.least_squares
+        bound = part.covariance_bound
+
+        def of_case(case: Mapping[str, float], gain: Array) -> ErrorsAt:
+            alpha, f0 = case["alpha"], case["f0"]
+            info = information(regression, alpha, f0, case["beta"], bound)
+
+            def at(t: Array, inside: Array) -> ErrorSystem:
+                s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
+                rate = s.forgetting(alpha, f0, case["beta"], bound)
+                delta, weights = _adjugate(s, alpha, f0)
+                adjugate = (s.vectors * weights[:, None]) @ transpose(s.vectors)
+                rates = np.broadcast_to(rate[:, None], weights.shape)
+                return scalar_errors(rates, into, delta, adjugate, gain)
+
+            return at
+
+        gains = self.gains("gamma", regression.parameters)
+        return tuple(of_case(case, gain) for case in part.cases for gain in gains)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLsDrem:
         """The same at samples.
@@ -133,13 +157,9 @@ def mix_least_squares(
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         s = info.spectrum(t, inside)
-        shares = _shares(s, alpha, f0)
-        others = np.stack(
-            [np.prod(np.delete(shares, i, axis=1), axis=1) for i in range(shares.shape[1])], axis=1
-        )
-        covariance = alpha / (alpha * s.eigenvalues + (s.memory * f0)[:, None])
-        Y = s.vectors @ ((others * covariance)[..., None] * s.rotated)
-        return np.prod(shares, axis=1), Y.reshape(len(t), -1), s.digits
+        delta, weights = _adjugate(s, alpha, f0)
+        Y = s.vectors @ (weights[..., None] * s.rotated)
+        return delta, Y.reshape(len(t), -1), s.digits
 
     s = info.spectrum(mesh.points.ravel(), mesh.inside.ravel())
     usable: BoolArray = np.asarray(s.digits > SINGULAR)
@@ -152,6 +172,17 @@ def mix_least_squares(
     shape = mesh.points.shape
     quotient = filled(quotient.reshape(*shape, -1), usable.reshape(shape))
     return scalar_path(mesh, signals, delta.reshape(shape), quotient, t, floor=floor)
+
+
+def _adjugate(s: Spectrum, alpha: float, f0: float) -> tuple[Array, Array]:
+    """Δ (M,), and adj(H) αF in the eigenbasis of G_z: its diagonal (M, p)."""
+    shares = _shares(s, alpha, f0)
+    others = np.stack(
+        [np.prod(np.delete(shares, i, axis=1), axis=1) for i in range(shares.shape[1])], axis=1
+    )
+    return np.prod(shares, axis=1), others * alpha / (
+        alpha * s.eigenvalues + (s.memory * f0)[:, None]
+    )
 
 
 def _shares(s: Spectrum, alpha: float, f0: float) -> Array:

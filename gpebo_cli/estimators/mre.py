@@ -11,15 +11,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gpebo_cli.estimators._base import ResumableEstimator, gain
+from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import reached
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import largest
+from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.schema import number
@@ -50,6 +51,23 @@ class MemoryExtension(ResumableEstimator):
         )
         state = reached(largest(regression.outer.values), extended, known)
         return replace(self._estimates(regression, extended, t), reached=(state,))
+
+    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+        """δ𝒴' = −λ(δ𝒴 − ψᵀδY), δη̂' = Γ(δ𝒴 − Ω δη̂), of every case."""
+        p = regression.p
+        rates = self._rates(p)
+        extended = kreisselmeier(regression, rates)
+
+        def of_case(gain: Array) -> ErrorsAt:
+            def at(t: Array, inside: Array) -> ErrorSystem:
+                into = rates[:, None] * transpose(regression.psi(t, inside))
+                law = gain * extended(t, inside)[..., :p]
+                return filtered_errors(rates, into, law, gain * np.eye(p))
+
+            return at
+
+        gains = self.gains("gamma", regression.parameters)
+        return tuple(of_case(np.broadcast_to(gain, p)[:, None]) for gain in gains)
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array

@@ -26,6 +26,7 @@ from gpebo_cli.experiment.online import Online, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
 from gpebo_cli.experiment.seeds import check_response, over_seeds
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
+from gpebo_cli.experiment.uncertainty import standard_deviations
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, StateMap
@@ -96,6 +97,13 @@ def continuous(
             )
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
+    if settings.uncertainty and observation.estimator is None:
+        with stage("uncertainty"):
+            deviation = standard_deviations(
+                observation, estimator, source, settings.noise, levels, system.states,
+                estimation.t,
+            )
+            estimation = replace(estimation, checks={**estimation.checks, **deviation})
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds"):

@@ -99,9 +99,12 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
         raise ConfigError(
             "observer=none simulates the plant, and data=csv does not; choose one of them"
         )
-    if recorded and not levels.silent:
-        raise ConfigError("noise is for simulations; a recording (data=csv) has its own")
-    if not levels.silent:
+    if recorded and (settings.noise.seeds > 1 or levels.steps.any()):
+        raise ConfigError(
+            "noise.seeds and noise.quantisation are for simulations; a recording (data=csv) has "
+            "its own noise, of which noise.outputs and noise.inputs say how large it is"
+        )
+    if not levels.silent and not recorded:
         check_samples(time.horizon, settings.noise.sample_time, settings.solver.max_elements)
     if recorded:
         return

@@ -12,6 +12,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import spectral_norm
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.estimator import Estimator
 from gpebo_cli.regression.linear import LinearRegression
 
@@ -148,6 +149,7 @@ class Observation:
     estimator: Estimator | None = None
     names: tuple[str, ...] | None = None
     respond: Response | None = None  # None: the observer cannot tell
+    errors: ErrorsAt | None = None  # the same as a linear system; its outputs are δY, δoffset
     growth_rate: float | None = None  # 1/s, ln ‖Φ‖₂ over the horizon
     note: str = ""  # what the last line of a run has to say of it, from "; " on
 

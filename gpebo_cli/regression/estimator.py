@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
@@ -96,6 +97,15 @@ class Moving(Protocol):
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
     ) -> Estimates:
         """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending."""
+        ...
+
+
+@runtime_checkable
+class Affine(Protocol):
+    """An estimator whose estimates are affine in Y, and that says how: for their deviations."""
+
+    def errors(self, regression: LinearRegression) -> Sequence[ErrorsAt]:
+        """For each case how errors of Y become errors of η̂, in continuous time, without resets."""
         ...
 
 

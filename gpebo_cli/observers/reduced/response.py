@@ -1,32 +1,52 @@
-"""What noise of the signals does to the regression."""
+"""What noise of the signals does to the regression and to the state."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers.reduced.matrices import ObserverMatrices
+from gpebo_cli.observers.reduced.extension import ReducedSystem
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 
 _RESPONSE = 1e-6  # error of the response to noise, which is known to no more digits than that
 
 
-def respond(
-    mesh: Mesh, matrices: Callable[[Array, Array], ObserverMatrices], kept: IntArray,
-    e_u: Array, e_y: Array,
-) -> Array:
-    """What errors of the signals add to Y, all columns in one solve on the mesh as it is.
+def errors_of(reduced: ReducedSystem, kept: IntArray) -> ErrorsAt:
+    """Errors e of [u; y], what they add to Y (rows that are ``kept``), and to the state's offset.
 
-        ζ' = A_0 ζ + b_0(e_u, e_y),  ζ(start) = 0,      δY = R (𝒜 ζ + g_y(e_u, e_y))
+    ζ' = A_0 ζ + b_0(e),    δY = R (𝒜 ζ + g_y(e)),    δoffset = ζ − K (𝒜 ζ + g_y(e))
+    """
+
+    def at(t: Array, inside: Array) -> ErrorSystem:
+        o = reduced.matrices(t, inside)
+        R, H, Q1 = o.residual[:, kept], o.elimination, transpose(o.range)
+        return ErrorSystem(
+            o.dynamics,
+            o.from_signals,
+            _stacked(R @ o.on_basis, o.split.basis - H @ (Q1 @ o.on_basis)),
+            _stacked(R @ o.g_signals, -H @ (Q1 @ o.g_signals)),
+        )
+
+    return at
+
+
+def _stacked(upper: Array, lower: Array) -> Array:
+    count = max(len(upper), len(lower))
+    parts = [np.broadcast_to(part, (count, *part.shape[1:])) for part in (upper, lower)]
+    return np.concatenate(parts, axis=1)
+
+
+def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) -> Array:
+    """What errors of the signals add to Y, all columns in one solve on the mesh as it is.
 
     Args:
         mesh: of the regression; errors are smooth within its elements.
-        matrices: of the observer at times.
-        kept: rows of the residual that are the regression.
+        errors_at: :func:`errors_of` the observer.
+        rows: of Y.
         e_u: of the inputs at the points of the mesh, (K, s + 1, m, c).
         e_y: of the outputs, (K, s + 1, r, c).
 
@@ -39,12 +59,10 @@ def respond(
     errors = Trajectory(mesh, np.concatenate([e_u, e_y], axis=2))
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
-        o, e = matrices(t, inside), errors(t, inside)
-        R = o.residual[:, kept]
-        seen = (R @ o.algebraic @ o.split.basis, (R @ o.g_signals) @ e)
-        return LinearEquation(None, o.dynamics, o.from_signals @ e, seen)
+        o, e = errors_at(t, inside), errors(t, inside)
+        return LinearEquation(None, o.A, o.B @ e, (o.C[:, :rows], o.D[:, :rows] @ e))
 
-    size = matrices(mesh.edges[:1], mesh.inside[0, :1]).split.basis.shape[1]
+    size = errors_at(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]
     start = np.zeros((size, e_y.shape[-1]))
     problem = LinearProblem(coefficients, start, name="response to noise")
     solution = solve(problem, mesh, tol=np.inf, max_elements=mesh.size)

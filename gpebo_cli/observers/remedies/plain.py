@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions, extend
 from gpebo_cli.observers.reduced.regression import on_mesh
-from gpebo_cli.observers.reduced.response import respond
+from gpebo_cli.observers.reduced.response import errors_of, respond
 from gpebo_cli.regression.linear import LinearRegression
 
 
@@ -28,6 +28,7 @@ class Plain:
         kept = final.kept_rows(system, reduced.regression)
         all_kept = len(kept) == final.Y.shape[1]
         start, stop = reduced.signals.span
+        errors = errors_of(reduced, kept)
         return Observation(
             regression=LinearRegression(
                 Y=on_mesh(mesh, final.Y if all_kept else final.Y[:, kept]),
@@ -43,5 +44,6 @@ class Plain:
             assumptions=assumptions(reduced, mesh, final),
             growth=extension.growth(q),
             growth_rate=extension.logarithm(q) / (stop - start),
-            respond=lambda e_u, e_y: respond(mesh, reduced.matrices, kept, e_u, e_y),
+            errors=errors,
+            respond=lambda e_u, e_y: respond(mesh, errors, len(kept), e_u, e_y),
         )

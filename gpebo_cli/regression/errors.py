@@ -1,0 +1,26 @@
+"""How small errors go through an observer or an estimator: a linear system of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from gpebo_cli.model.descriptor import Array
+
+
+class ErrorSystem(NamedTuple):
+    """s' = A s + B i, o = C s + D i at N times; a leading axis of 1 means constant in time.
+
+    Of an observer i are the errors of u and y, and o those of Y and of the state's offset. Of an
+    estimator i are those of Y, and o those of η̂ (mathematics: ζ' = A_0 ζ + B_e e,
+    δY = R(𝒜ζ + E e)).
+    """
+
+    A: Array  # (N, S, S)
+    B: Array  # (N, S, I)
+    C: Array  # (N, O, S)
+    D: Array  # (N, O, I)
+
+
+# (times (N,), inside (N,)) -> the system there
+ErrorsAt = Callable[[Array, Array], ErrorSystem]
