@@ -16,7 +16,7 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
@@ -113,9 +113,10 @@ def noise_level(
     duration = float(mesh.edges[-1] - mesh.edges[0])
     expected = duration * float((of_rows**2).sum(axis=1).mean()) - float((of_fit[-1] ** 2).sum())
     eta = root.T @ (root @ final[:, p])
-    residual = regression.Y.values - regression.psi.values @ eta
-    square = Trajectory(mesh, (residual**2).sum(axis=-1)).integral().final
-    return float(np.sqrt(max(float(square), 0.0) / expected)) if expected > 0.0 else np.nan
+    # At the instants: whatever is assumed between samples, there the noise is all there.
+    residual = regression.Y(instants) - regression.psi(instants) @ eta
+    square = duration * float((residual**2).sum(axis=-1).mean())
+    return float(np.sqrt(square / expected)) if expected > 0.0 else np.nan
 
 
 def _stretch(observer: ErrorsAt, estimator: ErrorsAt, mesh: Mesh, n: int) -> int:

@@ -1,0 +1,128 @@
+"""Standard deviations against closed forms, against seeds, and of recordings."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from examples import ROOT
+from plants import shipped
+
+from gpebo_cli import run
+from gpebo_cli.estimators import ErrorSystem, LinearRegression
+from gpebo_cli.evidence.uncertainty import deviations, noise_level
+
+sys.path.insert(0, str(ROOT / "docs"))
+import uncertainty as page
+
+SEEDS = 300
+ESTIMATORS = (
+    {"name": "gradient"}, {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3},
+    {"name": "least_squares", "beta": 0.3, "f0": 0.1, "bound": 1e3}, {"name": "ls_drem"},
+    {"name": "ls_drem", "beta": 0.2}, {"name": "drem", "gamma": 1e14}, {"name": "mre"},
+    {"name": "lion", "gamma": 1e10}, {"name": "fct", "gamma": 1e14},
+)
+
+
+def directly(t, inside):
+    """An observer that hands the error of its one output on to Y; there is no state."""
+    return ErrorSystem(
+        np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), np.zeros((1, 2, 1)), np.array([[[1.0], [0.0]]])
+    )
+
+
+def summing(f0):
+    """Least squares of one parameter with ψ = 1: δη̂ = ∫e/(f₀ + t)."""
+    def at(t, inside):
+        return ErrorSystem(
+            np.zeros((1, 1, 1)), np.ones((len(t), 1, 1)), (1.0 / (f0 + t))[:, None, None],
+            np.zeros((1, 1, 1)),
+        )
+
+    return at
+
+
+def test_the_mean_of_white_samples():
+    """Var = σ²T_s·t/(f₀ + t)² at the instants, and between them what the part of a sample adds."""
+    sigma, step, f0 = 0.3, 0.1, 0.5
+    t = np.array([0.1, 0.25, 1.0, 7.03, 10.0])
+    of_eta, of_x = deviations(
+        directly, summing(f0), np.full((5, 1, 1), 2.0), np.linspace(0, 10, 5),
+        np.arange(100) * step, np.array([sigma**2]), t,
+    )
+    whole = np.floor(t / step + 1e-9)
+    part = t - whole * step
+    expected = sigma * np.sqrt(whole * step**2 + part**2) / (f0 + t)
+    np.testing.assert_allclose(of_eta[:, 0], expected, rtol=1e-9)
+    np.testing.assert_allclose(of_x[:, 0], 2.0 * expected, rtol=1e-9)
+
+
+def test_the_level_is_that_of_the_residual_less_what_the_fit_takes():
+    """White samples around a constant: the estimate of σ² has no bias, for as few as five."""
+    mesh_edges = np.linspace(0.0, 5.0, 6)
+    generator, found = np.random.default_rng(3), []
+    for _ in range(400):
+        sample = generator.normal(2.0, 0.3, 5)
+        regression = LinearRegression.from_functions(
+            lambda t: np.ones((*t.shape, 1, 1)),
+            lambda t, sample=sample: np.repeat(sample, t.shape[1]).reshape(*t.shape, 1),
+            ["a"], 5.0, 5,
+        )
+        found.append(noise_level(directly, regression, mesh_edges[:-1], np.ones(1)) ** 2)
+    assert np.mean(found) == pytest.approx(0.09, rel=4.0 * np.sqrt(2.0 / 4.0 / 400))
+
+
+@pytest.mark.parametrize(("name", "remedy", "chosen"), [
+    ("descriptor", "none", ESTIMATORS), ("circuit", "none", ESTIMATORS[1:2]),
+    ("descriptor", "output_injection", ESTIMATORS[1:2]),
+])
+def test_deviations_are_those_of_the_seeds(name, remedy, chosen):
+    observer = {"name": "gpebo", "remedy": remedy}
+    found = page.errors_over_seeds(
+        shipped(name), chosen, SEEDS, np.array([8.0, 14.0, 20.0]), observer
+    )
+    for settings, one in zip(chosen, found, strict=True):
+        seen = one.errors.std(axis=2, ddof=1)
+        known = seen > 1e-9
+        assert known.sum() > 10
+        ratio = one.predicted[known] / seen[known]
+        # A deviation from 300 seeds has a deviation of 4.1 % of its own; thirty numbers here.
+        assert np.abs(np.log(ratio)).max() < 0.18, settings
+        assert abs(np.log(ratio).mean()) < 0.08, settings
+        assert one.predicted[~known].max(initial=0.0) < 1e-6
+
+
+def test_they_are_in_tables_and_summary_unless_switched_off(tmp_path):
+    noise = {"name": "gaussian", "outputs": 0.01, "sample_time": 0.1}
+    result = run("descriptor", estimator="ls_drem", noise=noise, time={"horizon": 5})
+    table = result.to_pandas("estimates")
+    assert {"theta1_std", "e0_x1_std", "x3_std"} <= set(table.columns)
+    assert (table["theta1_std"].iloc[1:] >= 0).all()
+    result.save(tmp_path / "run")
+    summary = __import__("json").loads((tmp_path / "run" / "summary.json").read_text())
+    theta = summary["estimates"]["theta1"]
+    assert theta["true"] == 1.5
+    assert abs(theta["value"] - 1.5) < 6 * theta["std"]
+    double = run(
+        "descriptor", estimator="ls_drem", noise={**noise, "outputs": 0.02}, time={"horizon": 5}
+    ).to_pandas("estimates")
+    np.testing.assert_allclose(double["x3_std"], 2.0 * table["x3_std"], rtol=1e-6)
+    silent = run("descriptor", estimator="ls_drem", time={"horizon": 5})
+    assert "theta1_std" not in silent.to_pandas("estimates").columns
+
+
+def test_of_a_recording_with_levels_and_without(tmp_path):
+    noise = {"name": "gaussian", "outputs": 0.02, "sample_time": 0.02}
+    made = run("descriptor", noise=noise, time={"samples": 1001}).to_pandas("signals")
+    measured = made.filter(regex="measured").rename(columns=lambda c: c.removesuffix("_measured"))
+    measured.to_csv(tmp_path / "rows.csv")
+    data = {"file": str(tmp_path / "rows.csv"), "hold": "linear"}
+    std = [
+        run("descriptor", estimator="ls_drem", data=data, noise=own).to_pandas("estimates")
+        ["theta1_std"].iloc[-1]
+        for own in ("none", noise)
+    ]
+    assert std[0] == pytest.approx(std[1], rel=0.15)
+    with pytest.raises(Exception, match=r"noise\.seeds and noise\.quantisation are for simul"):
+        run("descriptor", data=data, noise={**noise, "seeds": 3})
