@@ -103,11 +103,11 @@ def errors_over_seeds(
             eta = estimator.estimate(only_noise, t).parameters(slice(0, 1))[0]
             own.append(np.concatenate([eta, offset + gain @ eta], axis=1))
     for own, estimator in zip(found, built, strict=True):
-        columns = standard_deviations(
-            observation, estimator, source, noise, levels, system.states, t
-        )
-        names = tuple(name.removesuffix("_std") for name in columns)
-        predicted = np.stack([column[0] for column in columns.values()], axis=1)
+        deviations = standard_deviations(observation, estimator, source, noise, levels, t)
+        if deviations is None:
+            raise ValueError(f"{estimator} has no deviations")
+        predicted = np.concatenate([each[0] for each in deviations], axis=1)
+        names = (*regression.parameters, *system.states)
         yield Errors(names, np.concatenate(own, axis=2), predicted)
 
 

@@ -99,11 +99,11 @@ def continuous(
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
     if settings.uncertainty and observation.estimator is None:
         with stage("uncertainty"):
-            deviation = standard_deviations(
-                observation, estimator, source, settings.noise, levels, system.states,
-                estimation.t,
+            found = standard_deviations(
+                observation, estimator, source, settings.noise, levels, estimation.t
             )
-            estimation = replace(estimation, checks={**estimation.checks, **deviation})
+            if found is not None:
+                estimation = replace(estimation, parameters_std=found[0], states_std=found[1])
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds"):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from gpebo_cli.evidence.uncertainty import deviations, noise_level
@@ -19,20 +17,20 @@ _CASES = 32  # each takes a pass of its own; more are a study of gains, not of a
 
 def standard_deviations(
     observation: Observation, estimator: Estimator, source: Source, noise: NoiseSettings,
-    levels: NoiseLevels, states: tuple[str, ...], t: Array,
-) -> Mapping[str, Array]:
-    """Columns ``<name>_std`` (G, M) of parameters and states at the times t (M,).
+    levels: NoiseLevels, t: Array,
+) -> tuple[Array, Array] | None:
+    """Of parameters (G, M, p) and states (G, M, n) at the times t (M,).
 
-    Empty where they are not known: an observer that cannot tell how it responds to noise, an
+    None where they are not known: an observer that cannot tell how it responds to noise, an
     estimator that is not ``Affine``, more than 32 cases, a simulation without noise. Rounding to
     steps q counts as noise of variance q²/12. Of a recording without levels, the one level that
     all outputs share is that of the residual.
     """
     state_map, errors = observation.state_map, observation.errors
     if errors is None or not isinstance(state_map, AffineStateMap):
-        return {}
+        return None
     if not isinstance(estimator, Affine) or len(estimator.cases) > _CASES:
-        return {}
+        return None
     regression = observation.regression
     edges = regression.mesh.edges
     instants = (
@@ -42,7 +40,7 @@ def standard_deviations(
     variances = signal_noise(noise, levels).variances
     if levels.silent:
         if not source.recording:
-            return {}
+            return None
         variances = np.concatenate([np.zeros(len(levels.inputs)), np.ones(len(levels.outputs))])
         variances *= noise_level(errors, regression, instants, variances) ** 2
     gain = state_map.gain(t)
@@ -50,6 +48,4 @@ def standard_deviations(
         deviations(errors, of_case, gain, edges, instants, variances, t)
         for of_case in estimator.errors(regression)
     ]
-    values = np.array([np.concatenate(both, axis=1) for both in found])  # (G, M, p + n)
-    names = (*regression.parameters, *states)
-    return {f"{name}_std": values[:, :, i] for i, name in enumerate(names)}
+    return np.array([eta for eta, _ in found]), np.array([x for _, x in found])

@@ -461,10 +461,18 @@ def _per_case(result: RunResult, values: Array) -> tuple[Curve, ...]:
     )
 
 
-def _deviation(estimation: EstimationResult, name: str) -> Array | None:
-    """The standard deviation (M,) that an estimator with one case states of an estimate."""
+def _deviation(result: RunResult, name: str) -> Array | None:
+    """The standard deviation (M,) of an estimate, where there is one case."""
+    estimation = result.estimation
+    if estimation is None or len(estimation.cases) != 1:
+        return None
+    for names, found in (
+        (estimation.names, estimation.parameters_std), (result.system.states, estimation.states_std)
+    ):
+        if name in names and found is not None:
+            return found[0, :, names.index(name)]
     stated = estimation.checks.get(f"{name}_std")
-    return stated[0] if stated is not None and len(stated) == 1 else None
+    return None if stated is None else stated[0]
 
 
 def _estimate(
@@ -474,7 +482,7 @@ def _estimate(
     estimation = result.estimation
     assert estimation is not None  # noqa: S101  the callers looked
     curves = _per_case(result, values)
-    deviation = _deviation(estimation, name)
+    deviation = _deviation(result, name)
     if deviation is not None:
         low, high = values[0] - 2 * deviation, values[0] + 2 * deviation
         curves = (
@@ -535,7 +543,7 @@ def _error(result: RunResult, name: str, error: Array, size: float) -> Panel:
     assert estimation is not None  # noqa: S101  the callers looked
     signed = result.settings.output.error == "linear"
     curves = _per_case(result, error if signed else np.abs(error))
-    deviation = _deviation(estimation, name)
+    deviation = _deviation(result, name)
     if deviation is not None:
         up, down = 2 * deviation, -2 * deviation if signed else None
         label, text = ("± 2σ", r"$\pm\,2\sigma$") if signed else ("2σ", r"$2\sigma$")

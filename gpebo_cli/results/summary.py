@@ -61,8 +61,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "warnings": result.warnings,
         "excitation": _excitation(result.excitation),
         "estimator_requirement": _requirement(estimation),
-        "cases": _cases(result, estimation, result.metrics),
-        "estimates": _estimates(result, estimation, 0) if estimation else None,
+        "cases": _cases(estimation, result.metrics),
         "error_estimate": {
             "states": simulation.error_estimate if simulation else None,
             "regression": regression.error_estimate if regression else None,
@@ -215,40 +214,14 @@ def _requirement(estimation: EstimationResult | None) -> dict[str, Any] | None:
     }
 
 
-def _estimates(
-    result: RunResult, estimation: EstimationResult, case: int
-) -> dict[str, dict[str, float | str | None]]:
-    """Every parameter and state at the end: value, one standard deviation, unit and truth."""
-    system = result.system
-    names = (*estimation.names, *system.states)
-    values = (*estimation.parameters[case, -1], *estimation.states[case, -1])
-    truth = (*estimation.true_parameters[-1], *result.signals.states[-1])
-    found: dict[str, dict[str, float | str | None]] = {}
-    for name, value, true in zip(names, values, truth, strict=True):
-        std = estimation.checks.get(f"{name}_std")
-        found[name] = {
-            "value": value,
-            "std": None if std is None else std[case, -1],
-            "unit": system.units.get(name) or system.units.get(name.removeprefix("e0_")),
-            "true": true,
-        }
-    return found
-
-
-def _cases(
-    result: RunResult, estimation: EstimationResult | None, metrics: Metrics | None
-) -> object:
+def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> object:
     """List the cases with gains and metrics; ranges of the metrics when they are many."""
     if estimation is None or metrics is None:
         return None
     columns = metrics.columns
     if len(estimation.cases) <= MAX_LISTED_CASES:
         return [
-            {
-                "case": case, "gains": gains,
-                **{name: col[case] for name, col in columns.items()},
-                "estimates": _estimates(result, estimation, case),
-            }
+            {"case": case, "gains": gains, **{name: col[case] for name, col in columns.items()}}
             for case, gains in enumerate(estimation.cases)
         ]
     return {

@@ -89,13 +89,16 @@ def write_excitation(path: Path, excitation: Excitation) -> None:
 
 
 def estimates_header(states: Sequence[str], estimation: EstimationResult) -> list[str]:
-    """``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, checks.
+    """``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, deviations, checks.
 
-    Then ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value.
+    Deviations ``<parameter>_std…, <state>_std…`` are there where the noise is known. Then
+    ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value.
     """
     header = ["case", "t", *(f"{name}_hat" for name in (*estimation.names, *states))]
     if estimation.delta is not None:
         header.append("delta")
+    if estimation.parameters_std is not None:
+        header += [f"{name}_std" for name in (*estimation.names, *states)]
     return [*header, *estimation.checks, *(f"{name}_true" for name, _ in varying_truth(estimation))]
 
 
@@ -105,6 +108,8 @@ def case_values(estimation: EstimationResult, case: int) -> Array:
     columns = [estimation.t, estimation.parameters[case], estimation.states[case]]
     if delta is not None:
         columns.append(delta[case if len(delta) > 1 else 0])
+    if estimation.parameters_std is not None and estimation.states_std is not None:
+        columns += [estimation.parameters_std[case], estimation.states_std[case]]
     columns += [check[case] for check in estimation.checks.values()]
     columns += [values for _, values in varying_truth(estimation)]
     return np.column_stack(columns)
