@@ -24,18 +24,22 @@ static inline Interval widened(double low, double high)
 /* 0 · ∞ is 0: the bound is never reached. */
 static inline double times(double x, double y) { return x == 0.0 || y == 0.0 ? 0.0 : x * y; }
 
+/* Plain comparisons: what is not a number has been looked for. */
+static inline double lesser(double x, double y) { return x < y ? x : y; }
+static inline double greater(double x, double y) { return x > y ? x : y; }
+
 static inline Interval product(Interval a, Interval b)
 {
     const double p = times(a.low, b.low), q = times(a.low, b.high);
     const double r = times(a.high, b.low), s = times(a.high, b.high);
     if (p != p || q != q || r != r || s != s)
         return anything;
-    return widened(fmin(fmin(p, q), fmin(r, s)), fmax(fmax(p, q), fmax(r, s)));
+    return widened(lesser(lesser(p, q), lesser(r, s)), greater(greater(p, q), greater(r, s)));
 }
 
-static inline double nearest_to_zero(Interval a) { return fmax(fmax(a.low, -a.high), 0.0); }
+static inline double nearest_to_zero(Interval a) { return greater(greater(a.low, -a.high), 0.0); }
 
-static inline double largest(Interval a) { return fmax(fabs(a.low), fabs(a.high)); }
+static inline double largest(Interval a) { return greater(fabs(a.low), fabs(a.high)); }
 
 static inline Interval square(Interval a)
 {
@@ -100,7 +104,7 @@ static Interval rising(double (*function)(double), Interval a, double first, dou
 
 static double signum(double x) { return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : 0.0; }
 
-static Interval image(npy_intp what, Interval a, Interval b, int same_row)
+static inline Interval image(npy_intp what, Interval a, Interval b, int same_row)
 {
     switch (what) {
     case ADD: return widened(a.low + b.low, a.high + b.high);
