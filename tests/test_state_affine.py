@@ -294,3 +294,22 @@ def test_the_series_resistance_of_a_battery_is_seen_in_its_output():
     ocv, v1 = found.states(t).T
     current = found.inputs(t)[:, 0]
     np.testing.assert_allclose(found.outputs(t)[:, 0], ocv - v1 - 0.03 * current, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("right_side", "solution"),
+    [
+        ("1 - 2*max(y, 0)", lambda t: np.where(t < 1, t - 1, 0.5 - 0.5 * np.exp(-2 * (t - 1)))),
+        ("1 + abs(y)/2", lambda t: np.where(t < 2 * np.log(1.5), 2 - 3 * np.exp(-t / 2),
+                                            2 * np.exp((t - 2 * np.log(1.5)) / 2) - 2)),
+        ("2 - sign(y)", lambda t: np.where(t < 1 / 3, 3 * t - 1, t - 1 / 3)),
+    ],
+)  # fmt: skip
+def test_outputs_may_pass_kinks_and_jumps_of_the_right_side(right_side, solution):
+    system = plant_from_mapping({
+        "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[0]], "C": [[1]],
+        "phi": [right_side], "initial_state": [-1],
+    })  # fmt: skip
+    t = np.linspace(0, 2, 41)
+    found = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-10))
+    np.testing.assert_allclose(found.signals.states(t)[:, 0], solution(t), atol=1e-8)

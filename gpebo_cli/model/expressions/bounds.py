@@ -173,6 +173,8 @@ def roots(tape: Tape, knots: Array, start: float, stop: float) -> Array:
     """
     places = [s.argument for s in tape.switches if s.affine is None]
     arguments = tape.of([place for place in places if place in tape.of_time])
+    if not arguments.outputs:
+        return np.zeros(0)
     nested = Bounds(arguments.of([s.argument for s in arguments.switches]))
     bounds, searched = Bounds(arguments), range(len(arguments.outputs))
     grid = np.union1d(np.linspace(start, stop, _CELLS + 1), knots)
