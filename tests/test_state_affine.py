@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -313,3 +317,20 @@ def test_outputs_may_pass_kinks_and_jumps_of_the_right_side(right_side, solution
     t = np.linspace(0, 2, 41)
     found = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-10))
     np.testing.assert_allclose(found.signals.states(t)[:, 0], solution(t), atol=1e-8)
+
+
+RECIPES = {
+    "lorenz_attractor": "lorenz", "boost_converter": "boost", "motor_drive": "motor",
+    "battery_cycle": "battery", "bioreactor_feed": "bioreactor", "generator_swing": "generator",
+    "duffing_wells": "duffing",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipes_run_from_the_command_line(name, tmp_path):
+    words = ["run", f"experiment={name}", f"hydra.run.dir={tmp_path}", "time.horizon=0.5"]
+    subprocess.run([sys.executable, "-m", "gpebo_cli", *words], check=True, capture_output=True)
+    summary = json.loads((tmp_path / "summary.json").read_text("utf-8"))
+    assert summary["plant"] == RECIPES[name]
+    assert (tmp_path / "figures" / "states.png").exists()
+    assert (tmp_path / "signals.csv").exists()

@@ -157,7 +157,7 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
     D2: rank [E A; 0 C; 0 E] = rank E + n is impulse observability, equivalent to Assumption 1.
     """
     t = simulation.signals.mesh.edges[:1]
-    c = system.coefficients.taylor(t, 0)
+    c = system.coefficients.of_time.taylor(t, 0)
     E, A, C = c.E[0, 0], c.A[0, 0], c.C[0, 0]
     scale = float(np.linalg.norm(E) / max(np.linalg.norm(A), np.finfo(float).tiny)) or 1.0
     # det(λE − A) is a polynomial of degree ≤ n: it vanishes identically if it does at n + 1 points.
