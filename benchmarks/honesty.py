@@ -122,6 +122,10 @@ class Manufactured:
         """What does not depend on time."""
         return frozenset({"B", "C"} | self.zero | ({"E", "A"} if self.still else set()))
 
+    def resolved(self, edges: Array) -> Array | None:  # noqa: ARG002
+        """No bounds between the nodes."""
+        return None
+
     def breakpoints(self, start: float, stop: float) -> Array:  # noqa: ARG002
         """None."""
         return np.zeros(0)
@@ -328,7 +332,7 @@ def measure(case: Case) -> Outcome:
     error = np.abs(result.signals.states(times) - truth).max(axis=0) / np.abs(truth).max(axis=0)
     # What the truth itself cannot be known better than.
     rounding = 4 * np.finfo(float).eps
-    ratio = float((np.maximum(error - rounding, 0.0) / result.error_estimate).max())
+    ratio = float((np.maximum(error - rounding, 0.0) / result.state_errors).max())
     return Outcome(case.what, seconds, "", float(error.max()), ratio)
 
 

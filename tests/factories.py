@@ -88,6 +88,7 @@ def make_result(
         impulses=(),
         error_estimate=3e-13,
         elements=40,
+        state_errors=np.array([1e-13] * 5 + [3e-13]),
     )
     p = len(parameters)
     truth = np.array([1.0, -1.0, -2.0, 0.5, 0.1, 0.2])[:p]

@@ -9,14 +9,9 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.numerics.collocation import (
-    Constraints,
-    LinearEquation,
-    LinearProblem,
-    solve,
-    solve_constant,
-)
+from gpebo_cli.numerics.collocation import solve, solve_constant
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
 
 

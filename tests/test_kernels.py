@@ -80,15 +80,6 @@ def _maps(rng, k=7, s=4, n=3, c=2, one=False):
     )
 
 
-def _solution(rng, k=7, s=5, n=3, c=2, one=False, amplified=True):
-    return (
-        rng.normal(size=(1 if one else k, s, n, n)) / 2,
-        rng.normal(size=(k, s + 1, n, c)) * 10.0 ** rng.integers(-9, 1, size=(1, 1, n, c)),
-        radau_rule(s).to_legendre, min(4, s - 1),
-        rng.uniform(size=(n, n + 1)) if amplified else None, 1e-3, 1e-3, 0.3,
-    )
-
-
 def _signal(rng, k=8, s=6, c=5):
     values = rng.normal(size=(k, s + 1, c)) * 10.0 ** rng.integers(-12, 3, size=c)
     return values, radau_rule(s).to_legendre, min(4, s - 1), 1e-8, 1e-3, 1e-5
@@ -206,9 +197,6 @@ CASES: list[tuple[str, str, Case]] = [
     ("elements", "chain", _maps),
     ("elements", "chain", partial(_maps, one=True)),
     ("elements", "chain", partial(_maps, k=1, n=16, c=9)),
-    ("elements", "estimates", _solution),
-    ("elements", "estimates", partial(_solution, one=True, amplified=False)),
-    ("elements", "estimates", partial(_solution, s=2, k=1)),
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
     ("signals", "interpolation", _times),
@@ -300,9 +288,6 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("chain", _maps, 0, np.s_[:-1]),
     ("chain", _maps, 1, np.s_[:, :-1]),
     ("chain", _maps, 2, np.s_[:-1]),
-    ("estimates", _solution, 0, np.s_[:-1]),
-    ("estimates", _solution, 2, np.s_[:-1]),
-    ("estimates", _solution, 4, np.s_[:-1]),
     ("tails", _signal, 1, np.s_[:-1]),
     ("interpolation", _times, 0, np.s_[:1]),
     ("interpolation", _times, 1, np.s_[:-1]),

@@ -210,7 +210,10 @@ def test_summary_has_the_evidence(tmp_path: Path) -> None:
     assert excitation["pe_level_min"] == pytest.approx(0.01 * (1 - np.exp(-2.0)))
     assert summary["assumptions"][0]["evidence"] == {"sigma_min": 0.3, "at": None}
     assert summary["estimator_requirement"]["name"] == "Δ not in L2"
-    assert summary["error_estimate"] == {"states": 3e-13, "regression": 2e-13}
+    by_state = dict.fromkeys(STATES, 1e-13) | {"iv": 3e-13}
+    assert summary["error_estimate"] == {
+        "states": 3e-13, "by_state": by_state, "regression": 2e-13,
+    }
     assert [case["gains"] for case in summary["cases"]] == [{"gamma": 1e10}, {"gamma": 1e8}]
     assert summary["git"] == {"commit": "c0ffee", "dirty": False}
     assert summary["verdict"].startswith("done")

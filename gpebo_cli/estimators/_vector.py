@@ -9,8 +9,9 @@ import numpy as np
 
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import with_realisations
 from gpebo_cli.regression.resets import ExtensionState

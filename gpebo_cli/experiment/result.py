@@ -97,10 +97,11 @@ class SimulationResult:
     moved: tuple[StateChange, ...]  # by consistent initialisation at the start
     jumps: tuple[StateChange, ...]  # at jumps of the inputs inside the horizon
     impulses: tuple[tuple[float, str], ...]  # (time, state) where a jump puts a Dirac impulse
-    error_estimate: float  # relative to each state's own size
+    error_estimate: float  # relative to each state's own size, the largest
     elements: int
     measured_inputs: Array | None = None  # (N, m) what the observer saw; None: the same
     measured_outputs: Array | None = None  # (N, r)
+    state_errors: Array | None = None  # (n,) the estimate for each state, relative to its own size
 
 
 @dataclass(frozen=True)

@@ -224,6 +224,7 @@ def _sample_simulation(
         jumps=tuple(jumps),
         impulses=tuple(impulses),
         error_estimate=simulation.error_estimate,
+        state_errors=simulation.state_errors,
         elements=signals.mesh.size,
     )
 

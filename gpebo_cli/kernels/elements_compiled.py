@@ -44,16 +44,3 @@ def chain(
         return elements_numpy.chain(homogeneous, particular, start, renew)
     values, whole = _compiled.chain(homogeneous, particular, start)
     return values, int(whole[0])
-
-
-def estimates(
-    homogeneous: Array, values: Array, to_legendre: Array, used: int,
-    amplification: Array | None, floor: float, share: float, level: float,
-    renew: Callable[[Array, Array], Array] | None = None,
-) -> tuple[float, float, float]:
-    """In C for few components that nothing replaces."""
-    arguments = homogeneous, values, to_legendre, used, amplification, floor, share, level
-    if renew is not None or not _is_small(*values.shape[2:]):
-        return elements_numpy.estimates(*arguments, renew)
-    propagated, noise, rounding = _compiled.estimates(*arguments).tolist()
-    return propagated, noise, rounding

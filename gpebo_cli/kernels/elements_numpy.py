@@ -1,4 +1,4 @@
-"""Collocation on elements: their systems, chaining, and estimates of the error."""
+"""Collocation on elements: their systems, and chaining."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from collections.abc import Callable
 import numpy as np
 
 from gpebo_cli.kernels.arrays import Array, IntArray
-
-_EPS = float(np.finfo(float).eps)
-_TINY = float(np.finfo(float).tiny)
 
 
 def element_maps(
@@ -142,75 +139,3 @@ def chain(
         values[:, 1:] = maps @ values[:, :1] + particular
     finite = np.isfinite(values).all(axis=(1, 2, 3))
     return values, size if finite.all() else int(np.argmin(finite))
-
-
-def estimates(
-    homogeneous: Array, values: Array, to_legendre: Array, used: int,
-    amplification: Array | None, floor: float, share: float, level: float,
-    renew: Callable[[Array, Array], Array] | None = None,
-) -> tuple[float, float, float]:
-    """Accumulated error of the end points, visible noise, and rounding, relative to the sizes.
-
-    The error of an element's right end is carried through the same maps as the solution, so that
-    it decays where the system forgets and grows where it does not. The local error of an end point
-    is superconvergent (order 2s − 1 against s + 1 inside): with ρ the decay per Legendre
-    coefficient it is about ρ^(s−1) times the element's tail. Half that exponent is used, to stay
-    on the safe side of it, plus the rounding of one element. Noise is what the last coefficients
-    show: those of a signal fall, those of noise do not.
-
-    Args:
-        homogeneous: maps (K or 1, s, n, n).
-        values: (K, s + 1, n, c).
-        to_legendre: from values at the points to coefficients (s + 1, s + 1).
-        used: how many of the last coefficients predict the next.
-        amplification: by how much relative rounding of the components, and of 1, reaches each
-            component (n, n + 1), or None.
-        floor: size below which a component is rounding.
-        share: of the largest component; what is smaller is measured against that.
-        level: coefficients that fall by less than this over two degrees are noise.
-        renew: what becomes of errors (e, n, c) where what an element has reached (n, c) is
-            replaced.
-    """
-    s = values.shape[1] - 1
-    flat = values.reshape(*values.shape[:2], -1)
-    whole = np.abs(flat).max(axis=(0, 1))
-    largest = float(whole.max(initial=0.0))
-    scale = np.maximum(whole, max(share * largest, _TINY))
-    last = np.abs(np.matmul(to_legendre[-4:], flat))  # degrees s − 3 … s
-    noise = np.zeros_like(whole)
-    if s >= 4:
-        before, after = last[:, :2].max(axis=1), last[:, 2:].max(axis=1)
-        noise = np.where(after >= level * before, after, 0.0).max(axis=0)
-    local = _local_errors(last[:, last.shape[1] - used :], np.abs(flat).max(axis=1), scale, s)
-    # Local errors have signs that nobody knows: all equal, and alternating, so that neither kind
-    # of system can cancel both. Absolute values of the maps were rejected: a rotation would grow.
-    local = local.reshape(-1, 1, *values.shape[2:])
-    signs = np.ones((len(local), 2, 1, 1))
-    signs[1::2, 1] = -1.0
-    errors = signs * local
-    ends = np.broadcast_to(homogeneous[:, -1], (len(values), *homogeneous.shape[2:]))
-    for k in range(1, len(errors)):
-        carried = errors[k - 1]
-        if renew is not None:
-            carried = renew(values[k - 1, -1], carried)
-        errors[k] += ends[k] @ carried
-    worst = np.abs(errors).max(axis=(0, 1), initial=0.0).ravel()
-    brought = np.zeros_like(whole)
-    if amplification is not None:
-        size = whole.reshape(values.shape[2:])
-        brought = _EPS * (amplification[:, :-1] @ size + amplification[:, -1:]).ravel()
-    floored = np.maximum(whole, max(share * largest, floor, _TINY))
-    return (
-        float((worst / scale).max(initial=0.0)),
-        float((noise / scale).max(initial=0.0)),
-        float(((_EPS * largest + brought) / floored).max(initial=0.0)),
-    )
-
-
-def _local_errors(last: Array, size: Array, scale: Array, s: int) -> Array:
-    """Of the right end of each element (K, c), from its last coefficients (K, used, c)."""
-    power = (s + 1.0) / np.arange(s + 1 - last.shape[1], s + 1)[:, None]
-    tail = scale * (np.minimum(last / scale, 1.0) ** power).max(axis=1, initial=0.0)
-    decay = np.clip(tail / np.maximum(size, _TINY), 0.0, 1.0) ** (1 / s)
-    rounding = 4 * _EPS * np.maximum(size, scale * _EPS)
-    return np.asarray(tail * decay ** (0.5 * (s - 1)) + rounding)

@@ -21,7 +21,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -29,83 +28,21 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements
 from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.mesh import (
-    SHARE,
-    Mesh,
-    Trajectory,
-    unresolved_kinds,
-    used_coefficients,
-)
+from gpebo_cli.numerics.errors import EPS, estimated_errors, least_sizes
+from gpebo_cli.numerics.linalg import inverse_or_none
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, at_least, unresolved_kinds
+from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import RadauRule, differentiation_schur
-
-
-class Constraints(NamedTuple):
-    """All X that satisfy the constraints at N times: X = T z + offset with any z."""
-
-    basis: Array  # (N, n, d) T
-    offset: Array  # (N, n, columns)
-
-
-class LinearEquation(NamedTuple):
-    """The equation at N times; a leading axis of 1 means constant in time.
-
-    With ``constraints``, E, A and f are the d differential equations only.
-    """
-
-    E: Array | None  # (N, n or d, n), None for the identity
-    A: Array  # (N, n or d, n)
-    f: Array  # (N, n or d, columns)
-    extras: tuple[Array, ...] = ()  # (N, ...) each: whatever the monitor needs at these times
-    constraints: Constraints | None = None
-
-
-# (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind
-Monitor = Callable[[Array, tuple[Array, ...]], list[tuple[Array, float]]]
 
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _MODEST = 1e100  # values up to here may be multiplied with each other
 _MAX_PARTS = 8  # an element is cut into at most this many at once
-_LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
-_EPS = float(np.finfo(float).eps)
-_ROUNDING = 64 * _EPS
 _EQUAL = 1e-11  # relative difference of lengths that is rounding
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.
 np.empty(_CHUNK // 4)
-
-
-class Renewal(Protocol):
-    """At every edge, an equivalent value to go on with: a basis whose columns grow is changed."""
-
-    def state(self, reached: Array) -> Array:
-        """What (n, columns) replaces the limit from the left."""
-        ...
-
-    def error(self, reached: Array, error: Array) -> Array:
-        """What becomes of small errors (e, n, columns) of that limit."""
-        ...
-
-
-@dataclass(frozen=True)
-class LinearProblem:
-    """The equation, and which other signals of the solution have to be resolved by the mesh.
-
-    ``coefficients(t, inside)`` evaluates E, A, f at times of shape (N,); functions that jump are
-    decided at ``inside``. It is called once for each element, at all of its points.
-    ``monitor`` returns further signals computed from the solution, grouped by kind: (point values
-    (K, s + 1, c), size below which that kind is rounding).
-    """
-
-    coefficients: Callable[[Array, Array], LinearEquation]
-    start: Array  # (n, columns)
-    monitor: Monitor | None = None
-    name: str = "equation"
-    floor: float = 0.0  # size below which the solution itself is rounding
-    # (n, n + 1) by how much relative rounding of the components, and of 1, reaches each component
-    amplification: Array | None = None
-    renewal: Renewal | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +50,10 @@ class LinearSolution:
     """Point values of X on the mesh that resolves it, and an estimate of the error."""
 
     trajectory: Trajectory  # values (K, s + 1, n, columns)
-    error_estimate: float  # relative to each signal's own size
+    error_estimate: float  # relative to each signal's own size, the largest
     rounds: int
+    errors: Array  # (n, columns) of each component of X relative to its largest value
+    lost: float | None  # from when on a component's error exceeds the component
     extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each, or (1, 1, ...)
 
 
@@ -124,6 +63,7 @@ class _ElementMaps:
 
     homogeneous: Array  # (K, s, n, n), or (1, s, n, n) if it is the same for all
     particular: Array  # (K, s, n, columns)
+    noise: Array  # (K, n, n + columns), see estimated_errors
     extras: tuple[Array, ...]  # (K, s + 1, ...) each, or (1, 1, ...) if constant
 
 
@@ -156,7 +96,7 @@ def solve(
     rounds = 1
     while True:
         values, whole = _chain(maps, problem, mesh, restarts or {})
-        tail = _tail_of_numbers(problem, mesh, values, maps.extras, whole)
+        tail = _tail_of_numbers(problem, mesh, values, maps, whole, tol)
         poor = tail > tol
         if floor is not None:
             # Rounding floor: an element whose parent was already this good is not cut again.
@@ -178,12 +118,18 @@ def solve(
         floor = np.where(fresh, np.repeat(tail, parts), before)
         maps = _merge(maps, new, kept, fresh)
         mesh, rounds = finer, rounds + 1
-    estimate = max(float(tail.max(initial=0.0)), _estimates(problem, maps, values, mesh))
-    return LinearSolution(Trajectory(mesh, values), estimate, rounds, maps.extras)
+    errors, lost = estimated_errors(
+        problem, mesh, maps.homogeneous[:, -1], maps.particular[:, -1], maps.noise, values
+    )
+    estimate = max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0)))
+    return LinearSolution(
+        Trajectory(mesh, values), estimate, rounds, errors,
+        None if lost == mesh.size else float(mesh.edges[lost + 1]), maps.extras,
+    )
 
 
 def _tail_of_numbers(
-    problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...], whole: int
+    problem: LinearProblem, mesh: Mesh, values: Array, maps: _ElementMaps, whole: int, tol: float
 ) -> Array:
     """:func:`unresolved_signals`; where not all is finite, of the elements before, else zero.
 
@@ -192,15 +138,21 @@ def _tail_of_numbers(
     Elements that are too long may seem to grow, and many of them multiply to anything: those in
     front are resolved first.
     """
-    if whole == mesh.size:
-        return unresolved_signals(problem, mesh, values, extras)
-    with np.errstate(invalid="ignore"):
-        count = int(np.argmin((np.abs(values) < _MODEST).all(axis=(1, 2, 3))))
+    count = mesh.size
+    if whole < mesh.size:
+        with np.errstate(invalid="ignore"):
+            count = int(np.argmin((np.abs(values) < _MODEST).all(axis=(1, 2, 3))))
     tail = np.zeros(mesh.size)
     if count:
-        tail[:count] = unresolved_signals(
-            problem, Mesh(mesh.edges[: count + 1], mesh.rule), values[:count],
-            tuple(e if e.shape[:2] == (1, 1) else e[:count] for e in extras),
+        part = slice(count)
+        made_of = np.abs(values[part])
+        if problem.apart:
+            last = np.abs(maps.homogeneous[part, -1])
+            made_of = last @ made_of[:, 0] + np.abs(maps.particular[part, -1])
+        tail[part] = unresolved_signals(
+            problem, Mesh(mesh.edges[: count + 1], mesh.rule), values[part],
+            tuple(e if e.shape[:2] == (1, 1) else e[part] for e in maps.extras),
+            made_of.max(axis=tuple(range(made_of.ndim - 2))), tol,
         )
     return tail
 
@@ -214,26 +166,20 @@ def wanted_parts(tail: Array, poor: BoolArray, tol: float, stages: int) -> IntAr
 
 
 def unresolved_signals(
-    problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...]
+    problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...], made_of: Array,
+    tol: float,
 ) -> Array:
-    """:func:`unresolved_kinds` over the solution and everything computed from it, shape (K,)."""
+    """:func:`unresolved_kinds` over the solution and everything computed from it, shape (K,).
+
+    Each component is measured by its own size, but see :func:`least_sizes` for what it is
+    ``made_of`` (n, columns).
+    """
     size, points, n, columns = values.shape
-    kinds = [(values.reshape(size, points, n * columns), problem.floor)]
+    seen = at_least(values, least_sizes(problem, made_of, tol))
+    kinds = [(seen.reshape(size, points, n * columns), 0.0)]
     if problem.monitor is not None:
         kinds += problem.monitor(values, extras)
     return unresolved_kinds(kinds, mesh.rule)
-
-
-def _estimates(
-    problem: LinearProblem, maps: _ElementMaps, values: Array, mesh: Mesh
-) -> float:
-    """The largest of accumulated error, visible noise and rounding, relative to the sizes."""
-    renew = None if problem.renewal is None else problem.renewal.error
-    found = elements.estimates(
-        maps.homogeneous, values, mesh.rule.to_legendre, used_coefficients(mesh.rule),
-        problem.amplification, problem.floor, SHARE, _LEVEL, renew,
-    )
-    return max(_ROUNDING, *found)
 
 
 def _check_budget(
@@ -242,7 +188,7 @@ def _check_budget(
     worst = int(np.argmax(tail))
     t = mesh.edges[worst]
     # Next to t = 0 floating point resolves any transient; elsewhere 64 units in the last place.
-    resolution = 64 * _EPS * np.abs(mesh.edges[1:])
+    resolution = 64 * EPS * np.abs(mesh.edges[1:])
     if parts.sum() > max_elements:
         raise SolverError(
             f"the {problem.name} is not resolved with {max_elements} elements; worst near "
@@ -266,6 +212,7 @@ def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArra
     return _ElementMaps(
         merged(old.homogeneous, new.homogeneous),
         merged(old.particular, new.particular),
+        merged(old.noise, new.noise),
         tuple(
             a if a.shape[:2] == (1, 1) else merged(a, b)
             for a, b in zip(old.extras, new.extras, strict=True)
@@ -298,7 +245,7 @@ def _element_maps(
         else:
             c = _at_points(known, slice(i * (s + 1), (i + chunk) * (s + 1)))
         maps = _solve_elements(problem, mesh.rule, h[part], t[part], c)
-        piece = [maps.homogeneous, maps.particular, *maps.extras]
+        piece = [maps.homogeneous, maps.particular, maps.noise, *maps.extras]
         if not whole:
             whole = [
                 values if values.shape[:2] == (1, 1) else np.empty((len(h), *values.shape[1:]))
@@ -307,7 +254,7 @@ def _element_maps(
         for everywhere, here in zip(whole, piece, strict=True):
             if everywhere.shape[:2] != (1, 1):
                 everywhere[part] = here
-    return _ElementMaps(whole[0], whole[1], tuple(whole[2:]))
+    return _ElementMaps(whole[0], whole[1], whole[2], tuple(whole[3:]))
 
 
 def _is_constant(c: LinearEquation) -> bool:
@@ -343,7 +290,12 @@ def _solve_elements(
     k, s = len(h), rule.stages
     extras = tuple([at_points(extra, k, s) for extra in c.extras])
     basis, offset = (None, None) if c.constraints is None else c.constraints
-    group = _equal_lengths(h) if _is_constant(c) else np.arange(k)
+    group = np.arange(k)
+    if _is_constant(c):
+        # One length for all that are equal would be wrong each time in the same direction, and over
+        # many elements that adds up; what their mean is wrong by adds up to nothing.
+        group = _equal_lengths(h)
+        h = (np.bincount(group, weights=h) / np.bincount(group))[group]
     groups = int(group.max(initial=-1)) + 1
     solve = elements.element_maps
     if _is_constant(c) and s * c.A.shape[1] > _DIRECT:
@@ -359,7 +311,31 @@ def _solve_elements(
         ) from error
     if 1 < groups < k:
         homogeneous = homogeneous[group]
-    return _ElementMaps(homogeneous, particular, extras)
+    return _ElementMaps(homogeneous, particular, _noise(h, t, c), extras)
+
+
+def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
+    """By how much relative rounding of each component, and of 1, may move X within an element.
+
+    h times what T brings of |A| and |f|; and what rounding of the times t (k, s + 1) makes of A and
+    f that move. Shape (k, n, n + columns); zero where E is not invertible.
+    """
+    k, s = len(h), t.shape[1] - 1
+    length, late = h[:, None, None], np.abs(t[:, -1, None, None])
+    terms = []
+    for values in (c.A, c.f):
+        apart = at_points(values, k, s)
+        terms.append(length * np.abs(apart).max(axis=1))
+        if len(values) > 1:
+            terms[-1] = terms[-1] + late * np.ptp(apart, axis=1)
+    found = np.concatenate(terms, axis=2)
+    if c.constraints is not None:
+        return np.asarray(np.abs(at_points(c.constraints.basis, k, s)).max(axis=1) @ found)
+    if c.E is None:
+        return found
+    inverse, singular = inverse_or_none(at_points(c.E, k, s)[:, -1])
+    inverse[singular] = 0.0
+    return np.asarray(np.abs(inverse) @ found)
 
 
 def _equal_lengths(h: Array) -> IntArray:

@@ -306,6 +306,16 @@ def unresolved_kinds(kinds: Sequence[tuple[Array, float]], rule: RadauRule) -> A
     return np.asarray((np.minimum(worst, 1.0) ** _to_next(rule)).max(axis=1, initial=0.0))
 
 
+def at_least(values: Array, level: Array | float) -> Array:
+    """Signals (K, s + 1, …) that count as being of the size ``level`` (…) where they are smaller.
+
+    What is smaller gets a constant added: that changes no coefficient that a tail is read from.
+    """
+    size = np.abs(values).max(axis=(0, 1))
+    level = np.maximum(level, _TINY)
+    return np.asarray(values / np.maximum(size, level) + (size < level))
+
+
 def used_coefficients(rule: RadauRule) -> int:
     """How many of the last Legendre coefficients predict the next one."""
     return min(_COEFFICIENTS, rule.stages - 1)

@@ -12,8 +12,9 @@ from collections.abc import Mapping
 
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import (
     AtSamples,
     Measurements,

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 
 _WINDOWS = 10  # to a horizon
 

@@ -31,9 +31,10 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, Monitor, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, Monitor
 
 _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
 # Standard deviations below this share of the largest one, each relative to that at the start, are

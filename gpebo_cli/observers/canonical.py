@@ -29,8 +29,9 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import Measurements, initial_extension, output_scale, refuse_beyond
 from gpebo_cli.observers._observation import (
     InitialError,

@@ -113,7 +113,11 @@ def jump(
     significant = np.abs(w[1:]) > _IMPULSE * scale
     impulses = np.where(significant, w[1:], 0.0)
     _refuse_ambiguous_products(system, t, width, w[0], impulses, scale)
-    return Jump(before + w[0], impulses)
+    state = before + w[0]
+    if reduced.basis is not None and reduced.offset is not None:
+        # On the constraints to the last digit: a component that they make zero is zero.
+        state = reduced.basis[0] @ (reduced.E1[0] @ state) + reduced.offset[0]
+    return Jump(state, impulses)
 
 
 def _refuse_ambiguous_products(

@@ -86,6 +86,14 @@ def without_equations() -> Structure:
     )
 
 
+def growth_rates(E1: Array, A1: Array, basis: Array | None) -> Array:
+    """Largest real part (N,) of the eigenvalues of z' = A1 T z, E1 T = I, or zero, in 1/s."""
+    if not len(E1[0]):
+        return np.zeros(len(E1))
+    frozen = np.asarray(np.linalg.solve(E1, A1) if basis is None else A1 @ basis, dtype=np.float64)
+    return np.maximum(_largest_real_parts(frozen), 0.0)
+
+
 def _largest_real_parts(matrices: Array) -> Array:
     """Largest real parts (N,) of the eigenvalues of matrices (N, d, d), d > 0."""
     if matrices.shape[1] == 1:

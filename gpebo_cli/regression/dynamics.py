@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 
 _TOLERANCE = 1e-12
 _MAX_ELEMENTS = 200_000

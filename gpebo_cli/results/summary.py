@@ -64,6 +64,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "cases": _cases(estimation, result.metrics),
         "error_estimate": {
             "states": simulation.error_estimate if simulation else None,
+            "by_state": _by_state(result.system.states, simulation),
             "regression": regression.error_estimate if regression else None,
         },
         "fit": _fit(result.fit),
@@ -72,6 +73,14 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "versions": made_by.versions,
         "git": {"commit": made_by.git.commit, "dirty": made_by.git.dirty} if made_by.git else None,
     }
+
+
+def _by_state(
+    states: tuple[str, ...], simulation: SimulationResult | None
+) -> dict[str, float] | None:
+    if simulation is None or simulation.state_errors is None:
+        return None
+    return dict(zip(states, simulation.state_errors.tolist(), strict=True))
 
 
 def plain(value: object) -> Any:

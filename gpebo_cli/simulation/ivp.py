@@ -8,6 +8,7 @@ strangeness-free equations). It exists to check the engine, and is selected by `
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,13 +16,9 @@ import numpy as np
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels.structure_numpy import derivative_array, scaled
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import (
-    LinearProblem,
-    LinearSolution,
-    at_points,
-    unresolved_signals,
-)
+from gpebo_cli.numerics.collocation import LinearSolution, at_points, unresolved_signals
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearProblem
 from gpebo_cli.reduction.derivative_array import forcing
 from gpebo_cli.reduction.structure import Structure
 
@@ -101,11 +98,15 @@ def solve(
         values = _sample(problem, mesh, max(tol, 1e-13), restarts or {})
         extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
         extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in extras)
-        tail = unresolved_signals(problem, mesh, values, extras)
+        sizes = np.abs(values).max(axis=(0, 1))
+        tail = unresolved_signals(replace(problem, apart=False), mesh, values, extras, sizes, tol)
         poor = tail > 1e3 * tol  # its dense output is of lower order than its steps
         if not poor.any():
             estimate = float(max(tail.max(initial=0.0), 1e2 * tol))
-            return LinearSolution(Trajectory(mesh, values), estimate, rounds, extras)
+            errors = np.full_like(sizes, estimate)
+            return LinearSolution(
+                Trajectory(mesh, values), estimate, rounds, errors, None, extras
+            )
         if mesh.size + poor.sum() > max_elements:
             break
         mesh, _ = mesh.split(np.where(poor, 2, 1))

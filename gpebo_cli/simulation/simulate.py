@@ -10,7 +10,7 @@ from math import isfinite
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.errors import ModelError
+from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import (
     MATRIX_NAMES,
     Array,
@@ -19,15 +19,18 @@ from gpebo_cli.model.descriptor import (
     DescriptorSystem,
     IntArray,
 )
-from gpebo_cli.numerics.collocation import (
-    Constraints,
-    LinearEquation,
-    LinearProblem,
-    LinearSolution,
-    solve,
-    wanted_parts,
+from gpebo_cli.numerics.collocation import LinearSolution, solve, wanted_parts
+from gpebo_cli.numerics.errors import least_sizes
+from gpebo_cli.numerics.mesh import (
+    FIRST_ELEMENTS,
+    SHARE,
+    Mesh,
+    Trajectory,
+    at_least,
+    initial_mesh,
+    unresolved,
 )
-from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, Mesh, Trajectory, initial_mesh, unresolved
+from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
 from gpebo_cli.reduction.strangeness_free import (
@@ -35,7 +38,7 @@ from gpebo_cli.reduction.strangeness_free import (
     direct_part,
     strangeness_free_form,
 )
-from gpebo_cli.reduction.structure import Structure, analyse
+from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.newton import Effort, follow
@@ -74,9 +77,11 @@ class Simulation:
     structure: Structure
     initial_state: Array  # (n,) consistent
     jumps: tuple[tuple[float, Array, Jump], ...]  # (time, limit from the left, jump)
-    error_estimate: float
+    error_estimate: float  # relative to each signal's own size, the largest
     bounded: bool  # known functions are bounded between the nodes: nothing narrow was missed
     effort: Effort | None = None  # of Newton's method, where the plant is not linear
+    state_errors: Array | None = None  # (n,) of each state relative to its own largest value
+    lost: float | None = None  # from when on rounding errors exceed a state
 
 
 def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Simulation:
@@ -88,7 +93,14 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         ConfigError: an entry without a finite value.
     """
     if not system.depends_on_outputs:
-        return _simulate_linear(system, time, solver)
+        simulation = _simulate_linear(system, time, solver)
+        if simulation.lost is not None:
+            raise SolverError(
+                f"the plant {system.name} grows so that rounding errors are larger than a state "
+                f"from t = {simulation.lost:.6g} on, and no digit of it is known; shorten "
+                "time.horizon"
+            )
+        return simulation
     last: list[Simulation] = []
 
     def solve_linear(
@@ -138,13 +150,19 @@ def _simulate_linear(
         u, C, *direct = extras
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
-        y, size = _outputs(C, values[..., 0], *direct)
-        return [(u, 0.0), (y, 1e-3 * max(size, floor))]
+        y = _outputs(C, values[..., 0], *direct)
+        size = np.abs(values[..., 0]).max(axis=(0, 1))
+        least = np.abs(C).max(axis=(0, 1)) @ least_sizes(problem, size[:, None], solver.tol)[:, 0]
+        return [(at_least(u, SHARE * terms(size)), 0.0), (at_least(y, least), 0.0)]
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
-    floor = 1e-3 * max(map(abs, system.initial_state.tolist()), default=0.0)
+    floor = SHARE * np.abs(system.initial_state)
+    if first.basis is not None:
+        floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
+    terms = _beside_inputs(c)
     problem = LinearProblem(
-        coefficients, x0[:, None], monitor, f"plant {system.name}", floor, first.amplification
+        coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
+        first.amplification, apart=True,
     )
     if solver.name == "ivp":
         solution = _integrate(system, structure, problem, mesh, solver, restarts)
@@ -156,7 +174,7 @@ def _simulate_linear(
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
     u, C, *direct = solution.extras
-    y, _ = _outputs(C, x, *direct)
+    y = _outputs(C, x, *direct)
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
         structure=structure,
@@ -164,6 +182,8 @@ def _simulate_linear(
         jumps=tuple((t, *happened[t]) for t in sorted(happened)),
         error_estimate=solution.error_estimate,
         bounded=edges is not None,
+        state_errors=solution.errors[:, 0],
+        lost=solution.lost,
     )
 
 
@@ -185,7 +205,7 @@ def _known_resolved(
 
     longest = _SHORT / max(structure.rate, _TINY)
     if solver.name != "ivp" and mesh.steps.max() > longest:
-        mesh = _growth_resolved(structure, mesh, solver)
+        mesh = _growth_resolved(system, structure, mesh, solver)
     c = evaluated(mesh)
     if solver.name == "ivp":
         return mesh, c
@@ -197,8 +217,10 @@ def _known_resolved(
         mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
         c = evaluated(mesh)
     before: Array | float = np.inf
+    beside = _beside_inputs(c)(np.abs(system.initial_state))
     while system.m and "u" not in system.coefficients.constant:
-        tail = unresolved(c.u[0].reshape(*mesh.points.shape, -1), mesh.rule)
+        u = c.u[0].reshape(*mesh.points.shape, -1)
+        tail = unresolved(at_least(u, SHARE * beside), mesh.rule)
         if tail.max() <= solver.tol:
             break
         poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
@@ -254,19 +276,34 @@ def _looks(rule: RadauRule, looks: int) -> tuple[Array, Array]:
     return places, np.ascontiguousarray(rule.interpolation(places).T)
 
 
-def _growth_resolved(structure: Structure, mesh: Mesh, solver: SolverSettings) -> Mesh:
+def _growth_resolved(
+    system: DescriptorSystem, structure: Structure, mesh: Mesh, solver: SolverSettings
+) -> Mesh:
     """The mesh with elements short enough for the state not to grow much within one.
 
     An element that is too long damps what it does not resolve. A state that has become small would
     never be seen to grow again: its error is invisible beside the size it once had.
+
+    Raises:
+        SolverError: that takes more elements than there may be.
     """
-    parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / _SHORT)))
-    if parts.max() == 1.0:
-        return mesh
     n = structure.d + structure.a
-    if parts.sum() > min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements / 2):
-        return mesh
-    return mesh.split(parts.astype(np.intp))[0]
+    most = min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements)
+    parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / _SHORT)))
+    if parts.sum() > most:
+        # Only where it grows.
+        form = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel())
+        rates = np.broadcast_to(growth_rates(form.E1, form.A1, form.basis), mesh.points.size)
+        rates = rates.reshape(mesh.points.shape).max(axis=1)
+        parts = np.maximum(1.0, np.ceil(mesh.steps * (rates / _SHORT)))
+        if parts.sum() > most:
+            worst = int(np.argmax(rates))
+            raise SolverError(
+                f"the plant {system.name} may grow by a factor of e^{_SHORT * parts.sum():.3g}, at "
+                f"{rates[worst]:.3g} 1/s near t = {mesh.edges[worst]:.6g}, which takes more than "
+                f"solver.max_elements = {most:.0f} elements; shorten time.horizon"
+            )
+    return mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
 
 
 def _known_kinds(
@@ -331,13 +368,25 @@ def _restart(
     return restart
 
 
-def _outputs(C: Array, x: Array, direct: Array | None = None) -> tuple[Array, float]:
-    """y = C x + direct at points (K, s + 1), and how large it could be: C times x, the largest."""
-    size = float(np.abs(C).max(initial=0.0)) * float(np.abs(x).max(initial=0.0))
-    y = np.asarray(np.matmul(C, x[..., None])[..., 0])
-    if direct is None:
-        return y, size
-    return y + direct, max(size, float(np.abs(direct).max(initial=0.0)))
+def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
+    """From the sizes of the states (n,) to those that the inputs (m,) have to compare with.
+
+    An input whose share of every equation is rounding of the others' is rounding itself.
+    """
+    A, B = np.abs(c.A[0]).max(axis=0), np.abs(c.B[0]).max(axis=0)
+
+    def terms(size: Array) -> Array:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.where(B > 0.0, (A @ size)[:, None] / B, np.inf)
+        least = shares.min(axis=0, initial=np.inf)
+        return np.where(np.isfinite(least), least, 0.0)
+
+    return terms
+
+
+def _outputs(C: Array, x: Array, direct: Array | float = 0.0) -> Array:
+    """y = C x + direct at points (K, s + 1)."""
+    return np.asarray(np.matmul(C, x[..., None])[..., 0] + direct)
 
 
 def _integrate(
@@ -352,9 +401,7 @@ def _integrate(
         seen = c.u[0], c.C[0], direct_part(c, system.coefficients.zero)
         return LinearEquation(None, A, f[:, :, None], tuple(e for e in seen if e is not None))
 
-    ode = LinearProblem(
-        explicit, problem.start, problem.monitor, problem.name, problem.floor
-    )
+    ode = replace(problem, coefficients=explicit)
     return ivp.solve(
         ode, mesh, tol=solver.tol, max_elements=solver.max_elements, restarts=restarts
     )

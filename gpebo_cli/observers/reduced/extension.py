@@ -10,8 +10,9 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, LinearSolution, solve
+from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import (
     ByName,
     Measurements,

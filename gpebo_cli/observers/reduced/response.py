@@ -6,9 +6,10 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 

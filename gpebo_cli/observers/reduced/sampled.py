@@ -19,8 +19,9 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import ByName, initial_extension, output_scale, refuse_beyond
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices

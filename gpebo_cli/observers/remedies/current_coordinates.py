@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._observation import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations

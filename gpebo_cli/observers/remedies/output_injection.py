@@ -34,9 +34,10 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._observation import Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices

@@ -23,9 +23,10 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import LinearEquation, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._observation import (
     AffineStateMap,
     Observation,

@@ -1,0 +1,69 @@
+"""What is integrated: linear equations in their unknowns, with columns that share the matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from gpebo_cli.model.descriptor import Array
+
+
+class Constraints(NamedTuple):
+    """All X that satisfy the constraints at N times: X = T z + offset with any z."""
+
+    basis: Array  # (N, n, d) T
+    offset: Array  # (N, n, columns)
+
+
+class LinearEquation(NamedTuple):
+    """The equation at N times; a leading axis of 1 means constant in time.
+
+    With ``constraints``, E, A and f are the d differential equations only.
+    """
+
+    E: Array | None  # (N, n or d, n), None for the identity
+    A: Array  # (N, n or d, n)
+    f: Array  # (N, n or d, columns)
+    extras: tuple[Array, ...] = ()  # (N, ...) each: whatever the monitor needs at these times
+    constraints: Constraints | None = None
+
+
+# (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind
+Monitor = Callable[[Array, tuple[Array, ...]], list[tuple[Array, float]]]
+
+
+class Renewal(Protocol):
+    """At every edge, an equivalent value to go on with: a basis whose columns grow is changed."""
+
+    def state(self, reached: Array) -> Array:
+        """What (n, columns) replaces the limit from the left."""
+        ...
+
+    def error(self, reached: Array, error: Array) -> Array:
+        """What becomes of small errors (e, n, columns) of that limit."""
+        ...
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """The equation, and which other signals of the solution have to be resolved by the mesh.
+
+    ``coefficients(t, inside)`` evaluates E, A, f at times of shape (N,); functions that jump are
+    decided at ``inside``. It is called once for each element, at all of its points.
+    ``monitor`` returns further signals computed from the solution, grouped by kind: (point values
+    (K, s + 1, c), size below which that kind is rounding).
+    """
+
+    coefficients: Callable[[Array, Array], LinearEquation]
+    start: Array  # (n, columns)
+    monitor: Monitor | None = None
+    name: str = "equation"
+    # Size below which the solution itself is rounding, or one (n, 1) for each component.
+    floor: float | Array = 0.0
+    # (n, n + 1) by how much relative rounding of the components, and of 1, reaches each component
+    amplification: Array | None = None
+    renewal: Renewal | None = None
+    # Whether components have units of their own: then one that is small beside the others counts
+    # for itself, unless it is small beside what it is made of.
+    apart: bool = False
