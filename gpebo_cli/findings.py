@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isfinite
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Requirement:
     holds: bool
     evidence: Mapping[str, float]
     text: str  # one sentence
+    gain: float = float("nan")  # the least that would do, infinite if none does; NaN: it has none
 
 
 @dataclass(frozen=True)
@@ -36,3 +38,10 @@ class Assumption:
     statement: str  # what it says, one line
     holds: bool
     evidence: Mapping[str, float | int | str | None]
+
+
+def would_do(gain: float, least: float) -> str:
+    """What a requirement's text says of the least gain that would do, if this one is less."""
+    if gain >= least:
+        return ""
+    return f": γ ≥ {least:.2g}" if isfinite(least) else ": no γ would do"

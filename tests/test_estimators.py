@@ -382,6 +382,27 @@ def test_many_rows_of_rough_data(name):
     np.testing.assert_allclose(final, ETA, atol=0.02)
 
 
+@pytest.mark.parametrize("name", ["drem", "lion", "ls_drem", "fct"])
+def test_a_gain_that_is_auto_settles_before_the_end(name):
+    built = estimators.tuned(estimators.build({"name": name, "gamma": "auto"}), CLEAN)
+    (case,) = built.cases
+    error = np.linalg.norm(built.estimate(CLEAN, T).parameters(slice(None))[0] - ETA, axis=1)
+    assert error[-1] < 0.01 * error[0]
+    least = built.estimate(CLEAN, T).requirement.gain
+    assert case["gamma"] == pytest.approx(10.0 * least, rel=1e-6)
+    # What the text of a gain that is too small says would do, does; half of it does not.
+    said = estimate(name, CLEAN, gamma=least / 100).requirement
+    assert not said.holds
+    assert f"γ ≥ {least:.2g}" in said.text
+    assert estimate(name, CLEAN, gamma=1.01 * least).requirement.holds
+    assert not estimate(name, CLEAN, gamma=0.5 * least).requirement.holds
+
+
+def test_a_gain_that_is_auto_is_not_for_samples():
+    with pytest.raises(ConfigError, match="auto needs to know the signals to their end"):
+        estimators.build({"name": "drem", "gamma": "auto"}).recursive(["a"])
+
+
 # --- gains ----------------------------------------------------------------------------------
 
 
@@ -426,6 +447,7 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "dream"}, "'dream' is not an estimator"),
         ({"name": "drem", "gamma": -1}, "positive number"),
         ({"name": "drem", "gamma": []}, "empty list"),
+        ({"name": "gradient", "gamma": "auto"}, "'auto' is not a positive number"),
         ({"name": "drem", "gamma": "logspace(0, 400, 5)"}, "±300"),
         ({"name": "drem", "gamma": "import os"}, "not a positive number"),
         ({"name": "drem", "gamma": float("nan")}, "positive number"),

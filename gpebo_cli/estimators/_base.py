@@ -10,10 +10,10 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from math import prod
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from gpebo_cli.schema import Accepted, number, per_name
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
 _MAX_CASES = 10_000_000
+_AMPLE = 10.0  # times the least gain that would do: 1 % long before the end
 _MANY = 8  # numbers, from which on looking at them one by one is what takes the time
 
 
@@ -36,17 +37,23 @@ class _Gain:
 
     accept: Accepted
     by_parameter: bool
+    auto: bool
 
 
-def gain(default: object, accept: Accepted = "positive", *, by_parameter: bool = False) -> Any:
+def gain(
+    default: object, accept: Accepted = "positive", *, by_parameter: bool = False,
+    auto: bool = False,
+) -> Any:
     """A field of an estimator that is a gain: a number, a list, or ``logspace(a, b, n)``.
 
     Args:
         default: its value where nothing is said.
         accept: which numbers it may be.
         by_parameter: whether it may also be a mapping by parameter, which makes one case.
+        auto: whether it may be ``auto``, which :meth:`GainEstimator.tuned` replaces: the larger the
+            gain the faster, and the requirement says which one is the least.
     """
-    return field(default=default, metadata={"gain": _Gain(accept, by_parameter)})
+    return field(default=default, metadata={"gain": _Gain(accept, by_parameter, auto)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +81,8 @@ class GainEstimator(ABC):
             if declared.by_parameter and isinstance(value, Mapping):
                 for key, of_one in value.items():
                     axes[f"{own.name}_{key}"] = (number(of_one, f"{where}.{key}", declared.accept),)
+            elif declared.auto and is_auto(value):
+                axes[own.name] = (float("nan"),)
             else:
                 axes[own.name] = axis(value, where, declared.accept)
         return axes
@@ -83,6 +92,21 @@ class GainEstimator(ABC):
         """Every combination of the gains; the last one that is declared varies fastest."""
         return combinations(self.axes())
 
+    def tuned(self, regression: LinearRegression) -> Self:
+        """The same with a number for a gain that is ``auto``: ten times the least that would do.
+
+        The least is that of the requirement for γ = 1 over the whole regression; where no gain
+        would do, it is the default one.
+        """
+        chosen = {}
+        for own in fields(self):
+            if "gain" in own.metadata and is_auto(getattr(self, own.name)):
+                once: dict[str, Any] = {own.name: 1.0}
+                found = replace(self, **once).estimate(regression, regression.mesh.edges[-1:])
+                least = found.requirement.gain
+                chosen[own.name] = _AMPLE * least if 0.0 < least < np.inf else own.default
+        return replace(self, **chosen)
+
     def gains(self, name: str, parameters: Sequence[str]) -> Array:
         """The values of one gain, shape (g, 1), or (1, p) where it is a mapping by parameter.
 
@@ -90,6 +114,11 @@ class GainEstimator(ABC):
             ConfigError: a mapping that does not name every parameter.
         """
         value, where = getattr(self, name), f"estimator.{name}"
+        if is_auto(value):
+            raise ConfigError(
+                f"{where}: auto needs to know the signals to their end; give a number at samples, "
+                "with resets and in streams"
+            )
         if isinstance(value, Mapping):
             return per_name(value, parameters, "parameter", where, "positive")[None]
         return np.array(axis(value, where))[:, None]
@@ -142,6 +171,11 @@ def filtered_errors(
     B = np.concatenate([into, np.zeros_like(into)], axis=1)
     C = np.concatenate([np.zeros((p, p)), np.eye(p)], axis=1)[None]
     return ErrorSystem(A, B, C, np.zeros((1, p, rows)))
+
+
+def is_auto(value: object) -> bool:
+    """Whether a gain is to be chosen when the excitation is known."""
+    return isinstance(value, str) and value == "auto"
 
 
 def axis(value: object, where: str, accept: Accepted = "positive") -> tuple[float, ...]:

@@ -13,7 +13,7 @@ from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
-from gpebo_cli.findings import Requirement
+from gpebo_cli.findings import Requirement, would_do
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
@@ -42,7 +42,7 @@ class FilteredEstimator(ResumableEstimator):
         initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
-    gamma: object = gain(1e10, by_parameter=True)
+    gamma: object = gain(1e10, by_parameter=True, auto=True)
     rates: object = field(default=None, metadata={"key": "lambda"})
 
     def resume(
@@ -124,7 +124,7 @@ def energy_requirement(
     needed_for: str = "1 % of the initial error",
 ) -> Requirement:
     """Whether ∫Δ² is enough at the smallest gain: the error shrinks by e^{−γ∫Δ²}."""
-    reached = gain * energy
+    reached, least = gain * energy, needed / energy if energy > 0.0 else float("inf")
     return Requirement(
         name=condition,
         holds=reached >= needed,
@@ -135,8 +135,9 @@ def energy_requirement(
         },
         text=(
             f"γ∫Δ² = {reached:.3g} at the smallest gain {gain:.3g}; "
-            f"{needed_for} needs {needed:.3g}"
+            f"{needed_for} needs {needed:.3g}{would_do(gain, least)}"
         ),
+        gain=least,
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gpebo_cli.estimators._base import GainEstimator
 from gpebo_cli.estimators._registry import able
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
@@ -21,6 +22,13 @@ from gpebo_cli.regression.resets import ExtensionState, Reset
 
 _FOLLOW = "observer.remedy=current_coordinates needs an estimator that can follow a state"
 _GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
+
+
+def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
+    """The estimator with numbers for gains that are ``auto``; one of another kind as it is."""
+    if not isinstance(estimator, GainEstimator) or regression.resets or regression.dynamics:
+        return estimator
+    return estimator.tuned(regression)
 
 
 def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Estimates:

@@ -39,7 +39,7 @@ class FiniteTime(ResumableEstimator):
     f0: object = gain(1e-4)
     beta: object = gain(0.0, "nonnegative")
     bound: object = None
-    gamma: object = gain(1e10, by_parameter=True)
+    gamma: object = gain(1e10, by_parameter=True, auto=True)
     rates: object = field(default=None, metadata={"key": "lambda"})
 
     @property

@@ -46,7 +46,7 @@ class LsDrem(ResumableEstimator):
     f0: object = gain(1e-4)
     beta: object = gain(0.0, "nonnegative")
     bound: object = None
-    gamma: object = gain(10.0, by_parameter=True)
+    gamma: object = gain(10.0, by_parameter=True, auto=True)
 
     @property
     def least_squares(self) -> LeastSquares:

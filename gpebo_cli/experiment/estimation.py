@@ -89,6 +89,7 @@ def continuous(
     with stage("estimate"):
         known = excitation.known
         determined = visible(observation, known, t, system.n)
+        estimator = estimators.tuned(estimator, regression)
         times = estimable(excitation, regression.parameters, system.states, determined)
         try:
             estimation, metrics = _estimate(
