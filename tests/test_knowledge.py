@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from test_cli import gpebo
 
+from gpebo_cli import run
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
@@ -151,3 +152,34 @@ def test_only_all_sensors_can_be_asked_for(half_seen):
     done = gpebo("check", "plant=circuit", "sensors=il", cwd=half_seen)
     assert done.returncode == 2
     assert "sensors=il: the only choice is sensors=all" in done.stderr
+
+
+def recorded(folder, plant=None, noise=0.01):
+    """The command's lines and summary for a recording of the plant, estimated with another one."""
+    rng = np.random.default_rng(0)
+    made = run(folder / "plant" / "half_seen.yaml", observer="none",
+               time={"horizon": 20, "samples": 2001})
+    y = made["y"] + noise * rng.normal(size=2001)
+    np.savetxt(folder / "r.csv", np.column_stack([made.t, made["u"], y]), delimiter=",",
+               header="t,u,y", comments="")
+    done = gpebo("run", "--config-dir", ".", "plant=half_seen", "data=csv", "data.file=r.csv",
+                 "estimator=ls_drem", "hydra.run.dir=out", *(plant or []), cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines(), json.loads((folder / "out" / "summary.json").read_text())
+
+
+def test_a_recording_gives_numbers_with_deviations_and_says_what_is_left(half_seen):
+    lines, summary = recorded(half_seen)
+    k1 = summary["estimates"]["k1"]
+    assert abs(k1["value"] - 2.0) < 4 * k1["std"] < 0.004
+    assert summary["estimates"]["k2"] == {"value": None, "std": None, "unit": None, "true": None}
+    assert any("k1" in line and "1.999" in line and "s" in line for line in lines)
+    assert any("k2" in line and "not determined" in line for line in lines)
+    assert "up to white noise" in lines[-1]
+    assert {"fit.png", "parameters.png"} <= {p.name for p in (half_seen / "out/figures").iterdir()}
+
+
+def test_a_wrong_plant_is_noticed(half_seen):
+    lines, summary = recorded(half_seen, ["plant.A=[[-1.05,1,0],[0,-0.6,0],[0,0,-2]]"])
+    assert summary["fit"]["white"] is False
+    assert "the residual is not white" in lines[-1]

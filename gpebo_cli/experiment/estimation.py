@@ -35,6 +35,7 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
 
 _SAMPLES_AT_ONCE = 2048
+_LAGS = 20  # of the residual's autocorrelation
 _PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that counts as this large
 _BATCH = 1 << 19  # numbers held at once while cases are evaluated: what fits the cache
@@ -100,11 +101,18 @@ def continuous(
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
     if settings.uncertainty and observation.estimator is None:
         with stage("uncertainty"):
+            reduced, columns = _reduced(observation, known.independent)
             found = standard_deviations(
-                observation, estimator, source, settings.noise, levels, estimation.t
+                reduced, estimator, source, settings.noise, levels, estimation.t
             )
             if found is not None:
-                estimation = replace(estimation, parameters_std=found[0], states_std=found[1])
+                deviations = np.full(estimation.parameters.shape, np.nan)
+                deviations[..., columns] = found[0]
+                deviations[np.isnan(estimation.parameters)] = np.nan
+                of_states = np.where(np.isnan(estimation.states), np.nan, found[1])
+                estimation = replace(
+                    estimation, parameters_std=deviations, states_std=of_states
+                )
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds"):
@@ -112,7 +120,7 @@ def continuous(
             noise = over_seeds(observation, source.true, estimator, truth, settings.noise, levels)
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
-        _fit(observation, estimation) if source.recording else None, times, noise,
+        _fit(observation, estimation, system, source) if source.recording else None, times, noise,
         observation.estimator is not None, observation.note,
     )
 
@@ -195,7 +203,7 @@ def _estimate(
     determined = np.ones(p, dtype=bool)
     if observation.names is None and observation.estimator is None:
         determined = known.parameters[-1]
-        estimates, columns = _estimates(estimator, regression, grid, known.independent)
+        estimates, columns = _estimates(estimator, observation, grid, known.independent)
     else:
         seen = np.ones(n, dtype=bool)
         estimates, columns = estimators.estimate(estimator, regression, grid), np.arange(p)
@@ -232,22 +240,35 @@ def _estimate(
 
 
 def _estimates(
-    estimator: estimators.Estimator, regression: LinearRegression, grid: Array, columns: IntArray
+    estimator: estimators.Estimator, observation: Observation, grid: Array, columns: IntArray
 ) -> tuple[estimators.Estimates, IntArray]:
     """The estimates of some of the parameters, and of which: all, where settings are one each."""
-    everything = np.arange(regression.p)
-    plain = not regression.resets and regression.dynamics is None
-    if len(columns) in (0, regression.p) or not plain:
-        return estimators.estimate(estimator, regression, grid), everything
-    some = replace(
-        regression, psi=Trajectory(regression.mesh, regression.psi.values[..., columns]),
-        parameters=tuple(regression.parameters[j] for j in columns),
-        scale=np.broadcast_to(regression.scale, (regression.mesh.size, regression.p))[:, columns],
-    )
+    reduced, columns = _reduced(observation, columns)
     try:
-        return estimators.estimate(estimator, some, grid), columns
-    except ConfigError:  # as many numbers in its settings as parameters
-        return estimators.estimate(estimator, regression, grid), everything
+        return estimators.estimate(estimator, reduced.regression, grid), columns
+    except ConfigError:
+        if reduced is observation:
+            raise
+        # As many numbers in its settings as parameters.
+        whole = observation.regression
+        return estimators.estimate(estimator, whole, grid), np.arange(whole.p)
+
+
+def _reduced(observation: Observation, columns: IntArray) -> tuple[Observation, IntArray]:
+    """The observation about some of the parameters, the others being zero, and about which."""
+    whole, state_map = observation.regression, observation.state_map
+    plain = not whole.resets and whole.dynamics is None and observation.names is None
+    if len(columns) in (0, whole.p) or not plain or not isinstance(state_map, AffineStateMap):
+        return observation, np.arange(whole.p)
+    regression = replace(
+        whole, psi=Trajectory(whole.mesh, whole.psi.values[..., columns]),
+        parameters=tuple(whole.parameters[j] for j in columns),
+        scale=np.broadcast_to(whole.scale, (whole.mesh.size, whole.p))[:, columns],
+    )
+    gain = Trajectory(state_map.gain.mesh, state_map.gain.values[..., columns])
+    return replace(
+        observation, regression=regression, state_map=replace(state_map, gain=gain)
+    ), columns
 
 
 def _natural_sizes(regression: LinearRegression, p: int) -> Array:
@@ -356,8 +377,11 @@ def _evaluation(
     return evaluate_affine
 
 
-def _fit(observation: Observation, estimation: EstimationResult) -> Fit | None:
-    """Root mean squares over time of Y − ψη̂ with the final estimates, and of Y."""
+def _fit(
+    observation: Observation, estimation: EstimationResult, system: DescriptorSystem,
+    source: Source,
+) -> Fit | None:
+    """Root mean squares over time of Y − ψη̂ with the final estimates, and of Y; the fitted ŷ."""
     regression = observation.regression
     if estimation.names != regression.parameters:
         return None
@@ -368,4 +392,41 @@ def _fit(observation: Observation, estimation: EstimationResult) -> Fit | None:
         return float(np.sqrt(max(float(square.integral().final), 0.0) / duration))
 
     Y, psi = regression.Y.values, regression.psi.values
-    return Fit(np.array([rms(Y - psi @ eta[-1]) for eta in estimation.parameters]), rms(Y))
+    # What is not determined was zero, and matters neither to Y nor to what is.
+    final = np.nan_to_num(estimation.parameters[:, -1])
+    fit = Fit(np.array([rms(Y - psi @ eta) for eta in final]), rms(Y))
+    if regression.resets or regression.dynamics is not None:
+        return fit
+    return _explained(fit, final[fit.best], observation.state_map, system, source)
+
+
+def _explained(
+    fit: Fit, eta: Array, state_map: StateMap, system: DescriptorSystem, source: Source
+) -> Fit:
+    """With ŷ = C x̂ + D u + H θ̂ of the final estimates η̂ (p,), and how white y − ŷ is."""
+    t, recording = source.t, source.recording
+    if recording is None or len(state_map.times):
+        return fit
+    x = state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
+    u, y = recording.inputs, recording.outputs
+    c = system.coefficients.taylor(t, 0, signals=np.hstack([u, y])[None])
+    fitted = sum(
+        np.matmul(matrix[0], signal[..., None])[..., 0]
+        for matrix, signal in ((c.C, x), (c.D, u), (c.H, np.tile(eta[: system.q], (len(t), 1))))
+    )
+    # Two samples apart: between samples the signals are interpolated and no noise is white.
+    apart = 2.0 * (recording.last - recording.first) / max(recording.rows - 1, 1)
+    stride = max(1, int(np.ceil(apart / (t[1] - t[0]))))
+    residual = (y - fitted)[::stride]
+    residual = residual - residual.mean(axis=0)
+    power = (residual**2).sum(axis=0)
+    count, seen = len(residual), power > 0.0
+    lags = range(1, min(_LAGS, count // 4) + 1)
+    if not seen.any() or not lags:
+        return replace(fit, outputs=fitted)
+    correlation = np.array([
+        ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
+    ])
+    return replace(
+        fit, outputs=fitted, correlation=correlation, band=1.96 / np.sqrt(count * seen.sum())
+    )

@@ -10,11 +10,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import numpy as np
+
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.settings import Settings
+
+_OUTSIDE = 0.15  # share of correlations outside a band that white noise leaves with 5 % of them
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,21 @@ class Fit:
 
     residual: Array  # (G,) root mean square over time of ‖Y − ψη̂(end)‖
     size: float  # the same of ‖Y‖
+    outputs: Array | None = None  # (N, r) ŷ of the best case at the times of the signals
+    correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
+    band: float = np.nan  # 95 % of the correlations of white noise are within
+
+    @property
+    def white(self) -> bool | None:
+        """Whether the residual looks like white noise; None: it was not looked at."""
+        if self.correlation is None:
+            return None
+        return bool((np.abs(self.correlation) > self.band).mean() <= _OUTSIDE)
+
+    @property
+    def best(self) -> int:
+        """The case with the least residual."""
+        return int(np.argmin(np.where(np.isfinite(self.residual), self.residual, np.inf)))
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from gpebo_cli.experiment.result import Fit, SimulationResult
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 
+_EXACT = 1e-4  # of Y: what is left is the interpolation between samples
+
 
 def verdict(
     excitation: Excitation, cases: Sequence[Mapping[str, float]], requirement: Requirement,
@@ -43,19 +45,33 @@ def verdict(
         reached = f"below 1 % after {seconds:.4g} s" if isfinite(seconds) else "never below 1 %"
         parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end, {reached}")
     elif fit is not None:
-        best = int(np.argmin(np.where(np.isfinite(fit.residual), fit.residual, np.inf)))
+        best = fit.best
     else:
         best = 0
     if fit is not None:
         parts.append(
             f"|Y − ψη̂| with the final estimates is {fit.residual[best]:.2g}, |Y| is "
-            f"{fit.size:.2g} (root mean squares)"
+            f"{fit.size:.2g} (root mean squares){_explains(fit, best)}"
         )
     label = _case_label(cases[best])
     line = "; ".join(parts) + (f" ({label})" if label else "")
     if not requirement.holds:
         line += f"; {requirement.name} not met: {requirement.text}"
     return line
+
+
+def _explains(fit: Fit, case: int) -> str:
+    """What the residual says of the model."""
+    if fit.correlation is None:
+        return ""
+    if fit.residual[case] <= _EXACT * fit.size:
+        return ": the estimates explain the data"
+    if fit.white:
+        return ": the estimates explain the data up to white noise"
+    return (
+        f": the residual is not white (its correlation is {np.abs(fit.correlation).max():.2f}), "
+        "which suggests a missing or wrong parameter, a drifting sensor, or a delay"
+    )
 
 
 def simulation_verdict(simulated: SimulationResult) -> str:

@@ -110,6 +110,28 @@ def parameters(result: RunResult) -> list[Panel]:
     return _with_legend(panels, _note(estimation))
 
 
+def fit(result: RunResult) -> list[Panel]:
+    """Measured outputs with those of the final estimates, the difference below; of a recording."""
+    found = result.fit
+    if found is None or found.outputs is None:
+        return []
+    s, labels = result.signals, result.system.labels
+    panels = []
+    for i, name in enumerate(result.system.outputs):
+        unit, text = result.system.units.get(name, ""), typeset(name, labels)
+        measured, fitted = s.outputs[:, i], found.outputs[:, i]
+        curves = (
+            Curve(s.t, measured, f"{name} measured", style.MEASURED, f"{text} measured"),
+            Curve(s.t, fitted, f"{name} fitted", line(0), f"{text} fitted"),
+        )
+        left = (Curve(s.t, measured - fitted, "", line(1)),)
+        panels += [
+            Panel(name, curves, unit, text, legend=True),
+            Panel(f"residual of {name}", left, unit, f"residual of {text}"),
+        ]
+    return panels
+
+
 def parameter_error(result: RunResult) -> list[Panel]:
     """Fig. 6: error of every parameter (for the circuit, the initial conditions).
 

@@ -8,6 +8,7 @@ FIGURE_NAMES = (
     "estimates_a",
     "estimates_b",
     "parameters",
+    "fit",
     "parameter_error",
     "state_error",
     "state_error_a",

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import NoiseStatistics, RunResult
 
@@ -69,6 +71,30 @@ def noise_table(noise: NoiseStatistics) -> list[str]:
     return columns([head, *body]) + ([f"… {more} more cases in noise.csv"] if more else [])
 
 
+def estimate_table(result: RunResult) -> list[str]:
+    """Each estimate of a recording with its deviation and unit, and since when it stands."""
+    from gpebo_cli.results.summary import estimates_at_end
+
+    estimation = result.estimation
+    if estimation is None:
+        return []
+    case = result.fit.best if result.fit is not None else 0
+    over_time = np.concatenate([estimation.states[case], estimation.parameters[case]], axis=1)
+    names = [*result.system.states, *estimation.names]
+    rows = [["", "estimate", "± std", "unit", "within 1 % of the end since"]]
+    for name, told in estimates_at_end(result, case).items():
+        value, std = told["value"], told["std"]
+        if not math.isfinite(value):
+            rows.append([name, "not determined", "", told["unit"] or "", ""])
+            continue
+        away = np.abs(over_time[:, names.index(name)] - value) > 0.01 * abs(value)
+        first = int(len(away) - np.argmax(away[::-1])) if away.any() else 0
+        since = f"{estimation.t[first]:.4g} s" if name in estimation.names else ""
+        deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
+        rows.append([name, f"{value:.6g}", deviation, told["unit"] or "", since])
+    return columns(rows)
+
+
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Rows of text as lines with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -93,6 +119,8 @@ def run_lines(result: RunResult, folder: str = "") -> list[str]:
     lines: list[str] = []
     if rows and result.estimation is not None:
         lines += case_table(rows, list(result.estimation.cases[0]))
+    if result.recording is not None:
+        lines += estimate_table(result)
     if result.noise is not None:
         lines += noise_table(result.noise)
     changes = result.simulation.moved if result.simulation else ()

@@ -146,6 +146,7 @@ def _fit(fit: Fit | None) -> dict[str, Any] | None:
         "rms_Y": fit.size,
         "rms_residual": listed,
         "least_rms_residual": finite.min() if finite.size else None,
+        "white": fit.white,
     }
 
 
@@ -178,16 +179,17 @@ def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
         (estimation.names, estimation.parameters, estimation.parameters_std,
          estimation.true_parameters[-1]),
     )
-    out = {
-        name: {
-            "value": values[case, -1, i],
-            "std": None if std is None else std[case, -1, i],
-            "unit": units.get(name.removeprefix("e0_")),
-            "true": truth[i],
-        }
-        for names, values, std, truth in kinds
-        for i, name in enumerate(names)
-    }
+    out = {}
+    for names, values, deviations, truth in kinds:
+        for i, name in enumerate(names):
+            stated = estimation.checks.get(f"{name}_std")  # of an observer that estimates itself
+            std = None if deviations is None else deviations[case, -1, i]
+            out[name] = {
+                "value": values[case, -1, i],
+                "std": stated[case, -1] if std is None and stated is not None else std,
+                "unit": units.get(name.removeprefix("e0_")),
+                "true": truth[i],
+            }
     return {name: out[name] for name in (*estimation.names, *result.system.states)}
 
 
