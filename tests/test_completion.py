@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import fields
 from typing import get_args, get_type_hints
 
 import pytest
@@ -18,7 +17,7 @@ from examples import ROOT, environment
 from gpebo_cli.cli.app import COMMANDS
 from gpebo_cli.cli.completion import SCRIPTS, candidates
 from gpebo_cli.configs.locations import GROUPS
-from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.evidence.metrics import NAMES
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.results.figures import FIGURES
 from gpebo_cli.results.names import FIGURE_NAMES, METRICS
@@ -106,7 +105,7 @@ def test_what_cannot_be_completed_is_nothing():
 
 def test_names_that_are_written_twice_agree():
     assert tuple(FIGURES) == FIGURE_NAMES
-    assert tuple(field.name for field in fields(Metrics)) == METRICS
+    assert NAMES == METRICS
     regressions = get_args(get_type_hints(Gpebo)["regression"])
     offered = set(names("run", "observer.regression="))
     assert offered == {f"observer.regression={name}" for name in regressions}
