@@ -164,27 +164,27 @@ def test_jets_refuses_programs_that_lead_out_of_the_arrays():
 
     assert COMPILED.jets(t, t, none, *good) is not None
     for place, index, value, what in [
-        (0, (0, 0), 99, "operations: no such one as 99"),
-        (0, (0, 1), 1, "rows: no such one as 1"),
-        (0, (0, 1), 50, "rows: no such one as 50"),
+        (0, (0, 0), 99, "operations: 99 will not do"),
+        (0, (0, 1), 1, "rows: 1 will not do"),
+        (0, (0, 1), 50, "rows: 50 will not do"),
         (0, (0, 2), 50, "left operands"),
         (0, (0, 2), -50, "left operands"),
         (2, (0, 0), 50, "rows of results"),
         (2, (0, 0), -50, "rows of results"),
-        (3, (0, 0), 10, "matrices: no such one as 10"),
-        (3, (0, 1), 9, "entries: no such one as"),
+        (3, (0, 0), 10, "matrices: 10 will not do"),
+        (3, (0, 1), 9, "entries: "),
     ]:
         with pytest.raises(ValueError, match=what):
             COMPILED.jets(t, t, none, *changed(place, index, value))
-    with pytest.raises(ValueError, match="times: 3 and 2"):
+    with pytest.raises(ValueError, match="expected 3"):
         COMPILED.jets(t, t[:2], none, *good)
-    with pytest.raises(ValueError, match="times of signals: 2 and 3"):
+    with pytest.raises(ValueError, match="expected 3"):
         COMPILED.jets(t, t, np.zeros((1, 2)), *good)
-    with pytest.raises(ValueError, match="orders of a matrix"):
+    with pytest.raises(ValueError, match="in a matrix"):
         COMPILED.jets(t, t, none, *good[:4], *(matrix[:1] for matrix in good[4:]))
-    with pytest.raises(ValueError, match="times in a matrix"):
+    with pytest.raises(ValueError, match="in a matrix"):
         COMPILED.jets(t, t, none, *good[:4], *(np.repeat(matrix, 2, axis=1) for matrix in good[4:]))
-    with pytest.raises(TypeError, match="arguments, expected"):
+    with pytest.raises(TypeError, match="arguments"):
         COMPILED.jets(t, t, none, *good[:4])
     with pytest.raises(TypeError, match="argument 7 must be an array"):
         COMPILED.jets(t, t, none, *good[:4], None)
@@ -230,7 +230,7 @@ def test_a_pulse_between_the_nodes_is_far_from_the_polynomial():
     seen = np.sin(t).reshape(1, -1, 1) * [1.0, 1.0, 2.0]
     seen[0, looks + 2, 2] += 4.0
     still = np.ones((1, nodal.shape[1], 1)), np.ones((1, seen.shape[1], 1))
-    far = COMPILED.missed_between(between, nodal, seen, *still)
+    far = simulate._missed_between(between, nodal, seen, *still)
     np.testing.assert_array_equal(far[1], 0.0)
     np.testing.assert_allclose(far[0], [0.0, 4.0 / seen.max(), 0.0], atol=1e-6)
 
@@ -268,21 +268,6 @@ def test_growth_and_jumps_leave_the_mesh_as_it_was():
     one, other = by_both(lambda: simulate.simulate(system, TimeSettings(0.0, 2.0), settings))
     np.testing.assert_array_equal(one.signals.mesh.edges, other.signals.mesh.edges)
     np.testing.assert_allclose(one.signals.states.values, other.signals.states.values, atol=1e-10)
-
-
-def test_kernels_of_the_mesh_refuse_arrays_that_do_not_fit():
-    between, nodal, seen = np.zeros((4, 5)), np.zeros((1, 8, 1)), np.zeros((1, 10, 1))
-    for bad, what in [
-        ((between, nodal, seen[:, :9]), "looks: 9 and 10"),
-        ((between, nodal[:, :7], seen), "nodes: 7 and 4"),
-        ((between, nodal, np.zeros((1, 10, 2))), "entries: 1 and 2"),
-        ((between, nodal[:0], seen), "orders: no such one as 0"),
-        ((between, nodal, seen, np.zeros((1, 4, 1)), np.zeros((1, 5, 1))), "nodes: 4 and 8"),
-    ]:
-        with pytest.raises(ValueError, match=what):
-            COMPILED.missed_between(*bad)
-    with pytest.raises(TypeError, match="arguments, expected"):
-        COMPILED.missed_between(between, nodal)
 
 
 def test_a_mesh_without_breakpoints_has_the_edges_of_one_with_them():

@@ -14,7 +14,6 @@ import numpy as np
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, Requirement
-from gpebo_cli.kernels import spectra
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
@@ -82,13 +81,13 @@ def assess(
 
     def reached(at: Array, matrices: Array) -> Array:
         """At least 0 where ψ is exciting; to be read as a distance from that in logarithms."""
-        smallest = spectra.eigenvalues(matrices)[:, 0]
+        smallest = _eigenvalues(matrices)[:, 0]
         level = known(at, matrices).margin if rho is None else smallest / rho
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
     values = gram(t)
     return excitation(
-        known(t, values), t, regression.parameters, np.maximum(spectra.eigenvalues(values), 0.0),
+        known(t, values), t, regression.parameters, np.maximum(_eigenvalues(values), 0.0),
         segment_level(regression, t, window), window, _first_time(gram, reached), rho,
     )
 
@@ -192,7 +191,7 @@ def segment_level(regression: LinearRegression, t: Array, window: float) -> Arra
         here = np.flatnonzero(b > a)
         gram[here] += between(segment.outer, a[here], b[here])
         before = segment
-    level[whole] = np.maximum(spectra.eigenvalues(gram)[:, 0], 0.0)
+    level[whole] = np.maximum(_eigenvalues(gram)[:, 0], 0.0)
     return level
 
 
@@ -217,7 +216,7 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     to_there = mesh.sampler(t)
     to_there = Sampler(to_there.element[whole], to_there.weights[whole])
     sums = _window_sums(outer, from_there, to_there, outer.values.shape[2])
-    level[whole] = np.maximum(spectra.eigenvalues(sums)[:, 0], 0.0)
+    level[whole] = np.maximum(_eigenvalues(sums)[:, 0], 0.0)
     return level
 
 
@@ -260,7 +259,7 @@ def sampled_window_level(regression: SampledRegression, window: float) -> Array:
     first = np.searchsorted(t, t[whole] - window + slack, side="right")
     pairs = np.stack([first, whole + 1], axis=1).ravel()
     sums = np.add.reduceat(steps, pairs, axis=0)[::2]
-    level[whole] = np.maximum(spectra.eigenvalues(sums)[:, 0], 0.0)
+    level[whole] = np.maximum(_eigenvalues(sums)[:, 0], 0.0)
     return level
 
 
@@ -290,3 +289,8 @@ def persistent(outer: Trajectory, gain: float) -> Requirement:
             f"{gain * level:.3g}; 1 % of the initial error needs {needed:.3g}"
         ),
     )
+
+
+def _eigenvalues(matrices: Array) -> Array:
+    """Of symmetric matrices (N, p, p), ascending (N, p); further columns are not looked at."""
+    return np.asarray(np.linalg.eigvalsh(matrices[..., : matrices.shape[1]]), dtype=np.float64)

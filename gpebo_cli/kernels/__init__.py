@@ -21,7 +21,7 @@ _COMPILED = _ASKED != "numpy" and find_spec(f"{__name__}._compiled") is not None
 if _ASKED == "compiled" and not _COMPILED:
     raise ImportError("GPEBO_KERNELS=compiled, but nothing was compiled when gpebo was installed")
 
-SUBJECTS = ("elements", "expressions", "laws", "observer", "signals", "spectra", "structure")
+SUBJECTS = ("elements", "expressions", "laws", "observer", "signals", "structure")
 
 
 def kind() -> str:
@@ -35,12 +35,10 @@ if TYPE_CHECKING:
     from gpebo_cli.kernels import laws_numpy as laws
     from gpebo_cli.kernels import observer_numpy as observer
     from gpebo_cli.kernels import signals_numpy as signals
-    from gpebo_cli.kernels import spectra_numpy as spectra
     from gpebo_cli.kernels import structure_numpy as structure
 
     __all__ = [
-        "SUBJECTS", "elements", "expressions", "kind", "laws", "observer", "signals", "spectra",
-        "structure",
+        "SUBJECTS", "elements", "expressions", "kind", "laws", "observer", "signals", "structure",
     ]
 else:
     for _subject in SUBJECTS:

@@ -173,8 +173,16 @@ static Outcome element_maps(Call *call)
     Moving at_points[5];
     for (int i = 0; i < 5; i++)
         at_points[i] = (Moving){call->in[2 + i], call->step[2 + i]};
-    Equation q = {.s = s, .d = d, .n = n, .columns = columns, .D = call->in[0], .h = call->in[1],
-                  .E = at_points[0], .A = at_points[1], .f = at_points[2], .T = at_points[3],
+    Equation q = {.s = s,
+                  .d = d,
+                  .n = n,
+                  .columns = columns,
+                  .D = call->in[0],
+                  .h = call->in[1],
+                  .E = at_points[0],
+                  .A = at_points[1],
+                  .f = at_points[2],
+                  .T = at_points[3],
                   .p = at_points[4]};
     if ((q.T.from == NULL) != (q.p.from == NULL) || (q.T.from == NULL && d != n) ||
         (q.T.from != NULL && q.E.from == NULL))
@@ -208,7 +216,8 @@ static Outcome element_maps(Call *call)
         for (npy_intp k = first; k < K && found < sizes[g]; k++)
             if (group[k] == g)
                 members[found++] = k;
-        if (found && !solve_group(&q, members, found, W, call->out[0] + g * s * n * n, call->out[1]))
+        if (found &&
+            !solve_group(&q, members, found, W, call->out[0] + g * s * n * n, call->out[1]))
             return DECLINED;
     }
     return DONE;

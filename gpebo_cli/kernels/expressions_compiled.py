@@ -7,4 +7,3 @@ from gpebo_cli.kernels import _compiled
 RUNS_PROGRAMS = True
 jets = _compiled.jets
 intervals = _compiled.intervals
-missed_between = _compiled.missed_between

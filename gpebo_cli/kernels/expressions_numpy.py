@@ -7,8 +7,6 @@ leave the work to it.
 
 from __future__ import annotations
 
-import numpy as np
-
 from gpebo_cli.kernels.arrays import Array, IntArray
 
 RUNS_PROGRAMS = False
@@ -52,25 +50,3 @@ def intervals(
     """
     del low, high, inside, code, constants, results
     return None
-
-
-def missed_between(between: Array, *pairs: Array) -> Array:
-    """How far functions are from the polynomials through their nodes, (pairs, K), relative.
-
-    Args:
-        between: the polynomial at the places between, from its points (s + 1, looks).
-        pairs: values (orders, K (s + 1), ...) at the points and (orders, K looks, ...) between, of
-            one function after the other; the first order counts, of entries that move the worst.
-    """
-    points, looks = between.shape
-    found = []
-    for nodal, seen in zip(pairs[::2], pairs[1::2], strict=True):
-        nodes = nodal[0].reshape(nodal.shape[1] // points, points, -1)
-        actual = seen[0].reshape(len(nodes), looks, -1)
-        first = nodes[:1, :1]
-        moves = (nodes != first).any(axis=(0, 1)) | (actual != first).any(axis=(0, 1))
-        nodes, actual = nodes[..., moves], actual[..., moves]
-        size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodes).max(axis=(0, 1)))
-        far = np.abs(between.T @ nodes - actual).max(axis=1) / size
-        found.append(far.max(axis=1, initial=0.0))
-    return np.array(found)

@@ -1,6 +1,4 @@
 /* Known functions over cells of time: gpebo_cli/model/expressions/intervals.py and bounds.py. */
-#include "common.h"
-
 #include "program.h"
 
 #define WIDER (4 * 2.220446049250313e-16)
@@ -124,7 +122,8 @@ static inline Interval image(npy_intp what, Interval a, Interval b, int same_row
     case COSH: return widened(cosh(nearest_to_zero(a)), cosh(largest(a)));
     case TANH: return rising(tanh, a, -INFINITY, INFINITY);
     case ASIN: return rising(asin, a, -1.0, 1.0);
-    case ACOS: return widened(acos(fmax(-1.0, fmin(1.0, a.high))), acos(fmax(-1.0, fmin(1.0, a.low))));
+    case ACOS:
+        return widened(acos(fmax(-1.0, fmin(1.0, a.high))), acos(fmax(-1.0, fmin(1.0, a.low))));
     case ATAN: return rising(atan, a, -INFINITY, INFINITY);
     case ASINH: return rising(asinh, a, -INFINITY, INFINITY);
     case ACOSH: return rising(acosh, a, 1.0, INFINITY);
@@ -134,61 +133,46 @@ static inline Interval image(npy_intp what, Interval a, Interval b, int same_row
     }
 }
 
-/* intervals(low (N,), high (N,), inside (N,), code (operations, 4), constants (c,),
-             results (orders, outputs))
-
-   least, most (orders, N, outputs): bounds of the outputs of the code, see expressions/program.py,
-   for all times of each cell; jumps are decided at `inside` where the code says so. */
-static PyObject *intervals(PyObject *module, PyObject *const *given, Py_ssize_t count)
+/* Bounds of the results of the code at one cell, whose first two rows are given. */
+static void run_cell(const Call *call, Interval *row)
 {
-    (void)module;
-    Call call;
-    if (!begin(&call, given, count, 6))
-        return NULL;
-    PyArrayObject *low = doubles(&call, 0, 1), *high = low ? doubles(&call, 1, 1) : NULL;
-    PyArrayObject *inside = high ? doubles(&call, 2, 1) : NULL;
-    PyArrayObject *code = inside ? indices(&call, 3, 2) : NULL;
-    PyArrayObject *constants = code ? doubles(&call, 4, 1) : NULL;
-    PyArrayObject *rows_of_results = constants ? indices(&call, 5, 2) : NULL;
-    if (rows_of_results == NULL || !same("cells", size(low, 0), size(high, 0)) ||
-        !same("cells", size(low, 0), size(inside, 0)) ||
-        !same("numbers of an operation", size(code, 1), 4))
-        return failed(&call);
-    const npy_intp cells = size(low, 0), operations = size(code, 0);
-    const npy_intp orders = size(rows_of_results, 0), outputs = size(rows_of_results, 1);
-    const npy_intp shape[] = {orders, cells, outputs};
-    const npy_intp used = rows_used(code, GIVEN, size(constants, 0));
-    if (!used || !results_fit(rows_of_results, used, size(constants, 0)))
-        return failed(&call);
-    PyArrayObject *least = fresh(&call, 3, shape), *most = least ? fresh(&call, 3, shape) : NULL;
-    const double *constant = data(constants);
-    Interval *row = most ? (Interval *)old_scratch(&call, 2 * used) : NULL;
-    if (row == NULL)
-        return failed(&call);
-    const npy_intp *result = PyArray_DATA(rows_of_results);
-    double *to_low = data(least), *to_high = data(most);
-    for (npy_intp i = 0; i < cells; i++) {
-        row[0] = (Interval){data(low)[i], data(high)[i]};
-        row[1] = (Interval){data(inside)[i], data(inside)[i]};
-        const Operation *operation = PyArray_DATA(code);
-        for (npy_intp k = 0; k < operations; k++, operation++) {
-            const npy_intp left = operation->left, right = operation->right;
-            const Interval a = left < 0 ? (Interval){constant[~left], constant[~left]} : row[left];
-            const Interval b =
-                right < 0 ? (Interval){constant[~right], constant[~right]} : row[right];
-            row[operation->result] = image(operation->what, a, b, left == right && left >= 0);
-        }
-        for (npy_intp k = 0; k < orders; k++)
-            for (npy_intp j = 0; j < outputs; j++) {
-                const npy_intp from = result[k * outputs + j], to = (k * cells + i) * outputs + j;
-                const double x = from < 0 ? constant[~from] : 0.0;
-                to_low[to] = from < 0 ? (x == x ? x : -INFINITY) : row[from].low;
-                to_high[to] = from < 0 ? (x == x ? x : INFINITY) : row[from].high;
-            }
+    const Operation *operation = (const Operation *)call->index[3];
+    const double *constant = call->in[4];
+    for (npy_intp k = 0; k < SIZE(v); k++, operation++) {
+        const npy_intp left = operation->left, right = operation->right;
+        const Interval a = left < 0 ? (Interval){constant[~left], constant[~left]} : row[left];
+        const Interval b = right < 0 ? (Interval){constant[~right], constant[~right]} : row[right];
+        row[operation->result] = image(operation->what, a, b, left == right && left >= 0);
     }
-    return results(&call, 2, least, most);
 }
 
-PyMethodDef intervals_kernels[] = {
-    KERNEL(intervals), {NULL, NULL, 0, NULL},
+/* low, high, inside, code, constants, rows of the results -> least, most; jumps are decided at
+   `inside` where the code says so. */
+static Outcome intervals(Call *call)
+{
+    const npy_intp N = SIZE(N), orders = SIZE(o), outputs = SIZE(j), constants = SIZE(c);
+    const npy_intp used = rows_used((const Operation *)call->index[3], SIZE(v), GIVEN, constants);
+    if (!used || !results_fit(call->index[5], orders * outputs, used, constants))
+        return ERROR;
+    Interval *row = (Interval *)scratch(call, 2 * used);
+    if (row == NULL)
+        return ERROR;
+    for (npy_intp i = 0; i < N; i++) {
+        row[0] = (Interval){call->in[0][i], call->in[1][i]};
+        row[1] = (Interval){call->in[2][i], call->in[2][i]};
+        run_cell(call, row);
+        for (npy_intp k = 0; k < orders * outputs; k++) {
+            const npy_intp from = call->index[5][k];
+            const npy_intp to = (k / outputs * N + i) * outputs + k % outputs;
+            const double x = from < 0 ? call->in[4][~from] : 0.0;
+            call->out[0][to] = from < 0 ? (x == x ? x : -INFINITY) : row[from].low;
+            call->out[1][to] = from < 0 ? (x == x ? x : INFINITY) : row[from].high;
+        }
+    }
+    return DONE;
+}
+
+const Kernel interval_kernels[] = {
+    {"intervals", "N N N @v4 c @oj", "oNj oNj", intervals},
+    {NULL, NULL, NULL, NULL},
 };

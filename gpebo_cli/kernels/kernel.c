@@ -105,8 +105,8 @@ static PyArrayObject *laid_out(Call *call, PyArrayObject *given, int type, int t
     }
     if (usable)
         return given;
-    return (PyArrayObject *)keep(
-        call, PyArray_FROM_OTF((PyObject *)given, type, NPY_ARRAY_CARRAY_RO));
+    return (PyArrayObject *)keep(call,
+                                 PyArray_FROM_OTF((PyObject *)given, type, NPY_ARRAY_CARRAY_RO));
 }
 
 /* One argument that is an array, as `word` describes it. */
@@ -143,7 +143,9 @@ static int array_argument(Call *call, int place, PyObject *given, const char *wo
 static int define(Call *call, const char *word)
 {
     const npy_intp left = call->size[(int)word[2]], right = call->size[(int)word[4]];
-    const npy_intp value = word[3] == '+' ? left + right : word[3] == '-' ? left - right : left * right;
+    const npy_intp value = word[3] == '+'   ? left + right
+                           : word[3] == '-' ? left - right
+                                            : left * right;
     npy_intp *size = &call->size[(int)word[0]];
     if (value < 0 || (*size >= 0 && *size != value))
         return wrong_size(0, word[0], *size, value);
@@ -200,7 +202,7 @@ static int read_arguments(Call *call, const char *takes, PyObject *const *given,
 {
     int place = 0;
     for (const char *word = takes; *word; word = after(word)) {
-        if (*word == '*' ) {
+        if (*word == '*') {
             if (count > MOST_ARGUMENTS || count <= place) {
                 PyErr_Format(PyExc_TypeError, "%zd arguments", count);
                 return 0;
@@ -250,8 +252,7 @@ static int make_results(Call *call, const char *gives, PyObject **results)
         const char *rest = word + whole;
         Axis axis;
         for (; next_axis(&rest, &axis); axes++)
-            shape[axes] =
-                axis.letter ? call->size[(int)axis.letter] + axis.extra : axis.length;
+            shape[axes] = axis.letter ? call->size[(int)axis.letter] + axis.extra : axis.length;
         PyObject *array = keep(call, PyArray_SimpleNew(axes, shape, whole ? NPY_INTP : NPY_DOUBLE));
         if (array == NULL)
             return -1;
@@ -317,8 +318,9 @@ static int add_kernels(PyObject *module, const Kernel *kernels)
 
 int add_all_kernels(PyObject *module)
 {
-    const Kernel *tables[] = {law_kernels,     spectrum_kernels,  element_kernels,
-                              signal_kernels, structure_kernels, reduction_kernels, observer_kernels};
+    const Kernel *tables[] = {law_kernels,      element_kernels,
+                              signal_kernels,   structure_kernels, reduction_kernels,
+                              observer_kernels, jet_kernels,       interval_kernels};
     for (size_t i = 0; i < sizeof(tables) / sizeof(tables[0]); i++)
         if (add_kernels(module, tables[i]) < 0)
             return -1;

@@ -36,8 +36,8 @@ typedef enum { DONE, DECLINED, ERROR } Outcome;
 
 /* Arguments of one call and results under way; the caller of the kernel gives all back. */
 typedef struct {
-    npy_intp size[128];                  /* of an axis, by its letter */
-    const double *in[MOST_ARGUMENTS];    /* arrays of float64; NULL for None */
+    npy_intp size[128];                    /* of an axis, by its letter */
+    const double *in[MOST_ARGUMENTS];      /* arrays of float64; NULL for None */
     const npy_intp *index[MOST_ARGUMENTS]; /* arrays of intp */
     double number[MOST_ARGUMENTS];
     npy_intp step[MOST_ARGUMENTS];  /* numbers from one time to the next, 0 for what is constant */
@@ -82,8 +82,11 @@ PyObject *keep(Call *call, PyObject *made);
 /* The larger one; what is not a number stays. */
 static inline double larger(double a, double b) { return a >= b || a != a ? a : b; }
 
+/* Adds all kernels to the module; −1 with an exception. */
+int add_all_kernels(PyObject *module);
+
 /* Each file of kernels has a table, which ends with an entry without a name. */
-extern const Kernel law_kernels[], spectrum_kernels[], element_kernels[], signal_kernels[],
-    structure_kernels[], reduction_kernels[], observer_kernels[];
+extern const Kernel law_kernels[], element_kernels[], signal_kernels[],
+    structure_kernels[], reduction_kernels[], observer_kernels[], jet_kernels[], interval_kernels[];
 
 #endif

@@ -45,8 +45,8 @@ EVERY_WIDTH void lanes_multiply(Lane *C, npy_intp c, const Lane *A, npy_intp a, 
 }
 
 EVERY_WIDTH void lanes_multiply_transposed(Lane *C, npy_intp c, const Lane *A, npy_intp a,
-                                           const Lane *B, npy_intp b, npy_intp rows,
-                                           npy_intp inner, npy_intp columns, double sign)
+                                           const Lane *B, npy_intp b, npy_intp rows, npy_intp inner,
+                                           npy_intp columns, double sign)
 {
     for (npy_intp i = 0; i < rows; i++)
         for (npy_intp k = 0; k < inner; k++) {

@@ -138,8 +138,8 @@ static Outcome stepped_law(Call *call)
                 const double change = call->in[6][m] * steps.change[k + j];
                 const npy_intp gain = w == 1 ? 0 : j;
                 for (npy_intp l = 0; l < used; l++)
-                    eta[(l * M + m) * p + j] = left + end[gain][l] * distance[k + j][l] +
-                                               (1.0 - mean[gain][l]) * change;
+                    eta[(l * M + m) * p + j] =
+                        left + end[gain][l] * distance[k + j][l] + (1.0 - mean[gain][l]) * change;
             }
         }
     }

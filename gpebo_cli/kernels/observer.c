@@ -6,12 +6,12 @@
 typedef struct {
     npy_intp n, m, q, r, d, b, e, all, width;
     const double *rows, *scale, *domain, *range, *kernel, *equations;
-    Lane *E, *A, *B, *F, *C;      /* (n, n), (n, n), (n, m), (n, q), (r, n) */
-    Lane *Q, *R, *X;              /* of UᵀE B: (d, d) each */
-    Lane *pinv, *Lambda, *LH;     /* (d, n), (d, n), (d, b) */
-    Lane *algebraic, *through;    /* (all, n), (all, d + q + m + r): 𝒜 B | G | g_signals */
-    Lane *Q1, *R1, *X1, *H;       /* (all, b), (b, b), (b, b), (n, b) */
-    Lane *whole, *seen, *work;    /* (d, width), (b, width), (n, n + e + d) */
+    Lane *E, *A, *B, *F, *C;        /* (n, n), (n, n), (n, m), (n, q), (r, n) */
+    Lane *Q, *R, *X;                /* of UᵀE B: (d, d) each */
+    Lane *pinv, *Lambda, *LH;       /* (d, n), (d, n), (d, b) */
+    Lane *algebraic, *through;      /* (all, n), (all, d + q + m + r): 𝒜 B | G | g_signals */
+    Lane *Q1, *R1, *X1, *H;         /* (all, b), (b, b), (b, b), (n, b) */
+    Lane *whole, *seen, *work;      /* (d, width), (b, width), (n, n + e + d) */
     double outside, inner, inverse; /* so far the largest */
 } Frame;
 
@@ -112,13 +112,14 @@ static int prepare(Call *call, Frame *f)
 {
     const npy_intp n = f->n, d = f->d, b = f->b, all = f->all, width = f->width;
     const npy_intp sizes[] = {
-        n * n, n * n, n * f->m, n * f->q, f->r * n, d * d, d * d, d * d, d * n, d * n, d * b,
-        all * n, all * width, all * b, b * b, b * b, n * b, d * width, b * width,
-        n * (n + f->e + d),
+        n * n, n * n,   n * f->m,    n * f->q,  f->r * n,
+        d * d, d * d,   d * d,       d * n,     d * n,
+        d * b, all * n, all * width, all * b,   b * b,
+        b * b, n * b,   d * width,   b * width, n * (n + f->e + d),
     };
-    Lane **parts[] = {&f->E, &f->A, &f->B, &f->F, &f->C, &f->Q, &f->R, &f->X, &f->pinv,
-                      &f->Lambda, &f->LH, &f->algebraic, &f->through, &f->Q1, &f->R1, &f->X1,
-                      &f->H, &f->whole, &f->seen, &f->work};
+    Lane **parts[] = {&f->E,  &f->A,    &f->B,      &f->F,     &f->C,         &f->Q,       &f->R,
+                      &f->X,  &f->pinv, &f->Lambda, &f->LH,    &f->algebraic, &f->through, &f->Q1,
+                      &f->R1, &f->X1,   &f->H,      &f->whole, &f->seen,      &f->work};
     npy_intp total = 0;
     for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++)
         total += sizes[i];
@@ -134,10 +135,21 @@ static int prepare(Call *call, Frame *f)
    many times there are of E⁺, of 𝒜, of G and of the dynamics -> see observer_numpy.py. */
 static Outcome in_frame(Call *call)
 {
-    Frame f = {.n = SIZE(n), .m = SIZE(m), .q = SIZE(q), .r = SIZE(r), .d = SIZE(d), .b = SIZE(b),
-               .e = SIZE(e), .all = SIZE(i), .width = SIZE(d) + SIZE(q) + SIZE(k),
-               .rows = call->in[5], .scale = call->in[6], .domain = call->in[7],
-               .range = call->in[8], .kernel = call->in[9], .equations = call->in[10]};
+    Frame f = {.n = SIZE(n),
+               .m = SIZE(m),
+               .q = SIZE(q),
+               .r = SIZE(r),
+               .d = SIZE(d),
+               .b = SIZE(b),
+               .e = SIZE(e),
+               .all = SIZE(i),
+               .width = SIZE(d) + SIZE(q) + SIZE(k),
+               .rows = call->in[5],
+               .scale = call->in[6],
+               .domain = call->in[7],
+               .range = call->in[8],
+               .kernel = call->in[9],
+               .equations = call->in[10]};
     const npy_intp N = SIZE(N), n = f.n, k = f.m + f.r, all = f.all, width = f.width;
     const npy_intp times[] = {SIZE(x), SIZE(y), SIZE(z), SIZE(w)};
     for (int i = 0; i < 4; i++)
@@ -192,7 +204,8 @@ static Outcome regression_signals(Call *call)
     const npy_intp rows = SIZE(i), b = SIZE(b);
     if (columns < 1 + q)
         return refused("unknowns", q);
-    const npy_intp sizes[] = {k * columns, 0, 0, rows * k, rows, rows * q, rows * b, n * b,
+    const npy_intp sizes[] = {k * columns,    0,           0,          rows * k,
+                              rows,           rows * q,    rows * b,   n * b,
                               rows * columns, b * columns, n * columns};
     npy_intp total = 0;
     for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++)
@@ -242,10 +255,9 @@ static Outcome regression_signals(Call *call)
 }
 
 const Kernel observer_kernels[] = {
-    {"in_frame",
-     "N?nn N?nn N?nm N?nq N?rn n r nd nd nb en %x %y %z %w i=e+r k=m+r",
+    {"in_frame", "N?nn N?nn N?nm N?nq N?rn n r nd nd nb en %x %y %z %w i=e+r k=m+r",
      "3 xdn yin yid zik ziq yib ynb y wdd Ndq Ndk", in_frame},
-    {"regression_signals", "N?kp+ %q nk N?ik N?i N?iq N?ib N?nb",
-     "Ni Nip Nn Nnp p+", regression_signals},
+    {"regression_signals", "N?kp+ %q nk N?ik N?i N?iq N?ib N?nb", "Ni Nip Nn Nnp p+",
+     regression_signals},
     {NULL, NULL, NULL, NULL},
 };

@@ -2,7 +2,7 @@
 #ifndef GPEBO_PROGRAM_H
 #define GPEBO_PROGRAM_H
 
-#include "common.h"
+#include "kernel.h"
 
 #define GIVEN 2 /* rows that are always given: t, inside; those of signals follow */
 
@@ -40,14 +40,14 @@ typedef struct {
     npy_intp what, result, left, right;
 } Operation;
 
-/* An exception: there is no such thing as `value`; 0. */
-int outside(const char *what, npy_intp value);
-
 /* How many rows the operations use, those given included; 0 with an exception if they are none
    that can be run. */
-npy_intp rows_used(PyArrayObject *code, npy_intp given, npy_intp constants);
+npy_intp rows_used(const Operation *operation, npy_intp count, npy_intp given, npy_intp constants);
 
-/* Whether results (orders, outputs) are rows or constants that there are. */
-int results_fit(PyArrayObject *results, npy_intp used, npy_intp constants);
+/* Whether results (count,) are rows or constants that there are. */
+int results_fit(const npy_intp *row, npy_intp count, npy_intp used, npy_intp constants);
+
+/* An exception: there is no such thing as `value`; 0. */
+static inline int no_such(const char *what, npy_intp value) { return refused(what, value) == DONE; }
 
 #endif

@@ -20,16 +20,21 @@ typedef struct {
 static Outcome begin(Call *call, int place, const Model *m, Elimination *el)
 {
     const npy_intp n = m->n, size = m->size, r = SIZE(r), a = size - r;
-    *el = (Elimination){.rows = call->index[place], .columns = call->index[place + 1],
-                        .rank = r, .a = a, .d = n - a, .Z1 = call->in[place + 3]};
+    *el = (Elimination){.rows = call->index[place],
+                        .columns = call->index[place + 1],
+                        .rank = r,
+                        .a = a,
+                        .d = n - a,
+                        .Z1 = call->in[place + 3]};
     for (npy_intp i = 0; i < size; i++)
         if (el->rows[i] < 0 || el->rows[i] >= size || el->columns[i] < 0 || el->columns[i] >= size)
             return refused("a row or a column of M", i);
     const npy_intp widest = r > n ? r : n;
-    const npy_intp sizes[] = {n * size, n * size, r * r, r * a, a * r, a * a, a * r,
-                              r * n, a * n, n * n, n * n, 2 * widest * (widest + n + 1)};
-    Lane **parts[] = {&el->e, &el->A, &el->M11, &el->M12, &el->M21, &el->M22, &el->X,
-                      &el->N1, &el->N2, &el->whole, &el->inverse, &el->work};
+    const npy_intp sizes[] = {n * size, n * size, r * r, r * a,
+                              a * r,    a * a,    a * r, r * n,
+                              a * n,    n * n,    n * n, 2 * widest * (widest + n + 1)};
+    Lane **parts[] = {&el->e, &el->A,  &el->M11, &el->M12,   &el->M21,     &el->M22,
+                      &el->X, &el->N1, &el->N2,  &el->whole, &el->inverse, &el->work};
     npy_intp total = 0;
     for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++)
         total += sizes[i];
@@ -64,9 +69,9 @@ static void block_of(const Model *m, const Elimination *el, npy_intp from, npy_i
                 continue;
             }
             const double *e = el->e[(i - j) * n * n + entry];
-            EACH (*out)[l] = factor * e[l];
+            EACH(*out)[l] = factor * e[l];
             if (j < i)
-                EACH (*out)[l] -= el->A[(i - j - 1) * n * n + entry][l];
+                EACH(*out)[l] -= el->A[(i - j - 1) * n * n + entry][l];
         }
 }
 
@@ -342,8 +347,15 @@ static Outcome eliminated(Call *call)
     const npy_intp n = m.n, p = SIZE(m), q = SIZE(q), widest = p > q ? p : q, every = SIZE(e);
     if (every < 1)
         return refused("times between looks", every);
-    Forcing f = {series(call, 6, n * p), series(call, 7, n * q), series(call, 8, p),
-                 series(call, 9, q), p, q, NULL, NULL, NULL};
+    Forcing f = {series(call, 6, n * p),
+                 series(call, 7, n * q),
+                 series(call, 8, p),
+                 series(call, 9, q),
+                 p,
+                 q,
+                 NULL,
+                 NULL,
+                 NULL};
     const npy_intp wide = el.rank > n ? el.rank : n;
     f.matrix = (Lane *)scratch(call, LANES * (m.orders * (n * widest + widest + n) +
                                               (el.a + wide) * (n + 1)));

@@ -59,10 +59,11 @@ static int prepare(Call *call, const Model *m, Look *look)
     look->order = memory ? scratch_indices(call, size) : NULL;
     if (look->order == NULL)
         return 0;
-    double **parts[] = {&look->e, &look->a, &look->M, &look->W, &look->mirrors, &look->square,
-                        &look->Z2, &look->sigma, &look->A2, &look->T2, &look->Z1};
-    const npy_intp sizes[] = {n * size, n * size, many, many, many, many,
-                              many, size, n * n, n * n, n * n};
+    double **parts[] = {&look->e,       &look->a,      &look->M,  &look->W,
+                        &look->mirrors, &look->square, &look->Z2, &look->sigma,
+                        &look->A2,      &look->T2,     &look->Z1};
+    const npy_intp sizes[] = {n * size, n * size, many,  many,  many, many,
+                              many,     size,     n * n, n * n, n * n};
     for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++) {
         *parts[i] = memory;
         memory += sizes[i];
@@ -81,7 +82,8 @@ static int triangular_values(const double *W, npy_intp rows, npy_intp length, do
     return orthogonalise(square, rows, rows, sigma);
 }
 
-static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank_tol, int upto, Look *look)
+static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank_tol, int upto,
+                   Look *look)
 {
     const npy_intp n = m->n, size = m->size;
     look->smallest[0] = look->smallest[1] = look->smallest[2] = HUGE_VAL;

@@ -27,8 +27,15 @@ static inline Series series(const Call *call, int place, npy_intp entries)
 static inline Outcome read_model(Call *call, Model *m)
 {
     const npy_intp n = SIZE(n), v = SIZE(v);
-    *m = (Model){series(call, 0, n * n), series(call, 1, n * n), call->in[2], call->in[3],
-                 call->number[4], n, v, v * n, SIZE(N)};
+    *m = (Model){series(call, 0, n * n),
+                 series(call, 1, n * n),
+                 call->in[2],
+                 call->in[3],
+                 call->number[4],
+                 n,
+                 v,
+                 v * n,
+                 SIZE(N)};
     if (n < 1 || v < 1 || SIZE(o) < v || SIZE(N) < 1)
         return refused("Taylor coefficients", SIZE(o));
     return DONE;

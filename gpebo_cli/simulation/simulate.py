@@ -9,7 +9,6 @@ from math import isfinite
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import (
     MATRIX_NAMES,
@@ -259,7 +258,7 @@ def _overlooked(
     seen = system.coefficients.taylor(t.ravel(), 0)
     least = max(tol, 1e-12)
     pairs = [array for name in names for array in (getattr(c, name), getattr(seen, name))]
-    missed = kernels.expressions.missed_between(between, *pairs)
+    missed = _missed_between(between, *pairs)
     for name, far in zip(names, missed, strict=True):
         if far.max(initial=0.0) <= _SURPRISE * least:
             continue
@@ -267,6 +266,28 @@ def _overlooked(
         nodal = nodal[..., np.ptp(nodal, axis=(0, 1)) > 0.0]
         found |= far > _SURPRISE * np.maximum(unresolved(nodal, mesh.rule), least)
     return found
+
+
+def _missed_between(between: Array, *pairs: Array) -> Array:
+    """How far functions are from the polynomials through their nodes, (pairs, K), relative.
+
+    Args:
+        between: the polynomial at the places between, from its points (s + 1, looks).
+        pairs: values (orders, K (s + 1), ...) at the points and (orders, K looks, ...) between, of
+            one function after the other; the first order counts, of entries that move the worst.
+    """
+    points, looks = between.shape
+    found = []
+    for nodal, seen in zip(pairs[::2], pairs[1::2], strict=True):
+        nodes = nodal[0].reshape(nodal.shape[1] // points, points, -1)
+        actual = seen[0].reshape(len(nodes), looks, -1)
+        first = nodes[:1, :1]
+        moves = (nodes != first).any(axis=(0, 1)) | (actual != first).any(axis=(0, 1))
+        nodes, actual = nodes[..., moves], actual[..., moves]
+        size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodes).max(axis=(0, 1)))
+        far = np.abs(between.T @ nodes - actual).max(axis=1) / size
+        found.append(far.max(axis=1, initial=0.0))
+    return np.array(found)
 
 
 @lru_cache(maxsize=16)
