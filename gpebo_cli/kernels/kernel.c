@@ -318,9 +318,9 @@ static int add_kernels(PyObject *module, const Kernel *kernels)
 
 int add_all_kernels(PyObject *module)
 {
-    const Kernel *tables[] = {law_kernels,      element_kernels,
-                              signal_kernels,   structure_kernels, reduction_kernels,
-                              observer_kernels, jet_kernels,       interval_kernels};
+    const Kernel *tables[] = {law_kernels,       element_kernels,   signal_kernels,
+                              structure_kernels, reduction_kernels, observer_kernels,
+                              jet_kernels,       interval_kernels};
     for (size_t i = 0; i < sizeof(tables) / sizeof(tables[0]); i++)
         if (add_kernels(module, tables[i]) < 0)
             return -1;

@@ -86,7 +86,7 @@ static inline double larger(double a, double b) { return a >= b || a != a ? a : 
 int add_all_kernels(PyObject *module);
 
 /* Each file of kernels has a table, which ends with an entry without a name. */
-extern const Kernel law_kernels[], element_kernels[], signal_kernels[],
-    structure_kernels[], reduction_kernels[], observer_kernels[], jet_kernels[], interval_kernels[];
+extern const Kernel law_kernels[], element_kernels[], signal_kernels[], structure_kernels[],
+    reduction_kernels[], observer_kernels[], jet_kernels[], interval_kernels[];
 
 #endif
