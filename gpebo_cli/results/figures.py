@@ -30,6 +30,7 @@ FigureFunction = Callable[[RunResult], list[Panel]]
 
 MAX_CASES = 4  # curves of more cases than that do not stay apart
 _INITIAL = "e0_"  # of the names of parameters that stand for an initial state
+MAX_DOTS = 200  # more points than that are a line
 MIN_GAINS = 3  # fewer points are not a curve over the gain
 
 
@@ -223,7 +224,7 @@ def gains(result: RunResult) -> list[Panel]:
     def over_gain(kind: str) -> tuple[Curve, ...]:
         return tuple(
             Curve(values[order], getattr(metrics, f"{kind}_{of}")[order], of,
-                  replace(line(k), dots=True))
+                  replace(line(k), dots=len(order) <= MAX_DOTS))
             for k, of in enumerate(("parameters", "states"))
         )
 
