@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import time
+import warnings
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
@@ -254,6 +255,14 @@ def test_long_sums_and_products() -> None:
 
 
 # Refusals
+
+
+def test_python_does_not_warn_of_text_that_is_refused() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ConfigError, match="has no meaning here"):
+            read("1if t else 2")
+
 
 HOSTILE = {
     "import": "__import__('os').system('true')",
