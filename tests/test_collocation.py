@@ -262,3 +262,20 @@ def test_growth_beyond_all_numbers_is_named_with_its_time():
     mesh = initial_mesh(0.0, 1000.0, [], 250, radau_rule(14))
     with pytest.raises(SolverError, match=r"not finite from t = 70"):
         solve(LinearProblem(coefficients, np.ones((1, 1))), mesh, tol=1e-8, max_elements=5000)
+
+
+@given(st.lists(st.sampled_from([0.1, 0.2, 0.25, 0.3, 0.05, 0.4]), min_size=1, max_size=6,
+                unique=True))
+@settings(deadline=None)
+def test_elements_of_different_lengths_in_any_order_with_constant_matrices(lengths):
+    """x' = −x + cos(t): no element is left out, whatever its place among the lengths."""
+    edges = np.append(0.0, np.cumsum(lengths))
+    mesh = Mesh(edges, radau_rule(9))
+
+    def equation(t, inside):
+        return LinearEquation(None, -np.ones((1, 1, 1)), np.cos(t)[:, None, None])
+
+    found = fixed(equation, [[1.0]], mesh)
+    exact = 0.5 * (np.cos(edges) + np.sin(edges)) + 0.5 * np.exp(-edges)
+    np.testing.assert_allclose(found(edges[:-1])[:, 0, 0], exact[:-1], rtol=1e-12)
+    np.testing.assert_allclose(found.final[0, 0], exact[-1], rtol=1e-12)

@@ -339,12 +339,16 @@ def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
 
 
 def _equal_lengths(h: Array) -> IntArray:
-    """Group (K,) of each length; those that differ by rounding only count as equal."""
+    """Group (K,) of each length; those that differ by rounding only count as equal.
+
+    Groups are numbered as they first appear.
+    """
     order = np.argsort(h, kind="stable")
     new = np.diff(h[order]) > _EQUAL * h.max()
-    group = np.empty(len(h), dtype=np.intp)
-    group[order] = np.append(0, np.cumsum(new))
-    return group
+    by_length = np.empty(len(h), dtype=np.intp)
+    by_length[order] = np.append(0, np.cumsum(new))
+    first = np.unique(by_length, return_index=True)[1]
+    return np.asarray(np.argsort(np.argsort(first))[by_length])
 
 
 def _decoupled_maps(
