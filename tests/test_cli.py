@@ -202,6 +202,7 @@ WRONG = [
     (["run", "-m", "time.horizon=range(0,1,1e-6)", "plant=window,circuit"], "of 2000000 jobs"),
     (["run", "observer.xi_a0.foo=1"], "observer.xi_a0 is empty; give it as a whole"),
     (["run", "plant.title='a\udcff'"], "is not text in UTF-8"),
+    (["run", "+launcher=null"], "cannot be composed: Config group override must be"),
     (["run", "time=1"], "time: expected a mapping"),
     (["run", "--resolve"], "--resolve is for what --cfg prints; add --cfg job"),
     (["run", "--cfg", "job", "-m"], "only one of --multirun, --cfg at a time"),

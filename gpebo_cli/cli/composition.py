@@ -94,7 +94,10 @@ class Loader(ConfigLoaderImpl):
         Raises:
             ConfigError: something in it names code to run, or a folder to search.
         """
-        config = super().load_configuration(*args, **kwargs)
+        try:
+            config = super().load_configuration(*args, **kwargs)
+        except ValueError as error:  # +launcher=null, for instance
+            raise ConfigError(f"the configuration cannot be composed: {error}") from error
         plain = OmegaConf.to_container(config, resolve=False)
         refuse_code(cast("dict[str, Any]", plain))
         return config
