@@ -29,6 +29,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression.dynamics import filtered
 from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.settings import (
@@ -90,7 +91,7 @@ def observed(name, horizon=20.0, **observer):
 
 def test_the_plant_is_the_one_that_needs_a_remedy():
     system = plant_from_mapping(UNBOUNDED)
-    o = observer_matrices(system, np.zeros(1), np.zeros(1), 1e-10)
+    o = observer_matrices(EquationForm(system), np.zeros(1), np.zeros(1), 1e-10)
     eigenvalues = np.sort_complex(np.linalg.eigvals(o.dynamics[0]))
     np.testing.assert_allclose(eigenvalues, [0.33, 0.64 - 1.01j, 0.64 + 1.01j], atol=1e-12)
 

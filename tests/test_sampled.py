@@ -136,8 +136,8 @@ def test_it_does_not_matter_how_samples_are_grouped():
     u, y = signals(system, t)
     for name in ("ls_drem", "least_squares", "drem"):
         settings = Settings(plant={}, estimator={"name": name})
-        whole = Online(settings, system, "linear", t[0]).feed(t, u, y)
-        parts = Online(settings, system, "linear", t[0])
+        whole = Online(settings, system, "linear", t[0], np.append(u[0], y[0])).feed(t, u, y)
+        parts = Online(settings, system, "linear", t[0], np.append(u[0], y[0]))
         cuts = [0, 1, 2, 9, 40, 60]
         made = [
             parts.feed(t[a:b], u[a:b], y[a:b]) for a, b in pairwise(cuts)
@@ -151,7 +151,8 @@ def test_what_is_remembered_does_not_grow():
     system = shipped("circuit")
     t = np.arange(0.0, 4.0, 0.01)
     u, y = signals(system, t)
-    online = Online(Settings(plant={}, estimator={"name": "ls_drem"}), system, "zoh", 0.0)
+    online = Online(Settings(plant={}, estimator={"name": "ls_drem"}), system, "zoh", 0.0,
+                    np.append(u[0], y[0]))
     sizes = []
     for part in (slice(0, 100), slice(100, 200), slice(200, 400)):
         online.feed(t[part], u[part], y[part])

@@ -40,7 +40,7 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
             came = samples(reader.header, np.array(rows), system)
             head = ""
             if online is None:
-                online = begin(float(came.t[0]))
+                online = begin(float(came.t[0]), np.append(came.inputs[0], came.outputs[0]))
                 names = [f"{name}_hat" for name in (*online.parameters, *system.states)]
                 head = ",".join(["t", *names, "lambda_min"]) + "\n"
             made = online.feed(came.t, came.inputs, came.outputs)

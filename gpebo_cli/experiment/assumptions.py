@@ -21,6 +21,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.observers import Measurements, Observation, Observer, build
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.recordings.load import load
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Simulation
@@ -52,7 +53,9 @@ def examine(
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if seen is None and settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
-        seen = Measurements(recording.inputs, recording.outputs)
+        seen = Measurements(
+            recording.inputs, recording.outputs, derivatives=recording.derivatives
+        )
     if seen is not None:
         return Examination(()) if observer is None else _of_observer(
             observer, settings, system, seen, []
@@ -74,7 +77,8 @@ def examine(
         return Examination(tuple(found))
     signals = simulation.signals
     noise = signal_noise(settings.noise, levels)
-    seen = Measurements(signals.inputs, signals.outputs, noise)
+    derivatives = InputDerivatives.of_plant(system, ~levels.noisy_inputs)
+    seen = Measurements(signals.inputs, signals.outputs, noise, derivatives)
     return _of_observer(observer, settings, system, seen, found)
 
 

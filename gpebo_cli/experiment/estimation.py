@@ -75,7 +75,7 @@ def continuous(
     t = source.t
     with stage("observe"):
         seen = Measurements(
-            source.inputs, source.outputs, signal_noise(settings.noise, levels)
+            source.inputs, source.outputs, signal_noise(settings.noise, levels), source.derivatives
         )
         observation = observer.observe(system, seen, settings.solver)
         check_response(settings.noise, observation.respond)
@@ -139,9 +139,10 @@ def at_samples(
     check_response(settings.noise, None)
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
     with stage("observe and estimate"):
-        online = Online(settings, system, samples.hold, start, estimator)
         t = sample_times(samples.step, start, stop)
         u, y = source.inputs(t), source.outputs(t)
+        first = np.append(u[0], y[0])
+        online = Online(settings, system, samples.hold, start, first, estimator)
         parts = [slice(i, i + _SAMPLES_AT_ONCE) for i in range(0, len(t), _SAMPLES_AT_ONCE)]
         made = joined([online.feed(t[part], u[part], y[part]) for part in parts])
         truth = online.truth(made.extension)(t, source.theta(t), source.states)

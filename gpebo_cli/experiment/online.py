@@ -18,6 +18,7 @@ from gpebo_cli.experiment.result import Fit
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.observers._observation import InitialError
+from gpebo_cli.observers.reduced.extension import form_used
 from gpebo_cli.observers.reduced.sampled import TOLERANCE, SampledState
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
@@ -64,7 +65,7 @@ class Online:
     """An observer with its estimator, from one sample to the next."""
 
     def __init__(
-        self, settings: Settings, system: DescriptorSystem, hold: str, start: float,
+        self, settings: Settings, system: DescriptorSystem, hold: str, start: float, sample: Array,
         estimator: estimators.Estimator | None = None,
     ) -> None:
         """Prepare for samples of which the first is at ``start``.
@@ -74,6 +75,7 @@ class Online:
             system: the plant.
             hold: what is assumed between samples, zoh or linear.
             start: time of the first sample.
+            sample: the first one, [u; y] (m + r,).
             estimator: used instead of the one that the settings name.
 
         Raises:
@@ -83,7 +85,7 @@ class Online:
         self._observer = observers.able(
             observers.build(settings.observer), observers.AtSamples,
             "observer.sample_time and streams need an observer that runs at samples",
-        ).at_samples(system, settings.solver, hold, start)
+        ).at_samples(system, settings.solver, hold, start, sample)
         if estimator is None:
             estimator = estimators.build(settings.estimator)
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases
@@ -171,7 +173,8 @@ class Online:
             ),
             Assumption(
                 "Assumption 1", "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
-                True, {"smallest_singular_value_at_least": self.reached.injectivity},
+                True, {"smallest_singular_value_at_least": self.reached.injectivity,
+                       **form_used(self._observer.form, self._observer.note)},
             ),
         )
 

@@ -21,7 +21,7 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_response, check_seeds
 from gpebo_cli.experiment.verdict import verdict
-from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
 
@@ -102,7 +102,7 @@ def run_experiment(
     )
 
 
-def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float], Online]:
+def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Array], Online]:
     """The estimation of rows that come one after the other, from the time of the first one on.
 
     Raises:
@@ -115,7 +115,9 @@ def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float], On
             f"the gains of the estimator make {len(estimator.cases)} cases; a stream has room for "
             "one"
         )
-    return lambda start: Online(settings, system, settings.data.hold, start, estimator)
+    return lambda start, sample: Online(
+        settings, system, settings.data.hold, start, sample, estimator
+    )
 
 
 def stream_verdict(online: Online) -> str:

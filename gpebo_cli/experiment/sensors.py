@@ -13,6 +13,7 @@ from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.model.descriptor import Array, Coefficients, CoefficientSource, DescriptorSystem
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, build
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
 
@@ -57,7 +58,10 @@ def candidates(settings: Settings, system: DescriptorSystem) -> list[Sensor]:
             system, outputs=(*system.outputs, f"{state} measured"),
             coefficients=_WithOutput(system.coefficients, row),
         )
-        examined = examine(settings, larger, Measurements(signals.inputs, outputs))
+        examined = examine(settings, larger, Measurements(
+            signals.inputs, outputs,
+            derivatives=InputDerivatives.of_plant(larger, np.ones(larger.m, dtype=bool)),
+        ))
         found[state] = (
             (examined.excitation, examined.estimable) if examined.excitation is not None
             else next(str(a.evidence.get("found")) for a in examined.assumptions if not a.holds)

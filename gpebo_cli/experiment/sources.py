@@ -17,6 +17,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.recordings.load import Recording, load
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.simulate import Signals, Simulation
@@ -38,6 +39,7 @@ class Source:
     judged: slice  # parameters that count when estimates are compared with the truth
     assumptions: tuple[Assumption, ...]
     verdict: str
+    derivatives: InputDerivatives | None = None  # of the inputs, as far as they are known
     true: Signals | None = None  # of a simulation, without noise
     simulation: SimulationResult | None = None
     recording: RecordingResult | None = None
@@ -68,7 +70,9 @@ def simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels)
         t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
         theta=system.theta_at, judged=_judged(system),
         assumptions=tuple(of_simulation(system, simulation)),
-        verdict=simulation_verdict(simulated), true=simulation.signals, simulation=simulated,
+        verdict=simulation_verdict(simulated),
+        derivatives=InputDerivatives.of_plant(system, ~levels.noisy_inputs),
+        true=simulation.signals, simulation=simulated,
     )
 
 
@@ -83,7 +87,7 @@ def recorded(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) 
     return Source(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
-        assumptions=(), verdict="",
+        assumptions=(), verdict="", derivatives=recording.derivatives,
         recording=_sample_recording(system, recording, t),
     )
 

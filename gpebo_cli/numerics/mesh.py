@@ -9,6 +9,7 @@ from itertools import pairwise
 from math import prod
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import signals
 from gpebo_cli.model.descriptor import Array, IntArray
@@ -233,6 +234,14 @@ class Trajectory:
     def final(self) -> Array:
         """Value at the end of the mesh."""
         return np.asarray(self.values[-1, -1])
+
+    def derivative(self) -> Trajectory:
+        """That of each element's polynomial, in 1/s."""
+        rule, flat = self.mesh.rule, _flat(self.values)
+        slopes = legendre.legder(np.moveaxis(rule.to_legendre @ flat, 1, 0))
+        at_points = legendre.legvander(2.0 * rule.points - 1.0, len(slopes) - 1)
+        out = 2.0 * (at_points @ np.moveaxis(slopes, 0, 1)) / self.mesh.steps[:, None, None]
+        return Trajectory(self.mesh, out.reshape(self.values.shape))
 
     def local_integral(self) -> Trajectory:
         """∫ from the left end of each element, starting at zero again in the next one."""

@@ -15,6 +15,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers._observation import Observation
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import SolverSettings
 
@@ -45,6 +46,7 @@ class Measurements:
     inputs: Trajectory  # u (m,) and
     outputs: Trajectory  # y (r,), on the same mesh
     noise: SignalNoise | None = None  # for an observer that weighs by it; None: there is none
+    derivatives: InputDerivatives | None = None  # of the inputs; None: they are not known
 
     @property
     def mesh(self) -> Mesh:
@@ -98,9 +100,10 @@ class AtSamples(Observer, Protocol):
         ...
 
     def at_samples(
-        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float
+        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
+        sample: Array,
     ) -> SampledObserver:
-        """The observer in discrete time, whose first sample is at ``start``."""
+        """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``."""
         ...
 
 
@@ -140,19 +143,3 @@ def output_scale(weights: ByName | None, system: DescriptorSystem) -> Array:
     if not w.any():
         raise ConfigError("observer.weights: at least one output must have a positive weight")
     return np.asarray(np.sqrt(w / w.max()))
-
-
-def refuse_beyond(system: DescriptorSystem) -> None:
-    """Refuse a plant with terms that no observer here makes use of.
-
-    Raises:
-        ConfigError: names them.
-    """
-    source = system.coefficients
-    beyond = [key for key in ("phi", "D", "H") if key not in source.zero]
-    beyond += [f"{key} of {', '.join(sorted(names))}" for key, names in source.signals.items()]
-    if beyond:
-        raise ConfigError(
-            f"plant {system.name}: observers take E x' = A x + B u + F θ, y = C x with functions "
-            f"of t alone, and it has {beyond[0]}; use observer=none"
-        )

@@ -32,7 +32,7 @@ from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._base import Measurements, initial_extension, output_scale, refuse_beyond
+from gpebo_cli.observers._base import Measurements, initial_extension, output_scale
 from gpebo_cli.observers._observation import (
     InitialError,
     Observation,
@@ -130,7 +130,7 @@ class Canonical:
             ConfigError: settings that do not fit the plant.
             SolverError: the tolerance cannot be reached.
         """
-        refuse_beyond(system)
+        _refuse_beyond(system)
         inputs, outputs, mesh = signals.inputs, signals.outputs, signals.mesh
         blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())
         scale = output_scale(self.weights, system)
@@ -211,6 +211,18 @@ class Canonical:
 
 
 OBSERVER = Canonical
+
+
+def _refuse_beyond(system: DescriptorSystem) -> None:
+    """The canonical form has no further terms."""
+    source = system.coefficients
+    beyond = [key for key in ("phi", "D", "H") if key not in source.zero]
+    beyond += [f"{key} of {', '.join(sorted(names))}" for key, names in source.signals.items()]
+    if beyond:
+        raise ConfigError(
+            f"plant {system.name}: observer=canonical takes E x' = A x + B u + F θ, y = C x with "
+            f"functions of t alone, and it has {beyond[0]}; use observer=gpebo"
+        )
 
 
 def _outputs_without_zb(system: DescriptorSystem, blocks: Blocks, n_a: int) -> list[int]:

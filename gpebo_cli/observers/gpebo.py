@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import Measurements, Sampling
 from gpebo_cli.observers._observation import Observation
 from gpebo_cli.observers.reduced.extension import reduced_system
@@ -25,6 +25,8 @@ class Gpebo:
     """Section II of the paper, with all rows of the residual.
 
     Attributes:
+        form: the equations as given, or with all hidden constraints beside them, which takes any
+            index and needs no output to see the algebraic states; auto: as given where that does.
         regression: the whole residual, or its last r rows as the paper has it.
         xi_a0: where the dynamic extension starts: by state name, or a list of n_a numbers; None:
             what the plant proposes, else zero.
@@ -35,6 +37,7 @@ class Gpebo:
         remedy: what is done about a Φ that grows (docs/howto/unstable.md).
     """
 
+    form: Literal["auto", "given", "strangeness_free"] = "auto"
     regression: Literal["projected", "paper"] = "projected"
     xi_a0: Mapping[str, float] | list[float] | None = None
     weights: Mapping[str, float] | list[float] | None = None
@@ -58,7 +61,7 @@ class Gpebo:
         """
         return self.remedy.observe(reduced_system(
             system, signals, solver,
-            xi_a0=self.xi_a0, weights=self.weights, regression=self.regression,
+            xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=self.form,
         ))
 
     def sampling(self) -> Sampling | None:
@@ -66,9 +69,10 @@ class Gpebo:
         return None if self.sample_time is None else Sampling(self.sample_time, self.hold)
 
     def at_samples(
-        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float
+        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
+        sample: Array,
     ) -> SampledObserver:
-        """The observer in discrete time, whose first sample is at ``start``.
+        """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``.
 
         Raises:
             ModelError: Assumption 1 fails at the start.
@@ -76,8 +80,8 @@ class Gpebo:
         """
         self._refuse_remedy()
         return sampled_observer(
-            system, solver, hold, start,
-            xi_a0=self.xi_a0, weights=self.weights, regression=self.regression,
+            system, solver, hold, start, sample,
+            xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=self.form,
         )
 
     def _refuse_remedy(self) -> None:

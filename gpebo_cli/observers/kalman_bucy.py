@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -36,9 +37,10 @@ from gpebo_cli.observers._base import ByName, Measurements, SignalNoise
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
 from gpebo_cli.observers._observation import AffineStateMap, Observation, Reconstruction
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
-from gpebo_cli.observers.reduced.extension import reduced_system
+from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
 from gpebo_cli.observers.remedies.plain import Plain
+from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings, SolverSettings
@@ -67,17 +69,20 @@ class FilterModel:
     projector: Array  # (N, states, states) P
 
 
-def filter_model(o: ObserverMatrices, u: Array, y: Array) -> FilterModel:
+def filter_model(
+    o: ObserverMatrices, v: Array, y: Array, form: EquationForm
+) -> FilterModel:
     """The linear system of the filter, w in coordinates of the observer's basis.
 
     Args:
         o: at N times.
-        u: (N, m).
+        v: driving signals (N, ·).
         y: (N, r).
+        form: of the equations.
     """
-    count, r, basis = len(u), y.shape[1], o.split.basis
+    count, r, basis = len(v), y.shape[1], o.split.basis
     q, k = o.from_unknowns.shape[2], basis.shape[1]
-    signals = np.concatenate([u, y], axis=1)
+    signals = np.concatenate([v, y], axis=1)
     A = np.zeros((count, q + k, q + k))
     A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
     inward = np.zeros((count, q + k, signals.shape[1]))
@@ -89,26 +94,32 @@ def filter_model(o: ObserverMatrices, u: Array, y: Array) -> FilterModel:
     K_g, K_c = (np.asarray(o.elimination @ (transpose(o.range) @ x)) for x in (g, c))
     gain = -K_c  # [X_θ, X_w B] = [−K G, B − K 𝒜 B]
     gain[:, :, q:] += basis
-    # The residual's r rows: of its n rows with Π, those in the range of E are zero.
-    L = o.split.equations
-    rows = -o.range @ transpose(o.range)
-    rows = np.broadcast_to(rows, (max(len(rows), len(L)), *rows.shape[1:])).copy()
-    e = L.shape[1]
-    rows[:, :e, :e] += L @ transpose(L)
-    rows[:, e:, e:] += np.eye(r)
-    _, vectors = np.linalg.eigh(0.5 * (rows + transpose(rows)))
-    Z = vectors[:, :, e:]
+    if form.structure is not None:
+        # Outputs take no part in the elimination, and the constraints have been used up for w.
+        Z = np.zeros((1, g.shape[1], r))
+        Z[0, g.shape[1] - r :] = np.eye(r)
+    else:
+        # The residual's r rows: of its n rows with Π, those in the range of E are zero.
+        L = o.split.equations
+        rows = -o.range @ transpose(o.range)
+        rows = np.broadcast_to(rows, (max(len(rows), len(L)), *rows.shape[1:])).copy()
+        e = L.shape[1]
+        rows[:, :e, :e] += L @ transpose(L)
+        rows[:, e:, e:] += np.eye(r)
+        _, vectors = np.linalg.eigh(0.5 * (rows + transpose(rows)))
+        Z = vectors[:, :, e:]
+    m = form.system.m
     return FilterModel(
         A=A,
         b=np.einsum("nij,nj->ni", inward, signals),
         c=c,
         rows=np.broadcast_to(Z, (count, *Z.shape[1:])),
         g_y=np.einsum("nij,nj->ni", g, signals),
-        from_noise=-inward,
-        in_measurement=-g,
+        from_noise=-o.of_noise(inward, m),
+        in_measurement=-o.of_noise(g, m),
         offset=-np.einsum("nij,nj->ni", K_g, signals),
         gain=gain,
-        direct=-K_g,
+        direct=-o.of_noise(K_g, m),
         projector=np.broadcast_to(o.projector, (count, *o.projector.shape[1:])),
     )
 
@@ -173,6 +184,7 @@ class KalmanBucy:
     """Unknown parameters are constant states; it estimates by itself.
 
     Attributes:
+        form: of the equations, as for gpebo.
         xi_a0: first estimate of the differential states, as for gpebo; of unknowns: 0.
         P0: its variance: one number, a list, or by name (theta1, w_e1; absent: 10).
         process: intensity of white noise that drives what is estimated, likewise (absent: 0).
@@ -180,6 +192,7 @@ class KalmanBucy:
             assumed instead, relative to each one's own size, at the noise's sample time.
     """
 
+    form: Literal["auto", "given", "strangeness_free"] = "auto"
     xi_a0: Mapping[str, float] | list[float] | None = None
     P0: float | list[float] | Mapping[str, float] = 10.0
     process: float | list[float] | Mapping[str, float] = 0.0
@@ -195,7 +208,9 @@ class KalmanBucy:
             ConfigError: settings that do not fit the plant.
             SolverError: the tolerance cannot be reached.
         """
-        known = reduced_system(system, signals, solver, xi_a0=self.xi_a0)
+        known = reduced_system(
+            system, signals, solver, xi_a0=self.xi_a0, form=self.form
+        )
         evidence = Plain().observe(known)
         mesh, q, basis = known.mesh, system.q, known.basis
         noise = signals.noise or SignalNoise(
@@ -204,15 +219,12 @@ class KalmanBucy:
 
         def reduced(t: Array, inside: Array) -> FilterModel:
             o = known.matrices(t, inside)
-            return filter_model(o, signals.inputs(t, inside), signals.outputs(t, inside))
+            return filter_model(o, *known.driving(t, inside), known.form)
 
-        V1, initial = known.initial_basis, known.names
-        fixed = basis.shape[1] == known.rank
-        labels = tuple(name.removeprefix("e0_") for name in initial) if fixed else system.states
-        names = (*system.unknowns, *(f"w_{label}" for label in labels))
-        w0 = basis.T @ V1 @ known.xi_a0
+        names = (*system.unknowns, *(f"w_{label}" for label in known.labels))
+        w0 = basis.T @ known.xi_a
         start = np.concatenate([np.zeros(q), w0])
-        P0 = _initial_covariance(self.P0, names, q, basis.T @ V1)
+        P0 = _initial_covariance(self.P0, names, known)
         process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
         model_noise = noise_model(
             reduced(mesh.points.ravel(), mesh.inside.ravel()), noise, process, self.regularisation
@@ -242,7 +254,7 @@ class KalmanBucy:
             information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
             max_elements=solver.max_elements,
         )
-        observability = _uniform_observability(windows, P0, projector, basis, q)
+        observability = _uniform_observability(windows, P0, projector, known)
         spread = Spread(filtered, AffineStateMap(offset, gain), direct, noise.variances)
         return Observation(
             regression=evidence.regression,
@@ -263,7 +275,7 @@ class KalmanBucy:
             growth=None,
             estimator=Filter(filtered, observability),
             names=names,
-            note=_note(model_noise, self.regularisation),
+            note=known.note + _note(model_noise, self.regularisation),
         )
 
 
@@ -279,23 +291,22 @@ def _note(model: NoiseModel, regularisation: float) -> str:
     )
 
 
-def _initial_covariance(
-    P0: ByName, names: tuple[str, ...], q: int, V: Array
-) -> Array:
-    """P(start) (n, n), within the range of the coordinates V (n_w, n_a) of V1."""
+def _initial_covariance(P0: ByName, names: tuple[str, ...], known: ReducedSystem) -> Array:
+    """P(start) (n, n) of what is possible: w = offset + from_unknowns θ + V z."""
     variances = per_name(P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
+    q, basis = known.system.q, known.basis
     inside = np.zeros((len(names), len(names)))
-    inside[:q, :q] = np.eye(q)
-    inside[q:, q:] = V @ V.T
+    inside[:q, :q], inside[q:, :q] = np.eye(q), basis.T @ known.begin.from_unknowns
+    inside[q:, q:] = basis.T @ known.initial_basis @ known.initial_basis.T @ basis
     return np.asarray((inside * variances) @ inside.T)
 
 
 def _uniform_observability(
-    windows: WindowGramians, P0: Array, projector: Trajectory, basis: Array, q: int
+    windows: WindowGramians, P0: Array, projector: Trajectory, known: ReducedSystem
 ) -> Requirement:
     """λ_min of M over all windows, in units of P(0)⁻¹, in the directions that ζ has."""
     P = projector(windows.starts)
-    n = len(P0)
+    n, q, basis = len(P0), known.system.q, known.basis
     inside = np.zeros((len(P), n, n))
     inside[:, :q, :q] = np.eye(q)
     inside[:, q:, q:] = basis.T @ P @ basis
@@ -303,7 +314,7 @@ def _uniform_observability(
     scale = np.where(scale > 0, scale, scale.max(initial=0.0) or 1.0)
     M = scale[:, None] * (inside @ windows.gramians @ inside) * scale
     values = np.linalg.eigvalsh(M)
-    rank = q + int(np.rint(np.trace(P[0])))
+    rank = q + len(known.names)
     smallest = np.maximum(values[:, n - rank], 0.0)
     k = int(np.argmin(smallest))
     level, at, window = float(smallest[k]), float(windows.starts[k]), windows.window

@@ -153,9 +153,10 @@ def _parts(source: CoefficientSource, signal: Held, mesh: Mesh, tol: float) -> f
     """
     chosen = np.unique(np.linspace(0, mesh.size - 1, _PROBED).round().astype(np.intp))
     t, inside = mesh.points[chosen], mesh.inside[chosen]
-    c = source.taylor(t.ravel(), 1, inside.ravel())
     samples = signal(t.ravel(), inside.ravel())
-    kinds = (c.E[0], c.E[1], c.A[0], c.B[0], c.F[0], c.C[0], samples, samples**2)
+    c = source.taylor(t.ravel(), 1, inside.ravel(), samples[None] if source.signals else None)
+    matrices = (c.A, c.B, c.F, c.C, c.phi, c.D, c.H)
+    kinds = (c.E[0], c.E[1], *(matrix[0] for matrix in matrices), samples, samples**2)
     values = np.concatenate([kind.reshape(*t.shape, -1) for kind in kinds], axis=2)
     scale = signal_scale(values)
     tail = float((legendre_tail(values, mesh.rule, scale) / scale).max(initial=0.0))

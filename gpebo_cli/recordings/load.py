@@ -13,6 +13,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.recordings.hold import held, on_mesh, recording_mesh
 from gpebo_cli.recordings.table import Samples, Table, read_table
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
 
 _ROUNDING = 1e-12  # of the largest time: by how much a span may miss the samples
@@ -28,6 +29,11 @@ class Recording:
     inputs: Trajectory  # (m,)
     outputs: Trajectory  # (r,)
     states: Trajectory  # (n,), NaN for a state that was not recorded
+
+    @property
+    def derivatives(self) -> InputDerivatives | None:
+        """Of the inputs: only a cubic interpolant has any."""
+        return InputDerivatives.of_signal(self.inputs) if self.hold == "cubic" else None
 
     def sampled(self, t: Array) -> Samples:
         """All signals at the times t (N,) of the span.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,38 +19,110 @@ from gpebo_cli.observers._base import (
     Measurements,
     initial_extension,
     output_scale,
-    refuse_beyond,
 )
 from gpebo_cli.observers._observation import largest_entry, log_norm
 from gpebo_cli.observers.reduced.matrices import (
     AlgebraicEquations,
     Injection,
+    NotObservableError,
     ObserverMatrices,
     observer_matrices,
     weakest,
 )
 from gpebo_cli.observers.reduced.regression import Assembled, regression_signals, term_sizes
 from gpebo_cli.observers.reduced.split import initial_basis
+from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 
 
+class Start(NamedTuple):
+    """Where the dynamic extension starts at some time: w = offset + from_unknowns θ − V (e − ξ_a0).
+
+    Of the equations as given every w in the range of P may be one, and offset and from_unknowns are
+    zero. Hidden constraints leave d of n_a dimensions.
+    """
+
+    basis: Array  # (n, d) V, orthonormal
+    names: tuple[str, ...]  # of e's components
+    offset: Array  # (n,)
+    from_unknowns: Array  # (n, q)
+
+
+def start_at(
+    form: EquationForm, o: ObserverMatrices, driving: Array, y: Array
+) -> Start:
+    """The start at one time, from the matrices there.
+
+    With 0 = N_c w + g_c + G_c θ the residual of the equations without outputs,
+    w = −N_c⁺(g_c + G_c θ) + V z, V of the kernel of N_c.
+
+    Args:
+        form: of the plant.
+        o: the matrices at one time.
+        driving: v there (1, ·).
+        y: there (1, r).
+    """
+    rank, states = o.split.rank, form.system.states
+    V1, names = initial_basis(o.split.projector[0], rank, states)
+    n, q = form.system.n, form.system.q
+    if form.structure is None or form.structure.d == rank:
+        return Start(V1, names, np.zeros(n), np.zeros((n, q)))
+    exact = slice(0, o.algebraic.shape[1] - o.outputs)
+    seen = o.equations(np.concatenate([driving, y], axis=1)[:, :, None])
+    R = o.residual[0][exact]
+    U, sigma, Vt = np.linalg.svd(R @ o.algebraic[0] @ V1)
+    d = form.structure.d
+    known = (Vt[: rank - d].T / sigma[: rank - d]) @ U[:, : rank - d].T @ R
+    free = V1 @ Vt[rank - d :].T
+    basis, names = initial_basis(free @ free.T, d, states)
+    return Start(basis, names, -V1 @ known @ seen.g_y[0], -V1 @ known @ seen.G[0])
+
+
+def begin_at(
+    xi_a0: Mapping[str, float] | list[float] | None, system: DescriptorSystem,
+    o: ObserverMatrices, begin: Start,
+) -> Array:
+    """``observer.xi_a0``, of the differential states, in the coordinates of the start, (d,).
+
+    Raises:
+        ConfigError: an unknown state, or the wrong number of values.
+    """
+    V1, names = initial_basis(o.split.projector[0], o.split.rank, system.states)
+    return np.asarray(begin.basis.T @ V1 @ initial_extension(xi_a0, system, names))
+
+
 @dataclass(frozen=True, eq=False)
 class ReducedSystem:
     """w' = A_0 w + b_0 + D_0 θ and 0 = R (𝒜 w + g_y + G θ) on measured signals."""
 
-    system: DescriptorSystem
+    form: EquationForm
     signals: Measurements
     solver: SolverSettings
     mesh: Mesh  # where to start integrating
     first: ObserverMatrices  # at the points of the signals' mesh, without injection
-    initial_basis: Array  # (n, n_a) V1
-    names: tuple[str, ...]  # of e₀'s components
-    xi_a0: Array  # (n_a,) where the extension starts, in the coordinates of V1
+    begin: Start  # at the start
+    xi_a0: Array  # (d,) where the extension starts, in the coordinates of its basis
     regression: str  # projected: all rows of the residual, paper: the last r
+    note: str = ""  # which form is used, where that was not said, and why
     injection: Injection | None = None
+
+    @property
+    def system(self) -> DescriptorSystem:
+        """The plant."""
+        return self.form.system
+
+    @property
+    def initial_basis(self) -> Array:
+        """V1 (n, d)."""
+        return self.begin.basis
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of e₀'s components, (d,)."""
+        return self.begin.names
 
     @property
     def basis(self) -> Array:
@@ -61,22 +134,47 @@ class ReducedSystem:
         """n_a."""
         return int(self.first.split.rank)
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of w's coordinates, (k,)."""
+        states = self.system.states
+        if self.basis.shape[1] > self.rank:
+            return states
+        _, names = initial_basis(self.first.split.projector[0], self.rank, states)
+        return tuple(name.removeprefix("e0_") for name in names)
+
     def matrices(self, t: Array, inside: Array) -> ObserverMatrices:
         """At the times t (N,), output injection included."""
-        o = observer_matrices(self.system, t, inside, self.solver.rank_tol, self.first)
+        signals = self.signals.at(t, inside) if self.form.follows_signals else None
+        o = observer_matrices(
+            self.form, t, inside, self.solver.rank_tol, self.first, signals=signals
+        )
         return o if self.injection is None else o.injected(self.injection(o, t, inside))
 
-    def start(self, xi_a: Array | None = None, basis: Array | None = None) -> Array:
-        """[ξ_a | ξ_b | Φ] = [ξ_a | 0 | V] for ξ_a (n,) and V (n, n_a), shape (k, 1 + q + n_a).
+    def driving(self, t: Array, inside: Array) -> tuple[Array, Array]:
+        """v (N, ·) and y (N, r) at the times t (N,)."""
+        u = self.form.driving(t, inside, self.signals.inputs(t, inside))
+        return u, self.signals.outputs(t, inside)
 
-        By default those of the start, V1 ξ_a0 and V1.
+    def start_at(self, time: float, inside: float) -> Start:
+        """Where the extension may start at a later time."""
+        t, t_in = np.array([time]), np.array([inside])
+        return start_at(self.form, self.matrices(t, t_in), *self.driving(t, t_in))
+
+    def start(self, begin: Start | None = None, xi_a: Array | None = None) -> Array:
+        """[ξ_a | ξ_b | Φ] = [ξ_a | from_unknowns | V] for ξ_a (n,), shape (k, 1 + q + d).
+
+        By default that of the start, with ξ_a = offset + V ξ_a0.
         """
-        basis = self.initial_basis if basis is None else basis
-        xi_a = basis @ self.xi_a0 if xi_a is None else xi_a
-        still = np.zeros((len(xi_a), self.system.q))
-        return np.asarray(
-            self.basis.T @ np.concatenate([xi_a[:, None], still, basis], axis=1)
-        )
+        begin = self.begin if begin is None else begin
+        xi_a = self.xi_a if xi_a is None else xi_a
+        whole = np.concatenate([xi_a[:, None], begin.from_unknowns, begin.basis], axis=1)
+        return np.asarray(self.basis.T @ whole)
+
+    @property
+    def xi_a(self) -> Array:
+        """ξ_a at the start, (n,)."""
+        return np.asarray(self.begin.offset + self.initial_basis @ self.xi_a0)
 
 
 def reduced_system(
@@ -87,6 +185,7 @@ def reduced_system(
     xi_a0: Mapping[str, float] | list[float] | None = None,
     weights: ByName | None = None,
     regression: str = "projected",
+    form: str = "auto",
 ) -> ReducedSystem:
     """The reduced system on measured signals.
 
@@ -97,25 +196,85 @@ def reduced_system(
         xi_a0: ``observer.xi_a0``.
         weights: of the outputs, ``observer.weights``.
         regression: which rows of the residual to keep.
+        form: given, strangeness_free, or auto: as given where Assumption 1 holds.
 
     Raises:
         ModelError: rank of E not constant, or Assumption 1 violated.
         ConfigError: no outputs, or a setting that does not fit.
     """
-    refuse_beyond(system)
+    mesh = signals.mesh
+    t, inside = mesh.points.ravel(), mesh.inside.ravel()
+    at = signals.at(t, inside) if system.coefficients.signals else None
+    used, first, note = choose_form(
+        system, t, inside, at, signals.derivatives, solver, form, weights
+    )
+    whole = ReducedSystem(
+        used, signals, solver, mesh, first,
+        start_at(used, *_beginning(used, first, signals, solver)), np.zeros(0), regression, note,
+    )
+    return replace(whole, xi_a0=begin_at(xi_a0, system, first, whole.begin))
+
+
+def _beginning(
+    form: EquationForm, first: ObserverMatrices, signals: Measurements, solver: SolverSettings
+) -> tuple[ObserverMatrices, Array, Array]:
+    """The matrices at the first time, and v and y there."""
+    t, inside = signals.mesh.points.ravel()[:1], signals.mesh.inside.ravel()[:1]
+    at = signals.at(t, inside)
+    o = observer_matrices(
+        form, t, inside, solver.rank_tol, first, signals=at if form.follows_signals else None
+    )
+    return o, form.driving(t, inside, at[:, : form.system.m]), at[:, form.system.m :]
+
+
+def choose_form(
+    system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
+    derivatives: InputDerivatives | None, solver: SolverSettings, form: str,
+    weights: ByName | None,
+) -> tuple[EquationForm, ObserverMatrices, str]:
+    """The form of the equations, its matrices at the times t (N,), and why it is this one.
+
+    Args:
+        system: the model.
+        t: times, the first one that of the start.
+        inside: where functions that jump are decided.
+        signals: [u; y] there (N, m + r), for a plant whose matrices follow them.
+        derivatives: of the inputs, as far as they are known.
+        solver: tolerances.
+        form: given, strangeness_free or auto.
+        weights: of the outputs, ``observer.weights``.
+
+    Raises:
+        ModelError: rank of E not constant, Assumption 1 violated, not uniquely solvable.
+        ConfigError: no outputs, wrong weights, a derivative of an input that is not known.
+    """
     if system.r == 0:
         raise ConfigError(
             f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
         )
-    mesh = signals.mesh
-    t, inside = mesh.points.ravel(), mesh.inside.ravel()
-    first = observer_matrices(
-        system, t, inside, solver.rank_tol, normalise=True,
-        output_scale=output_scale(weights, system),
+    scale = output_scale(weights, system)
+
+    def matrices(chosen: EquationForm) -> ObserverMatrices:
+        return observer_matrices(
+            chosen, t, inside, solver.rank_tol, normalise=True, output_scale=scale,
+            signals=signals,
+        )
+
+    note = ""
+    if form != "strangeness_free":
+        given = EquationForm(system, inputs=derivatives)
+        try:
+            return given, matrices(given), note
+        except NotObservableError as error:
+            if form == "given":
+                raise
+            reason = str(error).rpartition("; ")[0].partition(": ")[2]
+            note = f"; observer on the strangeness-free form, for as given {reason}"
+    hidden = strangeness_free(
+        system, t, inside, signals, derivatives,
+        max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol,
     )
-    V1, names = initial_basis(first.split.projector[0], first.split.rank, system.states)
-    start = initial_extension(xi_a0, system, names)
-    return ReducedSystem(system, signals, solver, mesh, first, V1, names, start, regression)
+    return hidden, matrices(hidden), note
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,18 +314,17 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         SolverError: the tolerance cannot be reached, or the extension grows beyond all bounds.
     """
     system, solver, basis = reduced.system, reduced.solver, reduced.basis
-    q, n_a = system.q, reduced.rank
+    q, columns = system.q, start.shape[1]
 
-    def equations(o: ObserverMatrices, u: Array, y: Array) -> LinearEquation:
-        f, g_y = _driven(o, u, y, 1 + q + n_a)
+    def equations(o: ObserverMatrices, v: Array, y: Array) -> LinearEquation:
+        f, g_y = _driven(o, v, y, columns)
         seen = AlgebraicEquations(
             o.on_basis, g_y, o.G, o.range, o.elimination, o.injectivity
         )
         return LinearEquation(None, o.dynamics, f, seen)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
-        u, y = reduced.signals.inputs(t, inside), reduced.signals.outputs(t, inside)
-        return equations(reduced.matrices(t, inside), u, y)
+        return equations(reduced.matrices(t, inside), *reduced.driving(t, inside))
 
     latest: list[Assembled] = []
 
@@ -193,17 +351,18 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         signals = reduced.signals
         if mesh is signals.mesh and reduced.injection is None:
             u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
-            known = equations(reduced.first, u, y)
+            points, inside = _over_time(mesh.points), _over_time(mesh.inside)
+            known = equations(reduced.first, reduced.form.driving(points, inside, u), y)
         solution = solve(
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         )
     return Extension(solution, latest[0])
 
 
-def _driven(o: ObserverMatrices, u: Array, y: Array, columns: int) -> tuple[Array, Array]:
-    """[b_0 | D_0 | 0], shape (N, k, columns), and g_y (N, e + r), of u (N, m) and y (N, r)."""
-    signals = np.concatenate([u, y], axis=1)[:, :, None]
-    f = np.zeros((len(u), o.dynamics.shape[1], columns))
+def _driven(o: ObserverMatrices, v: Array, y: Array, columns: int) -> tuple[Array, Array]:
+    """[b_0 | D_0 | 0], shape (N, k, columns), and g_y (N, e + r), of v (N, ·) and y (N, r)."""
+    signals = np.concatenate([v, y], axis=1)[:, :, None]
+    f = np.zeros((len(v), o.dynamics.shape[1], columns))
     f[:, :, :1] = o.from_signals @ signals
     f[:, :, 1 : 1 + o.from_unknowns.shape[2]] = o.from_unknowns
     return f, (o.g_signals @ signals)[:, :, 0]
@@ -228,6 +387,13 @@ def assumptions(
             "Assumption 1",
             "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
             True,
-            {"smallest_singular_value": smallest, "at": float(mesh.points.ravel()[where])},
+            {"smallest_singular_value": smallest, "at": float(mesh.points.ravel()[where]),
+             **form_used(reduced.form, reduced.note)},
         ),
     )
+
+
+def form_used(form: EquationForm, note: str) -> dict[str, float | int | str | None]:
+    """Which form of the equations is used, and why, as evidence."""
+    name = "given" if form.structure is None else "strangeness_free"
+    return {"form": name, **({"because": note.removeprefix("; ")} if note else {})}

@@ -24,8 +24,14 @@ from gpebo_cli.observers.reduced.split import (
     split_in_frame,
     within_frame,
 )
+from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
 
+_ROUNDING = 1e3 * float(np.finfo(float).eps)
 _SMALL = 24  # states, up to which NumPy's calls cost more than the kernels' plain loops
+
+
+class NotObservableError(ModelError):
+    """Assumption 1, impulse observability, fails."""
 
 
 class AlgebraicEquations(NamedTuple):
@@ -52,10 +58,10 @@ class ObserverMatrices:
     output_scale: Array  # (r,) √w, by which rows of C and y were multiplied
     dynamics: Array  # (N, k, k) BᵀA_0 B
     from_unknowns: Array  # (N, k, q) BᵀD_0
-    from_signals: Array  # (N, k, m + r) Bᵀb_0 = from_signals [u; y]
-    algebraic: Array  # (N, e + r, n) 𝒜
+    from_signals: Array  # (N, k, · + r) Bᵀb_0 = from_signals [v; y], v as the form has it
+    algebraic: Array  # (N, e + r, n) 𝒜; e of Π and of hidden constraints
     on_basis: Array  # (N, e + r, k) 𝒜 B
-    g_signals: Array  # (N, e + r, m + r) g_y = g_signals [u; y]
+    g_signals: Array  # (N, e + r, · + r) g_y = g_signals [v; y]
     G: Array  # (N, e + r, q)
     range: Array  # (N, e + r, n_b) Q1
     elimination: Array  # (N, n, n_b) H
@@ -64,8 +70,12 @@ class ObserverMatrices:
 
     @property
     def outputs(self) -> int:
-        """Number of outputs r."""
-        return int(self.algebraic.shape[1] - self.split.equations.shape[1])
+        """Number of outputs r; theirs are the last rows."""
+        return len(self.output_scale)
+
+    def of_noise(self, matrix: Array, inputs: int) -> Array:
+        """The columns of a matrix (N, ·, · + r) of [v; y] that belong to [u; y], m inputs."""
+        return np.concatenate([matrix[:, :, :inputs], matrix[:, :, -self.outputs :]], axis=2)
 
     @property
     def projector(self) -> Array:
@@ -78,7 +88,7 @@ class ObserverMatrices:
         return orthonormal_complement(self.range)
 
     def equations(self, signals: Array) -> AlgebraicEquations:
-        """The algebraic equations with the signals [u; y] (N, m + r, 1)."""
+        """The algebraic equations with the signals [v; y] (N, · + r, 1)."""
         g_y = (self.g_signals @ signals)[:, :, 0]
         return AlgebraicEquations(
             self.on_basis, g_y, self.G, self.range, self.elimination, self.injectivity
@@ -103,79 +113,64 @@ Injection = Callable[[ObserverMatrices, Array, Array], Array]
 
 
 def row_sizes(entries: Array) -> Array:
-    """Size of each row of E over the times, shape (n,), one for rows that are zero.
+    """Size of each row of E, shape (n,), one for rows that are zero but for rounding.
 
     Dividing equations by constants changes nothing, but an equation in picofarads would else look
     like a rank deficiency of E. Powers of two: no rounding.
 
     Args:
-        entries: the size of each entry of E over the times, (n, n).
+        entries: the size of each entry of E, (n, n).
     """
     size = entries.max(axis=1, initial=0.0)
-    return np.asarray(np.exp2(np.rint(np.log2(np.where(size > 0, size, 1.0)))))
+    known = size > _ROUNDING * size.max(initial=0.0)
+    return np.asarray(np.exp2(np.rint(np.log2(np.where(known, size, 1.0)))))
 
 
 def observer_matrices(
-    system: DescriptorSystem, t: Array, inside: Array, rank_tol: float,
+    form: EquationForm, t: Array, inside: Array, rank_tol: float,
     like: ObserverMatrices | None = None, *, normalise: bool = False,
-    output_scale: Array | None = None,
+    output_scale: Array | None = None, signals: Array | None = None,
 ) -> ObserverMatrices:
     """Evaluate the observer's matrices at the times t (N,).
 
     Args:
-        system: the model.
-        t: times.
+        form: of the plant.
+        t: times, those of the start first.
         inside: where functions that jump are decided.
         rank_tol: singular values below this, relative, are zero.
         like: those of other times, whose basis and scaling of the equations are kept.
         normalise: divide the equations by their sizes first, see :func:`row_sizes`.
         output_scale: √w (r,) of the outputs' weights; default: that of ``like``, else ones.
+        signals: [u; y] at these times (N, m + r), for a plant whose matrices follow them.
 
     Raises:
         ModelError: the rank of E is not constant, or Assumption 1 fails; names the time and the
             singular value.
     """
-    turning = like is not None and like.split.frame is None
-    c = system.coefficients.taylor(t, 1 if turning else 0, inside)
-    constant = system.coefficients.constant
-
-    def value(name: str) -> Array:
-        matrix: Array = getattr(c, name)[0]
-        return matrix[:1] if name in constant else matrix
-
-    model = _Model(value("E"), value("A"), value("B"), value("F"), value("C"))
+    system, model = form.system, form.equations(t, inside, signals)
     if like is not None:
         rows, scale = like.rows, like.output_scale
     else:
-        entries = entry_sizes(model.E)
-        rows = row_sizes(entries) if normalise else np.ones(system.n)
+        # By what is known at the start: what comes later must not change what was before.
+        rows = row_sizes(np.abs(model.E[0])) if normalise else np.ones(system.n)
         scale = np.ones(system.r)
     if output_scale is not None:
         scale = output_scale
-    frame = axes_frame(entries) if like is None else like.split.frame
-    found = None if frame is None else _in_frame(model, rows, scale, frame, rank_tol)
+    plain = model.hidden is None and {"D", "H"} <= system.coefficients.zero
+    frame = axes_frame(entry_sizes(model.E)) if like is None else like.split.frame
+    found = None
+    if plain and frame is not None:
+        found = _in_frame(model, rows, scale, frame, rank_tol)
     if found is not None:
         return found
-
-    def slope() -> Array:
-        known = c if turning else system.coefficients.taylor(t, 1, inside)
-        return np.asarray(known.E[1][: len(model.E)])
-
-    return _by_steps(system, model, rows, scale, t, rank_tol, like, slope)
-
-
-class _Model(NamedTuple):
-    """The plant's matrices at N times; a leading axis of 1 means constant in time."""
-
-    E: Array
-    A: Array
-    B: Array
-    F: Array
-    C: Array
+    return _by_steps(
+        system, model, rows, scale, t, rank_tol, like,
+        lambda: form.mass(t, inside, signals, 1)[: len(model.E)],
+    )
 
 
 def _in_frame(
-    model: _Model, rows: Array, scale: Array, frame: Frame, rank_tol: float
+    model: Equations, rows: Array, scale: Array, frame: Frame, rank_tol: float
 ) -> ObserverMatrices | None:
     """What :func:`_by_steps` finds if the frame is that of E at all times, in one call.
 
@@ -183,7 +178,7 @@ def _in_frame(
     """
     (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
      from_signals) = kernels.observer.in_frame(
-        *model, rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
+        *model[:5], rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
     )
     outside, inner, inverse = sizes.tolist()
     size = 0.0 if outside == 0.0 else float(np.abs(model.E / rows[:, None]).max(initial=0.0))
@@ -199,15 +194,15 @@ def _in_frame(
 
 
 def _by_steps(
-    system: DescriptorSystem, model: _Model, rows: Array, scale: Array, t: Array, rank_tol: float,
-    like: ObserverMatrices | None, slope: Callable[[], Array],
+    system: DescriptorSystem, model: Equations, rows: Array, scale: Array, t: Array,
+    rank_tol: float, like: ObserverMatrices | None, slope: Callable[[], Array],
 ) -> ObserverMatrices:
     """The observer's matrices from those of the plant at the times t (N,) and Ė (N or 1, n, n)."""
-    m, q, r = system.m, system.q, system.r
-    E, A, B, F, C = model
+    q, r = system.q, system.r
+    E, A, B, F, C, D, H, hidden = model
     if (rows != 1.0).any():
         E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
-    C = scale[:, None] * C
+    C, D, H = (scale[:, None] * matrix for matrix in (C, D, H))
     if like is None:
         split = constant_split(E, system.states, rank_tol)
     else:
@@ -218,30 +213,34 @@ def _by_steps(
         split = split_by_svd(system, E, slope() / rows[:, None], t, rank_tol, known)
 
     L, pinv, basis = split.equations, split.pinv, split.basis
-    algebraic = joined(L @ A, C, axis=1)  # 𝒜 = [Π A; C]
+    # 0 = 𝒜 x + g_y + G θ: equations without derivatives, hidden constraints, outputs.
+    exact = [L @ A], [L @ B], [L @ F]
+    if hidden is not None:
+        for part, more in zip(exact, hidden, strict=True):
+            part.append(more)
+        C, D, H = _seen_through(hidden, split.kernel, C, D, H)
+    algebraic, of_inputs, G = (
+        joined(*part, last, axis=1) for part, last in zip(exact, (C, D, H), strict=True)
+    )
     on_basis = algebraic @ basis
-    e = L.shape[1]
-    of_y = np.zeros((1, e + r, r))
-    of_y[0, e:] = -np.diag(scale)
-    below = np.zeros((1, r, m + q))
-    of_u_theta = joined(joined(L @ B, L @ F, axis=2), below, axis=1)
-    # g_y = [Π B u; −y] and G = [Π F; 0]
-    g_signals, G = joined(of_u_theta[:, :, :m], of_y, axis=2), of_u_theta[:, :, m:]
-    Q1, H, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
+    of_y = np.zeros((1, algebraic.shape[1], r))
+    of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
+    g_signals = joined(of_inputs, of_y, axis=2)
+    Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
     Lambda = pinv @ A if split.turn is None else pinv @ A + split.turn  # Λ = E⁺A + Ṗ
     # [A_0 | D_0 | of u and y] = [Λ | E⁺F | E⁺B, 0] − Λ K [𝒜 | G | g_signals]
     direct = joined(
         Lambda @ basis, pinv @ F, pinv @ B, np.zeros((1, len(basis.T), r)), axis=2
     )
     through = joined(on_basis, G, g_signals, axis=2)
-    whole = direct - (Lambda @ H) @ (transpose(Q1) @ through)
+    whole = direct - (Lambda @ K) @ (transpose(Q1) @ through)
     k = basis.shape[1]
     dynamics = whole[:, :, :k]
     return ObserverMatrices(
         split=split,
         rows=rows,
         output_scale=scale,
-        dynamics=dynamics[:1] if len(E) == len(A) == len(C) == 1 else dynamics,
+        dynamics=dynamics[:1] if len(E) == len(A) == len(C) == 1 and hidden is None else dynamics,
         from_unknowns=whole[:, :, k : k + q],
         from_signals=whole[:, :, k + q :],
         algebraic=algebraic,
@@ -249,8 +248,22 @@ def _by_steps(
         g_signals=g_signals,
         G=G,
         range=Q1,
-        elimination=H,
+        elimination=K,
         injectivity=injectivity,
+    )
+
+
+def _seen_through(
+    hidden: HiddenConstraints, kernel: Array, C: Array, D: Array, H: Array
+) -> tuple[Array, Array, Array]:
+    """The outputs with v = Q x put in from the constraints: C − C J M, D − C J M_v, H − C J M_θ.
+
+    J = V2 (M V2)⁺ with V2 (N, n, n_b) of the kernel of E. What is left of C vanishes on that
+    kernel, so no output takes part in the elimination: they are all left to the regression.
+    """
+    through = C @ kernel @ np.linalg.pinv(hidden.states @ kernel)
+    return (
+        C - through @ hidden.states, D - through @ hidden.driving, H - through @ hidden.unknowns
     )
 
 
@@ -278,10 +291,11 @@ def _eliminate(
         smallest = np.linalg.svd(R1[doubtful], compute_uv=False)[:, -1] / size[doubtful]
         if (smallest <= rank_tol).any():
             k = int(np.argmax(smallest <= rank_tol))
-            raise ModelError(
+            raise NotObservableError(
                 f"plant {system.name}: Assumption 1 (impulse observability) fails at "
                 f"t = {t[doubtful[k]]:.6g}: [ΠA; C] has singular value {smallest[k]:.1e} on the "
-                "kernel of E; an output that sees the algebraic states is needed"
+                "kernel of E; an output that sees the algebraic states is needed, or "
+                "observer.form=strangeness_free"
             )
     return Q1, kernel @ inverse, bound
 

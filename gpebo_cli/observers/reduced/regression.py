@@ -37,6 +37,9 @@ class Assembled:
         columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
         psi, gain = self.psi / columns, self.gain / columns
         states = np.abs(gain).max(axis=(0, 2), initial=0.0)
+        if self.Y_scale > 0.0:  # a state that no parameter has part in is no signal to resolve
+            own = np.abs(self.offset).max(axis=0, initial=0.0) / self.Y_scale
+            states = np.maximum(states, 1e-3 * own)
         squares, right = _products(psi, self.Y)
         return [
             (self.Y, 1e-3 * self.Y_scale),

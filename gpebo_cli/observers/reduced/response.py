@@ -21,15 +21,17 @@ def errors_of(reduced: ReducedSystem, kept: IntArray) -> ErrorsAt:
 
     ζ' = A_0 ζ + b_0(e),    δY = R (𝒜 ζ + g_y(e)),    δoffset = ζ − K (𝒜 ζ + g_y(e))
     """
+    m = reduced.system.m
 
     def at(t: Array, inside: Array) -> ErrorSystem:
         o = reduced.matrices(t, inside)
         R, H, Q1 = o.residual[:, kept], o.elimination, transpose(o.range)
+        g = o.of_noise(o.g_signals, m)
         return ErrorSystem(
             o.dynamics,
-            o.from_signals,
+            o.of_noise(o.from_signals, m),
             _stacked(R @ o.on_basis, o.split.basis - H @ (Q1 @ o.on_basis)),
-            _stacked(R @ o.g_signals, -H @ (Q1 @ o.g_signals)),
+            _stacked(R @ g, -H @ (Q1 @ g)),
         )
 
     return at

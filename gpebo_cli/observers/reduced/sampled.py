@@ -17,17 +17,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers._base import ByName, initial_extension, output_scale, refuse_beyond
+from gpebo_cli.observers._base import ByName
+from gpebo_cli.observers.reduced.extension import begin_at, choose_form, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import regression_signals, term_sizes
-from gpebo_cli.observers.reduced.split import initial_basis, split_in_frame
+from gpebo_cli.observers.reduced.split import split_in_frame
 from gpebo_cli.recordings.hold import edges, held
+from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import SolverSettings
 
@@ -66,7 +68,7 @@ class SampledBlock:
 class SampledObserver:
     """A plant's observer in discrete time; immutable, see :class:`SampledState`."""
 
-    system: DescriptorSystem
+    form: EquationForm
     solver: SolverSettings
     hold: str
     regression: str  # projected or paper
@@ -75,6 +77,12 @@ class SampledObserver:
     initial_basis: Array  # (n, n_a) V1
     xi_a0: Array  # (n_a,)
     parameters: tuple[str, ...]
+    note: str  # which form of the equations is used, where that was not said, and why
+
+    @property
+    def system(self) -> DescriptorSystem:
+        """The plant."""
+        return self.form.system
 
     @property
     def basis(self) -> Array:
@@ -108,9 +116,9 @@ class SampledObserver:
         signal = held(times, signals, self.hold)
 
         def coefficients(at: Array, inside: Array) -> LinearEquation:
-            o = self._matrices(at, inside)
+            o, driving = self._matrices(at, inside, signal(at, inside))
             f = np.zeros((len(at), *self.start.shape))
-            f[:, :, :1] = o.from_signals @ signal(at, inside)[:, :, None]
+            f[:, :, :1] = o.from_signals @ driving
             f[:, :, 1 : 1 + self.system.q] = o.from_unknowns
             return LinearEquation(None, o.dynamics, f)
 
@@ -129,23 +137,31 @@ class SampledObserver:
         after = replace(state, error_estimate=error)
         return self._block(solution.trajectory.values[ends, -1], t, u, y, after)
 
-    def _matrices(self, t: Array, inside: Array) -> ObserverMatrices:
-        o = observer_matrices(self.system, t, inside, self.solver.rank_tol, self.like)
+    def _matrices(
+        self, t: Array, inside: Array, signals: Array
+    ) -> tuple[ObserverMatrices, Array]:
+        """The matrices at the times t (N,), and [v; y] (N, · + r, 1) from [u; y] (N, m + r)."""
+        o = observer_matrices(
+            self.form, t, inside, self.solver.rank_tol, self.like,
+            signals=signals if self.form.follows_signals else None,
+        )
         rank = self.like.split.rank
         if o.split.rank != rank:
             raise ModelError(
                 f"plant {self.system.name}: the rank of E changes from {rank} to {o.split.rank} "
                 f"before t = {t[-1]:.6g}; the observer needs it constant"
             )
-        return o
+        m = self.system.m
+        driving = self.form.driving(t, inside, signals[:, :m])
+        return o, np.concatenate([driving, signals[:, m:]], axis=1)[:, :, None]
 
     def _block(
         self, z: Array, t: Array, u: Array, y: Array, before: SampledState | None
     ) -> tuple[SampledState, SampledBlock]:
         """Regression and state map from [ξ_a | ξ_b | Φ] at the samples, z (K, k, ·)."""
         system = self.system
-        o = self._matrices(t, t)
-        equations = o.equations(np.hstack([u, y])[:, :, None])
+        o, driving = self._matrices(t, t, np.hstack([u, y]))
+        equations = o.equations(driving)
         assembled = regression_signals(z, system.q, self.basis, equations)
         rows = np.concatenate([assembled.psi, assembled.Y[:, :, None]], axis=2)
         if self.regression == "paper":
@@ -186,10 +202,11 @@ def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
 
 
 def sampled_observer(
-    system: DescriptorSystem, solver: SolverSettings, hold: str, start: float, *,
+    system: DescriptorSystem, solver: SolverSettings, hold: str, start: float, sample: Array, *,
     xi_a0: Mapping[str, float] | list[float] | None = None,
     weights: ByName | None = None,
     regression: str = "projected",
+    form: str = "auto",
 ) -> SampledObserver:
     """The observer in discrete time, whose first sample is at ``start``.
 
@@ -198,48 +215,44 @@ def sampled_observer(
         solver: tolerances.
         hold: zoh or linear.
         start: seconds.
+        sample: [u; y] there, (m + r,).
         xi_a0: ``observer.xi_a0``.
         weights: of the outputs, ``observer.weights``.
         regression: which rows of the residual to keep.
+        form: given, strangeness_free, or auto: as given where Assumption 1 holds at the start.
 
     Raises:
         ConfigError: no outputs, or a setting that does not fit.
         ModelError: Assumption 1 fails at the start.
     """
-    refuse_beyond(system)
-    if system.r == 0:
-        raise ConfigError(
-            f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
-        )
     t = np.array([start])
-    first = observer_matrices(
-        system, t, t, solver.rank_tol, normalise=True, output_scale=output_scale(weights, system)
-    )
-    if not _kernel_is_fixed(system, first, t + _PROBED, solver.rank_tol):
+    used, first, note = choose_form(system, t, t, sample[None], None, solver, form, weights)
+    if not _kernel_is_fixed(used, first, t + _PROBED, sample, solver.rank_tol):
         split = replace(first.split, basis=np.eye(system.n), frame=None)
         first = replace(first, split=split, on_basis=first.algebraic)
-    split = first.split
-    V1, names = initial_basis(split.projector[0], split.rank, system.states)
-    xi_a = initial_extension(xi_a0, system, names)
-    in_basis = split.basis.T @ V1
-    zeros = np.zeros((len(in_basis), system.q))
+    m = system.m
+    begin = start_at(used, first, used.driving(t, t, sample[None, :m]), sample[None, m:])
+    xi = begin_at(xi_a0, system, first, begin)
+    xi_a = begin.offset + begin.basis @ xi
+    whole = np.concatenate([xi_a[:, None], begin.from_unknowns, begin.basis], axis=1)
     return SampledObserver(
-        system=system, solver=solver, hold=hold, regression=regression, like=first,
-        start=np.concatenate([(in_basis @ xi_a)[:, None], zeros, in_basis], axis=1),
-        initial_basis=V1, xi_a0=xi_a, parameters=(*system.unknowns, *names),
+        form=used, solver=solver, hold=hold, regression=regression, like=first,
+        start=first.split.basis.T @ whole, initial_basis=begin.basis, xi_a0=xi,
+        parameters=(*system.unknowns, *begin.names), note=note,
     )
 
 
 def _kernel_is_fixed(
-    system: DescriptorSystem, first: ObserverMatrices, t: Array, rank_tol: float
+    form: EquationForm, first: ObserverMatrices, t: Array, sample: Array, rank_tol: float
 ) -> bool:
     """Whether kernel and range of E are at the times t (N,) what they are at the first sample.
 
-    If so the extension needs n_a coordinates, else all n. A kernel that starts to turn later on is
-    refused then.
+    The sample is [u; y] (m + r,). If so the extension needs n_a coordinates, else all n. A kernel
+    that starts to turn later on is refused then.
     """
     frame = first.split.frame
-    if frame is None or "E" in system.coefficients.constant:
+    if frame is None or "E" in form.system.coefficients.constant:
         return frame is not None
-    E = system.coefficients.taylor(t, 0).E[0] / first.rows[:, None]
+    signals = np.repeat(sample[None], len(t), axis=0) if form.follows_signals else None
+    E = form.mass(t, t, signals) / first.rows[:, None]
     return split_in_frame(E, frame, rank_tol) is not None

@@ -63,7 +63,7 @@ class CurrentCoordinates:
 
         def coefficients(t: Array, inside: Array) -> LinearEquation:
             o = reduced.matrices(t, inside)
-            signals = reduced.signals.at(t, inside)[:, :, None]
+            signals = np.concatenate(reduced.driving(t, inside), axis=1)[:, :, None]
             A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
             A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
             b[:, q:] = (o.from_signals @ signals)[:, :, 0]
@@ -99,14 +99,13 @@ class CurrentCoordinates:
         kept = final.kept_rows(system, reduced.regression)
         if rotates:
             kept = np.union1d(kept, np.arange(final.Y.shape[1] - n, final.Y.shape[1]))
-        labels = system.states if rotates else [s.removeprefix("e0_") for s in reduced.names]
         A_0 = A[:, q:, q:]
         fastest = float(np.linalg.eigvals(A_0).real.min(initial=0.0))
         return Observation(
             regression=LinearRegression(
                 Y=on_mesh(mesh, final.Y[:, kept]),
                 psi=on_mesh(mesh, final.psi[:, kept]),
-                parameters=(*system.unknowns, *(f"w_{label}" for label in labels)),
+                parameters=(*system.unknowns, *(f"w_{label}" for label in reduced.labels)),
                 scale=final.column_scale,
                 dynamics=Dynamics(on_mesh(mesh, A), on_mesh(mesh, b), -2.0 * fastest),
             ),
@@ -115,6 +114,7 @@ class CurrentCoordinates:
             error_estimate=solution.error_estimate,
             assumptions=assumptions(reduced, mesh, final),
             growth=None,
+            note=reduced.note,
         )
 
 

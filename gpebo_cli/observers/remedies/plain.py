@@ -28,7 +28,8 @@ class Plain:
         kept = final.kept_rows(system, reduced.regression)
         all_kept = len(kept) == final.Y.shape[1]
         start, stop = reduced.signals.span
-        errors = errors_of(reduced, kept)
+        # Along noisy signals the matrices change, too, and Y is not affine in the noise.
+        errors = None if reduced.form.follows_signals else errors_of(reduced, kept)
         return Observation(
             regression=LinearRegression(
                 Y=on_mesh(mesh, final.Y if all_kept else final.Y[:, kept]),
@@ -45,5 +46,8 @@ class Plain:
             growth=extension.growth(q),
             growth_rate=extension.logarithm(q) / (stop - start),
             errors=errors,
-            respond=lambda e_u, e_y: respond(mesh, errors, len(kept), e_u, e_y),
+            respond=None if errors is None else (
+                lambda e_u, e_y: respond(mesh, errors, len(kept), e_u, e_y)
+            ),
+            note=reduced.note,
         )

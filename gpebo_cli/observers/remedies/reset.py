@@ -36,11 +36,11 @@ from gpebo_cli.observers._observation import (
 from gpebo_cli.observers.reduced.extension import (
     Extension,
     ReducedSystem,
+    Start,
     assumptions,
     extend,
 )
 from gpebo_cli.observers.reduced.regression import Assembled, on_mesh
-from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
@@ -76,21 +76,21 @@ class Resets:
         """
         mesh, times = _with_edges(reduced.mesh, reset_times(reduced, self))
         cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
-        V1, p = reduced.initial_basis, reduced.system.q + reduced.rank
-        starts = [_Start(float(mesh.edges[0]), V1, V1 @ reduced.xi_a0)]
+        p = reduced.system.q + len(reduced.names)
+        starts = [_Start(float(mesh.edges[0]), reduced.begin, reduced.xi_a)]
         extensions: list[Extension] = []
         resets: list[Reset] = []
         known = ExtensionState(np.zeros((p, p + 1)), 0.0)
         for first, last in pairwise(cuts):
             piece = Mesh(mesh.edges[first : last + 1], mesh.rule) if len(times) else mesh
-            begun = reduced.start(starts[-1].xi_a, starts[-1].basis)
+            begun = reduced.start(starts[-1].begin, starts[-1].xi_a)
             extensions.append(extend(reduced, piece, begun))
             if last == mesh.size:
                 break
             known = _learned(extensions[-1], known)
             time = float(mesh.edges[last])
-            basis = _basis(reduced, time, float(mesh.inside[last, 0]))
-            reset, start = _restart(reduced, extensions[-1], known, time, basis)
+            begin = reduced.start_at(time, float(mesh.inside[last, 0]))
+            reset, start = _restart(reduced, extensions[-1], known, time, begin)
             reset = replace(reset, keep=self.keep)
             known = known.after(reset)
             resets.append(reset)
@@ -103,8 +103,13 @@ class _Start:
     """Where a segment begins: e = Vᵀ(ξ_a − w(time))."""
 
     time: float
-    basis: Array  # (n, n_a) V
+    begin: Start
     xi_a: Array  # (n,)
+
+    @property
+    def basis(self) -> Array:
+        """V (n, d)."""
+        return self.begin.basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,14 +140,6 @@ class SegmentErrors:
         return np.concatenate([theta, errors[segment]], axis=1)
 
 
-def _basis(reduced: ReducedSystem, time: float, inside: float) -> Array:
-    """V₊ (n, n_a): the one of the start where the kernel of E is constant."""
-    if reduced.first.split.turn is None:
-        return reduced.initial_basis
-    P = reduced.matrices(np.array([time]), np.array([inside])).projector[0]
-    return initial_basis(P, reduced.rank, reduced.system.states)[0]
-
-
 def _learned(extension: Extension, known: ExtensionState) -> ExtensionState:
     """[G | h] at the end of a segment."""
     a = extension.assembled
@@ -151,20 +148,21 @@ def _learned(extension: Extension, known: ExtensionState) -> ExtensionState:
 
 
 def _restart(
-    reduced: ReducedSystem, extension: Extension, known: ExtensionState, time: float, basis: Array
+    reduced: ReducedSystem, extension: Extension, known: ExtensionState, time: float, begin: Start
 ) -> tuple[Reset, _Start]:
     """T and τ from [ξ_a | ξ_b | Φ] at the end, and where the next segment begins."""
-    q = reduced.system.q
+    q, basis = reduced.system.q, begin.basis
     end = reduced.basis @ extension.solution.trajectory.final
     xi_a, xi_b, Phi = end[:, 0], end[:, 1 : 1 + q], end[:, 1 + q :]
     eta = np.linalg.pinv(known.values[:, :-1], rcond=_KNOWN, hermitian=True) @ known.values[:, -1]
-    after = basis @ (basis.T @ (xi_a + xi_b @ eta[:q] - Phi @ eta[q:]))
+    reached = xi_a + xi_b @ eta[:q] - Phi @ eta[q:]
+    after = begin.offset + basis @ (basis.T @ reached)
     p = q + basis.shape[1]
     transform = np.eye(p)
     transform[q:, :q], transform[q:, q:] = -basis.T @ xi_b, basis.T @ Phi
     shift = np.concatenate([np.zeros(q), basis.T @ (after - xi_a)])
     floor = _FLOOR * max(float(np.abs(part).max(initial=0.0)) for part in (eta[:q], after))
-    return Reset(time, transform, shift, floor), _Start(time, basis, after)
+    return Reset(time, transform, shift, floor), _Start(time, begin, after)
 
 
 def _joined(
@@ -206,6 +204,7 @@ def _joined(
         ),
         error_estimate=max(e.solution.error_estimate for e in extensions),
         assumptions=assumptions(reduced, mesh, whole),
+        note=reduced.note,
         growth=max(e.growth(q) for e in extensions),
         growth_rate=sum(e.logarithm(q) for e in extensions) / float(mesh.edges[-1] - mesh.edges[0]),
     )

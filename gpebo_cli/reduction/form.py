@@ -1,0 +1,301 @@
+"""The equations as an observer takes them: as given, or with all hidden constraints beside them.
+
+    E x' = A x + B v + F θ,     0 = M x + M_v v + M_θ θ,     y = C x + D v + H θ
+
+v are the inputs, one where there is a known term φ, and the derivatives of inputs that hidden
+constraints contain. M = Â2⁺Â2 comes from the derivative array (:mod:`.derivative_array`): whatever
+basis Z2 of its left kernel is taken, M is the same, and as smooth as the plant. [Z1ᵀE; Â2] is
+nonsingular (theory 1), so M is injective on the kernel of E: the observer needs no output to see
+the algebraic states, whatever the index. No output is differentiated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import factorial
+from typing import NamedTuple
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.kernels.structure_numpy import by_elimination, derivative_array, scaled
+from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.reduction.strangeness_free import _MAX_GROWTH as MAX_GROWTH
+from gpebo_cli.reduction.strangeness_free import _by_singular_vectors as by_singular_vectors
+from gpebo_cli.reduction.structure import RESIDUAL, Structure, analyse
+
+_AHEAD = np.linspace(0.0, 1.0, 17)  # seconds
+_ABSENT = 1e-10  # of the largest coefficient of an input: a derivative with less is not there
+
+
+class HiddenConstraints(NamedTuple):
+    """0 = M x + M_v v + M_θ θ at N times."""
+
+    states: Array  # (N, n, n) M
+    driving: Array  # (N, n, driving signals)
+    unknowns: Array  # (N, n, q)
+
+
+class Equations(NamedTuple):
+    """A plant's matrices at N times; a leading axis of 1 means constant in time."""
+
+    E: Array
+    A: Array
+    B: Array  # of the driving signals
+    F: Array
+    C: Array
+    D: Array  # of the driving signals
+    H: Array
+    hidden: HiddenConstraints | None
+
+
+@dataclass(frozen=True, eq=False)
+class InputDerivatives:
+    """What is known of the derivatives of the inputs."""
+
+    known: BoolArray  # (m,) of which inputs they are
+    # times (N,), where functions that jump are decided, order -> Taylor coefficients
+    taylor: Callable[[Array, Array, int], Array]  # (order + 1, N, m)
+
+    @classmethod
+    def of_plant(cls, system: DescriptorSystem, known: BoolArray) -> InputDerivatives | None:
+        """Exact ones, of the inputs (m,) that are the plant's own functions of time."""
+        if system.depends_on_outputs:
+            return None  # and then they serve nobody, see ``strangeness_free``
+        return cls(known, lambda t, inside, order: system.coefficients.taylor(t, order, inside).u)
+
+    @classmethod
+    def of_signal(cls, inputs: Trajectory) -> InputDerivatives:
+        """Those of the polynomials that stand for measured inputs (m,)."""
+
+        def taylor(t: Array, inside: Array, order: int) -> Array:
+            found, signal = [inputs(t, inside)], inputs
+            for k in range(1, order + 1):
+                signal = signal.derivative()
+                found.append(signal(t, inside) / factorial(k))
+            return np.array(found)
+
+        return cls(np.ones(inputs.values.shape[2], dtype=bool), taylor)
+
+
+@dataclass(frozen=True, eq=False)
+class EquationForm:
+    """A plant in the form that an observer takes."""
+
+    system: DescriptorSystem
+    structure: Structure | None = None  # of the strangeness-free form; None: as given
+    # Derivatives that hidden constraints contain: (order, input); of each from ``inputs``.
+    derivatives: tuple[tuple[int, int], ...] = ()
+    inputs: InputDerivatives | None = None
+
+    @property
+    def follows_signals(self) -> bool:
+        """Whether matrices depend on what is measured."""
+        return bool(self.system.coefficients.signals)
+
+    @property
+    def known_term(self) -> bool:
+        """Whether there is a φ."""
+        return "phi" not in self.system.coefficients.zero
+
+    def driving(self, t: Array, inside: Array, u: Array) -> Array:
+        """v (N, ·) at the times t (N,), from the measured inputs u (N, m)."""
+        if not (self.derivatives or self.known_term):
+            return u
+        parts = [u]
+        if self.derivatives and self.inputs is not None:
+            order = max(k for k, _ in self.derivatives)
+            taylor = self.inputs.taylor(t, inside, order)
+            parts += [taylor[k, :, j : j + 1] for k, j in self.derivatives]
+        if self.known_term:
+            parts.append(np.ones((len(u), 1)))
+        return np.concatenate(parts, axis=1)
+
+    def equations(self, t: Array, inside: Array, signals: Array | None) -> Equations:
+        """The matrices at the times t (N,), along the signals [u; y] (N, m + r) if they follow any.
+
+        Raises:
+            ModelError: a rank of the strangeness-free form changes; names the time.
+        """
+        system, source = self.system, self.system.coefficients
+        order = 0 if self.structure is None else self.structure.mu
+        along = self._along(t, inside, signals, order)
+        c = source.taylor(t, order, inside, along)
+
+        def value(name: str) -> Array:
+            matrix: Array = getattr(c, name)[0]
+            return matrix[:1] if name in source.constant else matrix
+
+        extra = len(self.derivatives)
+        B, D = value("B"), value("D")
+        if extra or self.known_term:
+            phi = value("phi")[:, :, None] if self.known_term else np.zeros((1, system.n, 0))
+            count = max(len(B), len(phi))
+            B = np.concatenate([
+                np.broadcast_to(B, (count, *B.shape[1:])), np.zeros((count, system.n, extra)),
+                np.broadcast_to(phi, (count, *phi.shape[1:])),
+            ], axis=2)
+            D = np.concatenate([D, np.zeros((len(D), system.r, extra + phi.shape[2]))], axis=2)
+        hidden = None
+        if self.structure is not None:
+            hidden = self._kept(hidden_constraints(system, self.structure, t, c))
+        return Equations(
+            value("E"), value("A"), B, value("F"), value("C"), D, value("H"), hidden
+        )
+
+    def mass(
+        self, t: Array, inside: Array, signals: Array | None, order: int = 0
+    ) -> Array:
+        """E or its derivative Ė (order 1) at the times t (N,), (N, n, n).
+
+        They follow no signal; any at which the other matrices have values will do.
+        """
+        along = None if signals is None else signals[None]
+        found: Array = self.system.coefficients.taylor(t, order, inside, along).E[order]
+        return found
+
+    def _along(
+        self, t: Array, inside: Array, signals: Array | None, order: int
+    ) -> Array | None:
+        if not self.follows_signals:
+            return None
+        if signals is None:
+            raise ValueError("the matrices follow signals, and none are given")
+        along = np.zeros((order + 1, *signals.shape))
+        if order and self.inputs is not None:
+            along[:, :, : self.system.m] = self.inputs.taylor(t, inside, order)
+        along[0] = signals
+        return along
+
+    def _kept(self, found: HiddenConstraints) -> HiddenConstraints:
+        """Of all driving signals [u_0 … u_μ, 1] those that this form has."""
+        m = self.system.m
+        chosen = [*range(m), *(k * m + j for k, j in self.derivatives)]
+        if self.known_term:
+            chosen.append(found.driving.shape[2] - 1)
+        return found._replace(driving=found.driving[:, :, chosen])
+
+
+def hidden_constraints(
+    system: DescriptorSystem, structure: Structure, t: Array, c: Coefficients
+) -> HiddenConstraints:
+    """M, M_v and M_θ at the times t (N,), with v = [u, u', …, u^(μ)/μ!, 1].
+
+    Args:
+        system: the model.
+        structure: of it.
+        t: times.
+        c: the model there, to the order μ.
+
+    Raises:
+        ModelError: a rank differs from that of ``structure``; names the time.
+    """
+    mu, s, n = structure.mu, structure.scaling, system.n
+    count = slice(0, 1) if structure.time_invariant else slice(None)
+    e, a = scaled(c.E[:, count], c.A[:, count], s.rows, s.columns, s.time, mu + 1)
+    M, N = derivative_array(e, a, mu)
+    weights = (s.time ** np.arange(mu + 1))[:, None] * s.rows
+    blocks = np.zeros((mu + 1, len(t), n, mu + 1, system.m))
+    for i in range(mu + 1):
+        for k in range(i + 1):
+            blocks[i, :, :, k] = c.B[i - k]
+    parts = blocks.reshape(mu + 1, len(t), n, -1), c.phi[: mu + 1, :, :, None], c.F[: mu + 1]
+    g = np.concatenate(
+        [np.broadcast_to(part, (mu + 1, len(t), n, part.shape[3])) for part in parts], axis=3
+    ) * weights[:, None, :, None]
+    g = np.moveaxis(g, 0, 1).reshape(len(t), (mu + 1) * n, -1)
+    known = structure.reference
+    A2, f2, _, _, poor = by_elimination(
+        e[0], M, N, g, known.rows, known.columns, known.rank, known.Z1, len(t), MAX_GROWTH,
+        RESIDUAL,
+    )
+    if poor.any():
+        _, Z2 = by_singular_vectors(
+            system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
+        )
+        everywhere = np.broadcast_to(poor, len(t))
+        A2[poor], f2[everywhere] = transpose(Z2) @ N[poor], transpose(Z2) @ g[everywhere]
+    # Rows of equal size first: they are of any size, and the factors below are then of order one.
+    size = np.maximum(np.abs(A2).max(axis=2, keepdims=True), np.finfo(float).tiny)
+    Q, R = np.linalg.qr(transpose(A2 / size))
+    inward = Q @ np.linalg.solve(transpose(R), f2 / size)  # Â2⁺ [f̂_v | f̂_θ], Â2 = RᵀQᵀ
+    driving = (mu + 1) * system.m + 1
+    return HiddenConstraints(
+        (Q @ transpose(Q)) / s.columns, inward[:, :, :driving], inward[:, :, driving:]
+    )
+
+
+def strangeness_free(
+    system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
+    inputs: InputDerivatives | None, *, max_mu: int, rank_tol: float,
+) -> EquationForm:
+    """The strangeness-free form, for a horizon that the times t (N,) span.
+
+    Args:
+        system: the model.
+        t: times by which to judge which derivatives of inputs there are.
+        inside: where functions that jump are decided.
+        signals: [u; y] there (N, m + r), for matrices that follow them.
+        inputs: derivatives of the inputs, as far as they are known.
+        max_mu: largest strangeness index.
+        rank_tol: singular values below this, relative, are zero.
+
+    Raises:
+        ModelError: not uniquely solvable, or the index is too high.
+        ConfigError: a derivative is needed of an input, or of an output, of which it is not known.
+    """
+    source = system.coefficients
+    if source.signals and system.depends_on_outputs:
+        names = sorted({name for s in source.signals.values() for name in s} & set(system.outputs))
+        raise ConfigError(
+            f"plant {system.name}: observer.form=strangeness_free differentiates the equations, "
+            f"and they contain the output {names[0]}, which is measured only"
+        )
+    if len(t) == 1:  # of samples that are still to come nothing is known but the plant
+        t = inside = t + _AHEAD
+        signals = None if signals is None else np.repeat(signals, len(t), axis=0)
+    structure = analyse(
+        system, float(t[0]), float(t[-1]), max_mu=max_mu, rank_tol=rank_tol
+    )
+    whole = EquationForm(
+        system, structure, tuple((k, j) for k in range(1, structure.mu + 1)
+                                 for j in range(system.m)), inputs,
+    )
+    if source.signals and structure.mu and (inputs is None or not inputs.known.all()):
+        raise ConfigError(_unknown(system, system.inputs[0], "the equations contain it"))
+    found = whole.equations(t, inside, signals).hidden
+    if found is None:
+        return whole
+    size = np.abs(found.driving).max(axis=(0, 1), initial=0.0)
+    m = system.m
+    used = []
+    for place, (k, j) in enumerate(whole.derivatives):
+        orders = [size[j] * 1.0, *(
+            size[m + other] / structure.scaling.time ** whole.derivatives[other][0]
+            for other in range(len(whole.derivatives)) if whole.derivatives[other][1] == j
+        )]
+        if size[m + place] / structure.scaling.time**k > _ABSENT * max(orders):
+            used.append((k, j))
+            if inputs is None or not inputs.known[j]:
+                raise ConfigError(_unknown(
+                    system, system.inputs[j],
+                    f"a hidden constraint contains its derivative of order {k}",
+                ))
+    return replace(whole, derivatives=tuple(used))
+
+
+def _unknown(system: DescriptorSystem, name: str, why: str) -> str:
+    return (
+        f"plant {system.name}: observer.form=strangeness_free needs the derivatives of the input "
+        f"{name}, {why}; of samples and of noisy signals they are not known; of a recording, "
+        "data.hold=cubic takes those of its interpolant"
+    )
+
+
+__all__ = [
+    "EquationForm", "Equations", "HiddenConstraints", "InputDerivatives", "ModelError",
+    "hidden_constraints", "strangeness_free",
+]

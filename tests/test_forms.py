@@ -1,0 +1,295 @@
+"""The observer on the strangeness-free form: any index, whatever is measured; further terms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plants import shipped
+from scipy.integrate import solve_ivp
+from test_observer import ROTATING
+
+from gpebo_cli import check, run
+from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers import Measurements, observe
+from gpebo_cli.reduction.form import InputDerivatives, strangeness_free
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+
+SOLVER = SolverSettings()
+
+# Manufactured: states are chosen functions, and the inputs are what makes them so.
+CAPACITORS = {
+    "name": "capacitors",
+    "states": ["v1", "v2", "i", "is"],
+    "inputs": {
+        "u1": "sin(2*t)/2 + 3*cos(2*t) + exp(-t/5)*sin(t)",
+        "u2": "-2*sin(t)**2 - 2*sin(t) + 5*cos(t)/4 + 8/5 - exp(-t/5)*sin(t)",
+        "u3": "-sin(2*t) + cos(t) + 1 + 2*exp(-t/5)*sin(t)/15 + exp(-t/5)*cos(t)",
+        "u4": "-sin(2*t)",
+    },
+    "unknowns": {"leak": -0.35},
+    "outputs": ["y"],
+    "E": [[2, 0, 0, 0], [0, "2 + sin(t)", 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]],
+    "A": [[-0.5, 0, -1, 1], [0, "-cos(t) - 1/4", 1, 0], [1, -1, "-1/3", 0], [1, 0, 0, 0]],
+    "B": np.eye(4).tolist(),
+    "F": [[0], [1], [0], [0]],
+    "C": [[0, 1, 0, 0]],
+    "initial_state": [0, 2, 0, 1],
+}
+CAPACITORS_STATES = ("sin(2*t)", "cos(t) + 1", "exp(-t/5)*sin(t)", "cos(2*t)")
+# A pendulum about its swing, index 3: positions, velocities, the force of the rod; θ is a load.
+PENDULUM = {
+    "name": "pendulum",
+    "parameters": {"a": "0.6*sin(t)"},
+    "states": ["x", "y", "vx", "vy", "force"],
+    "inputs": {"wind": "sin(2*t)", "pull": "cos(3*t)"},
+    "unknowns": {"load": 0.7},
+    "outputs": ["seen"],
+    "E": np.diag([1, 1, 1, 1, 0]).tolist(),
+    "A": [
+        [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [-2, 0, -0.1, 0, "sin(a)"], [0, "-1", 0, -0.2, "-cos(a)"],
+        ["sin(a)", "-cos(a)", 0, 0, 0],
+    ],
+    "B": [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]],
+    "F": [[0], [0], [1], ["cos(t)"], [0]],
+    "C": [[1, 0, 0, 0, 0]],
+    "initial_state": [1, 0, 0, 0.5, 0],
+}
+# Two tanks joined by a pipe of incompressible water: the flow in it is what keeps the levels equal.
+TANKS = {
+    "name": "tanks",
+    "states": ["h1", "h2", "flow"],
+    "inputs": {"feed": "2 + sin(t)"},
+    "unknowns": {"leak": 0.3},
+    "outputs": ["level"],
+    "E": [["2 + cos(t)/2", 0, 0], [0, 1, 0], [0, 0, 0]],
+    "A": [["sin(t)/2", 0, -1], [0, -0.4, 1], [1, -1, 0]],
+    "B": [[1], [0], [0]],
+    "F": [[-1], [0], [0]],
+    "C": [[0, 1, 0]],
+    "initial_state": [1, 1, 0],
+}
+
+
+def observed(plant, horizon=10.0, noisy=(), **settings):
+    """η − truth and the largest error of the states, by least squares over the whole horizon."""
+    system = plant if not isinstance(plant, dict) else plant_from_mapping(plant)
+    signals = simulate(system, TimeSettings(horizon=horizon), SOLVER).signals
+    known = np.array([name not in noisy for name in system.inputs], dtype=bool)
+    seen = Measurements(
+        signals.inputs, signals.outputs, None, InputDerivatives.of_plant(system, known)
+    )
+    found = observe(system, seen, SOLVER, **settings)
+    gram = found.regression.gram.final
+    eta = np.linalg.solve(gram[:, :-1], gram[:, -1])
+    t = np.linspace(0.0, horizon, 101)
+    truth = found.truth(t, system.theta_at(t), signals.states)[-1]
+    x = found.state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
+    return found, eta - truth, float(np.abs(x - signals.states(t)).max())
+
+
+@pytest.mark.parametrize("plant", [CAPACITORS, PENDULUM, TANKS], ids=lambda p: p["name"])
+def test_constrained_plants_from_one_output(plant):
+    with pytest.raises(ModelError, match=r"Assumption 1 .* observer\.form=strangeness_free"):
+        observed(plant, form="given")
+    found, error, of_states = observed(plant)
+    assert np.abs(error).max() < 1e-9
+    assert of_states < 1e-9
+    assert "on the strangeness-free form, for as given Assumption 1" in found.note
+    evidence = {a.name: a.evidence for a in found.assumptions}["Assumption 1"]
+    assert evidence["form"] == "strangeness_free"
+
+
+def test_the_states_are_those_in_closed_form():
+    system = plant_from_mapping(CAPACITORS)
+    result = run(CAPACITORS, estimator="ls_drem", time={"horizon": 10})
+    t = result["t"] if "t" in dir(result) else np.linspace(0, 10, 1001)
+    exact = [eval(text.replace("sin", "np.sin").replace("cos", "np.cos")  # noqa: S307
+                  .replace("exp", "np.exp"), {"np": np, "t": t}) for text in CAPACITORS_STATES]
+    for name, values in zip(system.states, exact, strict=True):
+        assert np.abs(result.estimates[name][0, -1] - values[-1]) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["circuit", "descriptor"])
+def test_both_forms_agree_where_both_exist(name):
+    """As given and with hidden constraints: the same parameters and states, to rounding."""
+    for form in ("given", "strangeness_free"):
+        found, error, of_states = observed(shipped(name), horizon=8.0, form=form)
+        assert np.abs(error).max() < 1e-9
+        assert of_states < 1e-9
+        assert found.note == ""
+
+
+@pytest.mark.parametrize("settings", [
+    {"remedy": "reset", "reset_interval": 3.0}, {"remedy": "output_injection"},
+], ids=lambda s: s["remedy"])
+def test_remedies_take_the_same_form(settings):
+    result = run(
+        PENDULUM, estimator="ls_drem", time={"horizon": 10}, observer={"name": "gpebo", **settings}
+    )
+    assert np.abs(result.errors["load"][0, -1]) < 1e-9
+    for state in PENDULUM["states"]:
+        assert np.abs(result.errors[state][0, -1]) < 1e-9
+
+
+def test_current_coordinates_take_the_same_form():
+    result = run(
+        TANKS, estimator={"name": "least_squares", "f0": 1e-9}, time={"horizon": 10},
+        observer={"name": "gpebo", "remedy": "current_coordinates"},
+    )
+    assert np.abs(result.errors["leak"][0, -1]) < 1e-6
+    assert np.abs(result.errors["flow"][0, -1]) < 1e-6
+
+
+def test_the_kalman_bucy_filter_takes_the_same_form():
+    result = run(TANKS, observer="kalman_bucy", time={"horizon": 10})
+    assert np.abs(result.errors["leak"][0, -1]) < 1e-6
+    assert np.abs(result.errors["flow"][0, -1]) < 1e-6
+
+
+def test_a_noisy_input_in_a_hidden_constraint_is_named():
+    with pytest.raises(ConfigError, match=r"the input u4, a hidden constraint contains .* order 1"):
+        observed(CAPACITORS, noisy=("u4",))
+    observed(CAPACITORS, noisy=("u1", "u2", "u3"))  # in no hidden constraint
+    with pytest.raises(ConfigError, match="the input u4"):
+        run(CAPACITORS, observer={"name": "gpebo", "sample_time": 0.1}, estimator="ls_drem")
+
+
+def test_samples_of_a_plant_without_inputs_in_hidden_constraints():
+    result = run(
+        TANKS, estimator="ls_drem", time={"horizon": 10},
+        observer={"name": "gpebo", "sample_time": 0.01, "hold": "linear"},
+    )
+    assert np.abs(result.errors["flow"][0, -1]) < 1e-3
+
+
+def test_check_says_which_form_and_why():
+    (found,) = [a for a in check(TANKS) if a.name == "Assumption 1"]
+    assert found.holds
+    assert found.evidence["form"] == "strangeness_free"
+    assert "as given Assumption 1" in str(found.evidence["because"])
+    (found,) = [a for a in check("circuit") if a.name == "Assumption 1"]
+    assert found.evidence["form"] == "given"
+
+
+def test_feedthrough_bias_of_a_sensor_and_a_known_term():
+    plant = {
+        "name": "biased", "states": ["x", "z"], "inputs": {"u": "sin(t) + cos(3*t)"},
+        "unknowns": {"load": 0.4, "bias": -0.2}, "outputs": ["y1", "y2"],
+        "E": [[1, 0], [0, 0]], "A": [["-1 + sin(t)/2", 1], [1, -2]], "B": [[1], [0.5]],
+        "F": [["cos(t)", 0], [0, 0]], "phi": ["sin(2*t)", 0.3],
+        "C": [[1, 0], [0, "1 + cos(t)/2"]], "D": [[0.7], [0]], "H": [[0, 1], ["sin(t)", 0]],
+        "initial_state": [1, 0],
+    }
+    for form in ("given", "strangeness_free"):
+        _, error, of_states = observed(plant, form=form)
+        assert np.abs(error).max() < 1e-10
+        assert of_states < 1e-10
+
+
+def test_an_unknown_of_the_outputs_alone_in_an_index_3_plant():
+    plant = {**PENDULUM, "unknowns": {"load": 0.7, "offset": 0.25}, "H": [[0, 1]],
+             "F": [[*row, 0] for row in PENDULUM["F"]], "D": [[0.3, 0]]}
+    _, error, of_states = observed(plant, horizon=20.0)
+    assert np.abs(error).max() < 1e-9
+    assert of_states < 1e-9
+
+
+def test_a_kernel_that_rotates():
+    _, error, of_states = observed(plant_from_mapping(ROTATING), 5.0, form="strangeness_free")
+    assert np.abs(error).max() < 1e-9
+    assert of_states < 1e-9
+
+
+def test_hidden_constraints_hold_on_the_solution():
+    """0 = M x + M_v v + M_θ θ on the simulated states, with M a projector's rows."""
+    system = plant_from_mapping(PENDULUM)
+    signals = simulate(system, TimeSettings(horizon=5.0), SOLVER).signals
+    t = np.linspace(0.0, 5.0, 57)
+    inputs = InputDerivatives.of_plant(system, np.ones(2, dtype=bool))
+    form = strangeness_free(system, t, t, None, inputs, max_mu=6, rank_tol=1e-10)
+    assert form.structure is not None
+    assert form.structure.mu == 2
+    assert form.derivatives == ()
+    hidden = form.equations(t, t, None).hidden
+    v = form.driving(t, t, signals.inputs(t))
+    left = np.einsum("nij,nj->ni", hidden.states, signals.states(t))
+    left += np.einsum("nij,nj->ni", hidden.driving, v) + hidden.unknowns @ system.theta
+    assert np.abs(left).max() < 1e-10
+    assert (np.linalg.matrix_rank(hidden.states) == form.structure.a).all()
+
+
+def test_derivatives_of_a_signal_are_those_of_its_polynomials():
+    mesh = Mesh(np.linspace(0.0, 2.0, 9), radau_rule(10))
+    signal = Trajectory(mesh, np.stack([np.sin(3 * mesh.points), mesh.points**2], axis=2))
+    t = np.linspace(0.05, 1.95, 41)
+    found = InputDerivatives.of_signal(signal).taylor(t, t, 2)
+    exact = [[np.sin(3 * t), t**2], [3 * np.cos(3 * t), 2 * t], [-4.5 * np.sin(3 * t), 1 + 0 * t]]
+    np.testing.assert_allclose(found, np.moveaxis(exact, 1, 2), atol=1e-7)
+
+
+# Matrices along measured signals ------------------------------------------------------------------
+
+
+BOOST = {
+    "name": "boost", "states": ["i", "v"], "inputs": {"duty": "0.5 + 0.1*sin(3*t)"},
+    "unknowns": {"power": 8}, "outputs": ["y"], "E": [[0.5, 0], [0, 0.2]],
+    "A": [[-0.1, "-(1-duty)"], ["1-duty", -0.05]], "F": [[0], ["-1/y"]], "phi": [10, 0],
+    "B": [[0], [0]], "C": [[0, 1]], "initial_state": [3, 18],
+}
+LORENZ = {
+    "name": "lorenz", "states": ["x1", "x2", "x3"], "unknowns": {"rho": 28}, "outputs": ["y"],
+    "E": np.eye(3).tolist(), "A": [[-10, 10, 0], [0, -1, "-y"], [0, "y", "-8/3"]],
+    "F": [[0], ["y"], [0]], "C": [[1, 0, 0]], "initial_state": [1, 1, 20],
+}
+
+
+def solved(system, duty, horizon):
+    """Trajectories of u, y and x by scipy."""
+    C = system.coefficients.taylor(np.zeros(1), 0, None, np.ones((1, 1, system.m + 1))).C[0, 0]
+
+    def right(t, x):
+        at, signals = np.array([t]), np.append(duty(t)[: system.m], C @ x)
+        c = system.coefficients.taylor(at, 0, at, signals[None, None])
+        f = c.A[0, 0] @ x + c.F[0, 0] @ system.theta + c.phi[0, 0]
+        return np.linalg.solve(c.E[0, 0], f)
+
+    mesh = Mesh(np.linspace(0.0, horizon, 161), radau_rule(14))
+    points = np.unique(mesh.points)
+    found = solve_ivp(
+        right, (0, horizon), system.initial_state, "DOP853", points, rtol=3e-14, atol=1e-13
+    )
+    x = found.y.T[np.searchsorted(points, mesh.points)]
+    u = np.stack([duty(t)[: system.m] for t in mesh.points.ravel()])
+    u = u.reshape(*mesh.points.shape, -1)
+    return Trajectory(mesh, u), Trajectory(mesh, x @ C.T), Trajectory(mesh, x)
+
+
+@pytest.mark.parametrize("plant", [BOOST, LORENZ], ids=lambda p: p["name"])
+def test_matrices_along_measured_signals(plant):
+    """Signals by scipy, an unknown and the initial state by the observer."""
+    system = plant_from_mapping(plant)
+    u, y, states = solved(system, lambda t: np.array([0.5 + 0.1 * np.sin(3 * t)]), 3.0)
+    found = observe(system, Measurements(u, y), replace(SOLVER, tol=1e-11))
+    gram = found.regression.gram.final
+    eta = np.linalg.solve(gram[:, :-1], gram[:, -1])
+    t = np.linspace(0.0, 3.0, 101)
+    truth = found.truth(t, system.theta_at(t), states)[-1]
+    np.testing.assert_allclose(eta, truth, atol=1e-9)
+    estimate = found.state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
+    np.testing.assert_allclose(estimate, states(t), atol=1e-8)
+    assert found.respond is None  # Y is not affine in noise that is in the matrices, too
+
+
+def test_a_hidden_constraint_along_an_output_is_refused():
+    plant = {**PENDULUM, "A": [*PENDULUM["A"][:2], ["-seen", 0, 0, 0, 1], *PENDULUM["A"][3:]]}
+    system = plant_from_mapping(plant)
+    mesh = Mesh(np.linspace(0.0, 1.0, 3), radau_rule(5))
+    signal = Trajectory(mesh, np.ones((2, 6, 2)))
+    with pytest.raises(ConfigError, match="they contain the output seen, which is measured only"):
+        observe(system, Measurements(signal, Trajectory(mesh, np.ones((2, 6, 1)))), SOLVER)
