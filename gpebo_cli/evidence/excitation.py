@@ -22,7 +22,7 @@ from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
-_WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hundredfold
+WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hundredfold
 _TINY = float(np.finfo(float).tiny)
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
@@ -79,10 +79,18 @@ def assess(
         element = np.maximum(np.searchsorted(mesh.edges, at, side="left") - 1, 0)
         return knowledge(matrices, sizes[element], at - mesh.edges[0], tol)
 
+    ends = known(gram.mesh.edges[1:], gram.values[:, -1])
+    # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
+    # or half as well as they ever are.
+    enough = min(WELL, 0.5 * float(ends.smallest[ends.margin >= 1.0].max(initial=0.0)))
+
     def reached(at: Array, matrices: Array) -> Array:
         """At least 0 where ψ is exciting; to be read as a distance from that in logarithms."""
-        smallest = _eigenvalues(matrices)[:, 0]
-        level = known(at, matrices).margin if rho is None else smallest / rho
+        if rho is not None:
+            level = _eigenvalues(matrices)[:, 0] / rho
+        else:
+            there = known(at, matrices)
+            level = np.minimum(there.smallest / enough, there.margin) if enough else 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
     values = gram(t)
@@ -97,7 +105,7 @@ def excitation(
     pe_level: Array, window: float, t_c: float | None, rho: float | None,
 ) -> Excitation:
     """The evidence from what is known at the times t (N,), the last of which is the end."""
-    spectrum, well = known.eigenvalues[-1], known.share >= _WELL
+    spectrum, well = known.eigenvalues[-1], known.share >= WELL
     v = known.vectors[-1, :, 0] if len(parameters) else np.zeros(0)
     sign = 1.0 if max(v, key=abs, default=1.0) >= 0.0 else -1.0
     smallest = float(spectrum[0]) if len(parameters) else 1.0

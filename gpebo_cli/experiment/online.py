@@ -12,7 +12,7 @@ import numpy as np
 
 from gpebo_cli import estimators, observers
 from gpebo_cli.estimators import InformationRoot
-from gpebo_cli.evidence.excitation import Excitation, excitation
+from gpebo_cli.evidence.excitation import WELL, Excitation, excitation
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
 from gpebo_cli.experiment.result import Fit
 from gpebo_cli.findings import Assumption, Requirement
@@ -101,7 +101,8 @@ class Online:
         self._state: SampledState | None = None
         self._root = np.zeros((len(self.parameters) + 1,) * 2)  # S of all data
         self._final = np.zeros((len(self.cases), len(self.parameters)))
-        self._t_c: float | None = None
+        # When parameters could first be told apart, and when well.
+        self._t_c: list[float | None] = [None, None]
         self._system = system
         self.count = 0
 
@@ -121,9 +122,13 @@ class Online:
         sigma: Array = np.linalg.svd(S, compute_uv=False).astype(np.float64)
         known = knowledge_of_roots(S, block.scale, t - self.start, self._tol)
         smallest = sigma.min(axis=1, initial=np.inf) ** 2
-        reached = known.margin >= 1.0 if self._rho is None else smallest >= self._rho
-        if self._t_c is None and reached.any():
-            self._t_c = float(t[np.argmax(reached)])
+        if self._rho is None:
+            reached = known.margin >= 1.0, (known.margin >= 1.0) & (known.smallest >= WELL)
+        else:
+            reached = smallest >= self._rho, smallest >= self._rho
+        for k, holds in enumerate(reached):
+            if self._t_c[k] is None and holds.any():
+                self._t_c[k] = float(t[np.argmax(holds)])
         gain = np.einsum("knp,gkp->gkn", block.gain, made.parameters)
         eigenvalues = sigma[:, ::-1] ** 2
         self._final = made.parameters[:, -1].copy()
@@ -195,7 +200,7 @@ class Online:
         )
         return excitation(
             known.at(shown), t[shown], self.parameters, eigenvalues[shown], pe_level, window,
-            self._t_c, self._rho,
+            self._t_c[0] if self._t_c[1] is None else self._t_c[1], self._rho,
         )
 
     @property
