@@ -1,8 +1,8 @@
 """``make bench``, or ``python -m benchmarks [PART…]``; numbers are measured, never typed in.
 
-Writes ``outputs/benchmarks.json`` and, from it, ``docs/benchmarks.md``. Parts that are not
+Writes ``benchmarks/benchmarks.json`` and, from it, ``docs/benchmarks.md``. Parts that are not
 measured keep what they had. Without words all parts are, but for ``sweeps``, which takes half an
-hour.
+hour. ``python -m benchmarks kernels`` prints what each compiled kernel is worth and writes nothing.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import circuit, cold, floor, gains, growth, problems, sweeps
+from benchmarks import kernels as ablation
 from benchmarks.measure import Row
 from benchmarks.page import PARTS, page
 from gpebo_cli import kernels
 
 ROOT = Path(__file__).parent.parent
-JSON = ROOT / "outputs" / "benchmarks.json"
+JSON = ROOT / "benchmarks" / "benchmarks.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
 PLOT = ROOT / "docs" / "img" / "growth.png"
 PACKAGES = ("numpy", "scipy", "matplotlib", "casadi", "scikit-sundae", "solve-dae", "diffrax",
@@ -108,6 +109,9 @@ def write(data: dict[str, Any]) -> None:
 
 def main(words: list[str]) -> int:
     """Measure the parts named by ``words`` and write after each, so that nothing is lost."""
+    if words == ["kernels"]:
+        sys.stdout.write(ablation.table() + "\n")
+        return 0
     unknown = [word for word in words if word not in PARTS]
     if unknown:
         sys.stderr.write(f"there is no part {unknown[0]!r}; there are {', '.join(PARTS)}\n")

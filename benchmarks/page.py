@@ -1,4 +1,4 @@
-"""``docs/benchmarks.md`` from ``outputs/benchmarks.json``; nothing on it is typed by hand."""
+"""``docs/benchmarks.md`` from ``benchmarks/benchmarks.json``; nothing on it is typed by hand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def page(data: Data) -> str:
     }
     text = [
         "# Benchmarks",
-        ("Made by `make bench` from `outputs/benchmarks.json`; not edited by hand. "
+        ("Made by `make bench` from `benchmarks/benchmarks.json`; not edited by hand. "
         "`python -m benchmarks circuit cold` measures some parts and keeps the others."),
         ("Ours and a peer run in turns in one process; seconds are medians, a ratio is the peer's "
         "over ours. Each solver gets the loosest tolerance whose measured error meets the target, "

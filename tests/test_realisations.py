@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from plants import seen, shipped
 from regressions import ETA, regression, three
+from scipy.integrate import trapezoid
 from test_cli import folders, gpebo
 
 from gpebo_cli.errors import ConfigError
@@ -115,10 +116,10 @@ def theory(rates, sigma, sample_time, horizon):
     middle = np.zeros((2, 2))
     per = round(sample_time / (fine[1] - fine[0]))
     for c, weight, deviation in zip((1.0, 0.5), rates, sigma, strict=True):
-        G += weight * c**2 * np.trapezoid(psi[:, :, None] * psi[:, None], fine, axis=0)
+        G += weight * c**2 * trapezoid(psi[:, :, None] * psi[:, None], fine, axis=0)
         for k in range(round(horizon / sample_time)):
             part = slice(per * k, per * (k + 1) + 1)
-            w = weight * c * np.trapezoid(psi[part], fine[part], axis=0)
+            w = weight * c * trapezoid(psi[part], fine[part], axis=0)
             middle += deviation**2 * np.outer(w, w)
     inverse = np.linalg.inv(G)
     return inverse @ middle @ inverse

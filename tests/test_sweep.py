@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from scipy.integrate import trapezoid
 
 from gpebo_cli.cli.arguments import logspace, parse, quoted
 from gpebo_cli.cli.sweep_folder import (
@@ -399,7 +400,7 @@ def test_error_curves_are_those_of_the_run(tmp_path):
     assert slow.parameters[0] == fast.parameters[0] == pytest.approx(np.sqrt(1.5**2 + 0.64 + 2))
     assert slow.parameter_size == slow.parameters[0]
     for case, curves in zip(cases, (slow, fast), strict=True):
-        rms = np.sqrt(np.trapezoid(curves.states**2, curves.t) / 20.0)
+        rms = np.sqrt(trapezoid(curves.states**2, curves.t) / 20.0)
         assert case.metrics["rms_error_states"] == pytest.approx(rms, rel=0.2)
 
 

@@ -24,6 +24,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import Assumption
@@ -396,7 +397,7 @@ def _assumptions(
     """Assumptions 4, 6 and 7 with their evidence."""
     divided = np.minimum(np.abs(N[:, 1, 0]), np.abs(N[:, 2, 1]))
     decay = transition_decay(M)
-    diagonal = np.trapezoid(
+    diagonal = trapezoid(
         np.diagonal(M.values, axis1=2, axis2=3), M.mesh.points[..., None], axis=1
     ).sum(axis=0)
     return (
