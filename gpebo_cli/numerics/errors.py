@@ -31,7 +31,7 @@ _VALUE = 32.0  # likewise of any value, which are not carried on
 _ROUNDING = 8.0  # units in the last place that cannot be resolved
 _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _SAME = 1e-9  # relative difference of rates that are constant
-_NOTHING = 1e3 * EPS  # of what it is made of: a component that is smaller is rounding itself
+_NOTHING = 8.0 * EPS  # of what it is made of: a component that is smaller is rounding itself
 
 
 class Errors(NamedTuple):
