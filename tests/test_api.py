@@ -43,7 +43,7 @@ initial_state: {x: 1}
 
 @pytest.fixture(scope="module")
 def circuit() -> Result:
-    return run("circuit", gamma=[1e8, 1e10], time={"horizon": 8, "samples": 201})
+    return run("circuit", estimator="drem", gamma=[1e8, 1e10], time={"horizon": 8, "samples": 201})
 
 
 def test_every_public_name_is_there():
@@ -113,7 +113,8 @@ def test_a_name_that_is_parameter_and_state_is_refused_rather_than_guessed():
 
 def test_what_is_printed_is_what_the_command_prints(circuit, tmp_path):
     done = gpebo(
-        "run", "estimator.gamma=[1e8,1e10]", "time.horizon=8", "time.samples=201", "figures=none",
+        "run", "estimator=drem", "estimator.gamma=[1e8,1e10]", "time.horizon=8",
+        "time.samples=201", "figures=none",
         "hydra.run.dir=there", cwd=tmp_path,
     )
     lines = done.stdout.splitlines()
@@ -269,7 +270,7 @@ def test_check_is_the_commands():
 
 
 WRONG = [
-    ({"gama": 1}, "run: no such keyword gama; estimator drem has initial, gamma, lambda; did you"),
+    ({"gama": 1}, "run: no such keyword gama; estimator ls_drem has initial, alpha, f0"),
     ({"gama": 1}, "did you mean gamma?"),
     ({"horizon": 3}, 'did you mean time={"horizon": …}?'),
     ({"estimtor": "drem"}, "did you mean estimator?"),

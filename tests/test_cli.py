@@ -343,7 +343,7 @@ def test_a_reader_that_stops_reading_is_no_error(tmp_path):
 
 
 def test_a_run_prints_table_folder_and_verdict(tmp_path):
-    done = gpebo("run", "estimator.gamma=[1e8,1e10]", *FAST, cwd=tmp_path)
+    done = gpebo("run", "estimator=drem", "estimator.gamma=[1e8,1e10]", *FAST, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     *table, moved, folder, verdict = done.stdout.splitlines()
     assert len(table) == 3
@@ -388,7 +388,7 @@ def test_an_experiment_chooses_gains(tmp_path):
 def test_a_plant_of_ones_own(tmp_path, mine):
     done = gpebo("run", "--config-dir", mine, "plant=mine", *FAST, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert folders(tmp_path)[0].name.endswith("_mine_drem")
+    assert folders(tmp_path)[0].name.endswith("_mine_ls_drem")
 
 
 def test_an_error_in_a_plant_names_its_file(tmp_path, mine):

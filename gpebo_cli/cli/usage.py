@@ -260,7 +260,7 @@ _DEFAULTS = {
     "plant": "circuit",
     "data": "none",
     "observer": "gpebo",
-    "estimator": "drem",
+    "estimator": "ls_drem",
     "solver": "collocation",
     "noise": "none",
 }
