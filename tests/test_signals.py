@@ -7,11 +7,10 @@ import pytest
 from kernel_paths import by_both
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.descriptor import MATRIX_NAMES
 from gpebo_cli.model.functions import system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
+from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 TIMES = np.linspace(0.1, 3.0, 17)
@@ -150,13 +149,3 @@ def test_known_terms_and_feedthrough_are_simulated(name, E):
     one, two = (simulate(s, TimeSettings(horizon=4.0), solver).signals for s in (ours, other))
     np.testing.assert_allclose(one.states(t), two.states(t)[:, :2], atol=1e-8)
     np.testing.assert_allclose(one.outputs(t), two.outputs(t), atol=1e-8)
-
-
-def test_observers_refuse_what_they_would_ignore():
-    system = plant(
-        A=[[-1, 0], [0, -1]], B=[[1], [0]], F=[[1], [0]], C=[[1, 1]], D=None, H=None,
-        phi=["t", 0],
-    )  # fmt: skip
-    settings = Settings(plant={}, estimator={"name": "drem"}, time=TimeSettings(horizon=1.0))
-    with pytest.raises(ConfigError, match="it has phi; use observer=none"):
-        run_experiment(settings, system)
