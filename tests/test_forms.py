@@ -293,3 +293,32 @@ def test_a_hidden_constraint_along_an_output_is_refused():
     signal = Trajectory(mesh, np.ones((2, 6, 2)))
     with pytest.raises(ConfigError, match="they contain the output seen, which is measured only"):
         observe(system, Measurements(signal, Trajectory(mesh, np.ones((2, 6, 1)))), SOLVER)
+
+
+# Edges ----------------------------------------------------------------------------------------
+
+
+def test_a_plant_without_derivatives():
+    plant = {
+        "name": "algebraic", "states": ["x", "z"], "inputs": {"u": "sin(t)"},
+        "unknowns": {"a": 0.5}, "outputs": ["y"], "E": [[0, 0], [0, 0]],
+        "A": [[-1, 0.3], [0, -2]], "B": [[1], [0]], "F": [[0], [1]], "C": [[1, 0]],
+        "initial_state": [0, 0],
+    }
+    for settings in ({}, {"remedy": "reset"}, {"remedy": "output_injection"}):
+        found, error, of_states = observed(plant, 5.0, **settings)
+        assert found.regression.parameters == ("a",)
+        assert np.abs(error).max() < 1e-12
+        assert of_states < 1e-12
+
+
+def test_the_horizon_does_not_change_the_past():
+    """A row of E that grows: what comes later has no part in ψ, Y and G before."""
+    plant = {**TANKS, "E": [["2 + t**3", 0, 0], [0, "1 + t", 0], [0, 0, 0]],
+             "A": [["-3*t**2", 0, -1], [0, -0.4, 1], [1, "-1 - t/5", 0.1]]}
+    t = np.linspace(0.0, 1.0, 21)
+    one, other = (observed(plant, horizon)[0].regression for horizon in (1.0, 4.0))
+    for name in ("psi", "Y"):
+        squares = [np.einsum("nr...,nr...->n...", x, x) for x in (
+            getattr(regression, name)(t) for regression in (one, other))]
+        np.testing.assert_allclose(*squares, rtol=1e-9, atol=1e-12)

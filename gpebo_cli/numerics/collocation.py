@@ -233,7 +233,7 @@ def _element_maps(
     numbers = s * n * (n + columns)
     if known is None or not _is_constant(known):
         numbers += s * s * n * n
-    chunk = max(1, min(_CHUNK // numbers, _POINTS // (s + 1)))
+    chunk = max(1, min(_CHUNK // max(numbers, 1), _POINTS // (s + 1)))
     if len(h) <= chunk:
         c = problem.coefficients(t.ravel(), inside.ravel()) if known is None else known
         return _solve_elements(problem, mesh.rule, h, t, c)
