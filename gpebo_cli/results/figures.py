@@ -143,9 +143,10 @@ def parameter_error(result: RunResult) -> list[Panel]:
         return []
     truth = estimation.true_parameters
     size = np.nan_to_num(np.max(np.abs(truth), axis=0))
-    largest = float(np.max(size, initial=0.0))  # the measure of one that is zero
+    largest = float(np.max(size, initial=0.0))
+    size = np.where(size > 1e-12 * largest, size, largest)  # of one that is zero but for rounding
     panels = [
-        _error(result, name, estimation.parameters[:, :, i] - truth[:, i], size[i] or largest)
+        _error(result, name, estimation.parameters[:, :, i] - truth[:, i], float(size[i]))
         for i, name in enumerate(estimation.names)
         if not np.isnan(truth[:, i]).any()
         and (not result.system.theta_varies or name in result.system.unknowns)
