@@ -133,8 +133,9 @@ static inline Interval image(npy_intp what, Interval a, Interval b, int same_row
     }
 }
 
-/* Bounds of the results of the code at one cell, whose first two rows are given. */
-static void run_cell(const Call *call, Interval *row)
+/* Bounds of the results of the code at one cell, whose first two rows are given. What is made of
+   `inside` and constants alone is a number, as it is without kernels: what decides has one sign. */
+static void run_cell(const Call *call, Interval *row, char *number)
 {
     const Operation *operation = (const Operation *)call->index[3];
     const double *constant = call->in[4];
@@ -142,7 +143,13 @@ static void run_cell(const Call *call, Interval *row)
         const npy_intp left = operation->left, right = operation->right;
         const Interval a = left < 0 ? (Interval){constant[~left], constant[~left]} : row[left];
         const Interval b = right < 0 ? (Interval){constant[~right], constant[~right]} : row[right];
-        row[operation->result] = image(operation->what, a, b, left == right && left >= 0);
+        Interval found = image(operation->what, a, b, left == right && left >= 0);
+        const double middle = found.low + 0.5 * (found.high - found.low);
+        const int one = (left < 0 || number[left]) && (right < 0 || number[right]);
+        if (one && isfinite(middle))
+            found.low = found.high = middle;
+        number[operation->result] = one && isfinite(middle);
+        row[operation->result] = found;
     }
 }
 
@@ -154,13 +161,15 @@ static Outcome intervals(Call *call)
     const npy_intp used = rows_used((const Operation *)call->index[3], SIZE(v), GIVEN, constants);
     if (!used || !results_fit(call->index[5], orders * outputs, used, constants))
         return ERROR;
-    Interval *row = (Interval *)scratch(call, 2 * used);
+    Interval *row = (Interval *)scratch(call, 3 * used);
     if (row == NULL)
         return ERROR;
+    char *number = (char *)(row + used);
     for (npy_intp i = 0; i < N; i++) {
         row[0] = (Interval){call->in[0][i], call->in[1][i]};
         row[1] = (Interval){call->in[2][i], call->in[2][i]};
-        run_cell(call, row);
+        number[0] = 0, number[1] = 1;
+        run_cell(call, row, number);
         for (npy_intp k = 0; k < orders * outputs; k++) {
             const npy_intp from = call->index[5][k];
             const npy_intp to = (k / outputs * N + i) * outputs + k % outputs;
