@@ -40,7 +40,7 @@ def _law(rng, cases=11, gains=1, p=3):
     )
 
 
-def _errors(rng, cases=11, times=70, p=3, n=4, constant=False):
+def _errors(rng, cases=11, times=70, p=3, n=4, constant=False, levels=True):
     of_time = 1 if constant else times
     truth, x = rng.normal(size=(of_time, p)), rng.normal(size=(of_time, n))
     truth[:, 1] = np.nan  # has no weight
@@ -48,6 +48,7 @@ def _errors(rng, cases=11, times=70, p=3, n=4, constant=False):
         rng.normal(size=(cases, times, p)), truth, np.array([2.0, 0.0, 1.0]),
         rng.normal(size=(of_time, n)), rng.normal(size=(of_time, n, p)), x,
         rng.uniform(0.5, 2.0, size=n),
+        rng.uniform(0.5, 9.0, size=(cases, p + n)) if levels else None,
     )
 
 
@@ -205,6 +206,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("laws", "stepped_law", lambda rng: _law(rng, 17, 3)),
     ("laws", "squared_errors", _errors),
     ("laws", "squared_errors", lambda rng: _errors(rng, 1, 5, constant=True)),
+    ("laws", "squared_errors", lambda rng: _errors(rng, levels=False)),
 ]
 NAMES = [f"{subject}-{name}-{i}" for i, (subject, name, _) in enumerate(CASES)]
 
@@ -271,6 +273,8 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("squared_errors", _errors, 2, np.s_[:-1]),
     ("squared_errors", _errors, 4, np.s_[:, :, :-1]),
     ("squared_errors", _errors, 5, np.s_[:, :-1]),
+    ("squared_errors", _errors, 7, np.s_[:, :-1]),
+    ("squared_errors", _errors, 7, np.s_[:-1]),
     ("mixed", _mixed, 0, np.s_[:, :, :2]),
     *(("element_maps", partial(_equation, constrained=True), place, np.s_[:-1])
       for place in range(8)),

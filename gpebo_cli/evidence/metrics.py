@@ -65,17 +65,21 @@ def measure_squares(
     return Metrics(*out)
 
 
-def settling_times(t: Array, error: Array, size: Array) -> Array:
-    """:func:`settling_time` of each of c errors (g, M, c), shape (g, c).
+def levels(first: Array, size: Array) -> Array:
+    """Levels (g, c) below which errors that are ``first`` (g, c) at the start have settled.
 
     An error that starts at less than a millionth of its quantity's size (c,) is to stay below 1 %
     of that.
     """
+    absolute = np.abs(first)
+    return np.asarray(SETTLED * np.where(absolute > _NOTHING * size, absolute, size))
+
+
+def settling_times(t: Array, error: Array, size: Array) -> Array:
+    """:func:`settling_time` of each of c errors (g, M, c) against :func:`levels`, shape (g, c)."""
     absolute = np.abs(np.moveaxis(error, 2, 1))  # (g, c, M)
-    first = absolute[..., 0]
-    reference = np.where(first > _NOTHING * size, first, size)
-    flat = absolute.reshape(-1, len(t))
-    out = settling_time(t, flat, level=SETTLED * reference.ravel()).reshape(first.shape)
+    level = levels(absolute[..., 0], size)
+    out = settling_time(t, absolute.reshape(-1, len(t)), level=level.ravel()).reshape(level.shape)
     out[np.isnan(absolute[..., -1])] = np.nan
     return out
 
@@ -100,16 +104,30 @@ def settling_time(
     level = fraction * error[:, :1] if level is None else level[:, None]
     above = error > level
     last = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
-    out = np.where(above.any(axis=1), np.nan, 0.0)
-    rows = np.flatnonzero(above.any(axis=1) & (last < error.shape[1] - 1))
-    k = last[rows]
+    rows = np.arange(len(last))
+    last = np.where(above[rows, last], last, -1)
+    k = np.clip(last, 0, max(len(t) - 2, 0))
+    following = np.minimum(k + 1, len(t) - 1)
+    return settled(t, last, error[rows, k], error[rows, following], level[:, 0])
+
+
+def settled(t: Array, last: Array, before: Array, after: Array, level: Array) -> Array:
+    """:func:`settling_time` where the time is known at which an error is above its level last.
+
+    Args:
+        t: times (M,).
+        last: index of that time, −1 where there is none (...).
+        before: size of the error there (...).
+        after: size of the error at the next time (...).
+        level: of the error (...).
+    """
     tiny = np.finfo(float).tiny
-    high = np.log(np.maximum(error[rows, k], tiny))
-    low = np.log(np.maximum(error[rows, k + 1], tiny))
-    wanted = np.log(np.maximum(level[rows, 0], tiny))
-    share = np.clip((high - wanted) / np.maximum(high - low, tiny), 0.0, 1.0)
-    out[rows] = t[k] + share * (t[k + 1] - t[k]) - t[0]
-    return out
+    high, low, wanted = (np.log(np.maximum(e, tiny)) for e in (before, after, level))
+    with np.errstate(over="ignore"):  # where it does not fall, and the result is another one
+        share = np.clip((high - wanted) / np.maximum(high - low, tiny), 0.0, 1.0)
+    k = np.clip(last, 0, max(len(t) - 2, 0)).astype(np.intp)
+    crossed = t[k] + share * (t[np.minimum(k + 1, len(t) - 1)] - t[k]) - t[0]
+    return np.where(last < 0, 0.0, np.where(last < len(t) - 1, crossed, np.nan))
 
 
 def time_rms(t: Array, squares: Array) -> Array:

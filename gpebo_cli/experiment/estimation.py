@@ -19,7 +19,7 @@ from gpebo_cli.evidence.excitation import (
 )
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
-from gpebo_cli.evidence.metrics import Metrics, measure_squares, settling_times
+from gpebo_cli.evidence.metrics import Metrics, levels, measure_squares, settled, settling_times
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.experiment.online import Online, joined
@@ -352,17 +352,32 @@ def _evaluation(
     judged: BoolArray, chosen: IntArray, *, each: bool,
 ) -> _Evaluation:
     """How a batch of cases is measured on the grid (M,) against η (M, p) and x (M, n)."""
-    reconstruct = state_map.at(grid)
+    if not isinstance(state_map, AffineStateMap):
+        reconstruct = state_map.at(grid)
 
-    def evaluate(eta: Array) -> tuple[Array, Array, Array]:
-        x_hat = reconstruct(eta)
-        numbers = _numbers(grid, eta - truth, x_hat - x, sizes, judged)
-        return numbers, eta[:, chosen], x_hat[:, chosen]
+        def evaluate(eta: Array) -> tuple[Array, Array, Array]:
+            x_hat = reconstruct(eta)
+            numbers = _numbers(grid, eta - truth, x_hat - x, sizes, judged)
+            return numbers, eta[:, chosen], x_hat[:, chosen]
 
-    if each or not isinstance(state_map, AffineStateMap):
         return evaluate
     sampler = state_map.offset.mesh.sampler(grid)
     offset, gain = sampler(state_map.offset.values), sampler(state_map.gain.values)
+    size, p = np.concatenate(sizes), truth.shape[1]
+    offset_kept, gain_kept = offset[chosen], np.swapaxes(gain[chosen], 1, 2)
+
+    def reconstruct_kept(eta: Array) -> Array:
+        """x̂ (g, k, n) of η̂ (g, k, p): a product for each time serves all cases."""
+        x_hat = np.swapaxes(np.matmul(np.swapaxes(eta, 0, 1), gain_kept), 0, 1)
+        return np.asarray(offset_kept + x_hat)
+
+    def errors(eta: Array, at: IntArray) -> Array:
+        """Of η̂ and x̂ (g, p + n) at one time for each quantity of each case, indices ``at``."""
+        case = np.arange(len(eta))[:, None]
+        of_eta = eta[case, at[:, :p], np.arange(p)] - truth[at[:, :p], np.arange(p)]
+        m, i = at[:, p:], np.arange(at.shape[1] - p)
+        x_hat = offset[m, i] + (gain[m, i] * eta[case, m]).sum(axis=2)
+        return np.concatenate([of_eta, x_hat - x[m, i]], axis=1)
 
     def evaluate_affine(eta: Array) -> tuple[Array, Array, Array]:
         """The norms, with x̂ only where it is needed: on the grid its errors are numbers."""
@@ -371,9 +386,21 @@ def _evaluation(
         of_x = offset[-1] + eta[:, -1] @ gain[-1].T - x[-1]
         in_eta = _weights(sizes[0], judged & ~np.isnan(of_eta[0]))
         in_x = _weights(sizes[1], ~np.isnan(of_x[0]))
-        squares = kernels.laws.squared_errors(eta, truth, in_eta, offset, gain, x, in_x)
-        x_hat = offset[chosen] + np.matmul(gain[chosen], eta[:, chosen, :, None])[..., 0]
-        return _of_all(grid, squares, of_eta, of_x, judged), eta[:, chosen], x_hat
+        level = None
+        if each:
+            level = levels(errors(eta, np.zeros((len(eta), len(size)), dtype=np.intp)), size)
+        *squares, last = kernels.laws.squared_errors(
+            eta, truth, in_eta, offset, gain, x, in_x, level
+        )
+        numbers = _of_all(grid, squares, of_eta, of_x, judged)
+        if level is not None:
+            k = np.clip(last, 0, max(len(grid) - 2, 0)).astype(np.intp)
+            after = np.minimum(k + 1, len(grid) - 1)
+            times = settled(grid, last, np.abs(errors(eta, k)), np.abs(errors(eta, after)), level)
+            times[np.isnan(np.hstack([of_eta, of_x]))] = np.nan
+            times[:, :p][:, ~judged] = np.nan
+            numbers = np.concatenate([numbers, times.T])
+        return numbers, eta[:, chosen], reconstruct_kept(eta[:, chosen])
 
     return evaluate_affine
 

@@ -148,30 +148,53 @@ static Outcome stepped_law(Call *call)
 
 #define TOGETHER 32 /* times that are brought into lanes at once */
 
+/* Levels of errors, and at which time each was above its own last; NULL if nobody asks. */
+typedef struct {
+    Lane *level, *last;
+} Course;
+
+static inline void note(const Course *course, npy_intp j, const double *error, double time)
+{
+    if (course->level == NULL)
+        return;
+    double *const last = course->last[j];
+    const double *const level = course->level[j];
+    Lane found;
+    EACH found[l] = fabs(error[l]) > level[l] ? time : last[l];
+    memcpy(last, found, sizeof(Lane));
+}
+
 /* Weighted squares of η̂ − η and x̂ − x at one time, x̂ = offset + gain η̂, in each lane. */
 static inline void squares(const Lane *eta, const double *truth, const double *in_eta, npy_intp p,
                            const double *offset, const double *gain, const double *x,
-                           const double *in_x, npy_intp n, double *of_eta, double *of_x)
+                           const double *in_x, npy_intp n, double time, const Course *course,
+                           double *of_eta, double *of_x)
 {
+    Lane error;
     EACH of_eta[l] = of_x[l] = 0.0;
-    for (npy_intp j = 0; j < p; j++)
+    for (npy_intp j = 0; j < p; j++) {
+        EACH error[l] = eta[j][l] - truth[j];
+        note(course, j, error, time);
         if (in_eta[j] != 0.0)
-            EACH of_eta[l] += in_eta[j] * (eta[j][l] - truth[j]) * (eta[j][l] - truth[j]);
+            EACH of_eta[l] += in_eta[j] * error[l] * error[l];
+    }
     for (npy_intp i = 0; i < n; i++) {
-        Lane error;
-        if (in_x[i] == 0.0)
+        if (in_x[i] == 0.0 && course->level == NULL)
             continue;
         EACH error[l] = 0.0;
         for (npy_intp j = 0; j < p; j++)
             EACH error[l] += gain[i * p + j] * eta[j][l];
         EACH error[l] += offset[i] - x[i];
-        EACH of_x[l] += in_x[i] * error[l] * error[l];
+        note(course, p + i, error, time);
+        if (in_x[i] != 0.0)
+            EACH of_x[l] += in_x[i] * error[l] * error[l];
     }
 }
 
 /* The squares of `used` cases η̂ (used, M, p) at M times into (used, M) both. */
 EVERY_WIDTH static void errors_of_cases(const Call *call, const double *eta, npy_intp used,
-                                        Lane *lanes, double *of_eta, double *of_x)
+                                        Lane *lanes, const Course *course, double *of_eta,
+                                        double *of_x)
 {
     const npy_intp M = SIZE(M), p = SIZE(p), n = SIZE(n);
     for (npy_intp from = 0; from < M; from += TOGETHER) {
@@ -186,7 +209,8 @@ EVERY_WIDTH static void errors_of_cases(const Call *call, const double *eta, npy
             const npy_intp m = from + i;
             squares(lanes + i * p, call->in[1] + m * call->step[1], call->in[2], p,
                     call->in[3] + m * call->step[3], call->in[4] + m * call->step[4],
-                    call->in[5] + m * call->step[5], call->in[6], n, in_eta[i], in_x[i]);
+                    call->in[5] + m * call->step[5], call->in[6], n, (double)m, course, in_eta[i],
+                    in_x[i]);
         }
         for (npy_intp l = 0; l < used; l++)
             for (npy_intp i = 0; i < now; i++) {
@@ -196,23 +220,33 @@ EVERY_WIDTH static void errors_of_cases(const Call *call, const double *eta, npy
     }
 }
 
-/* η̂, η, weights (p,), offset, gain, x, weights (n,) -> Σ weight (η̂ − η)² and Σ weight (x̂ − x)²;
-   what has the weight zero may be NaN. */
+/* η̂, η, weights (p,), offset, gain, x, weights (n,), levels (g, p + n) or None
+   -> Σ weight (η̂ − η)², Σ weight (x̂ − x)², and the last time, as an index, at which each error is
+   above its level, −1 for none; what has the weight zero may be NaN. */
 static Outcome squared_errors(Call *call)
 {
-    const npy_intp M = SIZE(M), p = SIZE(p), g = SIZE(g);
-    Lane *lanes = (Lane *)scratch(call, TOGETHER * p * LANES);
+    const npy_intp M = SIZE(M), p = SIZE(p), g = SIZE(g), c = SIZE(c);
+    Lane *lanes = (Lane *)scratch(call, (TOGETHER * p + 2 * c) * LANES);
     if (lanes == NULL)
         return ERROR;
-    for (npy_intp first = 0; first < g; first += LANES)
-        errors_of_cases(call, call->in[0] + first * M * p, g - first < LANES ? g - first : LANES,
-                        lanes, call->out[0] + first * M, call->out[1] + first * M);
+    Lane *const level = lanes + TOGETHER * p;
+    const Course course = {call->in[7] == NULL ? NULL : level, level + c};
+    for (npy_intp first = 0; first < g; first += LANES) {
+        const npy_intp used = g - first < LANES ? g - first : LANES;
+        if (course.level != NULL)
+            lanes_load(level, call->in[7], c, c, first, used);
+        for (npy_intp j = 0; j < c; j++)
+            EACH course.last[j][l] = -1.0;
+        errors_of_cases(call, call->in[0] + first * M * p, used, lanes, &course,
+                        call->out[0] + first * M, call->out[1] + first * M);
+        lanes_store(call->out[2], course.last, 1, c, 0, c, first, used);
+    }
     return DONE;
 }
 
 const Kernel law_kernels[] = {
     {"mixed", "Npw c=w-p", "N Npc N", mixed},
     {"stepped_law", "S Sp Sp Sp @M M M g?p gw", "gMp", stepped_law},
-    {"squared_errors", "gMp M?p p M?n M?np M?n n", "gM gM", squared_errors},
+    {"squared_errors", "gMp M?p p M?n M?np M?n n |gc c=p+n", "gM gM gc", squared_errors},
     {NULL, NULL, NULL, NULL},
 };

@@ -64,9 +64,12 @@ def mean_decay(x: Array) -> Array:
 
 
 def squared_errors(
-    eta: Array, truth: Array, in_eta: Array, offset: Array, gain: Array, x: Array, in_x: Array
-) -> tuple[Array, Array]:
+    eta: Array, truth: Array, in_eta: Array, offset: Array, gain: Array, x: Array, in_x: Array,
+    levels: Array | None,
+) -> tuple[Array, Array, Array]:
     """Weighted squares of η̂ − η and of x̂ − x, x̂ = offset + gain η̂, both (g, M).
+
+    And when each error is above its level for the last time, as an index, −1 for never (g, p + n).
 
     Args:
         eta: η̂ (g, M, p).
@@ -76,8 +79,15 @@ def squared_errors(
         gain: of x̂, (M or 1, n, p).
         x: the true states (M or 1, n).
         in_x: their weights (n,).
+        levels: of the errors (g, p + n); None: nobody asks when they are above them.
     """
     some, seen = in_eta != 0.0, in_x != 0.0
-    of_eta = np.einsum("gmj,j->gm", (eta - truth)[..., some] ** 2, in_eta[some])
-    error = np.matmul(gain[:, seen], eta[..., None])[..., 0] + (offset - x)[:, seen]
-    return of_eta, np.einsum("gmi,i->gm", error**2, in_x[seen])
+    in_all = [eta - truth, np.matmul(gain, eta[..., None])[..., 0] + (offset - x)]
+    of_eta = np.einsum("gmj,j->gm", in_all[0][..., some] ** 2, in_eta[some])
+    of_x = np.einsum("gmi,i->gm", in_all[1][..., seen] ** 2, in_x[seen])
+    last = np.full((len(eta), len(in_eta) + len(in_x)), -1.0)
+    if levels is not None:
+        above = np.abs(np.concatenate(in_all, axis=2)) > levels[:, None]
+        latest = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
+        last = np.where(above.any(axis=1), latest, last)
+    return of_eta, of_x, last
