@@ -69,11 +69,11 @@ class Knowledge:
         next_one = np.where(unknown, 1.0, self.eigenvalues).min(axis=1, initial=1.0)
         return self.vectors * unknown[:, None, :], _SEEN + _MIXED / next_one
 
-    @property
+    @cached_property
     def parameters(self) -> BoolArray:
         """Which parameters are determined, (M, p)."""
         kernel, slack = self._kernel
-        return np.asarray(np.linalg.norm(kernel, axis=2) <= slack[:, None])
+        return np.asarray(_row_norms(kernel) <= slack[:, None])
 
     @property
     def independent(self) -> IntArray:
@@ -94,9 +94,16 @@ class Knowledge:
     def states(self, gain: Array) -> BoolArray:
         """Which states x = offset + gain η are, for gain (M, n, p): shape (M, n)."""
         kernel, slack = self._kernel
+        if not kernel.any() and np.isfinite(gain).all():
+            return np.ones(gain.shape[:2], dtype=bool)
         scaled = gain / self.sizes[:, None, :]
-        size = np.linalg.norm(scaled, axis=2)
-        return np.asarray(np.linalg.norm(scaled @ kernel, axis=2) <= slack[:, None] * size)
+        size = _row_norms(scaled)
+        return np.asarray(_row_norms(scaled @ kernel) <= slack[:, None] * size)
+
+
+def _row_norms(matrices: Array) -> Array:
+    """Of the rows of matrices (M, n, p), shape (M, n)."""
+    return np.asarray(np.sqrt(np.einsum("mij,mij->mi", matrices, matrices)))
 
 
 def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:

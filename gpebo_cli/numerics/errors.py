@@ -12,6 +12,7 @@ Signs all equal were rejected: a rotation cancels them.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -92,12 +93,13 @@ def _carried(
 ) -> Array:
     """Bounds (K, n, columns) at right ends of the errors of both kinds that right ends add."""
     K, n, columns = left_out.shape
-    bits = np.random.default_rng(0).integers(0, 2, (K + 1, n, 2 * _SIGNS, 1), dtype=np.int8)
-    signs: Array = np.where(bits == 1, 1.0, -1.0)
-    width = 2 * _SIGNS * columns
-    kinds = np.stack([left_out, rounded], axis=2)
-    added = (signs[1:] * np.repeat(kinds, _SIGNS, axis=2)).reshape(K, n, width)
-    at_start = EPS * np.abs(values[0, 0])[:, None] * np.repeat([0.0, 1.0], _SIGNS)[:, None]
+    signs, width = _signs(K, n), 2 * _SIGNS * columns
+    kinds = np.empty((K, n, 2, _SIGNS, columns))
+    np.multiply(signs[1:, :, 0], left_out[:, :, None], out=kinds[:, :, 0])
+    np.multiply(signs[1:, :, 1], rounded[:, :, None], out=kinds[:, :, 1])
+    added = kinds.reshape(K, n, width)
+    at_start = np.zeros((n, 2, _SIGNS, columns))
+    at_start[:, 1] = EPS * np.abs(values[0, 0])[:, None]
     start: Array = (signs[0] * at_start).reshape(n, width)
     if problem.renewal is None:
         ends = elements.chain(last[:, None], added[:, None], start)[0][:, 1]
@@ -110,10 +112,20 @@ def _carried(
                 error = np.moveaxis(renewed, 0, 1).reshape(n, width)
             error = last[k if len(last) > 1 else 0] @ error + added[k]
             ends[k] = error
-    rms = np.sqrt(np.mean(ends.reshape(K, n, 2, _SIGNS, columns) ** 2, axis=3))
+    squares = ends.reshape(K, n, 2, _SIGNS, columns) ** 2
+    rms = np.sqrt(sum(squares[:, :, :, k] for k in range(_SIGNS)) / _SIGNS)
     systematic = np.sqrt(np.arange(2, K + 2))[:, None, None]
     chance = systematic if constant else np.minimum(systematic, _CHANCE)
     return np.asarray(systematic * rms[:, :, 0] + chance * rms[:, :, 1])
+
+
+@lru_cache(maxsize=8)
+def _signs(K: int, n: int) -> Array:
+    """For each kind of error at the start and the ends of K elements, (K + 1, n, 2, _SIGNS, 1)."""
+    bits = np.random.default_rng(0).integers(0, 2, (K + 1, n, 2, _SIGNS, 1), dtype=np.int8)
+    signs: Array = np.where(bits == 1, 1.0, -1.0)
+    signs.flags.writeable = False
+    return signs
 
 
 def least_sizes(problem: LinearProblem, made_of: Array, tol: float) -> Array:

@@ -33,7 +33,6 @@ class Assembled:
 
     def kinds(self) -> list[tuple[Array, float]]:
         """Everything the mesh has to resolve, with the size below which it is rounding."""
-        squares, right = _products(self.psi, self.Y)
         columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
         psi, gain = self.psi / columns, self.gain / columns
         states = np.abs(gain).max(axis=(0, 2), initial=0.0)
