@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.evidence.knowledge import Knowledge, knowledge
+from gpebo_cli.evidence.knowledge import Knowledge, knowledge, smallest_and_margin
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray
@@ -75,27 +75,31 @@ def assess(
     gram = Trajectory(gram.mesh, gram.values[..., :p])
     sizes = np.broadcast_to(regression.scale, (mesh.size, p))
 
-    def known(at: Array, matrices: Array) -> Knowledge:
+    def beside(at: Array) -> tuple[Array, Array, float]:
         element = np.maximum(np.searchsorted(mesh.edges, at, side="left") - 1, 0)
-        return knowledge(matrices, sizes[element], at - mesh.edges[0], tol)
+        return sizes[element], at - mesh.edges[0], tol
 
-    ends = known(gram.mesh.edges[1:], gram.values[:, -1])
+    ends = gram.mesh.edges[1:]
+    smallest, margin = smallest_and_margin(gram.values[:, -1], *beside(ends))
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
     # or half as well as they ever are.
-    enough = min(WELL, 0.5 * float(ends.smallest[ends.margin >= 1.0].max(initial=0.0)))
+    enough = min(WELL, 0.5 * float(smallest[margin >= 1.0].max(initial=0.0)))
 
     def reached(at: Array, matrices: Array) -> Array:
         """At least 0 where ψ is exciting; to be read as a distance from that in logarithms."""
         if rho is not None:
             level = _eigenvalues(matrices)[:, 0] / rho
+        elif enough:
+            smallest, margin = smallest_and_margin(matrices, *beside(at))
+            level = np.minimum(smallest / enough, margin)
         else:
-            there = known(at, matrices)
-            level = np.minimum(there.smallest / enough, there.margin) if enough else 0.0 * at
+            level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
     values = gram(t)
     return excitation(
-        known(t, values), t, regression.parameters, np.maximum(_eigenvalues(values), 0.0),
+        knowledge(values, *beside(t)), t, regression.parameters,
+        np.maximum(_eigenvalues(values), 0.0),
         segment_level(regression, t, window), window, _first_time(gram, reached), rho,
     )
 

@@ -115,14 +115,30 @@ def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> 
         elapsed: seconds that G has been gathered for, (M,).
         tol: to which ψ is resolved, relative to its terms.
     """
+    normalised, sizes, level = _normalised(gram, terms, elapsed, tol)
+    spectrum, vectors = np.linalg.eigh(normalised)
+    return Knowledge(sizes, spectrum, vectors, level)
+
+
+def smallest_and_margin(
+    gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12
+) -> tuple[Array, Array]:
+    """``smallest`` and ``margin`` (M,) of :func:`knowledge`, without what takes eigenvectors."""
+    normalised, _, level = _normalised(gram, terms, elapsed, tol)
+    spectrum = np.linalg.eigvalsh(normalised)
+    smallest = np.maximum(spectrum.min(axis=1, initial=1.0), 0.0)
+    return smallest, np.asarray(smallest / level.max(axis=1, initial=_SINGULAR))
+
+
+def _normalised(
+    gram: Array, terms: Array, elapsed: Array, tol: float
+) -> tuple[Array, Array, Array]:
+    """N (M, p, p), the sizes and the levels of the columns (M, p)."""
     p = gram.shape[1]
     energy = np.einsum("mjj->mj", gram[..., :p])
     sizes, level = _sizes(np.sqrt(np.maximum(energy, 0.0)), terms, elapsed, tol)
-    normal = np.where(level < 1.0, 1.0, 0.0)
-    normalised = gram[..., :p] / sizes[:, :, None] / sizes[:, None, :]
-    normalised = normalised * normal[:, :, None] * normal[:, None, :]
-    spectrum, vectors = np.linalg.eigh(normalised)
-    return Knowledge(sizes, spectrum, vectors, level)
+    factors = np.where(level < 1.0, 1.0 / sizes, 0.0)
+    return gram[..., :p] * factors[:, :, None] * factors[:, None, :], sizes, level
 
 
 def knowledge_of_roots(
