@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -113,21 +113,22 @@ def refuse_code(config: Mapping[str, Any]) -> None:
     for key in ("callbacks", "searchpath"):
         if hydra.get(key):
             raise ConfigError(f"hydra.{key}: not allowed; files of yours are found by --config-dir")
-    for where, value in _targets(config, ""):
-        if where not in _INSTANTIATED or not str(value).startswith(_PLUGINS):
+    for where, value in _leaves(config, ""):
+        ours = where in _INSTANTIATED and str(value).startswith(_PLUGINS)
+        if "_target_" in where and not ours:
             raise ConfigError(f"{where}: `_target_` is not allowed; a configuration is data")
 
 
-def _targets(value: object, where: str) -> Iterator[tuple[str, object]]:
-    if isinstance(value, Mapping):
+def _leaves(value: object, where: str) -> Iterator[tuple[str, object]]:
+    """Everything in a configuration that holds nothing else, and where it stands."""
+    if isinstance(value, Mapping) and value:
         for key, inner in value.items():
-            inside = f"{where}.{key}" if where else str(key)
-            if key == "_target_":
-                yield inside, inner
-            yield from _targets(inner, inside)
-    elif isinstance(value, Sequence) and not isinstance(value, str):
+            yield from _leaves(inner, f"{where}.{key}" if where else str(key))
+    elif isinstance(value, list) and value:
         for position, inner in enumerate(value):
-            yield from _targets(inner, f"{where}[{position}]")
+            yield from _leaves(inner, f"{where}[{position}]")
+    else:
+        yield where, value
 
 
 @contextmanager
@@ -210,7 +211,9 @@ def plain(config: DictConfig) -> dict[str, Any]:
     plant = config.get("plant")
     if not isinstance(plant, DictConfig):
         raise ConfigError("plant.name is missing; choose a file with plant=NAME")
-    _refuse_interpolations(OmegaConf.to_container(plant, resolve=False), "plant")
+    for where, value in _leaves(OmegaConf.to_container(plant, resolve=False), "plant"):
+        if "${" in f"{where}{value}":
+            raise ConfigError(f"{where}: ${{…}} is not allowed in a plant; write the value")
     try:
         missing = sorted(OmegaConf.missing_keys(config))
         if missing:
@@ -218,15 +221,3 @@ def plain(config: DictConfig) -> dict[str, Any]:
         return cast("dict[str, Any]", OmegaConf.to_container(config, resolve=True))
     except OmegaConfBaseException as error:
         raise ConfigError(f"{error.full_key or 'configuration'}: {error.msg}") from error
-
-
-def _refuse_interpolations(value: object, where: str) -> None:
-    if isinstance(value, str) and "${" in value:
-        raise ConfigError(f"{where}: ${{…}} is not allowed in a plant; write the value")
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            _refuse_interpolations(key, where)
-            _refuse_interpolations(inner, f"{where}.{key}")
-    elif isinstance(value, Sequence) and not isinstance(value, str):
-        for position, inner in enumerate(value):
-            _refuse_interpolations(inner, f"{where}[{position}]")

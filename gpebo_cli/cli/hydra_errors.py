@@ -20,7 +20,6 @@ LIBRARY_ERRORS = (HydraException, OmegaConfBaseException)
 _QUOTED = re.compile(r"^Could not (?:override|append to config)[^']*'([^']+)'")
 _SEVERAL = re.compile(r"^Ambiguous value for argument '([^']+)'")
 _TWICE = re.compile(r"^(?:Multiple values for )?([\w/]+)(?:\.| appears more than once)")
-_NO_NAME = re.compile(r"Interpolation key '(\w+)\.name' not found")  # asked for by hydra.run.dir
 _NO_MATCH = re.compile(r"^Could not override '([^']+)'\.\s+No match in the defaults list")
 _MISSING_IN = re.compile(r"^In '([^']+)'")
 _EXTRAS = {"joblib": "parallel", "ray": "ray", "submitit_slurm": "slurm", "submitit_local": "slurm"}
@@ -39,8 +38,6 @@ def explain(error: BaseException, arguments: Arguments) -> str:
     if (match := _TWICE.search(text)) and match[1] in GROUPS:
         group = match[1]
         return f"{group} is chosen twice; write {group}=NAME once, without +"
-    if match := _NO_NAME.search(text):
-        return f"{match[1]}.name is missing; choose a file with {match[1]}=NAME, or give the name"
     if match := _NO_MATCH.search(text):
         return _no_match(match[1])
     if match := _QUOTED.search(text):

@@ -42,22 +42,13 @@ def parse(text: str, path: str, interpolations: frozenset[str] | None = frozense
         raise ConfigError(f"{where}: not valid YAML: {problem}") from error
 
 
-class _Collection:
-    """A list or a mapping that is still open."""
-
-    def __init__(self, value: list[Any] | dict[str, Any], anchor: str | None, before: int) -> None:
-        self.value = value
-        self.anchor = anchor
-        self.before = before  # entries of the document up to here
-        self.key: str | None = None  # of the next value of a mapping, if that has been read
-
-
 class _Builder:
     def __init__(self, path: str, interpolations: frozenset[str] | None) -> None:
         self._path = path
         self._interpolations = interpolations
         self._documents: list[Any] = []
-        self._open: list[_Collection] = []
+        # Collections that are open: what is in them, anchor, entries before, key of the next value.
+        self._open: list[list[Any]] = []
         self._anchors: dict[str, tuple[Any, int]] = {}  # values, and how many entries they are
         self._count = 0
 
@@ -81,8 +72,8 @@ class _Builder:
             elif isinstance(event, yaml.CollectionStartEvent):
                 self._begin(event)
             elif isinstance(event, yaml.CollectionEndEvent):
-                ended = self._open.pop()
-                self._keep(ended.anchor, ended.value, self._count - ended.before)
+                value, anchor, before, _ = self._open.pop()
+                self._keep(anchor, value, self._count - before)
             if self._count > _MAX_ENTRIES:
                 self._refuse(event, f"more than {_MAX_ENTRIES} entries, aliases expanded")
         return self._documents[0] if self._documents else None
@@ -98,7 +89,7 @@ class _Builder:
             self._refuse(event, f"nested more than {_MAX_DEPTH} levels deep")
         value: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
         self._add(event, value)
-        self._open.append(_Collection(value, event.anchor, self._count))
+        self._open.append([value, event.anchor, self._count, None])
         self._anchors.pop(str(event.anchor), None)  # until it ends, the name means nothing
         self._count += 1
 
@@ -110,20 +101,20 @@ class _Builder:
         if not self._open:
             self._documents.append(value)
             return
-        inside = self._open[-1]
-        if isinstance(inside.value, list):
-            inside.value.append(value)
-        elif inside.key is not None:
-            inside.value[inside.key] = value
-            inside.key = None
+        inside, _, _, key = self._open[-1]
+        if isinstance(inside, list):
+            inside.append(value)
+        elif key is not None:
+            inside[key] = value
+            self._open[-1][3] = None
         elif not isinstance(value, str):
             self._refuse(event, "a key must be text; write it in quotes")
         elif value == "<<":
             self._refuse(event, "a merge key (<<) is not allowed; write the keys out")
-        elif value in inside.value:
+        elif value in inside:
             self._refuse(event, f"the key {value[:60]} stands twice")
         else:
-            inside.key = value
+            self._open[-1][3] = value
 
     def _scalar(self, event: yaml.ScalarEvent) -> Any:
         text = event.value
