@@ -71,9 +71,9 @@ def test_several_values_of_a_sweep():
 
 def test_keys_are_those_of_the_chosen_file():
     assert set(names("run", "time.")) == {"time.start=", "time.horizon=", "time.samples="}
-    assert "estimator.lambda=" in names("run", "estimator.")
-    assert "estimator.f0=" not in names("run", "estimator.")
-    assert "estimator.f0=" in names("run", "estimator=ls_drem", "estimator.")
+    assert "estimator.gamma=" in names("run", "estimator.")
+    assert "estimator.lambda=" not in names("run", "estimator.")
+    assert "estimator.lambda=" in names("run", "estimator=drem", "estimator.")
     assert "observer.output=" in names("run", "observer=canonical", "observer.")
     assert "solver.tol=" in names("run", "solver.")
 

@@ -62,7 +62,7 @@ def test_the_readme_runs(tmp_path):
     text = README.read_text()
     (script,) = blocks(text, "sh")
     said = shell(script, tmp_path)
-    assert "interval-exciting from t = 0.4749 s on" in said
+    assert "interval-exciting from t = 0.04962 s on" in said
     (source,) = blocks(text, "python")
     python(source, tmp_path)
     assert (tmp_path / "from_python" / "summary.json").is_file()

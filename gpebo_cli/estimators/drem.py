@@ -34,7 +34,7 @@ class Drem(FilteredEstimator):
         return kreisselmeier(regression, rates, start)
 
     def seen(self, psi: Array) -> Array:
-        """ψᵀ."""
+        """ψᵀ (N, p, rows) of ψ (N, rows, p)."""
         return transpose(psi)
 
     def size(self, regression: LinearRegression) -> float:

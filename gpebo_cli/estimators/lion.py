@@ -26,7 +26,7 @@ class Lion(FilteredEstimator):
         return lion(regression, rates, start)
 
     def seen(self, psi: Array) -> Array:
-        """Row i takes row i mod r of the regression."""
+        """Row i takes row i mod r of the regression: (N, p, rows) of ψ (N, rows, p)."""
         rows, p = psi.shape[1:]
         return np.broadcast_to(np.eye(rows)[np.arange(p) % rows], (len(psi), p, rows))
 

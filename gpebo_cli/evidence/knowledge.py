@@ -33,7 +33,7 @@ class Knowledge:
     level: Array  # (M, p) share below which each parameter is rounding
 
     def at(self, chosen: slice | IntArray) -> Knowledge:
-        """At some of the times."""
+        """At some of the times, a slice or indices (M,)."""
         return Knowledge(
             self.sizes[chosen], self.eigenvalues[chosen], self.vectors[chosen], self.level[chosen]
         )

@@ -191,8 +191,8 @@ class Online:
 
         Args:
             made: what they gave; None: nobody has kept more than the newest.
-            shown: which of those.
-            pe_level: at those that are shown.
+            shown: which of those, (M,).
+            pe_level: at those that are shown, (M,).
             window: of it, seconds.
         """
         t, known, eigenvalues = self._newest if made is None else (

@@ -24,7 +24,7 @@ _TINY = float(np.finfo(float).tiny)
 def scaled(
     E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int
 ) -> tuple[Array, Array]:
-    """Taylor coefficients of E and A in scaled rows, states and time."""
+    """Taylor coefficients of E and A, (K, N, n, n), in scaled rows, states and time."""
     powers = time ** np.arange(orders, dtype=np.float64)[:, None, None, None]
     weight = rows[:, None] * columns
     return E[:orders] * weight * powers / time, A[:orders] * weight * powers
@@ -44,7 +44,10 @@ def derivative_array(e: Array, a: Array, mu: int) -> tuple[Array, Array]:
 
 
 def array_size(M: Array, a: Array) -> Array:
-    """Size of what the derivative array was made from: with E = 0 it is still judged against A."""
+    """Size (N,) of what the derivative array M (N,) was made from, A (K, N, n, n) included.
+
+    With E = 0 it is still judged against A.
+    """
     size = np.maximum(M, np.abs(a).max(axis=(0, 2, 3)))
     return np.asarray(np.maximum(size, _TINY))  # a plant of zeros has none
 
@@ -325,7 +328,7 @@ def in_own_states(
     E: Array, A: Array, f: Array, Z1: Array, A2: Array, f2: Array, size: Array, inverse: Array,
     rows: Array, columns: Array, time: float, every: int,
 ) -> tuple[Array, ...]:
-    """What :func:`eliminated` returns from what is found in scaled rows and states.
+    """What :func:`eliminated` returns, from Z1 (N, n, d) and Â2 (N, a, n) in scaled form.
 
     Only rows stay scaled, and row scalings do not matter. E, A and f are those of the model.
     """

@@ -42,7 +42,7 @@ class Coefficients(NamedTuple):
     H: Array  # (K + 1, N, r, q)
 
     def along(self, signals: Array) -> Coefficients:
-        """These with u as it was measured; ``signals`` as in :meth:`CoefficientSource.taylor`."""
+        """These with u as it was measured; signals (J + 1, N, m + r) as for ``taylor``."""
         orders, times, m = self.u.shape
         u = np.zeros((orders, times, m))
         given = signals[:orders, :, :m]

@@ -120,7 +120,7 @@ class FunctionCoefficients:
         return np.zeros(0)
 
     def resolved(self, edges: Array) -> None:  # noqa: ARG002
-        """None: nothing bounds what functions do between the times at which they are looked at."""
+        """None, whatever the edges (K + 1,): nothing bounds what functions do between the nodes."""
         return
 
     def _fill(self, name: str, values: Array, t: Array, signals: Array | None) -> None:

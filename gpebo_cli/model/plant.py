@@ -175,7 +175,7 @@ class TextCoefficients:
         return {}
 
     def resolved(self, edges: Array) -> Array:
-        """Cells in which nothing narrow hides; see the protocol."""
+        """Edges of cells in which nothing narrow hides, from edges (K + 1,); see the protocol."""
         key = edges.tobytes()
         if key not in self._resolved:
             self._resolved[key] = resolved(self._bounds, edges)

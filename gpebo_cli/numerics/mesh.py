@@ -382,7 +382,7 @@ def initial_mesh(start: float, stop: float, breakpoints: Sequence[float] | Array
 def initial_edges(
     start: float, stop: float, breakpoints: Sequence[float] | Array, elements: int = FIRST_ELEMENTS
 ) -> Array:
-    """The edges of :func:`initial_mesh`."""
+    """The edges (K + 1,) of :func:`initial_mesh`, with breakpoints (B,) among them."""
     if not len(breakpoints):
         # The same numbers as np.linspace without its end.
         edges: Array = np.arange(elements + 1, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""No observer at all: Y and ψ are given, as text over signals (config group ``regression``)."""
+"""No observer at all: Y = ψη is given, as text over signals (config group ``regression``)."""
 
 from __future__ import annotations
 

@@ -32,9 +32,9 @@ class Scaling:
     rows: Array  # (n,)
     columns: Array  # (n,) x = columns * x̃
     time: float  # τ, derivatives are taken with respect to t/τ
-    # (n,) powers of ten by which the rows of E are of comparable size: equations within a decade of
+    # Powers of ten by which the rows of E are of comparable size: equations within a decade of
     # each other count as they were written.
-    weights: Array
+    weights: Array  # (n,)
 
 
 def forcing(c: Coefficients) -> Array:

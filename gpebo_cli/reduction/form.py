@@ -42,13 +42,13 @@ class HiddenConstraints(NamedTuple):
 class Equations(NamedTuple):
     """A plant's matrices at N times; a leading axis of 1 means constant in time."""
 
-    E: Array
-    A: Array
-    B: Array  # of the driving signals
-    F: Array
-    C: Array
-    D: Array  # of the driving signals
-    H: Array
+    E: Array  # (N, n, n)
+    A: Array  # (N, n, n)
+    B: Array  # (N, n, v) of the driving signals
+    F: Array  # (N, n, q)
+    C: Array  # (N, r, n)
+    D: Array  # (N, r, v) of the driving signals
+    H: Array  # (N, r, q)
     hidden: HiddenConstraints | None
 
 

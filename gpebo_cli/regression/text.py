@@ -169,6 +169,9 @@ def resolved(
 ) -> tuple[Mesh, tuple[Array, Array, list[tuple[Array, float]]], float]:
     """Cut elements until what is evaluated on the mesh is resolved; what it is then, and the tail.
 
+    What is evaluated are two arrays (K, s + 1, …) and kinds of signals (K, s + 1, c), each with
+    its floor.
+
     Raises:
         SolverError: ``max_elements`` do not reach ``tol``; names the time.
     """

@@ -65,7 +65,7 @@ class Linearised:
         return self.system.coefficients.breakpoints(start, stop)
 
     def resolved(self, edges: Array) -> Array | None:
-        """Cells for what depends on time alone; the guess has been resolved by its own edges."""
+        """Cells for what depends on time alone, from edges (K + 1,); the guess has its own."""
         found = self.system.coefficients.of_time.resolved(edges)
         if found is None or len(self.guess.mesh.edges) == 2:
             return found

@@ -1,6 +1,7 @@
 """Simulation of plants whose matrices depend on their outputs: Newton's method, window by window.
 
-Each iterate is one linear problem, the plant linearised along the iterate before. A trajectory
+Each iterate is one linear problem, the plant linearised along the iterate before: with
+G = E x' − f(x) it solves ∂G/∂x Δx = −G. A trajectory
 that grows or is chaotic has no start for the whole horizon from which Newton's method converges, so
 the horizon is followed in windows, as long as convergence allows. At last the whole horizon is
 solved once, linearised along what was found: errors of the windows are seen to grow with the
@@ -150,7 +151,7 @@ def _ends(system: DescriptorSystem, t: float, x: Array, error: GpeboError) -> Gp
 
 
 def joined(pieces: list[Trajectory]) -> Trajectory:
-    """Trajectories one after the other as one."""
+    """Trajectories (n,) one after the other as one."""
     edges = [pieces[0].mesh.edges[:1], *(piece.mesh.edges[1:] for piece in pieces)]
     mesh = Mesh(np.concatenate(edges), pieces[0].mesh.rule)
     return Trajectory(mesh, np.concatenate([piece.values for piece in pieces]))

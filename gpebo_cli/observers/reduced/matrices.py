@@ -74,7 +74,7 @@ class ObserverMatrices:
         return len(self.output_scale)
 
     def of_noise(self, matrix: Array, inputs: int) -> Array:
-        """The columns of a matrix (N, ·, · + r) of [v; y] that belong to [u; y], m inputs."""
+        """The columns (N, k, m + r) of a matrix of [v; y] that belong to [u; y], m inputs."""
         return np.concatenate([matrix[:, :, :inputs], matrix[:, :, -self.outputs :]], axis=2)
 
     @property
@@ -88,7 +88,7 @@ class ObserverMatrices:
         return orthonormal_complement(self.range)
 
     def equations(self, signals: Array) -> AlgebraicEquations:
-        """The algebraic equations with the signals [v; y] (N, · + r, 1)."""
+        """The algebraic equations with the signals [v; y], (N, v + r, 1)."""
         g_y = (self.g_signals @ signals)[:, :, 0]
         return AlgebraicEquations(
             self.on_basis, g_y, self.G, self.range, self.elimination, self.injectivity

@@ -17,7 +17,7 @@ _RESPONSE = 1e-6  # error of the response to noise, which is known to no more di
 
 
 def errors_of(reduced: ReducedSystem, kept: IntArray) -> ErrorsAt:
-    """Errors e of [u; y], what they add to Y (rows that are ``kept``), and to the state's offset.
+    """Errors e of [u; y], what they add to Y (rows ``kept`` (k,)), and to the state's offset.
 
     ζ' = A_0 ζ + b_0(e),    δY = R (𝒜 ζ + g_y(e)),    δoffset = ζ − K (𝒜 ζ + g_y(e))
     """
