@@ -21,6 +21,7 @@ help:
 
 run: $(VENV)/installed
 	$(BIN)/gpebo run plant=circuit estimator=drem
+	@echo 'next: . $(BIN)/activate; gpebo list'
 
 test: $(VENV)/installed-dev
 	$(BIN)/pytest -n auto

@@ -39,6 +39,14 @@ def test_it_can_be_written_elsewhere(tmp_path):
     assert "--config-dir 'my models' plant=tank" in done.stdout
 
 
+def test_an_observer_passes_its_test(tmp_path):
+    done = gpebo("new", "observer", "mine_too", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "2 passed" in shell(f"{shlex.quote(sys.executable)} -m pytest -q -p no:xdist", tmp_path)
+    entry = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]["entry-points"]
+    assert entry == {"gpebo.observers": {"mine_too": "mine_too:MineToo"}}
+
+
 def test_an_estimator_passes_its_test_and_is_found_once_it_is_installed(tmp_path):
     done = gpebo("new", "estimator", "two_words", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -71,7 +79,7 @@ def test_every_key_is_explained():
         (["plant"], "needs one name, as in gpebo new plant tank; got none"),
         (["plant", "a", "b"], "got 'a', 'b'"),
         (["plnt", "a"], "did you mean plant?"),
-        ([], "known: plant, estimator, recording, as in gpebo new plant tank"),
+        ([], "known: plant, estimator, observer, recording, as in gpebo new plant tank"),
         (["plant", "a", "--confg-dir", "b"], "did you mean --config-dir?"),
         (["plant", "a", "--config-dir"], "--config-dir needs a folder"),
         (["estimator", "ls_drem"], "ls_drem comes with gpebo"),

@@ -452,3 +452,12 @@ def test_a_folder_from_a_stranger_cannot_bring_launchers(tmp_path):
     done = gpebo("run", "-m", "--config-dir", ".", "launcher=evil", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "there is no such launcher; known: basic" in done.stderr
+
+
+def test_a_pipe_among_the_files_of_a_run_is_not_waited_for(tmp_path):
+    assert gpebo("run", "figures=none", "hydra.run.dir=a", cwd=tmp_path).returncode == 0
+    (tmp_path / "a" / "cases.csv").unlink()
+    os.mkfifo(tmp_path / "a" / "cases.csv")
+    done = gpebo("compare", "a", cwd=tmp_path)
+    assert done.returncode != 0
+    assert "a/cases.csv: not a regular file" in done.stderr

@@ -171,7 +171,7 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
         "report": ["--output", "--help"],
         "new": [
             "--config-dir", "--from", "--measure", "--unknown", "--plant", "--help",
-            *(["plant", "estimator", "recording"] if not before else []),
+            *(["plant", "estimator", "observer", "recording"] if not before else []),
         ],
         "completion": [*SCRIPTS, "--help"],
     }

@@ -16,7 +16,8 @@ from gpebo_cli.schema import nearest, shown
 
 _PACKAGE = {"{name}.py": "{kind}.py", "{kind}/{name}.yaml": "{kind}.yaml",
             "test_{name}.py": "test_{kind}.py", "pyproject.toml": "pyproject.toml"}
-KINDS = {"plant": {"plant/{name}.yaml": "plant.yaml"}, "estimator": _PACKAGE}
+KINDS = {"plant": {"plant/{name}.yaml": "plant.yaml"}, "estimator": _PACKAGE,
+         "observer": _PACKAGE}
 """For each kind the files that are written, and the template of each."""
 RECORDING = "recording"
 """The kind that is made from a look at a file, and has no template."""

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.reading import open_regular
 from gpebo_cli.results.files import remove_files, write_text
 
 PLAN = "sweep.json"
@@ -67,9 +68,12 @@ def read_plan(folder: Path) -> Plan | None:
         ConfigError: there is one, but it is not of a sweep.
     """
     try:
-        text = (folder / PLAN).read_text(encoding="utf-8")
-    except (FileNotFoundError, NotADirectoryError):
-        return None
+        with open_regular(folder / PLAN) as stream:
+            text = stream.read()
+    except ConfigError as error:
+        if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):
+            return None
+        raise
     try:
         content = json.loads(text)
         jobs = tuple({str(k): str(v) for k, v in job.items()} for job in content["jobs"])
@@ -100,7 +104,8 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
     """
     missing = JobRecord(number, overrides, "missing")
     try:
-        content: Any = json.loads((job_folder(folder, number) / RESULT).read_bytes())
+        with open_regular(job_folder(folder, number) / RESULT) as stream:
+            content: Any = json.loads(stream.read())
         if content["status"] not in ("done", "failed") or content["overrides"] != dict(overrides):
             return missing
         return JobRecord(
@@ -111,7 +116,7 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
             str(content["error"]),
             [dict(case) for case in content["cases"]],
         )
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ConfigError, OSError, ValueError, KeyError, TypeError):
         return missing
 
 

@@ -17,7 +17,7 @@ commands:
   figures [NAME …]    the paper's figures and tables, in outputs/paper
   reproduce [NAME …]  published numbers beside ours, from experiments/published
   list [KIND]         what there is: plants, regressions, observers, estimators, …
-  new KIND NAME       a plant or an estimator of your own, commented, which works as it stands
+  new KIND NAME       a plant, an estimator, an observer of your own, which works as it stands
   completion SHELL    completion of commands, groups and names for bash, zsh or fish
 
 options:
@@ -134,7 +134,7 @@ examples:
 """
 
 NEW_HELP = """\
-usage: gpebo new {plant|estimator} NAME [--config-dir DIR] [--from FILE …]
+usage: gpebo new {plant|estimator|observer} NAME [--config-dir DIR] [--from FILE …]
        gpebo new recording FILE.csv --plant NAME [--config-dir DIR]
 
 Writes below DIR, by default the current folder; nothing that exists is overwritten.
@@ -142,6 +142,7 @@ Writes below DIR, by default the current folder; nothing that exists is overwrit
   plant      DIR/plant/NAME.yaml: every key explained; it runs as it stands
   estimator  DIR/NAME.py, its settings DIR/estimator/NAME.yaml, its test DIR/test_NAME.py, and
              DIR/pyproject.toml, by which gpebo finds it once it is installed; the test passes
+  observer   likewise
 
   recording  DIR/data/FILE.yaml: which column of FILE.csv is which signal of the plant, separators,
              units, gaps, as far as they can be guessed; and what was not understood

@@ -7,14 +7,15 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from gpebo_cli.errors import GpeboError
+from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.reading import open_regular
 from gpebo_cli.schema import shown
 
 _TAIL = 1 << 16  # bytes in which the last row of a table is
@@ -85,7 +86,7 @@ def span(folder: Path) -> tuple[float, float]:
     """
     path = folder / "signals.csv"
     try:
-        with path.open("rb") as stream:
+        with _opened(path) as stream:
             names = stream.readline().decode().rstrip().split(",")
             first = stream.readline()
             stream.seek(max(0, path.stat().st_size - _TAIL))
@@ -169,7 +170,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     path = folder / "summary.json"
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(_bytes(path))
     except OSError as error:
         raise GpeboError(f"{path}: {error.strerror or error}") from error
     except ValueError:
@@ -184,6 +185,20 @@ def _estimator(summary: Mapping[str, Any]) -> str:
     return str(estimator.get("name")) if isinstance(estimator, Mapping) else str(estimator)
 
 
+def _bytes(path: Path) -> bytes:
+    """The content of a regular file; a pipe under its name would be waited for."""
+    with _opened(path) as stream:
+        return stream.read()
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return open_regular(path)
+    except ConfigError as error:  # nobody configured it: a run should have written it
+        reason = getattr(error.__cause__, "strerror", None) or "not a regular file"
+        raise GpeboError(f"{path}: {reason}") from error
+
+
 def read_columns(path: Path, *needed: str) -> dict[str, Array]:
     """A table of numbers that a run wrote, by column; NaN for an empty cell.
 
@@ -191,7 +206,7 @@ def read_columns(path: Path, *needed: str) -> dict[str, Array]:
         GpeboError: it is missing, or not such a table; the line and the column are named.
     """
     try:
-        content = path.read_bytes()
+        content = _bytes(path)
         header, *rows = csv.reader(content.decode().splitlines())
     except OSError as error:
         raise GpeboError(f"{path}: {error.strerror or error}") from error
