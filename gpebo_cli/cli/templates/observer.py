@@ -1,23 +1,28 @@
 """An observer for plants with E = I: its dynamic extension is integrated in open loop.
 
-ξ_a' = A ξ_a + B u,  ξ_b' = A ξ_b + F,  Φ' = A Φ:  x = ξ_a + ξ_b θ − Φ e₀,  Y = y − C ξ_a,  ψ = C [ξ_b, −Φ]
+ξ_a' = A ξ_a + B u,  ξ_b' = A ξ_b + F,  Φ' = A Φ,  x = ξ_a + ξ_b θ − Φ e₀,
+Y = y − C ξ_a,  ψ = C [ξ_b, −Φ]
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from gpebo_cli import DescriptorSystem, SolverSettings
 from gpebo_cli.observers import (
     AffineStateMap,
     InitialError,
     LinearEquation,
     LinearProblem,
     LinearRegression,
+    Measurements,
     Observation,
     Trajectory,
     initial_extension,
     solve,
 )
+
+Array = np.ndarray
 
 
 @dataclass(frozen=True)
@@ -26,20 +31,23 @@ class Mine:
 
     xi_a0: dict[str, float] | None = None
 
-    def observe(self, system, signals, solver):
+    def observe(
+        self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
+    ) -> Observation:
+        """The regression and the map to x (n,) from u (m,) and y (r,)."""
         n, q = system.n, system.q
         names = tuple(f"e0_{state}" for state in system.states)
         xi_a0 = initial_extension(self.xi_a0, system, names)
         start = np.concatenate([xi_a0[:, None], np.zeros((n, q)), np.eye(n)], axis=1)
 
-        def equation(t, inside):
+        def equation(t: Array, inside: Array) -> LinearEquation:
             c = system.coefficients.taylor(t, 0, inside)
             f = np.zeros((len(t), n, 1 + q + n))
             f[:, :, :1] = c.B[0] @ signals.inputs(t, inside)[:, :, None]
             f[:, :, 1 : 1 + q] = c.F[0]
             return LinearEquation(None, c.A[0], f, (c.C[0], signals.outputs(t, inside)))
 
-        def resolved(values, seen):
+        def resolved(values: Array, seen: tuple[Array, ...]) -> list[tuple[Array, float]]:
             C, y = seen
             both = C @ values
             return [(both.reshape(*both.shape[:2], -1), 1e-3), (y, 1e-3)]
