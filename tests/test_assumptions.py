@@ -101,7 +101,7 @@ def test_growth_of_the_fundamental_matrix_is_reported():
     [
         (["plant=circuit"], 0, "everything that is needed holds"),
         (["plant=circuit", "observer.regression=paper"], 1, "Assumption 2 failed"),
-        (["plant=canonical"], 1, "Assumption 1 failed"),
+        (["plant=canonical", "observer.form=given"], 1, "Assumption 1 failed"),
     ],
 )
 def test_command(words, code, last, tmp_path):

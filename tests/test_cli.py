@@ -406,7 +406,7 @@ def test_a_saved_configuration_repeats_the_run_in_a_new_folder(tmp_path, mine):
     again = gpebo("run", "--config-dir", first, "--config-name", "config", cwd=tmp_path)
     assert (again.returncode, again.stderr) == (0, "")
     (second,) = folders(tmp_path)
-    assert second.name.endswith("_mine_drem")
+    assert second.name.endswith("_mine_ls_drem")
     for name in ("signals.csv", "estimates.csv", "cases.csv", "config.yaml"):
         assert (second / name).read_bytes() == before[name], name
     assert {path.name: path.read_bytes() for path in first.iterdir() if path.is_file()} == before

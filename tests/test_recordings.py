@@ -30,7 +30,6 @@ from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import LineReader, read_table
 from gpebo_cli.settings import (
     DataSettings,
-    NoiseSettings,
     Settings,
     TimeSettings,
 )
@@ -552,13 +551,6 @@ def test_what_is_wrong_with_a_recording_is_one_line(tmp_path, words, part):
     assert done.stderr.startswith("gpebo: error: ")
     assert done.stderr.count("\n") == 1
     assert part in done.stderr
-
-
-def test_noise_is_not_added_to_a_recording(tmp_path):
-    path = tmp_path / "r.csv"
-    path.write_text(GOOD)
-    with pytest.raises(ConfigError, match="has its own"):
-        recorded(str(path), noise=NoiseSettings(outputs=0.1))
 
 
 def test_a_data_frame_from_python(tmp_path):

@@ -228,7 +228,7 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     to_there = mesh.sampler(t)
     to_there = Sampler(to_there.element[whole], to_there.weights[whole])
     sums = _window_sums(outer, from_there, to_there, outer.values.shape[2])
-    level[whole] = np.maximum(_eigenvalues(sums)[:, 0], 0.0)
+    level[whole] = np.maximum(_eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
     return level
 
 
@@ -271,7 +271,7 @@ def sampled_window_level(regression: SampledRegression, window: float) -> Array:
     first = np.searchsorted(t, t[whole] - window + slack, side="right")
     pairs = np.stack([first, whole + 1], axis=1).ravel()
     sums = np.add.reduceat(steps, pairs, axis=0)[::2]
-    level[whole] = np.maximum(_eigenvalues(sums)[:, 0], 0.0)
+    level[whole] = np.maximum(_eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
     return level
 
 

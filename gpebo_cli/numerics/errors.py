@@ -32,6 +32,7 @@ _VALUE = 32.0  # likewise of any value, which are not carried on
 _ROUNDING = 8.0  # units in the last place that cannot be resolved
 _LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _SAME = 1e-9  # relative difference of rates that are constant
+_FAINT = 1e-6  # of the largest state: errors below that do not end a solution
 _NOTHING = 8.0 * EPS  # of what it is made of: a component that is smaller is rounding itself
 
 
@@ -81,7 +82,8 @@ def estimated_errors(
         else:
             scale = np.maximum(np.maximum(own, problem.floor), SHARE * own.max(initial=0.0))
         scale = np.maximum(scale, _TINY)
-        lost = ~(carried < scale).all(axis=(1, 2))
+        # A state that is nothing beside the others is not lost: there is nothing to be known of it.
+        lost = ~((carried < scale) | (carried < _FAINT * own.max(initial=0.0))).all(axis=(1, 2))
         relative = np.where(total > 0.0, total / scale, 0.0)
     return Errors(np.where(np.isfinite(relative), relative, np.inf),
                   int(np.argmax(lost)) if lost.any() else K)

@@ -43,6 +43,9 @@ from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.linearised import Linearised
 from gpebo_cli.simulation.newton import Effort, follow
 
+# States, up to which each is resolved beside its own size. In a chain of many, those at its end are so
+# small at first that they are rounding of an element's solve, which no refinement resolves.
+_APART = 32
 _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
 _SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
@@ -166,7 +169,7 @@ def _simulate_linear(
     terms = _beside_inputs(c)
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
-        first.amplification, apart=True,
+        first.amplification, apart=system.n <= _APART,
     )
     if solver.name == "ivp":
         solution = _integrate(system, structure, problem, mesh, solver, restarts)
