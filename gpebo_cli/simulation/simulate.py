@@ -43,8 +43,8 @@ from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.linearised import Linearised
 from gpebo_cli.simulation.newton import Effort, follow
 
-# States, up to which each is resolved beside its own size. In a chain of many, those at its end are so
-# small at first that they are rounding of an element's solve, which no refinement resolves.
+# States, up to which each is resolved beside its own size. In a chain of many, those at its end are
+# so small at first that they are rounding of an element's solve, which no refinement resolves.
 _APART = 32
 _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
