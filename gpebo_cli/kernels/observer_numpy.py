@@ -9,6 +9,7 @@ from gpebo_cli.kernels.arrays import Array
 _TINY = float(np.finfo(float).tiny)
 
 
+@np.errstate(invalid="ignore")  # of times at which E or K does not exist; the caller looks
 def in_frame(
     E: Array, A: Array, B: Array, F: Array, C: Array, rows: Array, scale: Array, domain: Array,
     range_: Array, kernel: Array, equations: Array,
