@@ -128,15 +128,16 @@ def _style(name: str) -> dict[str, Any]:
     Raises:
         ConfigError: there is none of that name.
     """
-    from matplotlib import rcParamsDefault, style
+    from matplotlib import rcParamsDefault
+    from matplotlib.style import available, library
 
-    if name not in style.library:
-        known = sorted(style.available)
+    if name not in library:
+        known = sorted(available)
         raise ConfigError(
             f"figures.style: matplotlib has no style {shown(name)}; known: {', '.join(known)}"
             + nearest(name, known)
         )
-    changed: dict[str, Any] = {**style.library[name]}  # type: ignore[dict-item]
+    changed: dict[str, Any] = {**library[name]}  # type: ignore[dict-item]
     return {**{key: rcParamsDefault[key] for key in RC}, **changed}  # type: ignore[index]
 
 
