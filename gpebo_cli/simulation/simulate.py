@@ -20,6 +20,7 @@ from gpebo_cli.model.descriptor import (
 )
 from gpebo_cli.numerics.collocation import LinearSolution, solve, wanted_parts
 from gpebo_cli.numerics.errors import least_sizes
+from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.numerics.mesh import (
     FIRST_ELEMENTS,
     SHARE,
@@ -43,9 +44,7 @@ from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.linearised import Linearised
 from gpebo_cli.simulation.newton import Effort, follow
 
-# States, up to which each is resolved beside its own size. In a chain of many, those at its end are
-# so small at first that they are rounding of an element's solve, which no refinement resolves.
-_APART = 32
+_LOOKED_AT = 32  # times at which the mixing of states is looked at
 _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
 _SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
@@ -169,7 +168,7 @@ def _simulate_linear(
     terms = _beside_inputs(c)
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
-        first.amplification, apart=system.n <= _APART,
+        _amplification(first, float(mesh.steps.max())), apart=True,
     )
     if solver.name == "ivp":
         solution = _integrate(system, structure, problem, mesh, solver, restarts)
@@ -359,6 +358,27 @@ def _known_kinds(
     kinds = [kind for kind in kinds if kind.shape[2]]
     values = np.concatenate([np.zeros((*mesh.points.shape, 0)), *kinds], axis=2)
     return values, np.array([kind.shape[2] for kind in kinds], dtype=np.intp)
+
+
+def _amplification(form: StrangenessFree, step: float) -> Array:
+    """By how much relative rounding of each state, and of 1, reaches each state, (n, n + 1).
+
+    Through the constraints; through x = T z of z = E1 x, where a state that is the small difference
+    of large components of z is rounding of those; and through the equations within a ``step``
+    (seconds), because what integrates rounding is no signal either.
+    """
+    some = slice(None, None, max(1, len(form.E1) // _LOOKED_AT))
+    E1, A1 = form.E1[some], form.A1[some if len(form.A1) > 1 else slice(None)]
+    if form.basis is None:
+        T, singular = inverse_or_none(E1)
+        T[singular] = 0.0
+    else:
+        T = form.basis[some]
+    found = form.amplification.copy()
+    found[:, :-1] += (np.abs(T) @ np.abs(E1)).max(axis=0)
+    within = np.minimum(step * (np.abs(T) @ np.abs(A1)).max(axis=0), 1.0)
+    once = within @ found
+    return np.asarray(found + once + within @ once)
 
 
 def _equations(reduced: StrangenessFree) -> LinearEquation:
