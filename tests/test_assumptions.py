@@ -74,7 +74,7 @@ def test_constant_coefficients_get_regularity_and_the_rank_condition():
     names = found(lti())
     assert names["Regularity"].holds
     assert names["Rank condition D2"].holds
-    blind = found(lti(A=[[-1, 1], [1, 0]]))  # neither A22 nor C sees v
+    blind = found(lti(A=[[-1, 1], [1, 0]]), form="given")  # neither A22 nor C sees v
     assert not blind["Rank condition D2"].holds
     assert not blind["Assumption 1"].holds
 
@@ -123,3 +123,10 @@ def test_command_with_a_wrong_word(tmp_path):
     done = command("check", "plant=circut", cwd=tmp_path)
     assert done.returncode == 2
     assert "did you mean circuit" in done.stderr
+
+
+def test_nothing_to_estimate_is_exciting_and_gives_the_states():
+    """Hidden constraints alone determine the state: x = 0, v = −u (strangeness-free, d = 0)."""
+    names = found(lti(A=[[-1, 1], [1, 0]]))
+    assert names["Assumption 1"].holds
+    assert names["Assumption 2"].holds

@@ -117,7 +117,7 @@ def excitation(
         t=t, gram_eigenvalues=gram_eigenvalues, normalised_min=known.smallest, pe_level=pe_level,
         window=window, is_ie=t_c is not None, t_c=t_c, rho=rho,
         lambda_min=float(gram_eigenvalues[-1, 0]) if len(parameters) else 0.0,
-        condition=float(spectrum[-1]) / smallest if smallest > 0.0 else float("inf"),
+        condition=max(spectrum.tolist(), default=1.0) / smallest if smallest > 0.0 else np.inf,
         weakest_direction=Direction(dict(zip(parameters, (sign * v).tolist(), strict=True))),
         determined_at=dict(zip(parameters, since(t, well), strict=True)), known=known,
     )
@@ -161,7 +161,8 @@ def _first_time(
     if len(ends) == 0:
         return None
     before = int(ends[0]) + 1  # elements up to the first at whose end it is reached
-    level = reached(mesh.points[:before].ravel(), gram.values[:before].reshape(-1, p, p))
+    t = mesh.points[:before].ravel()
+    level = reached(t, gram.values[:before].reshape(len(t), p, p))  # spelled out: p may be 0
     level = level.reshape(before, -1)
     k = int(np.argmax((level >= 0.0).any(axis=1)))
     points, level = mesh.points[k], level[k]
