@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from plants import shipped
 
+from gpebo_cli import run
 from gpebo_cli.experiment.assumptions import check
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import Settings
@@ -130,3 +131,9 @@ def test_nothing_to_estimate_is_exciting_and_gives_the_states():
     names = found(lti(A=[[-1, 1], [1, 0]]))
     assert names["Assumption 1"].holds
     assert names["Assumption 2"].holds
+    for estimator in ("ls_drem", "drem", "gradient"):
+        details = run(lti(A=[[-1, 1], [1, 0]]), estimator=estimator).details
+        assert details.simulation.states.shape == details.estimation.states[0].shape
+        np.testing.assert_allclose(
+            details.estimation.states[0], details.simulation.states, atol=1e-12
+        )

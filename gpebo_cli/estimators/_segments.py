@@ -40,6 +40,8 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
     Raises:
         ConfigError: the estimator cannot follow parameters that move, or go on after a reset.
     """
+    if not regression.p:
+        return Nothing(len(estimator.cases), len(t))
     if regression.dynamics is not None:
         moving = able(estimator, Moving, _FOLLOW)
         return moving.estimate_moving(regression, regression.dynamics, t)
@@ -58,6 +60,26 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
         times = np.append(own, segment.mesh.edges[-1])
         parts.append(resumable.resume(segment, times, known))
     return Chain(tuple(parts), regression.resets, tuple(int(k) for k in first))
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """Of a regression without parameters: constraints alone determine the states."""
+
+    count: int  # of cases
+    times: int
+
+    @property
+    def requirement(self) -> Requirement:
+        """Met."""
+        return Requirement("none", True, {}, "there is nothing to estimate")
+
+    def delta(self, t: Array) -> None:
+        """Nothing is mixed at the times t (M,)."""
+
+    def parameters(self, cases: slice) -> Array:
+        """Of some cases, (g, M, 0)."""
+        return np.zeros((len(range(self.count)[cases]), self.times, 0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -177,9 +177,9 @@ def mix_least_squares(
 def _adjugate(s: Spectrum, alpha: float, f0: float) -> tuple[Array, Array]:
     """Δ (M,), and adj(H) αF in the eigenbasis of G_z: its diagonal (M, p)."""
     shares = _shares(s, alpha, f0)
-    others = np.stack(
-        [np.prod(np.delete(shares, i, axis=1), axis=1) for i in range(shares.shape[1])], axis=1
-    )
+    others = np.empty_like(shares)
+    for i in range(shares.shape[1]):
+        others[:, i] = np.prod(np.delete(shares, i, axis=1), axis=1)
     return np.prod(shares, axis=1), others * alpha / (
         alpha * s.eigenvalues + (s.memory * f0)[:, None]
     )
