@@ -129,7 +129,7 @@ def recording(r):
     while r.random() < 0.6:
         line = pick(r, lines)
         change = r.randrange(3)
-        if change == 0:
+        if change == 0 and line:
             line[r.randrange(len(line))] = pick(r, CELLS)
         elif change == 1:
             line.append(pick(r, CELLS))
