@@ -203,6 +203,7 @@ WRONG = [
     (["run", "observer.xi_a0.foo=1"], "observer.xi_a0 is empty; give it as a whole"),
     (["run", "plant.title='a\udcff'"], "is not text in UTF-8"),
     (["run", "+launcher=null"], "cannot be composed: Config group override must be"),
+    (["run", "+launcher=[1,2]"], "cannot be composed: argument of type"),
     (["run", "time=1"], "time: expected a mapping"),
     (["run", "--resolve"], "--resolve is for what --cfg prints; add --cfg job"),
     (["run", "--cfg", "job", "-m"], "only one of --multirun, --cfg at a time"),

@@ -96,7 +96,7 @@ class Loader(ConfigLoaderImpl):
         """
         try:
             config = super().load_configuration(*args, **kwargs)
-        except ValueError as error:  # +launcher=null, for instance
+        except (TypeError, ValueError) as error:  # +launcher=null or [1,2], for instance
             raise ConfigError(f"the configuration cannot be composed: {error}") from error
         plain = OmegaConf.to_container(config, resolve=False)
         refuse_code(cast("dict[str, Any]", plain))
