@@ -51,37 +51,30 @@ def balance(c: Coefficients) -> Scaling:
     """
     n = c.E.shape[2]
     sizes = np.array([np.abs(c.E[0]).max(axis=0), np.abs(c.A[0]).max(axis=0)])
-    logs = np.log(np.maximum(sizes, np.finfo(float).tiny))
-    factors, there = np.zeros(2 * n + 1), sizes > 0.0
-    normal = np.zeros((2 * n + 1, 2 * n + 1))
+    there = sizes > 0.0
     while True:
-        both, of_E = there.sum(axis=0), there[0]
-        known = np.where(there, logs, 0.0)
-        normal[:n, n:-1], normal[n:-1, :n] = both, both.T
-        normal[:n, -1], normal[n:-1, -1] = -of_E.sum(axis=1), -of_E.sum(axis=0)
-        normal[-1] = normal[:, -1]
-        diagonal = [both.sum(axis=1), both.sum(axis=0), of_E.sum(keepdims=True)[0]]
-        np.fill_diagonal(normal, np.concatenate(diagonal))
-        sums = known.sum(axis=0)
-        right = np.concatenate([-sums.sum(axis=1), -sums.sum(axis=0), [known[0].sum()]])
-        factors = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
-        r, columns, tau = factors[:n], factors[n:-1], factors[-1]
-        scaled_sizes = sizes * np.exp(r[:, None] + columns - np.array([tau, 0.0])[:, None, None])
-        rest = there & (scaled_sizes > _NOTHING * np.sqrt(
+        kind, i, j = there.nonzero()
+        logs, every = np.log(sizes[there]), np.arange(len(i))
+        terms = np.zeros((len(i), 2 * n + 1))  # of r, c and τ in the logarithm of each entry
+        terms[every, i] = terms[every, n + j] = 1.0
+        terms[:, -1] = kind - 1.0
+        factors = -np.linalg.lstsq(terms.T @ terms, logs @ terms, rcond=1e-12)[0]
+        entries = np.exp(terms @ factors + logs)
+        if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
+            break
+        scaled_sizes = np.zeros_like(sizes)
+        scaled_sizes[there] = entries
+        rest = scaled_sizes > _NOTHING * np.sqrt(
             scaled_sizes.max(axis=(0, 2))[:, None] * scaled_sizes.max(axis=(0, 1))
-        ))
+        )
         if (rest == there).all():
             break
         there = rest  # once more without what turned out to be rounding
+    r = factors[:n]
     # A factor of all rows is left open, and means nothing.
     weights = 10.0 ** np.rint((r - r[0]) / np.log(10.0)) if n else np.zeros(0)
-    return Scaling(
-        _power_of_two(r), _power_of_two(columns), float(_power_of_two(tau)), np.asarray(weights)
-    )
-
-
-def _power_of_two(logarithm: Array) -> Array:
-    return np.asarray(np.exp2(np.rint(logarithm / np.log(2.0))))
+    powers = np.exp2(np.rint(factors / np.log(2.0)))
+    return Scaling(powers[:n], powers[n:-1], float(powers[-1]), np.asarray(weights))
 
 
 def who(system: DescriptorSystem) -> str:

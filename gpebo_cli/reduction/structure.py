@@ -133,7 +133,7 @@ def analyse(
             reason = levels.failure
             continue
         steady, dips = (True, []) if invariant else _dips(levels.smallest)
-        _follow_dips(system, t, levels, dips, mu, scaling, rank_tol)
+        _follow_dips(system, t, levels, dips, mu, scaling, rank_tol, reference)
         if not levels.a and "E" not in system.coefficients.constant:
             _refuse_crossing(system, t, c.E[0])
         return Structure(
@@ -271,6 +271,8 @@ def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
     A dip is a local minimum far below the column's maximum, given as its column and its place;
     the deepest of each column come first. There is none in columns that are not finite.
     """
+    if (smallest.min(axis=0) >= _DIP * smallest.max(axis=0)).all():
+        return True, []
     steady, dips = True, []
     for column in range(3):
         values = smallest[:, column]
@@ -318,7 +320,7 @@ def _refuse_crossing(system: DescriptorSystem, t: Array, E: Array) -> None:
 
 def _follow_dips(
     system: DescriptorSystem, t: Array, levels: _Levels, dips: list[tuple[int, int]], mu: int,
-    scaling: Scaling, rank_tol: float,
+    scaling: Scaling, rank_tol: float, reference: Pivots,
 ) -> None:
     """Follow local minima of the decisive singular values between the probes.
 
@@ -329,37 +331,53 @@ def _follow_dips(
     probe may by luck be nearer to the zero than the times of the first round.
     """
     names = ("derivative array", "constraints", "differential part")
-    for column, k in dips:
-        left, right = t[max(k - 1, 0)], t[min(k + 1, len(t) - 1)]
-        lowest, where = float(levels.smallest[k, column]), t[k]
-        for _ in range(_DIP_ROUNDS):
-            grid = left + (right - left) * _CUTS
-            grid[-1] = right
-            c = system.coefficients.taylor(grid, mu)
-            line = _line(c, mu, scaling, rank_tol, levels.a, column)
-            best = int(line.argmin())
-            value = float(line[best])
-            lowest, where = min(lowest, value), grid[best]
-            before, after = max(best - 1, 0), min(best + 1, len(grid) - 1)
-            left, right = grid[before], grid[after]
-            flat = value >= 0.5 * max(line[before], line[after])
-            if lowest <= rank_tol or flat:
-                break
-        if lowest <= max(rank_tol, 1e-9):
+    column, k = np.array(dips, dtype=np.intp).reshape(-1, 2).T
+    left, right = t[np.maximum(k - 1, 0)], t[np.minimum(k + 1, len(t) - 1)]
+    lowest = levels.smallest[k, column]
+    for _ in range(_DIP_ROUNDS):
+        if not len(column):
+            break
+        grid = left[:, None] + (right - left)[:, None] * _CUTS
+        grid[:, -1] = right
+        c = system.coefficients.taylor(grid.ravel(), mu)
+        lines = _lines(c, mu, scaling, rank_tol, levels.a, column, reference)
+        dip, best = np.arange(len(lines)), lines.argmin(axis=1)
+        before, after = np.maximum(best - 1, 0), np.minimum(best + 1, _DIP_POINTS - 1)
+        value = lines[dip, best]
+        lowest = np.minimum(lowest, value)
+        lost = lowest <= max(rank_tol, 1e-9)
+        if lost.any():
+            i = int(np.argmax(lost))
             raise ModelError(
-                f"{who(system)}: the rank of the {names[column]} changes at t = {where:.9g} "
-                f"(singular value {lowest:.1e}); choose a horizon that avoids this time"
+                f"{who(system)}: the rank of the {names[column[i]]} changes at "
+                f"t = {grid[i, best[i]]:.9g} (singular value {lowest[i]:.1e}); choose a horizon "
+                "that avoids this time"
             )
+        falls = value < 0.5 * np.maximum(lines[dip, before], lines[dip, after])
+        left, right = grid[dip, before][falls], grid[dip, after][falls]
+        column, lowest = column[falls], lowest[falls]
 
 
 _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
 
 
-def _line(
-    c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, a: int, column: int
+def _lines(
+    c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, a: int, column: IntArray,
+    reference: Pivots,
 ) -> Array:
-    """One column (N,) of the levels that belong to ``a`` constraints, at the times of c."""
-    _, found = kernels.structure.levels(
-        c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1, rank_tol, a
+    """Columns (D,) of the levels that belong to ``a`` constraints, (D, points) at the times of c.
+
+    Bounds of them from below serve as well, where none of them comes near zero.
+    """
+    model = scaling.rows, scaling.columns, scaling.time, mu + 1
+    bounds, left, _ = kernels.structure.bounds(
+        c.E, c.A, *model, reference.rows, reference.columns, reference.rank, reference.Z1
     )
-    return np.asarray(found[:, column])
+    lines = bounds.reshape(len(column), -1, 3)[np.arange(len(column)), :, column]
+    sound = (lines > max(_PLAIN, 10.0 * rank_tol)).all(axis=1)
+    sound &= (left.reshape(lines.shape) <= RESIDUAL).all(axis=1)
+    for i in np.flatnonzero(~sound).tolist():
+        some = slice(i * lines.shape[1], (i + 1) * lines.shape[1])
+        E, A = (x if x.shape[1] == 1 else x[:, some] for x in (c.E, c.A))
+        lines[i] = kernels.structure.levels(E, A, *model, rank_tol, a)[1][:, column[i]]
+    return np.asarray(lines)
