@@ -28,17 +28,17 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements
 from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.errors import EPS, estimated_errors, least_sizes
+from gpebo_cli.numerics.errors import estimated_errors, least_sizes
 from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, at_least, unresolved_kinds
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import RadauRule, differentiation_schur
+from gpebo_cli.numerics.refinement import refine
 
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _MODEST = 1e100  # values up to here may be multiplied with each other
-_MAX_PARTS = 8  # an element is cut into at most this many at once
 _EQUAL = 1e-11  # relative difference of lengths that is rounding
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.
@@ -91,33 +91,27 @@ def solve(
     Raises:
         SolverError: if ``max_elements`` do not reach ``tol``; names the time.
     """
-    maps = _element_maps(problem, mesh, None, known)
-    floor: Array | None = None  # the tail of the parent, to notice that cutting no longer helps
-    rounds = 1
-    while True:
+
+    def evaluate(
+        mesh: Mesh, before: tuple[_ElementMaps, Array, int] | None, kept: IntArray
+    ) -> tuple[tuple[_ElementMaps, Array, int], Array]:
+        if before is None:
+            maps = _element_maps(problem, mesh, None, known)
+        else:
+            fresh = kept < 0
+            maps = _merge(before[0], _element_maps(problem, mesh, fresh), kept, fresh)
         values, whole = _chain(maps, problem, mesh, restarts or {})
         tail = _tail_of_numbers(problem, mesh, values, maps, whole, tol)
-        poor = tail > tol
-        if floor is not None:
-            # Rounding floor: an element whose parent was already this good is not cut again.
-            poor &= ~((floor > 0) & (tail > 0.25 * floor) & (tail < 1e-6))
-        if not poor.any():
-            if whole == mesh.size:
-                break
-            raise SolverError(
-                f"the solution of the {problem.name} is not finite from "
-                f"t = {mesh.edges[whole]:.6g} on: it grows beyond all numbers; "
-                "is a sign wrong? Else shorten time.horizon"
-            )
-        parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
-        _check_budget(problem, mesh, tail, parts, max_elements)
-        finer, kept = mesh.split(parts)
-        fresh = kept < 0
-        new = _element_maps(problem, finer, fresh)
-        before = np.repeat(np.zeros(mesh.size) if floor is None else floor, parts)
-        floor = np.where(fresh, np.repeat(tail, parts), before)
-        maps = _merge(maps, new, kept, fresh)
-        mesh, rounds = finer, rounds + 1
+        return (maps, values, whole), tail
+
+    mesh, (maps, values, whole), tail, rounds = refine(
+        evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name
+    )
+    if whole < mesh.size:
+        raise SolverError(
+            f"the solution of the {problem.name} is not finite from t = {mesh.edges[whole]:.6g} "
+            "on: it grows beyond all numbers; is a sign wrong? Else shorten time.horizon"
+        )
     errors, lost = estimated_errors(
         problem, mesh, maps.homogeneous[:, -1], maps.particular[:, -1], maps.noise, values
     )
@@ -157,14 +151,6 @@ def _tail_of_numbers(
     return tail
 
 
-def wanted_parts(tail: Array, poor: BoolArray, tol: float, stages: int) -> IntArray:
-    """Into how many parts (K,) to cut each element so that its tail (K,) falls to ``tol``."""
-    parts = np.ones(len(tail), dtype=np.intp)
-    wanted = 1.25 * (tail[poor] / tol) ** (1.0 / stages)
-    parts[poor] = np.minimum(np.maximum(np.ceil(wanted), 2), _MAX_PARTS).astype(np.intp)
-    return parts
-
-
 def unresolved_signals(
     problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...], made_of: Array,
     tol: float,
@@ -180,26 +166,6 @@ def unresolved_signals(
     if problem.monitor is not None:
         kinds += problem.monitor(values, extras)
     return unresolved_kinds(kinds, mesh.rule)
-
-
-def _check_budget(
-    problem: LinearProblem, mesh: Mesh, tail: Array, parts: IntArray, max_elements: int
-) -> None:
-    worst = int(np.argmax(tail))
-    t = mesh.edges[worst]
-    # Next to t = 0 floating point resolves any transient; elsewhere 64 units in the last place.
-    resolution = 64 * EPS * np.abs(mesh.edges[1:])
-    if parts.sum() > max_elements:
-        raise SolverError(
-            f"the {problem.name} is not resolved with {max_elements} elements; worst near "
-            f"t = {t:.6g} (tail {tail[worst]:.1e}); raise solver.max_elements or solver.tol"
-        )
-    if (mesh.steps < resolution)[parts > 1].any():
-        raise SolverError(
-            f"the {problem.name} cannot be resolved near t = {t:.6g}: elements reached the "
-            f"resolution of floating point (tail {tail[worst]:.1e}); is there a jump or a "
-            "singularity?"
-        )
 
 
 def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArray) -> _ElementMaps:

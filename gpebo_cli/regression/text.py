@@ -18,15 +18,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError, SolverError
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import Expression, Tape, breakpoints_of_tape, nodes, parse, record
 from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.syntax import signal
 from gpebo_cli.model.plant import plant_from_mapping, read_parameters
-from gpebo_cli.numerics.collocation import wanted_parts
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh, unresolved_kinds
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.reduction.structure import without_equations
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.schema import nearest, shown
@@ -100,7 +100,7 @@ class TextRegression:
             SolverError: the tolerance cannot be reached.
         """
 
-        def evaluated(mesh: Mesh) -> tuple[Array, Array, list[tuple[Array, float]]]:
+        def evaluated(mesh: Mesh) -> tuple[tuple[Array, Array], list[tuple[Array, float]]]:
             columns = self._signals(signals, mesh)
             psi = self._at(self.psi, mesh, columns).reshape(*mesh.points.shape, self.rows, -1)
             if self.Y is not None:
@@ -114,10 +114,11 @@ class TextRegression:
             kinds = [flat[..., k : k + 1] for k in range(flat.shape[2])]
             kinds += [psi.reshape(*mesh.points.shape, -1), right,
                       products.reshape(*mesh.points.shape, -1)]
-            return psi, right, [(kind, 0.0) for kind in kinds]
+            return (psi, right), [(kind, 0.0) for kind in kinds]
 
-        mesh, (psi, right, _), error = resolved(
-            evaluated, self._mesh(signals), tol, max_elements, f"regression {self.system.name}"
+        mesh, (psi, right), error = resolve(
+            evaluated, self._mesh(signals), tol=tol, max_elements=max_elements,
+            name=f"regression {self.system.name}",
         )
         regression = LinearRegression(
             Trajectory(mesh, right), Trajectory(mesh, psi), self.system.unknowns,
@@ -161,39 +162,6 @@ class TextRegression:
     def _at(tape: Tape, mesh: Mesh, columns: Array) -> Array:
         """Outputs of a tape at the points of a mesh, (K (s + 1), outputs)."""
         return np.asarray(tape.taylor(mesh.points.ravel(), 0, mesh.inside.ravel(), columns)[0])
-
-
-def resolved(
-    evaluated: Callable[[Mesh], tuple[Array, Array, list[tuple[Array, float]]]], mesh: Mesh,
-    tol: float, max_elements: int, name: str,
-) -> tuple[Mesh, tuple[Array, Array, list[tuple[Array, float]]], float]:
-    """Cut elements until what is evaluated on the mesh is resolved; what it is then, and the tail.
-
-    What is evaluated are two arrays (K, s + 1, …) and kinds of signals (K, s + 1, c), each with
-    its floor.
-
-    Raises:
-        SolverError: ``max_elements`` do not reach ``tol``; names the time.
-    """
-    floor: Array | None = None
-    while True:
-        found = evaluated(mesh)
-        tail = unresolved_kinds(found[-1], mesh.rule)
-        poor = tail > tol
-        if floor is not None:  # cutting no longer helps: what is left is rounding
-            poor &= ~((tail > 0.25 * floor) & (tail < 1e-6))
-        if not poor.any():
-            return mesh, found, float(tail.max(initial=0.0))
-        parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
-        if parts.sum() > max_elements:
-            at = float(mesh.edges[int(np.argmax(tail))])
-            raise SolverError(
-                f"{name} is not resolved with {max_elements} elements, near t = {at:.6g}; raise "
-                "solver.max_elements or solver.tol"
-            )
-        before = np.repeat(tail, parts)
-        mesh, kept = mesh.split(parts)
-        floor = np.where(kept < 0, before, np.inf)
 
 
 def _jumps(signals: Trajectory) -> Array:
@@ -364,13 +332,14 @@ def signals_of_time(
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
 
-    def evaluated(mesh: Mesh) -> tuple[Array, Array, list[tuple[Array, float]]]:
+    def evaluated(mesh: Mesh) -> tuple[Array, list[tuple[Array, float]]]:
         u = system.coefficients.taylor(mesh.points.ravel(), 0, mesh.inside.ravel()).u[0]
         values = u.reshape(*mesh.points.shape, system.m)
         kinds = [(values[..., k : k + 1], 0.0) for k in range(system.m)]
-        return values, values, kinds or [(np.zeros((*mesh.points.shape, 1)), 0.0)]
+        return values, kinds or [(np.zeros((*mesh.points.shape, 1)), 0.0)]
 
-    mesh, (values, _, _), _ = resolved(
-        evaluated, mesh, solver.tol, solver.max_elements, f"regression {system.name}"
+    mesh, values, _ = resolve(
+        evaluated, mesh, tol=solver.tol, max_elements=solver.max_elements,
+        name=f"regression {system.name}",
     )
     return Trajectory(mesh, values)

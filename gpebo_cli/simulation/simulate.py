@@ -18,7 +18,7 @@ from gpebo_cli.model.descriptor import (
     DescriptorSystem,
     IntArray,
 )
-from gpebo_cli.numerics.collocation import LinearSolution, solve, wanted_parts
+from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import least_sizes
 from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.numerics.mesh import (
@@ -32,6 +32,7 @@ from gpebo_cli.numerics.mesh import (
 )
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
+from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
 from gpebo_cli.reduction.strangeness_free import (
     StrangenessFree,

@@ -18,12 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._observation import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions
-from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.observers.reduced.regression import Assembled, on_mesh, regression_signals
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
@@ -61,41 +59,30 @@ class CurrentCoordinates:
         identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
         p = q + k
 
-        def coefficients(t: Array, inside: Array) -> LinearEquation:
+        def assembled(t: Array, inside: Array) -> tuple[Assembled, Array, Array]:
             o = reduced.matrices(t, inside)
             signals = np.concatenate(reduced.driving(t, inside), axis=1)[:, :, None]
             A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
             A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
             b[:, q:] = (o.from_signals @ signals)[:, :, 0]
-            zero = np.zeros((1, 1, 1))
-            kernel = np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n))
-            seen = (*o.equations(signals), A, b, kernel)
-            return LinearEquation(None, zero, np.zeros((len(t), 1, 1)), seen)
-
-        def assembled(extras: tuple[Array, ...]) -> tuple[Assembled, Array, Array]:
-            flat = [e.reshape(e.shape[0] * e.shape[1], *e.shape[2:]) for e in extras]
-            *parts, A, b, kernel = flat
-            z = np.broadcast_to(identity, (len(A), *identity.shape))
-            a = regression_signals(z, q, basis, AlgebraicEquations(*parts))
+            z = np.broadcast_to(identity, (len(t), *identity.shape))
+            a = regression_signals(z, q, basis, o.equations(signals))
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
-                a = _with_kernel(a, kernel, q)
+                a = _with_kernel(a, np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n)), q)
             return a, A, b
 
-        def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-            a, A, b = assembled(extras)
-            return [
-                (signal.reshape(*values.shape[:2], -1), floor)
-                for signal, floor in (*a.kinds(), (A, 0.0), (b, 0.0))
-            ]
+        def evaluate(
+            mesh: Mesh
+        ) -> tuple[tuple[Assembled, Array, Array], list[tuple[Array, float]]]:
+            a, A, b = assembled(mesh.points.ravel(), mesh.inside.ravel())
+            kinds = (*a.kinds(), (A, 0.0), (b, 0.0))
+            return (a, A, b), [(v.reshape(*mesh.points.shape, -1), floor) for v, floor in kinds]
 
-        # Nothing to integrate: a constant, and everything else resolved beside it.
-        problem = LinearProblem(
-            coefficients, np.ones((1, 1)), monitor, f"observer of plant {system.name}"
+        mesh, (final, A, b), error = resolve(
+            evaluate, reduced.mesh, tol=solver.tol, max_elements=solver.max_elements,
+            name=f"observer of plant {system.name}",
         )
-        solution = solve(problem, reduced.mesh, tol=solver.tol, max_elements=solver.max_elements)
-        mesh = solution.trajectory.mesh
-        final, A, b = assembled(solution.extras)
         kept = final.kept_rows(system, reduced.regression)
         if rotates:
             kept = np.union1d(kept, np.arange(final.Y.shape[1] - n, final.Y.shape[1]))
@@ -111,7 +98,7 @@ class CurrentCoordinates:
             ),
             state_map=AffineStateMap(on_mesh(mesh, final.offset), on_mesh(mesh, final.gain)),
             truth=CurrentState(reduced),
-            error_estimate=solution.error_estimate,
+            error_estimate=error,
             assumptions=assumptions(reduced, mesh, final),
             growth=None,
             note=reduced.note,

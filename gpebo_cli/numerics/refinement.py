@@ -1,0 +1,115 @@
+"""Refinement: elements are cut until everything that is computed on a mesh is resolved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from gpebo_cli.errors import SolverError
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.numerics.errors import EPS
+from gpebo_cli.numerics.mesh import Mesh, unresolved_kinds
+
+_MAX_PARTS = 8  # an element is cut into at most this many at once
+_ROUNDING = 1e-6  # a tail below may be rounding, which cutting does not make smaller
+
+Found = TypeVar("Found")
+# (mesh, what was found on the mesh before, the old element of each new one or −1)
+# -> (what is found, the tail of each element (K,))
+Evaluate = Callable[[Mesh, "Found | None", IntArray], tuple[Found, Array]]
+
+
+def refine(
+    evaluate: Evaluate[Found], mesh: Mesh, *, tol: float, max_elements: int, name: str
+) -> tuple[Mesh, Found, Array, int]:
+    """Cut the elements of ``mesh`` until the tail of each one is at most ``tol``.
+
+    Args:
+        evaluate: finds what is wanted on a mesh, and what each element leaves out of it, relative
+            to its size; it may keep what was found on the elements that have not been cut.
+        mesh: where to start; its edges stay edges.
+        tol: of the tails.
+        max_elements: refuse to go beyond.
+        name: of what is found, for messages.
+
+    Returns:
+        The mesh, what was found on it, the tails (K,) and the number of rounds.
+
+    Raises:
+        SolverError: if ``max_elements`` do not reach ``tol``; names the time.
+    """
+    found: Found | None = None
+    kept = np.full(mesh.size, -1)
+    floor = np.full(mesh.size, np.inf)  # the tail of the element that each one was cut from
+    rounds = 1
+    while True:
+        found, tail = evaluate(mesh, found, kept)
+        # An element that was cut and is no better than the one it comes from shows rounding.
+        poor = (tail > tol) & ~((tail > 0.25 * floor) & (tail < _ROUNDING))
+        if not poor.any():
+            return mesh, found, tail, rounds
+        parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
+        _check_budget(mesh, tail, parts, max_elements, name)
+        before, cut = np.repeat(floor, parts), np.repeat(tail, parts)
+        mesh, kept = mesh.split(parts)
+        floor = np.where(kept < 0, cut, before)
+        rounds += 1
+
+
+def resolve(
+    evaluate: Callable[[Mesh], tuple[Found, list[tuple[Array, float]]]],
+    mesh: Mesh, *, tol: float, max_elements: int, name: str,
+) -> tuple[Mesh, Found, float]:
+    """Resolve signals that are known: nothing is integrated.
+
+    Args:
+        evaluate: what is wanted on a mesh, and the signals (K, s + 1, c) to resolve, each kind with
+            its floor (see :func:`unresolved_kinds`).
+        mesh: where to start; its edges stay edges.
+        tol: relative to each signal's own size.
+        max_elements: refuse to go beyond.
+        name: of the signals, for messages.
+
+    Returns:
+        The mesh, what is wanted on it, and the largest tail.
+
+    Raises:
+        SolverError: if ``max_elements`` do not reach ``tol``; names the time.
+    """
+
+    def on(mesh: Mesh, before: Found | None, kept: IntArray) -> tuple[Found, Array]:  # noqa: ARG001
+        found, kinds = evaluate(mesh)
+        return found, unresolved_kinds(kinds, mesh.rule)
+
+    mesh, found, tail, _ = refine(on, mesh, tol=tol, max_elements=max_elements, name=name)
+    return mesh, found, float(tail.max(initial=0.0))
+
+
+def wanted_parts(tail: Array, poor: BoolArray, tol: float, stages: int) -> IntArray:
+    """Into how many parts (K,) to cut each element so that its tail (K,) falls to ``tol``."""
+    parts = np.ones(len(tail), dtype=np.intp)
+    wanted = 1.25 * (tail[poor] / tol) ** (1.0 / stages)
+    parts[poor] = np.minimum(np.maximum(np.ceil(wanted), 2), _MAX_PARTS).astype(np.intp)
+    return parts
+
+
+def _check_budget(
+    mesh: Mesh, tail: Array, parts: IntArray, max_elements: int, name: str
+) -> None:
+    worst = int(np.argmax(tail))
+    t = mesh.edges[worst]
+    # Next to t = 0 floating point resolves any transient; elsewhere 64 units in the last place.
+    resolution = 64 * EPS * np.abs(mesh.edges[1:])
+    if parts.sum() > max_elements:
+        raise SolverError(
+            f"the {name} is not resolved with {max_elements} elements; worst near "
+            f"t = {t:.6g} (tail {tail[worst]:.1e}); raise solver.max_elements or solver.tol"
+        )
+    if (mesh.steps < resolution)[parts > 1].any():
+        raise SolverError(
+            f"the {name} cannot be resolved near t = {t:.6g}: elements reached the "
+            f"resolution of floating point (tail {tail[worst]:.1e}); is there a jump or a "
+            "singularity?"
+        )
