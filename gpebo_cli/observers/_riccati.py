@@ -146,9 +146,9 @@ class Filtered:
         """The mesh; the filter starts anew at each of its edges."""
         return self.pair.mesh
 
-    def at(self, t: Array) -> tuple[Array, Array]:
-        """P (M, n, n) and ζ̂ (M, n, g) at the times t (M,)."""
-        P, estimate = quotient(self.pair(t))
+    def at(self, t: Array, inside: Array | None = None) -> tuple[Array, Array]:
+        """P (M, n, n) and ζ̂ (M, n, g) at the times t (M,); at edges see ``Mesh.sampler``."""
+        P, estimate = quotient(self.pair(t, inside))
         return self.variance * P, estimate
 
 

@@ -14,19 +14,13 @@ By default K_o is that of a Kalman–Bucy filter with unit weights,
 with c₀ the root mean square of ‖c‖ over the horizon and κ twice that of the largest real part of
 A_0's eigenvalues where it is positive (at least four per horizon), so that neither the unit of
 time nor that of the outputs matters. Φ then decays about as fast as it would grow, or twice as
-fast; not faster, because with Φ the excitation of e₀ fades, too. S = X₂X₁⁻¹ follows from the
-linear Hamiltonian system
-
-    X₁' = −A_0ᵀX₁ + cᵀc/c₀² X₂,     X₂' = κ² P X₁ + A_0 X₂
-
-started anew from (I, S) at every edge of a mesh on which ‖A_0‖ h ≤ 10, before its growing
-solutions are all that is left. S need not be accurate: what counts is that it is one and the same
+fast; not faster, because with Φ the excitation of e₀ fades, too. S is the covariance
+of that filter (``_riccati``). It need not be accurate: what counts is that it is one and the same
 smooth function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,19 +28,16 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
-from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers._observation import Observation
+from gpebo_cli.observers._riccati import StateSpace, run_filter
 from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices
 from gpebo_cli.observers.remedies.plain import Plain
 
 _TOLERANCE = 1e-6  # of S
 _PER_HORIZON = 4.0  # rate of the injection where A_0 is stable
-_PER_ELEMENT = 10.0  # ‖A_0‖ h
-_MOST_PARTS = 10_000
 
 
 @dataclass(frozen=True)
@@ -121,50 +112,31 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     unstable = np.maximum(np.linalg.eigvals(A_0).real.max(axis=1, initial=0.0), 0.0)
     kappa = max(2.0 * float(np.sqrt((unstable**2).mean())), _PER_HORIZON / horizon)
     size = max(_rms(o.residual @ o.algebraic @ basis), np.finfo(float).tiny)
-    speed = np.linalg.norm(A_0, axis=(1, 2)).reshape(mesh.points.shape).max(axis=1)
-    parts = np.clip(np.ceil(mesh.steps * speed / _PER_ELEMENT), 1, _MOST_PARTS).astype(np.intp)
-    mesh, _ = mesh.split(parts)
 
-    def coefficients(t: Array, inside: Array) -> LinearEquation:
+    def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
         o = reduced.matrices(t, inside)
-        A = np.broadcast_to(o.dynamics, (len(t), n, n))
         c = o.residual @ o.algebraic @ basis / size
-        H = np.empty((len(t), 2 * n, 2 * n))
-        H[:, :n, :n], H[:, :n, n:] = -transpose(A), transpose(c) @ c
-        H[:, n:, :n], H[:, n:, n:] = kappa**2 * (basis.T @ o.projector @ basis), A
-        return LinearEquation(None, H, np.zeros((len(t), 2 * n, n)))
-
-    def again(reached: Array) -> Array:
-        return np.concatenate([np.eye(n), _quotient(reached)])
+        rows = c.shape[1]
+        Q = kappa**2 * (basis.T @ o.projector @ basis)
+        return StateSpace(
+            A=np.broadcast_to(o.dynamics, (len(t), n, n)), b=np.zeros((len(t), n, 0)),
+            c=np.broadcast_to(c, (len(t), rows, n)), z=np.zeros((len(t), rows, 0)),
+            Q=np.broadcast_to(Q, (len(t), n, n)), N=np.zeros((len(t), n, rows)),
+            V=np.broadcast_to(np.eye(rows), (len(t), rows, rows)),
+        ), ()
 
     S0 = kappa * (basis.T @ reduced.initial_basis) @ (reduced.initial_basis.T @ basis)
-    problem = LinearProblem(
-        coefficients, np.concatenate([np.eye(n), S0]),
+    S = run_filter(
+        model, np.zeros((n, 0)), S0, mesh, tol=_TOLERANCE,
+        max_elements=reduced.solver.max_elements,
         name=f"output injection for plant {reduced.system.name}",
     )
-    restarts: dict[float, Callable[[Array], Array]] = {
-        float(edge): again for edge in mesh.edges[1:-1]
-    }
-    with np.errstate(over="ignore", invalid="ignore"):  # of the error estimate, which is not used
-        solution = solve(
-            problem, mesh, tol=_TOLERANCE, max_elements=reduced.solver.max_elements,
-            restarts=restarts,
-        )
-    trajectory = solution.trajectory
-    S = Trajectory(trajectory.mesh, _quotient(trajectory.values))
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
-        weight = basis.T @ o.projector @ basis @ S(t, inside) / size**2
+        weight = basis.T @ o.projector @ basis @ S.at(t, inside)[0] / size**2
         return np.asarray(weight @ transpose(o.algebraic @ basis) @ o.residual)
 
     return gain, S.mesh
-
-
-def _quotient(X: Array) -> Array:
-    """S = X₂X₁⁻¹ (…, n, n), symmetric, from (X₁; X₂) (…, 2n, n)."""
-    n = X.shape[-1]
-    S: Array = np.asarray(np.linalg.solve(transpose(X[..., :n, :]), transpose(X[..., n:, :])))
-    return 0.5 * (S + transpose(S))
 
 
 def _rms(matrices: Array) -> float:
