@@ -18,6 +18,7 @@ from gpebo_cli.experiment import assumptions
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.recordings.drive import located
 from gpebo_cli.regression.text import system_from_mapping
 from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
@@ -226,7 +227,8 @@ def _configure(
         config["plant"], system = {}, plant
     else:
         content, source = choose("plant", plant, config_dir)
-        config["plant"], system = plain(content), system_from_mapping(content, source)
+        config["plant"] = plain(located(content, source))
+        system = system_from_mapping(content, source)
     for name in _CHOSEN:
         config[name], _ = choose(name, sections[name], config_dir)
     _check_gains(gains, config["estimator"])

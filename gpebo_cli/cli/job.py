@@ -45,10 +45,13 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     settings = configuration.settings(config, draw=draw)
 
     from gpebo_cli.estimators import build
+    from gpebo_cli.recordings.drive import located
     from gpebo_cli.regression.text import system_from_mapping
 
     build(settings.estimator)  # used or not: its name becomes part of a folder's
-    system = system_from_mapping(settings.plant, _plant_file(arguments))
+    source = _plant_file(arguments)
+    system = system_from_mapping(settings.plant, source)
+    config["plant"] = located(settings.plant, source)
     return Job(settings, system, configuration.complete(config, settings))
 
 

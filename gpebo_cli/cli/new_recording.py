@@ -12,8 +12,8 @@ from pathlib import Path
 from gpebo_cli.configs import files
 from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.recordings.guess import Guess, guess
+from gpebo_cli.regression.text import system_from_mapping
 from gpebo_cli.results.files import make_folder, write_text
 from gpebo_cli.schema import nearest
 
@@ -33,7 +33,8 @@ def write(file: str, plant: str, folder: str) -> int:
             f"--plant {plant}: there is no such plant; known: {', '.join(sorted(names))}"
             + nearest(plant, names)
         )
-    system = plant_from_mapping(files.load(names[plant], f"plant/{plant}"))
+    file_of_plant = os.path.join(names[plant], "plant", f"{plant}.yaml")
+    system = system_from_mapping(files.load(names[plant], f"plant/{plant}"), file_of_plant)
     found = guess(file, system)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", Path(file).stem).strip("_-") or "recording"
     if name in choices(conf_folder(), "data"):

@@ -98,7 +98,7 @@ def recording_mesh(
         if hold == "cubic":
             knots = _merged(signal, np.concatenate([[start], t[inner], [stop]]), rule, tol)
         else:
-            knots = np.concatenate([[start], t[inner & _bends(t, values, hold)], [stop]])
+            knots = np.concatenate([[start], t[inner & bends(t, values, hold)], [stop]])
         coarse = Mesh(edges(knots, cuts), rule)
         equal = np.rint(_FIRST_ELEMENTS * coarse.steps / (stop - start)).astype(np.intp)
         mesh, _ = coarse.split(np.maximum(1, equal))
@@ -107,7 +107,7 @@ def recording_mesh(
     return min(candidates, key=lambda candidate: candidate[0])[1]
 
 
-def _bends(t: Array, values: Array, hold: str) -> BoolArray:
+def bends(t: Array, values: Array, hold: str) -> BoolArray:
     """Samples at which the held signal jumps or has a kink, (N,)."""
     change = np.diff(values, axis=0)
     if hold == "linear":

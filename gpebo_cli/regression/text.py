@@ -27,6 +27,7 @@ from gpebo_cli.model.plant import plant_from_mapping, read_parameters
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import resolve
+from gpebo_cli.recordings.drive import driven, tables
 from gpebo_cli.reduction.structure import without_equations
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.schema import nearest, shown
@@ -277,9 +278,13 @@ def system_from_mapping(mapping: Mapping[str, object], source: str = "") -> Desc
     Raises:
         ConfigError: whatever is wrong in it.
     """
-    if "psi" not in mapping:
-        return plant_from_mapping(mapping, source)
+    key = "signals" if "psi" in mapping else "inputs"
+    inputs, found = tables(mapping.get(key), f"plant {mapping.get('name')}: {key}", source)
+    mapping = {**mapping, key: inputs} if found else mapping
+    if key == "inputs":
+        return driven(plant_from_mapping(mapping, source), found)
     regression = regression_from_mapping(mapping, source)
+    regression = replace(regression, system=driven(regression.system, found))
     return replace(regression.system, regression=regression)
 
 

@@ -1,0 +1,236 @@
+"""Inputs given as tables of samples, so that what was recorded drives a simulation.
+
+    inputs: {u: {file: u.csv, column: u, hold: linear}}
+
+Between samples an input is a polynomial of t, with the derivatives that a plant of higher index
+needs. Elements end at the samples where it jumps or bends.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import comb
+from typing import Literal
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array, Coefficients, CoefficientSource, DescriptorSystem
+from gpebo_cli.recordings.hold import bends
+from gpebo_cli.recordings.table import TIME, read_table
+from gpebo_cli.schema import read
+from gpebo_cli.settings import DataSettings
+
+_ROUNDING = 1e-12  # of the largest time: by how much an experiment may exceed the samples
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What a plant's file says of such an input; keys as of ``data``."""
+
+    file: str
+    column: str | None = None  # by default the input's name
+    time: str = TIME  # the column of times
+    hold: Literal["zoh", "linear", "cubic"] = "linear"
+    scale: float = 1.0
+    time_unit: Literal["s", "ms", "min", "h", "datetime"] = "s"
+    separator: str = ","
+    decimal: Literal[".", ","] = "."
+    missing: Literal["refuse", "hold", "interpolate", "drop"] = "refuse"
+
+
+@dataclass(frozen=True, eq=False)
+class Piecewise:
+    """A function of time, one polynomial from each sample to the next."""
+
+    where: str  # for messages
+    t: Array  # (N,)
+    pieces: Array  # (degree + 1, N - 1), coefficients of powers of t − t_k
+    corners: Array  # samples (C,) where neighbouring pieces are not one polynomial
+
+    def taylor(self, t: Array, order: int, inside: Array) -> Array:
+        """Taylor coefficients (order + 1, M) at times t (M,).
+
+        Raises:
+            ConfigError: a time outside of the table.
+        """
+        first, last = self.t[0], self.t[-1]
+        slack = _ROUNDING * max(abs(first), abs(last))
+        if len(t) and (t.min() < first - slack or t.max() > last + slack):
+            beyond = t.min() if t.min() < first - slack else t.max()
+            raise ConfigError(
+                f"{self.where} is of t = {first:g} to {last:g}, and the experiment needs "
+                f"t = {beyond:g}; set time.start and time.horizon, or give a longer table"
+            )
+        k = np.clip(np.searchsorted(self.t, inside, side="right") - 1, 0, len(self.t) - 2)
+        since, degree = t - self.t[k], len(self.pieces) - 1
+        found = np.zeros((order + 1, len(t)))
+        for j in range(min(order, degree) + 1):
+            for i in range(degree, j - 1, -1):  # Horner's rule
+                found[j] = found[j] * since + comb(i, j) * self.pieces[i, k]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """Matrices of a text, some of its inputs being tables; a ``CoefficientSource``."""
+
+    given: CoefficientSource  # with zero in place of those inputs
+    tables: Mapping[int, Piecewise]  # by the number of the input
+    outputs: int  # r
+
+    @cached_property
+    def constant(self) -> frozenset[str]:
+        """Those of the text but u."""
+        return self.given.constant - {"u"}
+
+    @cached_property
+    def zero(self) -> frozenset[str]:
+        """Those of the text but u."""
+        return self.given.zero - {"u"}
+
+    @property
+    def signals(self) -> Mapping[str, frozenset[str]]:
+        """As of the text."""
+        return self.given.signals
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
+    ) -> Coefficients:
+        """All matrices at the times t (N,), see the protocol.
+
+        Raises:
+            ConfigError: as for a text, or a time outside of a table.
+        """
+        if signals is not None:
+            return self.given.taylor(t, order, inside, signals)
+        found = self.given.taylor(t, order, inside)
+        u = np.array(found.u)
+        for k, table in self.tables.items():
+            u[:, :, k] = table.taylor(t, order, t if inside is None else inside)
+        if not self.signals:
+            return found._replace(u=u)
+        y = np.zeros((order + 1, len(t), self.outputs))  # nothing depends on it
+        return self.given.taylor(t, order, inside, np.concatenate([u, y], axis=2))
+
+    @cached_property
+    def of_time(self) -> Driven:
+        """The same with zero for what depends on outputs."""
+        return Driven(self.given.of_time, self.tables, self.outputs)
+
+    def truth(self, t: Array) -> Array:
+        """True values of the unknowns at the times t (N,), shape (N, q)."""
+        return self.given.truth(t)
+
+    def breakpoints(self, start: float, stop: float) -> Array:
+        """Those of the text, and the samples where an input jumps or bends."""
+        corners = np.concatenate([table.corners for table in self.tables.values()])
+        inner = corners[(corners > start) & (corners < stop)]
+        return np.union1d(self.given.breakpoints(start, stop), inner)
+
+    def resolved(self, edges: Array) -> Array | None:
+        """As of the text, from edges (K + 1,); between them the tables are polynomials."""
+        return self.given.resolved(edges)
+
+
+def tables(
+    inputs: object, where: str, source: str = ""
+) -> tuple[object, dict[str, Piecewise]]:
+    """The inputs of a file with zero for each table, and the tables by name.
+
+    Args:
+        inputs: what the file has under that key.
+        where: the plant and the key, for messages.
+        source: the file, beside which tables are looked for first.
+
+    Raises:
+        ConfigError: a table cannot be read, or lies outside of the folders of a plant's file.
+    """
+    if not isinstance(inputs, Mapping):
+        return inputs, {}
+    found = {
+        str(name): _piecewise(str(name), given, f"{where}.{name}", source)
+        for name, given in inputs.items() if isinstance(given, Mapping)
+    }
+    return {name: 0 if str(name) in found else value for name, value in inputs.items()}, found
+
+
+def driven(system: DescriptorSystem, found: Mapping[str, Piecewise]) -> DescriptorSystem:
+    """The system with tables in place of the inputs of their names."""
+    if not found:
+        return system
+    numbers = {system.inputs.index(name): table for name, table in found.items()}
+    return replace(system, coefficients=Driven(system.coefficients, numbers, system.r))
+
+
+def located(mapping: Mapping[str, object], source: str) -> Mapping[str, object]:
+    """A file's mapping with the paths of its tables as they are from here, for ``config.yaml``.
+
+    Raises:
+        ConfigError: a table lies outside of the folders that the file may read from.
+    """
+    key = "signals" if "psi" in mapping else "inputs"
+    inputs = mapping.get(key)
+    if not isinstance(inputs, Mapping):
+        return mapping
+    return {**mapping, key: {
+        name: {**given, "file": _path(given["file"], source, f"{key}.{name}.file")}
+        if isinstance(given, Mapping) and isinstance(given.get("file"), str) else given
+        for name, given in inputs.items()
+    }}
+
+
+def _piecewise(name: str, content: Mapping[str, object], where: str, source: str) -> Piecewise:
+    given = read(_Given, content, where)
+    path = _path(given.file, source, f"{where}.file")
+    column = given.column or name
+    data = DataSettings(
+        name="csv", file=path, columns={TIME: given.time, name: column}, scale={name: given.scale},
+        time_unit=given.time_unit, separator=given.separator, decimal=given.decimal,
+        missing=given.missing,
+    )
+    alone = DescriptorSystem(  # of which the table is a recording; its matrices are not read
+        where, (), None, np.zeros(0), inputs=(name,),  # type: ignore[arg-type]
+    )
+    try:
+        samples = read_table(data, alone).samples
+    except ConfigError as error:
+        text = str(error).removeprefix("data.file: ").partition("; plant ")[0]
+        raise ConfigError(f"{where}: {text}") from error
+    t, values = samples.t, samples.inputs[:, 0]
+    if given.hold == "cubic":
+        from scipy.interpolate import CubicSpline
+
+        pieces, corners = CubicSpline(t, values).c[::-1], t[1:-1]
+    else:
+        pieces = values[None, :-1]
+        if given.hold == "linear":
+            pieces = np.stack([pieces[0], np.diff(values) / np.diff(t)])
+        corners = t[bends(t, values[:, None], given.hold)]
+    return Piecewise(f"{where}: {path}", t, np.asarray(pieces), corners)
+
+
+def _path(file: str, source: str, where: str) -> str:
+    """Where a table is: beside the plant's file, in its ``--config-dir``, or here.
+
+    Raises:
+        ConfigError: elsewhere, of a plant from a file, which may be a stranger's.
+    """
+    if not source:
+        return file  # of whoever calls from Python
+    folder = os.path.dirname(os.path.abspath(source))
+    if os.path.basename(folder) in ("plant", "regression"):
+        folder = os.path.dirname(folder)
+    folders = [os.path.dirname(os.path.abspath(source)), folder, os.getcwd()]
+    paths = [os.path.normpath(os.path.join(place, file)) for place in folders]
+    path = next((found for found in paths if os.path.exists(found)), paths[-1])
+    real = os.path.realpath(path)
+    if not any(os.path.commonpath([real, os.path.realpath(place)]) == os.path.realpath(place)
+               for place in folders):
+        raise ConfigError(
+            f"{where}: {file} lies outside of {folder} and of the current folder; copy it there"
+        )
+    return min(path, os.path.relpath(path), key=len)

@@ -1,0 +1,116 @@
+"""Inputs given as tables: what was recorded drives a simulation."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.interpolate import CubicSpline
+
+from gpebo_cli import run
+from gpebo_cli.errors import ConfigError
+
+T = np.array([0.0, 0.4, 1.1, 1.3, 2.2, 3.0])
+U = np.array([0.3, -1.0, 2.0, 2.0, 0.5, 1.0])
+FUNCTIONS = {
+    "zoh": lambda t: U[np.clip(np.searchsorted(T, t, side="right") - 1, 0, 4)],
+    "linear": lambda t: np.interp(t, T, U),
+    "cubic": CubicSpline(T, U),
+}
+PLANT = {
+    "name": "driven", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[-1]], "B": [[1]],
+    "C": [[1]], "initial_state": {"x": 0.5},
+}
+
+
+def table(folder):
+    rows = "".join(f"{t},{u}\n" for t, u in zip(T, U, strict=True))
+    (folder / "u.csv").write_text(f"t,u\n{rows}")
+    return str(folder / "u.csv")
+
+
+def signals(plant, **words):
+    return run(plant, observer="none", time={"horizon": 3, "samples": 61}, **words)
+
+
+@pytest.mark.parametrize("hold", FUNCTIONS)
+def test_the_solution_is_that_of_the_held_table(tmp_path, hold):
+    given = {"file": table(tmp_path), "column": "u", "hold": hold}
+    result = signals({**PLANT, "inputs": {"u": given}})
+    u = FUNCTIONS[hold]
+    for k in (13, 30, 60):  # x(t) = e^{−t} (x(0) + ∫ e^{s} u(s) ds)
+        t = result.t[k]
+        cuts = [c for c in T if c < t] + [t]
+        area = sum(quad(lambda s: np.exp(s) * u(s), a, b, epsabs=1e-13)[0]
+                   for a, b in pairwise(cuts))
+        assert result["x"][k] == pytest.approx(np.exp(-t) * (0.5 + area), abs=1e-8)
+    inner = ~np.isin(result.t, T)
+    assert result["u"][inner] == pytest.approx(u(result.t[inner]), abs=1e-12)
+
+
+def test_a_plant_of_index_2_gets_the_derivative(tmp_path):
+    """0 = x − u, x' = z."""
+    plant = {
+        **PLANT, "states": ["x", "z"], "E": [[1, 0], [0, 0]], "A": [[0, 1], [1, 0]],
+        "B": [[0], [-1]], "C": [[1, 1]], "initial_state": {"x": 0, "z": 0},
+        "inputs": {"u": {"file": table(tmp_path), "hold": "cubic"}},
+    }
+    result = signals(plant)
+    assert result["z"] == pytest.approx(FUNCTIONS["cubic"](result.t, 1), abs=1e-9)
+
+
+def test_matrices_may_depend_on_a_table_beside_other_inputs(tmp_path):
+    given = {"u": {"file": table(tmp_path), "scale": 2}, "v": "1 + t"}
+    result = signals({**PLANT, "inputs": given, "A": [["-u"]], "B": [[0, 1]]})
+
+    def integral(t):  # of 2 u
+        cuts = [c for c in T if c < t] + [t]
+        return np.trapezoid(2 * FUNCTIONS["linear"](np.array(cuts)), cuts) if t else 0.0
+
+    t = result.t[-1]
+    cuts = [*T]
+    area = sum(quad(lambda s: np.exp(integral(s) - integral(t)) * (1 + s), a, b)[0]
+               for a, b in pairwise(cuts))
+    assert result["x"][-1] == pytest.approx(0.5 * np.exp(-integral(t)) + area, rel=1e-7)
+
+
+def test_a_regression_takes_tables_too(tmp_path):
+    content = {"name": "line", "unknowns": {"a": 2.0}, "psi": [["u"]],
+               "signals": {"u": {"file": table(tmp_path)}}}
+    result = run(regression=content, estimator="least_squares", time={"horizon": 3})
+    assert result.estimates["a"][0, -1] == pytest.approx(2.0, abs=1e-6)
+
+
+def test_tables_are_found_beside_the_plant_and_nowhere_else(tmp_path):
+    home, other = tmp_path / "mine" / "plant", tmp_path / "other"
+    home.mkdir(parents=True)
+    other.mkdir()
+    text = "".join(f"{key}: {value}\n" for key, value in PLANT.items()).replace("'", "")
+    for name, file in (("near", "u.csv"), ("far", table(other))):
+        (home / f"{name}.yaml").write_text(
+            text.replace("driven", name) + f"inputs: {{u: {{file: {file}}}}}\n"
+        )
+    table(home.parent)
+    result = signals("near", config_dir=home.parent)
+    assert result["u"] == pytest.approx(FUNCTIONS["linear"](result.t))
+    with pytest.raises(ConfigError, match=r"inputs\.u\.file: .* lies outside of .*copy it there"):
+        signals("far", config_dir=home.parent)
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({"column": "w"}, r"inputs\.u: .*u\.csv, line 1: there is no column w"),
+    ({"colum": "u"}, r"inputs\.u\.colum: no such key; .*did you mean column\?"),
+    ({"hold": "spline"}, r"inputs\.u\.hold: expected zoh or linear or cubic"),
+    ({"file": "no.csv"}, r"inputs\.u: no\.csv cannot be read"),
+])
+def test_mistakes_are_named(tmp_path, given, said):
+    with pytest.raises(ConfigError, match=said):
+        signals({**PLANT, "inputs": {"u": {"file": table(tmp_path)} | given}})
+
+
+def test_an_experiment_stays_within_the_table(tmp_path):
+    plant = {**PLANT, "inputs": {"u": {"file": table(tmp_path)}}}
+    with pytest.raises(ConfigError, match=r"is of t = 0 to 3, and the experiment needs t = "):
+        run(plant, observer="none", time={"horizon": 4})
