@@ -42,7 +42,7 @@ class UnknownNameError(ConfigError, KeyError):
     __str__ = Exception.__str__  # KeyError's quotes the whole sentence
 
 
-class Signals(Mapping[str, Array]):
+class NamedArrays(Mapping[str, Array]):
     """Arrays by name; an unknown name is answered with the nearest known one."""
 
     def __init__(self, what: str, names: Sequence[str], values: Array) -> None:
@@ -102,19 +102,19 @@ class Result:
         return self.details.signals.t
 
     @cached_property
-    def inputs(self) -> Signals:
+    def inputs(self) -> NamedArrays:
         """Known inputs u by name, (N,) each."""
-        return Signals("inputs", self.details.system.inputs, self.details.signals.inputs)
+        return NamedArrays("inputs", self.details.system.inputs, self.details.signals.inputs)
 
     @cached_property
-    def outputs(self) -> Signals:
+    def outputs(self) -> NamedArrays:
         """Measured outputs y by name, (N,) each."""
-        return Signals("outputs", self.details.system.outputs, self.details.signals.outputs)
+        return NamedArrays("outputs", self.details.system.outputs, self.details.signals.outputs)
 
     @cached_property
-    def states(self) -> Signals:
+    def states(self) -> NamedArrays:
         """True states x by name, (N,) each."""
-        return Signals("states", self.details.system.states, self.details.signals.states)
+        return NamedArrays("states", self.details.system.states, self.details.signals.states)
 
     @property
     def estimates_t(self) -> Array:
@@ -123,24 +123,24 @@ class Result:
         return np.zeros(0) if estimation is None else estimation.t
 
     @cached_property
-    def estimates(self) -> Signals:
+    def estimates(self) -> NamedArrays:
         """Estimates of parameters and states by name, (G, M) each; NaN: a state not seen.
 
         Without an observer there are none.
         """
         estimation = self.details.estimation
         if estimation is None:
-            return Signals("estimates", (), np.zeros((0, 0, 0)))
+            return NamedArrays("estimates", (), np.zeros((0, 0, 0)))
         names = (*estimation.names, *self.details.system.states)
         values = np.concatenate([estimation.parameters, estimation.states], axis=-1)
-        return Signals("estimates", names, values)
+        return NamedArrays("estimates", names, values)
 
     @cached_property
-    def errors(self) -> Signals:
+    def errors(self) -> NamedArrays:
         """Estimate minus truth by name, (G, M) each."""
         estimation = self.details.estimation
         if estimation is None:
-            return Signals("errors", (), np.zeros((0, 0, 0)))
+            return NamedArrays("errors", (), np.zeros((0, 0, 0)))
         names = (*estimation.names, *self.details.system.states)
         values = np.concatenate(
             [
@@ -149,7 +149,7 @@ class Result:
             ],
             axis=-1,
         )
-        return Signals("errors", names, values)
+        return NamedArrays("errors", names, values)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -184,7 +184,7 @@ class Result:
         """A signal by its name in the CSV files: ``t``, ``il``, ``il_hat``."""
         if name == "t":
             return self.t
-        everything: dict[str, Signals] = {}
+        everything: dict[str, NamedArrays] = {}
         for signals in (self.inputs, self.outputs, self.states):
             everything |= dict.fromkeys(signals, signals)
         if name in everything:

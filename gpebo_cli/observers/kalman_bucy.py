@@ -39,6 +39,7 @@ from gpebo_cli.observers._observation import AffineStateMap, Observation, Recons
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
 from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
+from gpebo_cli.observers.remedies.current_coordinates import CurrentState
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression.linear import LinearRegression
@@ -259,7 +260,7 @@ class KalmanBucy:
         return Observation(
             regression=evidence.regression,
             state_map=FilterStateMap(spread, system.states, names),
-            truth=CurrentState(projector, basis),
+            truth=CurrentState(known),
             error_estimate=max(evidence.error_estimate, filtered.error_estimate),
             assumptions=(
                 *evidence.assumptions,
@@ -351,19 +352,6 @@ def _measurement_noise(
         True,
         used,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class CurrentState:
-    """ζ = (θ, w) at every time, w = P x in the coordinates of the basis."""
-
-    projector: Trajectory  # (states, states)
-    basis: Array  # (states, n_w)
-
-    def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
-        """(θ, w) at the times t (M,), shape (M, n)."""
-        w = np.einsum("mij,mj->mi", self.projector(t), states(t)) @ self.basis
-        return np.concatenate([theta, w], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
