@@ -82,6 +82,33 @@ static int triangular_values(const double *W, npy_intp rows, npy_intp length, do
     return orthogonalise(square, rows, rows, sigma);
 }
 
+/* Singular values of M, largest first, into sigma; how many rows of W hold more than rounding, or −1
+   where numbers overflow. M is used up. */
+static npy_intp values_of_M(npy_intp size, Look *look)
+{
+    memcpy(look->W, look->M, size * size * sizeof(double));
+    triangularise(look->W, size, size, look->mirrors, look->order);
+    if (!(fabs(look->W[0]) < DBL_MAX)) /* squares that overflow */
+        return -1;
+    /* Rows of W with nothing left but rounding: the left kernel is perpendicular to the rest. */
+    npy_intp rank = 0;
+    const double rounding = 4.0 * DBL_EPSILON * (double)size * fabs(look->W[0]);
+    while (rank < size && fabs(look->W[rank * size + rank]) > rounding)
+        rank++;
+    double *columns = look->M; /* (rank, size), the columns of L */
+    for (npy_intp i = 0; i < rank; i++)
+        for (npy_intp j = 0; j < size; j++)
+            columns[i * size + j] = look->W[j * size + i];
+    const double noise = rank < size ? fabs(look->W[rank * size + rank]) : 0.0;
+    triangularise(columns, rank, size, look->mirrors, NULL);
+    if (!triangular_values(columns, rank, size, look->square, look->sigma))
+        return -1;
+    sort_down(look->sigma, NULL, rank, 0);
+    for (npy_intp i = rank; i < size; i++)
+        look->sigma[i] = i == rank ? noise : 0.0;
+    return rank;
+}
+
 static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank_tol, int upto,
                    Look *look)
 {
@@ -96,26 +123,9 @@ static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank
     }
     if (!(fabs(all) < DBL_MAX))
         return 0;
-    memcpy(look->W, look->M, size * size * sizeof(double));
-    triangularise(look->W, size, size, look->mirrors, look->order);
-    if (!(fabs(look->W[0]) < DBL_MAX)) /* squares that overflow */
+    const npy_intp rank = values_of_M(size, look);
+    if (rank < 0)
         return 0;
-    /* Rows of W with nothing left but rounding: the left kernel is perpendicular to the rest. */
-    npy_intp rank = 0;
-    const double rounding = 4.0 * DBL_EPSILON * (double)size * fabs(look->W[0]);
-    while (rank < size && fabs(look->W[rank * size + rank]) > rounding)
-        rank++;
-    double *columns = look->M; /* M is used up: (rank, size), the columns of L */
-    for (npy_intp i = 0; i < rank; i++)
-        for (npy_intp j = 0; j < size; j++)
-            columns[i * size + j] = look->W[j * size + i];
-    const double noise = rank < size ? fabs(look->W[rank * size + rank]) : 0.0;
-    triangularise(columns, rank, size, look->mirrors, NULL);
-    if (!triangular_values(columns, rank, size, look->square, look->sigma))
-        return 0;
-    sort_down(look->sigma, NULL, rank, 0);
-    for (npy_intp i = rank; i < size; i++)
-        look->sigma[i] = i == rank ? noise : 0.0;
     double scale = look->sigma[0] > largest ? look->sigma[0] : largest;
     scale = scale > DBL_MIN ? scale : DBL_MIN;
     npy_intp counted = 0;
