@@ -9,16 +9,20 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
 from gpebo_cli.importers.netlist import GROUND, Element, Netlist, read_netlist, split_names
-from gpebo_cli.model.expressions import RESERVED
+from gpebo_cli.model.expressions import RESERVED, record
+from gpebo_cli.model.plant import read_parameters
 from gpebo_cli.schema import nearest, shown
 
 _WITH_CURRENT = "LVEHT"  # kinds whose current is an unknown
 _QUANTITY = re.compile(r"([vi])\((\w+)(?:,(\w+))?\)", re.IGNORECASE)
+_ORDER = "CLKRSVEHTIGF"  # of the kinds in a plant: what is differentiated first, what drives last
 _TERM = re.compile(r"([+-]?)(?:([\d.eE]+(?:[eE][+-]?\d+)?)\*)?([vi]\([\w,]+\))", re.IGNORECASE)
 
 
@@ -130,6 +134,16 @@ def examine(netlist: Netlist, file: str) -> Topology:
     )
 
 
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """A key by which n2 comes before n10."""
+    parts = re.findall(r"\d+|\D+", name.lower())
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+
+
+def _place_in_plant(e: Element) -> tuple[int, list[tuple[int, int, str]]]:
+    return _ORDER.index(e.kind), _natural(e.name)
+
+
 def _reserved(name: str) -> bool:
     return name in RESERVED or keyword.iskeyword(name)
 
@@ -209,18 +223,24 @@ class _Builder:
     """Stamps of the elements, row by row."""
 
     def __init__(self, netlist: Netlist, name: str, file: str, measured: Sequence[str]) -> None:
-        self.netlist, self.file = netlist, file
+        self.file = file
+        # The plant does not depend on the order of the lines, nor do roundings of its solution.
+        self.netlist = netlist = replace(
+            netlist, elements=tuple(sorted(netlist.elements, key=_place_in_plant))
+        )
         self.draft = PlantDraft(name, title=netlist.title or f"circuit {name}", reference=file)
         self.draft.comments.append(f"Modified nodal analysis of {file}.")
         self.elements = {e.name.lower(): e for e in netlist.elements}
         self.constants: dict[str, float] = {}  # of sources, by the input's name
         self._taken: set[str] = set()
+        self._turned: set[int] = set()  # rows that are multiplied by −1
+        self._called: dict[str, str] = {}  # parameter of an element's value, by lower-case name
         self._node: dict[str, str] = {}  # state of a node's voltage
         self._row: dict[str, int] = {}  # of a node's balance of currents
         self._current: dict[str, str] = {}  # state of an element's current, by lower-case name
         self._wanted = {
             match[2].lower()
-            for quantity in (*netlist.saved, *measured)
+            for quantity in (*netlist.saved, *netlist.initial, *measured)
             for match in _QUANTITY.finditer(quantity)
             if match[1].lower() == "i"
         }
@@ -229,8 +249,8 @@ class _Builder:
         draft = self.draft
         for key, value in self.netlist.parameters.items():
             draft.parameters[self._claim(key, key)] = value
-        nodes = dict.fromkeys(n for e in self.netlist.elements for n in e.nodes if n != GROUND)
-        for node in nodes:
+        nodes = {node for e in self.netlist.elements for node in e.nodes} - {GROUND}
+        for node in sorted(nodes, key=_natural):
             plain = node.isidentifier() and not _reserved(node)
             label = self._claim(node if plain else f"v{node}", f"v_{node}")
             self._node[node] = label
@@ -246,7 +266,9 @@ class _Builder:
                 draft.states[label] = (given if start is None else start, "A")
         for e in self.netlist.elements:
             getattr(self, f"_stamp_{e.kind}")(e)
+        draft.negate(self._turned)  # an algebraic equation begins with a minus, as balances do
         self._start_of_capacitors()
+        self._start_of_resistors()
         return draft
 
     def output(self, text: str) -> None:
@@ -326,10 +348,9 @@ class _Builder:
 
     def _value(self, e: Element) -> tuple[str, bool]:
         """A parameter that stands for the element's value; whether it varies with time."""
-        if e.name not in self.draft.parameters:
-            self.draft.parameters[self._claim(e.name, f"{e.name}_")] = e.value
-        varies = isinstance(e.value, str) and self._varies(e.value)
-        return e.name, varies
+        name = self._called[e.name.lower()] = self._claim(e.name, f"{e.name}_")
+        self.draft.parameters[name] = e.value
+        return name, isinstance(e.value, str) and self._varies(e.value)
 
     def _varies(self, text: str) -> bool:
         words = set(re.findall(r"[A-Za-z_]\w*", text))
@@ -408,15 +429,13 @@ class _Builder:
                 raise e.place.error(f"{e.name} couples {name}, which is no inductor")
         value, _ = self._value(e)
         first, second = (coil for coil in coils if coil is not None)
-        for coil in (first, second):  # their equations stand before the coupling's terms
-            if f"coil {coil.name.lower()}" not in self._row:
-                raise e.place.error(f"{e.name} has to stand below {coil.name}")
         mutual = self._claim(f"M_{e.name}", f"M_{e.name}_")
-        self.draft.parameters[mutual] = f"{value}*sqrt({first.name}*{second.name})"
+        own, other = (self._called[coil.name.lower()] for coil in (first, second))
+        self.draft.parameters[mutual] = f"{value}*sqrt({own}*{other})"
         varies = self._varies(str(self.draft.parameters[mutual]))
-        for own, other in ((first, second), (second, first)):
-            row = self._row[f"coil {own.name.lower()}"]
-            column = self._current[other.name.lower()]
+        for coil, by in ((first, second), (second, first)):
+            row = self._row[f"coil {coil.name.lower()}"]
+            column = self._current[by.name.lower()]
             self.draft.add("E", row, column, mutual)
             if varies:
                 self.draft.add("A", row, column, f"-d({mutual})")
@@ -465,11 +484,14 @@ class _Builder:
         self._branch((e.nodes[3], e.nodes[2]), column, name)
 
     def _voltage_row(self, e: Element, says: str) -> int:
-        """A row that begins with v_a − v_b."""
+        """A row that begins with v_a − v_b, or is turned to begin with a minus."""
         row = self.draft.equation(says)
-        for node, sign in ((e.nodes[0], 1.0), (e.nodes[1], -1.0)):
-            if node != GROUND:
-                self.draft.add("A", row, self._node[node], sign)
+        ends = {node: sign for node, sign in zip(e.nodes, (1.0, -1.0), strict=False)
+                if node != GROUND and e.nodes[0] != e.nodes[1]}
+        for node, sign in ends.items():
+            self.draft.add("A", row, self._node[node], sign)
+        if e.kind != "L" and ends and ends[min(ends, key=self._row.__getitem__)] > 0.0:
+            self._turned.add(row)
         return row
 
     def _input(self, e: Element, unit: str) -> str:
@@ -511,3 +533,22 @@ class _Builder:
             if node != GROUND:
                 label = self._node[node]
                 self.draft.states[label] = (value, self.draft.states[label][1])
+
+    def _start_of_resistors(self) -> None:
+        """Currents of resistors that nothing is said of, from the voltages that they start with."""
+        states, parameters = self.draft.states, self.draft.parameters
+        found = [
+            e for e in self.netlist.elements if e.kind == "R" and e.name.lower() in self._current
+            and f"i({e.name.lower()})" not in self.netlist.initial
+        ]
+        if not found:
+            return
+        known = read_parameters(f"circuit {self.draft.name}", parameters, {}, {})
+        tape = record([known[self._called[e.name.lower()]] for e in found])
+        for e, value in zip(found, tape.taylor(np.zeros(1), 0)[0, 0], strict=True):
+            first, second = (
+                float(states[self._node[node]][0]) if node != GROUND else 0.0 for node in e.nodes
+            )
+            if value and np.isfinite(value):
+                current = (first - second) / float(value)
+                states[self._current[e.name.lower()]] = (current + 0.0, "A")  # no minus zero

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -54,6 +54,13 @@ class PlantDraft:
         columns = list(self._columns(matrix))
         for i, j, value in _nonzero(values):
             self.add(matrix, first + i, columns[j], value)
+
+    def negate(self, rows: Collection[int]) -> None:
+        """Multiply equations by −1."""
+        for matrix in "EABF":
+            for (row, _), terms in self._terms[matrix].items():
+                if row in rows:
+                    terms[:] = [_negative(term) for term in terms]
 
     def make_unknown(self, names: Iterable[str], numbers: Mapping[str, float]) -> None:
         """Turn inputs into unknown parameters: their columns of B and D move to F and H.
@@ -170,6 +177,13 @@ def _nonzero(values: object) -> Iterable[tuple[int, int, Entry]]:
         for j, value in enumerate(row):
             if isinstance(value, str) or value != 0:
                 yield i, j, value if isinstance(value, str) else float(value)
+
+
+def _negative(term: Entry) -> Entry:
+    """The term with the other sign; texts are products, with a minus or without."""
+    if isinstance(term, str):
+        return term[1:] if term.startswith("-") else f"-{term}"
+    return -term
 
 
 def _sum(terms: list[Entry]) -> Entry:

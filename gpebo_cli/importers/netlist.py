@@ -10,6 +10,7 @@ case, and node 0 (or gnd) is ground.
 from __future__ import annotations
 
 import itertools
+import keyword
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -262,7 +263,7 @@ class _Reader:
     def _parameter(
         self, name: str, value: str, scope: Mapping[str, str], place: Place
     ) -> str:
-        taken = {key.lower() for key in self.parameters} | RESERVED
+        taken = {key.lower() for key in self.parameters}.union(RESERVED, keyword.kwlist)
         while name.lower() in taken:
             name += "_"
         self.parameters[name] = self.value(value, scope, place, name)
