@@ -184,6 +184,12 @@ class LeastSquaresEstimates:
         ]
         return ratio_requirement(float(min(ratios)))
 
+    def weights(self, case: int) -> Array:
+        """z f₀I + αG_z (M, p, p)."""
+        s, gains = self.spectra[case], self.cases[case]
+        values = s.memory[:, None] * gains["f0"] + gains["alpha"] * s.eigenvalues
+        return np.asarray((s.vectors * values[:, None]) @ transpose(s.vectors))
+
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
         chosen, spectra = self.cases[cases], self.spectra[cases]

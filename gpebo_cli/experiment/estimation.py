@@ -21,6 +21,7 @@ from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import Metrics, levels, measure_squares, settled, settling_times
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
+from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.experiment.online import Online, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
@@ -194,7 +195,9 @@ def _estimate(
     regression, state_map = observation.regression, observation.state_map
     cases, t = estimator.cases, source.t
     kept = t[kept_samples(len(cases), len(t), settings.output.max_rows)]
-    grid = np.unique(np.concatenate([regression.mesh.points.ravel(), state_map.times, kept]))
+    # Each time with bounds is a programme of its own: they are for the samples that are kept.
+    points = kept if observation.bounds else regression.mesh.points.ravel()
+    grid = np.unique(np.concatenate([points, state_map.times, kept]))
     chosen = np.searchsorted(grid, kept)
 
     x = source.states(grid)
@@ -208,6 +211,8 @@ def _estimate(
     else:
         seen = np.ones(n, dtype=bool)
         estimates, columns = estimators.estimate(estimator, regression, grid), np.arange(p)
+    if observation.bounds:
+        estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
     told = _told(determined), _told(seen)
     sizes = _sizes(truth, _natural_sizes(regression, p), x)
     evaluate = _evaluation(
@@ -236,6 +241,7 @@ def _estimate(
         delta=estimates.delta(kept),
         checks=state_map.checks(kept, estimated),
         requirement=estimates.requirement,
+        active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
     )
     return result, _metrics(numbers, observation.parameters, system)
 

@@ -88,7 +88,7 @@ def run_experiment(
     warned = warnings(found.observed)
     told = verdict(
         found.excitation, found.estimation.cases, found.estimation.requirement, found.metrics,
-        found.fit, found.estimable,
+        found.fit, found.estimable, found.estimation.active,
     )
     return replace(
         result, regression=found.regression, excitation=found.excitation,

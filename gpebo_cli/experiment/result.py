@@ -22,6 +22,24 @@ _OUTSIDE = 0.15  # share of correlations outside a band that white noise leaves 
 
 
 @dataclass(frozen=True)
+class ActiveBound:
+    """A bound that holds an estimate at the end."""
+
+    name: str  # of a state or an unknown
+    value: float
+    time: float | None  # at which the state is there; None: an unknown
+
+    def __str__(self) -> str:
+        when = "" if self.time is None else f" at t = {self.time:.4g}"
+        return f"{self.name} = {self.value:g}{when}"
+
+    def near(self, other: ActiveBound, distance: float) -> bool:
+        """Whether it is the same bound at nearly the same time."""
+        same = (self.name, self.value) == (other.name, other.value)
+        return same and abs((self.time or 0.0) - (other.time or 0.0)) <= distance
+
+
+@dataclass(frozen=True)
 class StateChange:
     """A state that consistent initialisation (or a jump of the input) moved."""
 
@@ -134,6 +152,7 @@ class EstimationResult:
     requirement: Requirement
     parameters_std: Array | None = None  # (G, M, p) standard deviations; None: nobody knows
     states_std: Array | None = None  # (G, M, n)
+    active: Mapping[int, tuple[ActiveBound, ...]] = field(default_factory=dict)  # bounds, by case
 
 
 @dataclass(frozen=True)

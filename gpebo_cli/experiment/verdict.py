@@ -9,7 +9,7 @@ import numpy as np
 
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
-from gpebo_cli.experiment.result import Fit, SimulationResult
+from gpebo_cli.experiment.result import ActiveBound, Fit, SimulationResult
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 
@@ -20,6 +20,7 @@ def verdict(
     excitation: Excitation, cases: Sequence[Mapping[str, float]], requirement: Requirement,
     metrics: Metrics | None = None, fit: Fit | None = None,
     estimable: Mapping[str, float | None] | None = None,
+    active: Mapping[int, Sequence[ActiveBound]] | None = None,
 ) -> str:
     """The last line: exciting or not and from when on, and how well the state is known.
 
@@ -53,6 +54,8 @@ def verdict(
             f"|Y − ψη̂| with the final estimates is {fit.residual[best]:.2g}, |Y| is "
             f"{fit.size:.2g} (root mean squares){_explains(fit, best)}"
         )
+    if active and active.get(best):
+        parts.append("held by bounds: " + ", ".join(map(str, active[best])))
     label = _case_label(cases[best])
     line = "; ".join(parts) + (f" ({label})" if label else "")
     if not requirement.holds:

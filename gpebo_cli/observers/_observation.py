@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -152,6 +152,7 @@ class Observation:
     errors: ErrorsAt | None = None  # the same as a linear system; its outputs are δY, δoffset
     growth_rate: float | None = None  # 1/s, ln ‖Φ‖₂ over the horizon
     note: str = ""  # what the last line of a run has to say of it, from "; " on
+    bounds: Mapping[str, Mapping[str, Sequence[float | None]]] | None = None  # ``observer.bounds``
 
     @property
     def parameters(self) -> tuple[str, ...]:

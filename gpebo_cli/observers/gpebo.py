@@ -6,7 +6,7 @@ The equations are those of :mod:`gpebo_cli.observers.reduced`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from gpebo_cli.errors import ConfigError
@@ -16,6 +16,7 @@ from gpebo_cli.observers._observation import Observation
 from gpebo_cli.observers.reduced.extension import reduced_system
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
+from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.settings import SolverSettings
 
@@ -34,6 +35,8 @@ class Gpebo:
             None: equally.
         sample_time: seconds between samples of an observer in discrete time; None: continuous.
         hold: what it assumes between samples.
+        bounds: of ``states`` and ``unknowns``, by name [low, high], null for no bound; estimates
+            respect them at all times so far (docs/howto/uncertainty.md).
         remedy: what is done about a Φ that grows (docs/howto/unstable.md).
     """
 
@@ -43,11 +46,17 @@ class Gpebo:
     weights: Mapping[str, float] | list[float] | None = None
     sample_time: float | None = field(default=None, metadata={"positive": True})  # seconds
     hold: Literal["zoh", "linear"] = "zoh"
+    bounds: Mapping[str, Mapping[str, list[float | None]]] | None = None
     remedy: Remedy = field(default=Plain(), metadata={"one_of": REMEDIES})
 
     def __post_init__(self) -> None:
         if self.sample_time is not None:
-            self._refuse_remedy()
+            self._refuse_what_needs_the_past()
+        if self.bounds and not isinstance(self.remedy, Plain | OutputInjection):
+            raise ConfigError(
+                "observer.bounds: parameters that change on the way have none; accepted remedies "
+                "are none and output_injection"
+            )
 
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
@@ -59,10 +68,10 @@ class Gpebo:
             ConfigError: no outputs, or a setting that does not fit the plant.
             SolverError: the tolerance cannot be reached.
         """
-        return self.remedy.observe(reduced_system(
+        return replace(self.remedy.observe(reduced_system(
             system, signals, solver,
             xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=self.form,
-        ))
+        )), bounds=self.bounds)
 
     def sampling(self) -> Sampling | None:
         """The samples that ``sample_time`` asks for."""
@@ -78,13 +87,18 @@ class Gpebo:
             ModelError: Assumption 1 fails at the start.
             ConfigError: a remedy, no outputs, or a setting that does not fit the plant.
         """
-        self._refuse_remedy()
+        self._refuse_what_needs_the_past()
         return sampled_observer(
             system, solver, hold, start, sample,
             xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=self.form,
         )
 
-    def _refuse_remedy(self) -> None:
+    def _refuse_what_needs_the_past(self) -> None:
+        if self.bounds:
+            raise ConfigError(
+                "observer.bounds works in continuous time only: at samples (observer.sample_time, "
+                "streams) the past is not kept"
+            )
         if not isinstance(self.remedy, Plain):
             name = next(key for key, kind in REMEDIES.items() if isinstance(self.remedy, kind))
             raise ConfigError(

@@ -73,6 +73,15 @@ class ResumableEstimates(Estimates, Protocol):
 
 
 @runtime_checkable
+class Weighing(Protocol):
+    """Estimates that are the least of a sum of squares, and that say how it weighs errors."""
+
+    def weights(self, case: int) -> Array:
+        """M (M, p, p) of (η − η̂)ᵀ M (η − η̂), by which the sum grows beside η̂, at the times."""
+        ...
+
+
+@runtime_checkable
 class Resumable(Protocol):
     """An estimator that can go on after a reset."""
 

@@ -53,6 +53,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "recording": _recording(result.recording),
         "parameters": _parameters(result.estimation),
         "estimates": _estimates(result),
+        "active_bounds": _active_bounds(estimation),
         "estimable": {name: since is not None for name, since in result.estimable.items()},
         "assumptions": [
             {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
@@ -164,6 +165,17 @@ def _estimates(result: RunResult) -> object:
     count = min(len(estimation.cases), MAX_LISTED_CASES)
     cases = [estimates_at_end(result, k) for k in range(count)]
     return cases[0] if len(cases) == 1 else {str(k): case for k, case in enumerate(cases)}
+
+
+def _active_bounds(estimation: EstimationResult | None) -> list[dict[str, Any]] | None:
+    """Which bounds hold the estimates at the end; None where there are no bounds."""
+    if estimation is None or not estimation.active:
+        return None
+    return [
+        {"case": case, **asdict(bound)}
+        for case, active in estimation.active.items() if case < MAX_LISTED_CASES
+        for bound in active
+    ]
 
 
 def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
