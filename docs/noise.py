@@ -1,4 +1,4 @@
-"""Regenerate the table and the figures of ``docs/howto/noise.md``: ``python docs/noise.py``."""
+"""Regenerate the tables and the figures of ``docs/howto/noise.md``: ``python docs/noise.py``."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ HERE = Path(__file__).parent
 PAGE = HERE / "howto" / "noise.md"
 IMAGES = HERE / "img"
 BEGIN, END = "<!-- table: begin, by docs/noise.py -->\n", "<!-- table: end -->\n"
+BEGIN_2, END_2 = (mark.replace("table", "matrices") for mark in (BEGIN, END))
 
 LEVELS = (1e-4, 1e-3, 1e-2, 1e-1)
 SEEDS, SAMPLE_TIME = 200, 0.02
@@ -44,6 +45,12 @@ ESTIMATORS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
         "fct": {"gamma": 1e14},
     },
 }
+
+# Noise in the matrices: an unknown, its plant, horizon, sample time, and levels of its noise.
+MATRICES = (
+    ("line", "generator", 5.0, 0.02, (0.01, 0.03, 0.1)),
+    ("rho", "lorenz", 5.0, 0.02, (0.1, 0.3, 1.0)),
+)
 
 
 def plant(name: str, **changes: object) -> DescriptorSystem:
@@ -152,11 +159,45 @@ def step_figure(path: Path) -> None:
     save(compose(both), path)
 
 
+def matrices_table() -> str:
+    """Bias and deviation of least squares along measured signals and along a noise-free copy."""
+    lines = [
+        "| unknown | σ | σ over the signal | bias | deviation | bias, `noise_free` | deviation |",
+        "|---" * 7 + "|",
+    ]
+    for unknown, name, horizon, sample_time, levels in MATRICES:
+        system = plant(name)
+        j = system.unknowns.index(unknown)
+        for level in levels:
+            cells = []
+            for remedy in ("none", "noise_free"):
+                result = run_experiment(Settings(
+                    plant={}, estimator={"name": "least_squares", "f0": 1e-12},
+                    observer={"name": "gpebo", "remedy": remedy},
+                    time=TimeSettings(horizon=horizon, samples=51),
+                    noise=NoiseSettings("gaussian", sample_time, level, seeds=SEEDS),
+                ), system)
+                if result.noise is None or result.simulation is None:
+                    raise RuntimeError("there is no noise")
+                cells += [result.noise.bias[0, j], result.noise.deviation[0, j]]
+            share = level / np.sqrt((result.simulation.outputs**2).mean())
+            numbers = " | ".join(f"{cell:.2g}" for cell in cells)
+            title = f"`{unknown}` = {system.theta[j]:g} of `{name}`"
+            lines.append(f"| {title} | {level:g} | {100 * share:.1f} % | {numbers} |")
+    return "\n".join([*lines, ""])
+
+
+def fill(begin: str, end: str, text: str) -> None:
+    """Put a table between its marks on the page."""
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
+    _, _, after = rest.partition(end)
+    write_text(PAGE, before + begin + "\n" + text + "\n" + end + after)
+
+
 if __name__ == "__main__":
     make_folder(IMAGES)
     step_figure(IMAGES / "theta_step.png")
     results = errors()
     level_figure(results, IMAGES / "noise_levels.png")
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    _, _, after = rest.partition(END)
-    write_text(PAGE, before + BEGIN + "\n" + table(results) + "\n" + END + after)
+    fill(BEGIN, END, table(results))
+    fill(BEGIN_2, END_2, matrices_table())

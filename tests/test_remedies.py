@@ -397,20 +397,23 @@ def test_settings_that_do_not_fit(observer, message):
     assert "\n" not in str(caught.value)
 
 
-def test_many_seeds_go_with_output_injection_and_with_no_other_remedy():
-    def settings_of(remedy):
+@pytest.mark.parametrize("remedy", ["output_injection", "reset"])
+def test_many_seeds_are_one_run_per_seed_with_every_remedy(remedy):
+    """With output injection they are one more right-hand side, with resets a run each."""
+    def settings_of(seed, seeds):
         return Settings(
             plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(horizon=10.0),
             observer={"name": "gpebo", "remedy": remedy},
-            noise=NoiseSettings(outputs=0.01, sample_time=0.1, seeds=5),
+            noise=NoiseSettings(outputs=0.01, sample_time=0.1, seed=seed, seeds=seeds),
         )
 
     system = plant_from_mapping(UNBOUNDED)
-    result = run_experiment(settings_of("output_injection"), system)
-    assert result.noise.seeds == 5
-    assert np.isfinite(result.noise.rms).all()
-    with pytest.raises(ConfigError, match=r"needs .* observer\.remedy=none or output_injection"):
-        run_experiment(settings_of("reset"), system)
+    found = run_experiment(settings_of(0, 3), system).noise
+    single = [run_experiment(settings_of(seed, 1), system).estimation for seed in range(3)]
+    errors = np.array([e.parameters[:, -1] - e.true_parameters[-1] for e in single])
+    np.testing.assert_allclose(found.bias, errors.mean(axis=0), rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(found.deviation, errors.std(axis=0, ddof=1), rtol=1e-4, atol=1e-7)
+
 
 
 @pytest.mark.parametrize("remedy", ["output_injection", "reset", "current_coordinates"])

@@ -25,7 +25,7 @@ from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.experiment.online import Online, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
-from gpebo_cli.experiment.seeds import check_response, over_seeds
+from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
 from gpebo_cli.experiment.uncertainty import standard_deviations
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
@@ -34,6 +34,7 @@ from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, S
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
+from gpebo_cli.simulation.simulate import Signals
 
 _SAMPLES_AT_ONCE = 2048
 _LAGS = 20  # of the residual's autocorrelation
@@ -74,12 +75,16 @@ def continuous(
     """
     levels = noise_levels(settings.noise, system)
     t = source.t
-    with stage("observe"):
+
+    def observe(signals: Source | Signals) -> Observation:
         seen = Measurements(
-            source.inputs, source.outputs, signal_noise(settings.noise, levels), source.derivatives
+            signals.inputs, signals.outputs, signal_noise(settings.noise, levels),
+            source.derivatives,
         )
-        observation = observer.observe(system, seen, settings.solver)
-        check_response(settings.noise, observation.respond)
+        return observer.observe(system, seen, settings.solver)
+
+    with stage("observe"):
+        observation = observe(source)
         regression = observation.regression
         sampler = regression.mesh.sampler(t)
         sampled = RegressionResult(
@@ -117,8 +122,10 @@ def continuous(
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds"):
-            truth = estimation.true_parameters[-1]
-            noise = over_seeds(observation, source.true, estimator, truth, settings.noise, levels)
+            theta = source.theta(t[-1:])
+            noise = over_seeds(
+                observation, observe, source.true, theta, estimator, settings.noise, levels
+            )
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
         _fit(observation, estimation, system, source) if source.recording else None, times, noise,
@@ -137,7 +144,7 @@ def at_samples(
         ModelError: an assumption of the observer fails.
         SolverError: a step between samples cannot be resolved.
     """
-    check_response(settings.noise, None)
+    refuse_seeds(settings.noise)
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
     with stage("observe and estimate"):
         t = sample_times(samples.step, start, stop)

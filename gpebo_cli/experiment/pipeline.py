@@ -19,7 +19,7 @@ from gpebo_cli.experiment.estimation import at_samples, continuous
 from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
-from gpebo_cli.experiment.seeds import check_response, check_seeds
+from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.verdict import verdict
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
@@ -77,7 +77,7 @@ def run_experiment(
         timings=stage.seconds, verdict=source.verdict, recording=source.recording,
     )
     if observer is None or estimator is None:
-        check_response(settings.noise, None)
+        refuse_seeds(settings.noise)
         return result
     samples = sampling(observer)
     found = (

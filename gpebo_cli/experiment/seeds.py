@@ -1,20 +1,26 @@
-"""Bias and variance of an estimator over many seeds of the noise, in one pass.
+"""Bias and variance of an estimator over many seeds of the noise.
 
-ψ does not depend on the signals, and Y and all estimators are affine in them. So all seeds share
-the simulation, the mesh, the observer's matrices, ψ and whatever an estimator makes of it (Gram
-matrices, filters, mixing); a seed is one more right-hand side of the same linear systems.
+Where ψ does not depend on the signals, Y and all estimators are affine in them. Then all seeds
+share the simulation, the mesh, the observer's matrices, ψ and whatever an estimator makes of it (Gram
+matrices, filters, mixing); a seed is one more right-hand side of the same linear systems. Where it
+does (matrices along noisy signals, resets at estimates), every seed is observed by itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators import estimate
 from gpebo_cli.experiment.noise import (
     NoiseLevels,
     SampledMesh,
     between,
     draw_errors,
+    measure,
     noise_grid,
     on_mesh,
     sampled_mesh,
@@ -43,53 +49,77 @@ def check_seeds(settings: NoiseSettings, levels: NoiseLevels) -> None:
         raise ConfigError(f"noise.seeds = {settings.seeds}, but there is no noise; set its levels")
 
 
-def check_response(settings: NoiseSettings, respond: Response | None) -> Response:
-    """How the observer responds to noise; many seeds are refused where it cannot tell.
+def refuse_seeds(settings: NoiseSettings) -> None:
+    """Refuse many seeds where there is no observer in continuous time.
 
     Raises:
         ConfigError: says what is possible.
     """
-    if settings.seeds > 1 and respond is None:
+    if settings.seeds > 1:
         raise ConfigError(
-            f"noise.seeds = {settings.seeds} needs observer=gpebo in continuous time, with "
-            "observer.remedy=none or output_injection; with others, run one job per seed: "
-            "-m noise.seed=0,1,2"
+            f"noise.seeds = {settings.seeds} needs an observer in continuous time; otherwise run "
+            "one job per seed: -m noise.seed=0,1,2"
         )
-    return respond or _no_response
-
-
-def _no_response(of_inputs: Array, of_outputs: Array) -> Array:  # noqa: ARG001  a response
-    raise ValueError("nobody asked how this observer responds to noise")
 
 
 def over_seeds(
-    observation: Observation, signals: Signals, estimator: Estimator, truth: Array,
-    settings: NoiseSettings, levels: NoiseLevels,
+    observation: Observation, observe: Callable[[Signals], Observation], signals: Signals,
+    theta: Array, estimator: Estimator, settings: NoiseSettings, levels: NoiseLevels,
 ) -> NoiseStatistics:
     """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, …
 
     Args:
         observation: made from the noisy signals of ``seed``.
+        observe: makes one from measured signals.
         signals: the true ones.
+        theta: true values of the unknowns at the horizon, (1, q).
         estimator: all of its cases are assessed.
-        truth: of the parameters at the horizon, (p,).
         settings: of the noise.
         levels: of the noise.
 
     Raises:
-        ConfigError: the observer cannot tell how it responds to noise.
+        ModelError: an assumption of the observer fails along some noise.
         SolverError: a tolerance cannot be reached.
     """
-    respond = check_response(settings, observation.respond)
+    horizon = observation.regression.mesh.edges[-1:]
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    if observation.respond is None:
+        found = []
+        for seed in seeds:
+            own = observe(measure(signals, replace(settings, seed=seed), levels))
+            eta = estimate(own.estimator or estimator, own.regression, horizon)
+            truth = own.truth(horizon, theta, signals.states)[0]
+            found.append(eta.parameters(slice(None))[:, 0] - truth)
+        error = np.stack(found, axis=-1)
+    else:
+        added = _added(observation, observation.respond, signals, settings, levels)
+        error = np.concatenate([
+            estimator.estimate(many, horizon).parameters(slice(None))[:, 0] for many in added
+        ], axis=-1)
+        error -= observation.truth(horizon, theta, signals.states)[0][:, None]
+    return NoiseStatistics(
+        seeds=settings.seeds,
+        t=float(horizon[0]),
+        names=observation.parameters,
+        truth=observation.truth(horizon, theta, signals.states)[0],
+        bias=error.mean(axis=-1),
+        deviation=error.std(axis=-1, ddof=1),
+        rms=np.sqrt(np.mean(error**2, axis=-1)),
+    )
+
+
+def _added(
+    observation: Observation, respond: Response, signals: Signals, settings: NoiseSettings,
+    levels: NoiseLevels,
+) -> Iterator[LinearRegression]:
+    """The regression with the noise of many seeds at once, batch by batch."""
     regression = observation.regression
     mesh = regression.mesh
     samples = noise_grid(signals.mesh, settings)
     outputs = on_mesh(signals.outputs, samples.mesh)
     grid = sampled_mesh(mesh, settings.sample_time)  # every instant is an edge of it already
-    horizon = mesh.edges[-1:]
     first = draw_errors(outputs, samples, levels, settings.seed)
     batch = max(1, _NUMBERS // regression.Y.values.size)
-    errors = []
     for start in range(0, settings.seeds, batch):
         seeds = range(settings.seed + start, settings.seed + min(start + batch, settings.seeds))
         drawn = [draw_errors(outputs, samples, levels, seed) for seed in seeds]
@@ -98,22 +128,10 @@ def over_seeds(
             for kind in (0, 1)
         )
         added = respond(of_inputs, of_outputs)
-        many = LinearRegression(
+        yield LinearRegression(
             Trajectory(mesh, regression.Y.values[..., None] + added),
             regression.psi, regression.parameters, regression.scale,
         )
-        final = estimator.estimate(many, horizon).parameters(slice(None))[:, 0]  # (G, p, c)
-        errors.append(final - truth[:, None])
-    error = np.concatenate(errors, axis=-1)
-    return NoiseStatistics(
-        seeds=settings.seeds,
-        t=float(horizon[0]),
-        names=regression.parameters,
-        truth=truth,
-        bias=error.mean(axis=-1),
-        deviation=error.std(axis=-1, ddof=1),
-        rms=np.sqrt(np.mean(error**2, axis=-1)),
-    )
 
 
 def _columns(errors: list[Array], grid: SampledMesh, mesh: Mesh, shape: str) -> Array:

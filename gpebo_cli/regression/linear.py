@@ -16,7 +16,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
-_FEW_COLUMNS = 32  # of a product, up to which BLAS costs more than what there is to add up
+_SINGULAR = 1e-10  # singular values of ψ with columns of equal size that count as zero, relatively
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +98,16 @@ class LinearRegression:
             if reset is not None:
                 known = ExtensionState(pieces[-1][-1, -1], level).after(reset).values
         return Trajectory(self.mesh, np.concatenate(pieces))
+
+    def least_squares(self) -> Array:
+        """η̂ (p,) that makes ∫‖Y − ψη̂‖² least; the smallest one where many do. Without resets."""
+        mesh = self.mesh
+        weights = np.sqrt(mesh.steps[:, None] * mesh.rule.integration[-1])[..., None, None]
+        rows = (weights * self.psi.values[:, 1:]).reshape(-1, self.p)
+        right = (weights[..., 0] * self.Y.values[:, 1:]).ravel()
+        size = np.linalg.norm(rows, axis=0)
+        size = np.where(size > 0.0, size, 1.0)
+        return np.asarray(np.linalg.lstsq(rows / size, right, rcond=_SINGULAR)[0] / size)
 
     @cached_property
     def segments(self) -> tuple[LinearRegression, ...]:

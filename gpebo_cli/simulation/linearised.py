@@ -2,11 +2,12 @@
 
 With F(t, x) = A x + B u + F θ + φ at (t, u, y), y = C x + D u + H θ, and a guess x̄ with outputs ȳ,
 
-    E x' = (A + G C) x + B u + F θ + φ − G C x̄,        G_j = ∂(A x̄ + B u + F θ + φ)/∂y_j,
+    E x' = (A + G C) x + B u + (F + G H) θ + φ − G (C x̄ + H θ̄),
+    G_j = ∂(A x̄ + B u + F θ̄ + φ)/∂y_j,
 
 everything at (t, u, ȳ): one step of Newton's method for the whole trajectory (quasilinearisation;
 Bellman & Kalaba 1965). It is a plant of the paper's class, for which index, consistent start and
-solution are found as for any other. Where x = x̄, it says what the plant says.
+solution are found as for any other. Where x = x̄ and θ = θ̄, it says what the plant says.
 """
 
 from __future__ import annotations
@@ -35,21 +36,31 @@ class Linearised:
 
     system: DescriptorSystem
     guess: Trajectory  # x̄ (n,)
+    theta: Array | None = None  # θ̄ (q,); None: the true one
+
+    @cached_property
+    def _moved(self) -> frozenset[str]:
+        no_H = "H" in self.system.coefficients.zero
+        return frozenset({"A", "phi"} if no_H else {"A", "F", "phi"})
 
     @cached_property
     def constant(self) -> frozenset[str]:
         """Those that do not depend on time."""
-        return self.system.coefficients.constant - {"A", "phi"}
+        return self.system.coefficients.constant - self._moved
 
     @cached_property
     def zero(self) -> frozenset[str]:
         """Those that vanish."""
-        return self.system.coefficients.zero - {"A", "phi"}
+        return self.system.coefficients.zero - self._moved
 
-    @property
+    @cached_property
     def signals(self) -> Mapping[str, frozenset[str]]:
-        """None: the guess says what u and y are."""
-        return {}
+        """Inputs only: the guess says what y is. Without signals u is the plant's own."""
+        kept = self.system.coefficients.signals
+        of_inputs = frozenset(self.system.inputs) & frozenset[str]().union(*kept.values())
+        found = {name: names & of_inputs for name, names in kept.items()}
+        found |= dict.fromkeys(self._moved, of_inputs)
+        return {name: names for name, names in found.items() if names}
 
     @property
     def of_time(self) -> Linearised:
@@ -76,15 +87,18 @@ class Linearised:
         return np.union1d(found, inner[np.minimum(apart, before) > close])
 
     def taylor(
-        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None  # noqa: ARG002
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
     ) -> Coefficients:
-        """Taylor coefficients of the linearised plant at the times t (N,).
+        """Taylor coefficients of the linearised plant at the times t (N,); of signals u counts.
 
         Raises:
             ConfigError: an entry without a finite value along the guess.
         """
         source = self.system.coefficients
-        known = source.of_time.taylor(t, order, inside)
+        known = source.of_time.taylor(t, order, inside, signals)
+        if self.theta is not None:
+            known = known._replace(theta=np.zeros((order + 1, len(t), self.system.q)))
+            known.theta[0] = self.theta
         x = self._states(t, order, inside)
         y = _product(known.C, x) + _product(known.D, known.u) + _product(known.H, known.theta)
         along = np.concatenate([known.u, y], axis=2)
@@ -99,8 +113,9 @@ class Linearised:
                 moved.append(_right_side(source.taylor(t, order, inside, along), known, x))
             along[0, :, self.system.m + j] = y[0, :, j]
             G[..., j] = (moved[0] - moved[1]) / (2.0 * shift[:, j, None])
-        GC = _product(G, c.C)
-        return c._replace(A=c.A + GC, phi=c.phi - _product(GC, x), u=known.u)
+        GC, GH = _product(G, c.C), _product(G, c.H)
+        phi = c.phi - _product(GC, x) - _product(GH, known.theta)
+        return c._replace(A=c.A + GC, F=c.F + GH, phi=phi, u=known.u)
 
     def _states(self, t: Array, order: int, inside: Array | None) -> Array:
         """Taylor coefficients of the guess, (order + 1, N, n)."""

@@ -1,4 +1,7 @@
-"""What is done where Φ grows, so that θ̂ → θ no longer implies x̂ → x; one module each."""
+"""What is done where Φ grows, or where matrices have noise in them; one module each.
+
+If Φ grows, θ̂ → θ no longer implies x̂ → x.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import Protocol
 from gpebo_cli.observers._observation import Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.remedies.current_coordinates import CurrentCoordinates
+from gpebo_cli.observers.remedies.noise_free import NoiseFree
 from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.observers.remedies.reset import Resets
@@ -25,5 +29,6 @@ REMEDIES = {
     "output_injection": OutputInjection,
     "reset": Resets,
     "current_coordinates": CurrentCoordinates,
+    "noise_free": NoiseFree,
 }
 """By the value of ``observer.remedy``."""
