@@ -2,8 +2,8 @@
 
 Where ψ does not depend on the signals, Y and all estimators are affine in them. Then all seeds
 share the simulation, the mesh, the observer's matrices, ψ and whatever an estimator makes of it
-(Gram matrices, filters, mixing); a seed is one more right-hand side of the same linear systems. Where it
-does (matrices along noisy signals, resets at estimates), every seed is observed by itself.
+(Gram matrices, filters, mixing); a seed is one more right-hand side of the same linear systems.
+Where it does (matrices along noisy signals, resets at estimates), every seed is observed by itself.
 """
 
 from __future__ import annotations
