@@ -74,9 +74,11 @@ def _maps(rng, k=7, s=4, n=3, c=2, one=False):
     )
 
 
-def _signal(rng, k=8, s=6, c=5):
+def _signal(rng, k=8, s=6, c=5, least=False):
     values = rng.normal(size=(k, s + 1, c)) * 10.0 ** rng.integers(-12, 3, size=c)
-    return values, radau_rule(s).to_legendre, min(4, s - 1), 1e-8, 1e-3, 1e-5
+    values += 10.0 * np.abs(values).max(axis=(0, 1))  # so that what is left out is not everything
+    sizes = 10.0 ** rng.integers(-12, 3, size=c) if least else None
+    return values, radau_rule(s).to_legendre, min(4, s - 1), 1e-8, 1e-3, 1e-5, sizes
 
 
 def _times(rng, k=6, s=4, count=50):
@@ -193,6 +195,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("elements", "chain", partial(_maps, k=1, n=16, c=9)),
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
+    ("signals", "tails", partial(_signal, least=True)),
     ("signals", "interpolation", _times),
     ("signals", "interpolation", partial(_times, k=1)),
     ("signals", "sample", _samples),
@@ -282,6 +285,7 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("chain", _maps, 1, np.s_[:, :-1]),
     ("chain", _maps, 2, np.s_[:-1]),
     ("tails", _signal, 1, np.s_[:-1]),
+    ("tails", partial(_signal, least=True), 6, np.s_[:-1]),
     ("interpolation", _times, 0, np.s_[:1]),
     ("interpolation", _times, 1, np.s_[:-1]),
     ("interpolation", _times, 4, np.s_[:-1]),

@@ -1,47 +1,58 @@
 /* How well a mesh resolves signals, sampling, filters; see signals_numpy.py. */
 #include "elements.h"
 
-/* worst (K, used) of one kind, values (K, points, c); `work` holds (K + 1 + used) c numbers. */
-EVERY_WIDTH static void tails_of_kind(double *worst, const double *to_legendre, npy_intp used,
+/* The largest of the last coefficients of each element, to the power that makes of degree j one of
+   the degree `points`. Components that are smaller than `least` (c,), if there is one, count as
+   that large, and all are compared in these units. `work` holds (K + 2 + used) c numbers. */
+EVERY_WIDTH static void tails_of_kind(double *tail, const double *to_legendre, npy_intp used,
                                       npy_intp K, npy_intp points, const double *values, npy_intp c,
-                                      double floor, double foot, double share, double *work)
+                                      const double *least, double floor, double foot, double share,
+                                      double *work)
 {
-    double *scale = work + K * c, *last = scale + c;
+    double *scale = work + K * c, *unit = scale + c, *last = unit + c;
     for (npy_intp k = 0; k < K; k++) { /* largest value of each component so far */
         for (npy_intp b = 0; b < c; b++)
             work[k * c + b] = k ? work[(k - 1) * c + b] : 0.0;
         enlarge(work + k * c, values + k * points * c, points, c);
     }
     const double *final = work + (K - 1) * c;
+    for (npy_intp b = 0; b < c; b++)
+        unit[b] = least ? larger(larger(final[b], least[b]), DBL_MIN) : 1.0;
     for (npy_intp k = 0; k < K; k++) {
-        for (npy_intp b = 0; b < c; b++)
-            scale[b] = larger(work[k * c + b], foot * final[b]);
+        for (npy_intp b = 0; b < c; b++) {
+            const int small = least && final[b] < unit[b];
+            scale[b] = small ? 1.0 : larger(work[k * c + b], foot * final[b]) / unit[b];
+        }
         const double level = larger(share * largest_of(0.0, scale, c), floor);
         for (npy_intp b = 0; b < c; b++)
-            scale[b] = larger(scale[b], level);
+            scale[b] = larger(scale[b], level) * unit[b];
         last_coefficients(last, to_legendre, values + k * points * c, used, points, c);
+        tail[k] = 0.0;
         for (npy_intp j = 0; j < used; j++) {
             for (npy_intp b = 0; b < c; b++)
                 last[j * c + b] /= scale[b];
-            worst[k * used + j] = largest_of(worst[k * used + j], last + j * c, c);
+            const double most = largest_of(0.0, last + j * c, c);
+            const double power = points / (double)(points - used + j);
+            tail[k] = larger(tail[k], most < 1.0 ? pow(most, power) : most != most ? most : 1.0);
         }
     }
 }
 
-/* Values of one kind, to_legendre, `used`, foot, share, floor -> the largest last Legendre
-   coefficients of each element relative to the components' sizes so far. */
+/* Values of one kind, to_legendre, `used`, foot, share, floor, least sizes or None -> the tail of
+   each element relative to the components' sizes so far. */
 static Outcome tails(Call *call)
 {
     const npy_intp K = SIZE(K), t = SIZE(t), c = SIZE(c), used = SIZE(u);
-    if (used > t)
+    if (used >= t)
         return refused("Legendre coefficients", used);
-    double *work = scratch(call, (K + 1 + used) * c);
+    double *work = scratch(call, (K + 2 + used) * c);
     if (work == NULL)
         return ERROR;
-    memset(call->out[0], 0, K * used * sizeof(double));
+    memset(call->out[0], 0, K * sizeof(double));
     if (K > 0 && c > 0)
         tails_of_kind(call->out[0], call->in[1] + (t - used) * t, used, K, t, call->in[0], c,
-                      larger(call->number[5], DBL_MIN), call->number[3], call->number[4], work);
+                      call->in[6], larger(call->number[5], DBL_MIN), call->number[3],
+                      call->number[4], work);
     return DONE;
 }
 
@@ -175,7 +186,7 @@ static Outcome low_pass(Call *call)
 }
 
 const Kernel signal_kernels[] = {
-    {"tails", "Ktc tt %u # # #", "Ku", tails},
+    {"tails", "Ktc tt %u # # # |c", "K", tails},
     {"interpolation", "K+ t t N N #", "@N Nt", interpolation},
     {"sample", "@N Nt Ktc", "Nc", sample},
     {"low_pass", "ss K Ks+c c c", "Ks+c", low_pass},

@@ -11,12 +11,14 @@ _TINY = float(np.finfo(float).tiny)
 
 
 def tails(
-    values: Array, to_legendre: Array, used: int, foot: float, share: float, floor: float
+    values: Array, to_legendre: Array, used: int, foot: float, share: float, floor: float,
+    least: Array | None,
 ) -> Array:
-    """The last Legendre coefficients (K, used) of each element, the largest of all signals.
+    """What each element's polynomial leaves out (K,), as its last Legendre coefficients say.
 
-    Relative to the largest value of each component so far, which is floored at ``foot`` times its
-    final one, ``share`` of the largest component, and ``floor``.
+    A coefficient of degree j < s + 1 is taken relative to the largest value of its component so
+    far, which is floored at ``foot`` times its final one, ``share`` of the largest component, and
+    ``floor``; ρ^j predicts ρ^(s + 1), and the largest prediction of all components counts.
 
     Args:
         values: of signals of one kind at the points (K, s + 1, c).
@@ -25,14 +27,24 @@ def tails(
         foot: of a component's final size.
         share: of the largest component's size.
         floor: size below which a signal is rounding.
+        least: components count as at least that large (c,), and are compared in units of their
+            size; None: as they are.
     """
     if not values.size:
-        return np.zeros((len(values), used))
+        return np.zeros(len(values))
     size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
-    size = np.maximum(size, foot * size[-1])
+    final = size[-1]
+    size = np.maximum(size, foot * final)
+    unit = np.ones_like(final)
+    if least is not None:
+        unit = np.maximum(np.maximum(final, least), _TINY)
+        size = np.where(final < unit, 1.0, size / unit)
     size = np.maximum(size, np.maximum(share * size.max(axis=1, keepdims=True), max(floor, _TINY)))
-    last = np.abs(np.matmul(to_legendre[len(to_legendre) - used :], values))
-    return np.asarray((last / size[:, None]).max(axis=2))
+    points = len(to_legendre)
+    last = np.abs(np.matmul(to_legendre[points - used :], values))
+    worst = (last / (size * unit)[:, None]).max(axis=2)
+    powers = points / np.arange(points - used, points)
+    return np.asarray((np.minimum(worst, 1.0) ** powers).max(axis=1, initial=0.0))
 
 
 def interpolation(

@@ -50,6 +50,11 @@ class Coefficients(NamedTuple):
         return self._replace(u=u)
 
 
+def distinct(matrix: Array) -> Array:
+    """Taylor coefficients (K + 1, N, …) at one time, where they are the same at all."""
+    return matrix[:, :1] if matrix.strides[1] == 0 else matrix
+
+
 class CoefficientSource(Protocol):
     """Where the matrices of a model come from: text (``plant.py``), arrays, or Python functions."""
 

@@ -29,8 +29,8 @@ from gpebo_cli.kernels import elements
 from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import estimated_errors, least_sizes
-from gpebo_cli.numerics.linalg import inverse_or_none
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, at_least, unresolved_kinds
+from gpebo_cli.numerics.linalg import inverse_or_none, joined
+from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, unresolved_kinds
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
@@ -161,8 +161,8 @@ def unresolved_signals(
     ``made_of`` (n, columns).
     """
     size, points, n, columns = values.shape
-    seen = at_least(values, least_sizes(problem, made_of, tol))
-    kinds = [(seen.reshape(size, points, n * columns), 0.0)]
+    least = least_sizes(problem, made_of, tol).reshape(n * columns)
+    kinds: list[Kind] = [(values.reshape(size, points, n * columns), least)]
     if problem.monitor is not None:
         kinds += problem.monitor(values, extras)
     return unresolved_kinds(kinds, mesh.rule)
@@ -287,18 +287,14 @@ def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
     f that move. Shape (k, n, n + columns); zero where E is not invertible.
     """
     k, s = len(h), t.shape[1] - 1
-    length, late = h[:, None, None], np.abs(t[:, -1, None, None])
-    terms = []
-    for values in (c.A, c.f):
-        apart = at_points(values, k, s)
-        terms.append(length * np.abs(apart).max(axis=1))
-        if len(values) > 1:
-            terms[-1] = terms[-1] + late * np.ptp(apart, axis=1)
-    found = np.concatenate(terms, axis=2)
+    apart = at_points(joined(c.A, c.f, axis=2), k, s)
+    high, low = apart.max(axis=1), apart.min(axis=1)
+    found = h[:, None, None] * np.maximum(high, -low)
+    found += np.abs(t[:, -1, None, None]) * (high - low)
     if c.constraints is not None:
         return np.asarray(np.abs(at_points(c.constraints.basis, k, s)).max(axis=1) @ found)
     if c.E is None:
-        return found
+        return np.asarray(found)
     inverse, singular = inverse_or_none(at_points(c.E, k, s)[:, -1])
     inverse[singular] = 0.0
     return np.asarray(np.abs(inverse) @ found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from itertools import pairwise
 from math import prod
 
@@ -31,6 +31,10 @@ _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
 _JOINED = (8, 4, 2)  # as many elements become one
 _MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
 _TINY = float(np.finfo(np.float64).tiny)
+
+
+# Point values (K, s + 1, c) of signals of one kind, and what is small among them: ``unresolved``.
+Kind = tuple[Array, float | Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +108,7 @@ class Mesh:
         bounds = [0, *sorted(inner - {0, self.size}), self.size]
         if len(bounds) > _MANY_PIECES + 1:
             return self
-        scale = _scale_so_far(values, counts, np.full(len(counts), _TINY))
+        allowed = tol * _scale_so_far(values, counts)[:, None]
         stays = np.ones(self.size + 1, dtype=bool)
         free = np.ones(self.size, dtype=bool)
         for count in _JOINED:
@@ -112,12 +116,14 @@ class Mesh:
                 [np.arange(a, b - count + 1, count) for a, b in pairwise(bounds)]
             )
             first = first[free[first] & (count * self.steps[first] <= longest)]
+            if not len(first):
+                continue
             together = first[:, None] + np.arange(count)
             there, back = joining(self.rule, count)
             seen = values[together].reshape(len(first), len(back), values.shape[2])
             change = np.abs(back @ (there @ seen) - seen)
             change = change.reshape(*together.shape, len(there), values.shape[2])
-            fits = (change <= tol * scale[together, None]).all(axis=(1, 2, 3))
+            fits = (change <= allowed[together]).all(axis=(1, 2, 3))
             stays[together[fits, 1:]] = False
             free[together[fits]] = False
         return self if stays.all() else Mesh(self.edges[stays], self.rule)
@@ -286,54 +292,37 @@ def _flat(values: Array) -> Array:
     return values.reshape(values.shape[0], values.shape[1], prod(values.shape[2:]))
 
 
-def unresolved(values: Array, rule: RadauRule, floor: float = 0.0) -> Array:
-    """:func:`unresolved_kinds` of signals of one kind, values (K, s + 1, …); shape (K,)."""
-    return unresolved_kinds([(values, floor)], rule)
-
-
-def unresolved_kinds(kinds: Sequence[tuple[Array, float]], rule: RadauRule) -> Array:
-    """How far each element is from resolving its signals, relative to the signals' own size.
+def unresolved(values: Array, rule: RadauRule, floor: float | Array = 0.0) -> Array:
+    """How far each element is from resolving signals of one kind, relative to their own size.
 
     The first Legendre coefficient that an element leaves out (see :func:`legendre_tail`) against
     the largest value of that component so far: in a system that grows, what is an invisible error
     beside the end of the horizon is what the end is made of.
 
     Args:
-        kinds: point values (K, s + 1, c) of signals of one kind each, and the size below which a
-            signal of that kind is rounding, see :func:`signal_scale`.
+        values: at the points (K, s + 1, c).
         rule: the mesh's rule.
+        floor: size below which a signal of this kind is rounding, see :func:`signal_scale`; or
+            sizes (c,) that the components count as having where they are smaller: then all of them
+            are compared in units of their own size.
 
     Returns:
         shape (K,).
     """
-    used = used_coefficients(rule)
-    worst = np.zeros((len(kinds[0][0]), used))
-    for values, floor in kinds:
-        found = signals.tails(values, rule.to_legendre, used, _FOOT, SHARE, floor)
-        np.maximum(worst, found, out=worst)
-    # Powers are monotone: the worst component of each degree first, then its power.
-    return np.asarray((np.minimum(worst, 1.0) ** _to_next(rule)).max(axis=1, initial=0.0))
+    least, level = (floor, 0.0) if isinstance(floor, np.ndarray) else (None, floor)
+    return signals.tails(
+        values, rule.to_legendre, used_coefficients(rule), _FOOT, SHARE, level, least
+    )
 
 
-def at_least(values: Array, level: Array | float) -> Array:
-    """Signals (K, s + 1, …) that count as being of the size ``level`` (…) where they are smaller.
-
-    What is smaller gets a constant added: that changes no coefficient that a tail is read from.
-    """
-    size = np.abs(values).max(axis=(0, 1))
-    level = np.maximum(level, _TINY)
-    return np.asarray(values / np.maximum(size, level) + (size < level))
+def unresolved_kinds(kinds: Sequence[Kind], rule: RadauRule) -> Array:
+    """:func:`unresolved` of signals of several kinds (values, floor), the worst; shape (K,)."""
+    return np.asarray(reduce(np.maximum, [unresolved(kind[0], rule, kind[1]) for kind in kinds]))
 
 
 def used_coefficients(rule: RadauRule) -> int:
     """How many of the last Legendre coefficients predict the next one."""
     return min(_COEFFICIENTS, rule.stages - 1)
-
-
-def _to_next(rule: RadauRule) -> Array:
-    """(ρ^j)^this = ρ^(s + 1) for the degrees j that are used."""
-    s = rule.stages
-    return (s + 1.0) / np.arange(s + 1 - used_coefficients(rule), s + 1)
 
 
 def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
@@ -346,11 +335,13 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     # Of degrees s + 1 − used … s:
     last = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
-    predicted = size * np.minimum(last / size, 1.0) ** _to_next(rule)[:, None]
+    s, used = rule.stages, len(last[0])
+    to_next = (s + 1.0) / np.arange(s + 1 - used, s + 1)  # (ρ^j)^this = ρ^(s + 1)
+    predicted = size * np.minimum(last / size, 1.0) ** to_next[:, None]
     return np.asarray(predicted.max(axis=1))
 
 
-def _scale_so_far(values: Array, counts: IntArray, floors: Array) -> Array:
+def _scale_so_far(values: Array, counts: IntArray) -> Array:
     """Size of each component up to each element, (K, c), floored as in :func:`signal_scale`.
 
     Also floored at a share of the final size, so that the foot of a pulse costs nothing. Components
@@ -358,9 +349,8 @@ def _scale_so_far(values: Array, counts: IntArray, floors: Array) -> Array:
     """
     size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
     size = np.maximum(size, _FOOT * size[-1])
-    largest = np.maximum.reduceat(size, np.cumsum(counts) - counts, axis=1)
-    level = np.maximum(SHARE * largest, floors)
-    return np.asarray(np.maximum(size, np.repeat(level, counts, axis=1)))
+    level = SHARE * np.maximum.reduceat(size, np.cumsum(counts) - counts, axis=1)
+    return np.asarray(np.maximum(size, np.repeat(np.maximum(level, _TINY), counts, axis=1)))
 
 
 def signal_scale(values: Array, floor: float = 0.0) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -30,7 +30,7 @@ class LinearEquation(NamedTuple):
 
 
 # (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind
-Monitor = Callable[[Array, tuple[Array, ...]], list[tuple[Array, float]]]
+Monitor = Callable[[Array, tuple[Array, ...]], Sequence[tuple[Array, float | Array]]]
 
 
 class Renewal(Protocol):
@@ -52,7 +52,8 @@ class LinearProblem:
     ``coefficients(t, inside)`` evaluates E, A, f at times of shape (N,); functions that jump are
     decided at ``inside``. It is called once for each element, at all of its points.
     ``monitor`` returns further signals computed from the solution, grouped by kind: (point values
-    (K, s + 1, c), size below which that kind is rounding).
+    (K, s + 1, c), size below which that kind is rounding, or one for each (c,), see
+    :func:`gpebo_cli.numerics.mesh.unresolved`).
     """
 
     coefficients: Callable[[Array, Array], LinearEquation]

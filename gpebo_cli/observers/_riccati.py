@@ -33,7 +33,7 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, Monitor
 
 _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
@@ -108,7 +108,7 @@ class _Restart:
         return out
 
 
-def _in_front(lost: BoolArray, found: list[tuple[Array, float]]) -> list[tuple[Array, float]]:
+def _in_front(lost: BoolArray, found: list[Kind]) -> list[Kind]:
     """The signals to resolve where elements that lose conditioning have to be cut first.
 
     What comes after such an element is rounding, and would be cut without end: it is left alone
@@ -204,13 +204,14 @@ def run_filter(
         H, f = hamiltonian(scaled)
         return LinearEquation(None, H, f, extras)
 
-    def signals(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+    def signals(values: Array, extras: tuple[Array, ...]) -> list[Kind]:
         P, estimate = quotient(values)
         d = np.sqrt(np.maximum(np.einsum("kjii->kji", P).max(axis=1), 0.0)) / unit  # (K, n)
         d = unit * np.maximum(d, _SMALLEST * d.max(axis=1, initial=1e-100, keepdims=True))
         own = P / (d[:, None, :, None] * d[:, None, None, :])
-        found = [(own.reshape(*own.shape[:2], -1), 0.0),
-                 (estimate.reshape(*estimate.shape[:2], -1), 0.0)]
+        found: list[Kind] = [
+            (own.reshape(*own.shape[:2], -1), 0.0), (estimate.reshape(*estimate.shape[:2], -1), 0.0)
+        ]
         if monitor is not None:
             found += monitor(estimate, extras)
         n = P.shape[-1]

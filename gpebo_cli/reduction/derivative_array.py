@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.kernels.structure_numpy import forcing as kernel_forcing
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, distinct
 
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 
@@ -50,7 +50,7 @@ def balance(c: Coefficients) -> Scaling:
     state or the time by a number changes its factor alone.
     """
     n = c.E.shape[2]
-    sizes = np.array([np.abs(c.E[0]).max(axis=0), np.abs(c.A[0]).max(axis=0)])
+    sizes = np.array([np.abs(distinct(matrix)[0]).max(axis=0) for matrix in (c.E, c.A)])
     there = sizes > 0.0
     while True:
         kind, i, j = there.nonzero()

@@ -14,7 +14,7 @@ from gpebo_cli.kernels.structure_numpy import (
     in_own_states,
     scaled,
 )
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, distinct
 from gpebo_cli.numerics.linalg import inverse_or_none, joined, transpose
 from gpebo_cli.reduction.derivative_array import forcing, who
 from gpebo_cli.reduction.structure import RESIDUAL, Structure
@@ -43,7 +43,7 @@ class StrangenessFree:
     amplification: Array  # (n, n + 1)
     E: Array  # (N or 1, n, n) the model's own
     u: Array  # (N, m) the inputs and
-    C: Array  # (N, r, n) the output matrix at the same times
+    C: Array  # (N or 1, r, n) the output matrix at the same times
     direct: Array | None  # (N, r) D u + H θ, what the state has no part in; None: nothing
 
 
@@ -88,7 +88,7 @@ def strangeness_free_form(
     none = not structure.a
     return StrangenessFree(
         E1, A1, f1, A2, f2, None if none else basis, None if none else offset, amplification,
-        E[0], c.u[0], c.C[0], direct,
+        E[0], c.u[0], distinct(c.C)[0], direct,
     )
 
 

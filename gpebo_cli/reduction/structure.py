@@ -13,7 +13,13 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.kernels.structure_numpy import relative_singular_values
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
+from gpebo_cli.model.descriptor import (
+    Array,
+    Coefficients,
+    DescriptorSystem,
+    IntArray,
+    distinct,
+)
 from gpebo_cli.numerics.linalg import frobenius_norm
 from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, initial_edges
 from gpebo_cli.reduction.derivative_array import Scaling, balance, who
@@ -158,7 +164,7 @@ def _refuse_overflow(
     """
     with np.errstate(all="ignore"):
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
-        finite = all(np.isfinite(matrix * weight).all() for matrix in (c.E, c.A))
+        finite = all(np.isfinite(distinct(matrix) * weight).all() for matrix in (c.E, c.A))
     if not finite:
         raise ModelError(
             f"{who(system)}: E and A change by more powers of ten than numbers hold; shorten "

@@ -17,6 +17,7 @@ from gpebo_cli.model.descriptor import (
     Coefficients,
     DescriptorSystem,
     IntArray,
+    distinct,
 )
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import least_sizes
@@ -24,9 +25,9 @@ from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.numerics.mesh import (
     FIRST_ELEMENTS,
     SHARE,
+    Kind,
     Mesh,
     Trajectory,
-    at_least,
     initial_mesh,
     unresolved,
 )
@@ -136,7 +137,9 @@ def _simulate_linear(
     edges = system.coefficients.resolved(mesh.edges)
     if edges is not None:
         mesh = Mesh(edges, mesh.rule)
-    mesh, c = _known_resolved(system, structure, mesh, cuts, solver, bounded=edges is not None)
+    mesh, c, terms = _known_resolved(
+        system, structure, mesh, cuts, solver, bounded=edges is not None
+    )
     first = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
     if solver.name == "ivp":
         inside = float(mesh.inside[0, 0])
@@ -153,20 +156,19 @@ def _simulate_linear(
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         return _equations(strangeness_free_form(system, structure, t, inside))
 
-    def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+    def monitor(values: Array, extras: tuple[Array, ...]) -> list[Kind]:
         u, C, *direct = extras
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
         y = _outputs(C, values[..., 0], *direct)
         size = np.abs(values[..., 0]).max(axis=(0, 1))
         least = np.abs(C).max(axis=(0, 1)) @ least_sizes(problem, size[:, None], solver.tol)[:, 0]
-        return [(at_least(u, SHARE * terms(size)), 0.0), (at_least(y, least), 0.0)]
+        return [(u, SHARE * terms(size)), (y, least)]
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
     floor = SHARE * np.abs(system.initial_state)
     if first.basis is not None:
         floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
-    terms = _beside_inputs(c)
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
         _amplification(first, float(mesh.steps.max())), apart=True,
@@ -197,8 +199,8 @@ def _simulate_linear(
 def _known_resolved(
     system: DescriptorSystem, structure: Structure, mesh: Mesh, cuts: Array,
     solver: SolverSettings, *, bounded: bool,
-) -> tuple[Mesh, Coefficients]:
-    """The mesh that the known functions ask for, and all of them at its points.
+) -> tuple[Mesh, Coefficients, Callable[[Array], Array]]:
+    """The mesh that the known functions ask for, all of them there, and :func:`_beside_inputs`.
 
     Where bounds do not already say that nothing narrow hides between the nodes, it is looked for.
     Elements are cut until the inputs are resolved, as far as cutting helps: the solution's mesh
@@ -214,8 +216,9 @@ def _known_resolved(
     if solver.name != "ivp" and mesh.steps.max() > longest:
         mesh = _growth_resolved(system, structure, mesh, solver)
     c = evaluated(mesh)
+    terms = _beside_inputs(c)
     if solver.name == "ivp":
-        return mesh, c
+        return mesh, c, terms
     given = mesh
     for _ in range(0 if bounded else _LOOK_ROUNDS):
         overlooked = _overlooked(system, c, mesh, solver.tol)
@@ -224,10 +227,10 @@ def _known_resolved(
         mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
         c = evaluated(mesh)
     before: Array | float = np.inf
-    beside = _beside_inputs(c)(np.abs(system.initial_state))
+    beside = terms(np.abs(system.initial_state))
     while system.m and "u" not in system.coefficients.constant:
         u = c.u[0].reshape(*mesh.points.shape, -1)
-        tail = unresolved(at_least(u, SHARE * beside), mesh.rule)
+        tail = unresolved(u, mesh.rule, SHARE * beside)
         if tail.max() <= solver.tol:
             break
         poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
@@ -238,13 +241,11 @@ def _known_resolved(
         before = np.repeat(tail, parts)
         mesh, _ = mesh.split(parts)
         c = evaluated(mesh)
-    if mesh is not given or not structure.steady:
-        return mesh, c
-    if 2.0 * float(mesh.steps.min()) > longest:
-        return mesh, c
+    if mesh is not given or not structure.steady or 2.0 * float(mesh.steps.min()) > longest:
+        return mesh, c, terms
     values, counts = _known_kinds(system, c, mesh)
     joined = mesh.joined(values, counts, _MARGIN * solver.tol, cuts, longest)
-    return (mesh, c) if joined is mesh else (joined, evaluated(joined))
+    return joined, c if joined is mesh else evaluated(joined), terms
 
 
 def _overlooked(
@@ -343,22 +344,27 @@ def _known_kinds(
     Reciprocals of what E holds are among them: the state sees those, and they may be harder to
     resolve by far.
     """
-    names = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
-    kinds: list[Array] = []
-    for name in names:
-        values = getattr(c, name)
-        if not values[0].size:
-            continue
-        flat = values.reshape(len(values), *mesh.points.shape, -1)
-        size = np.abs(flat[0])
-        moving = np.ptp(flat[0], axis=(0, 1)) > 0.0
-        kinds += list(flat[..., moving])
-        if name == "E":
-            away = moving & (size.min(axis=(0, 1)) > _NEAR_ZERO * size.max(axis=(0, 1)))
-            kinds.append(1.0 / flat[0][..., away])
-    kinds = [kind for kind in kinds if kind.shape[2]]
-    values = np.concatenate([np.zeros((*mesh.points.shape, 0)), *kinds], axis=2)
-    return values, np.array([kind.shape[2] for kind in kinds], dtype=np.intp)
+    parts = [
+        getattr(c, name).reshape(len(c.E), c.E.shape[1], -1)
+        for name in MATRIX_NAMES if name not in system.coefficients.constant
+    ]
+    parts = [part for part in parts if part.shape[2]]
+    if not parts:
+        return np.zeros((*mesh.points.shape, 0)), np.zeros(0, dtype=np.intp)
+    whole = np.concatenate(parts, axis=2)
+    high, low = whole[0].max(axis=0), whole[0].min(axis=0)
+    moving = high > low
+    kinds = list(whole[:, :, moving])
+    counts = np.add.reduceat(moving, np.cumsum([0, *(part.shape[2] for part in parts[:-1])]))
+    counts = np.tile(counts[counts > 0], len(kinds))
+    if "E" not in system.coefficients.constant:
+        first = slice(parts[0].shape[2])
+        size = np.abs([high[first], low[first]])
+        away = (size.min(axis=0) > _NEAR_ZERO * size.max(axis=0)) & (high[first] * low[first] > 0.0)
+        kinds.append(1.0 / parts[0][0][:, moving[first] & away])
+        counts = np.append(counts, kinds[-1].shape[1])
+    values = np.concatenate(kinds, axis=1).reshape(*mesh.points.shape, -1)
+    return values, counts[counts > 0]
 
 
 def _amplification(form: StrangenessFree, step: float) -> Array:
@@ -423,12 +429,12 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
 
     An input whose share of every equation is rounding of the others' is rounding itself.
     """
-    A, B = np.abs(c.A[0]).max(axis=0), np.abs(c.B[0]).max(axis=0)
+    A, B = (np.abs(distinct(matrix)[0]).max(axis=0) for matrix in (c.A, c.B))
 
     def terms(size: Array) -> Array:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.where(B > 0.0, (A @ size)[:, None] / B, np.inf)
-        least = shares.min(axis=0, initial=np.inf)
+        none = np.full_like(B, np.inf)
+        least = np.divide((A @ size)[:, None], B, out=none, where=B > 0.0)
+        least = least.min(axis=0, initial=np.inf)
         return np.where(np.isfinite(least), least, 0.0)
 
     return terms
@@ -436,6 +442,8 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
 
 def _outputs(C: Array, x: Array, direct: Array | float = 0.0) -> Array:
     """y = C x + direct at points (K, s + 1)."""
+    if C.shape[:2] == (1, 1):
+        return np.asarray(x @ C[0, 0].T + direct)
     return np.asarray(np.matmul(C, x[..., None])[..., 0] + direct)
 
 
