@@ -98,11 +98,11 @@ def environment() -> dict[str, str]:
     }
 
 
-def gpebo(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """One command."""
+def gpebo(*words: object, cwd: Path, text: str = "") -> subprocess.CompletedProcess[str]:
+    """One command with ``text`` as its standard input."""
     return subprocess.run(
         ["gpebo", *map(str, words)], cwd=cwd, env=environment(), capture_output=True, text=True,
-        check=False, timeout=300, stdin=subprocess.DEVNULL,
+        check=False, timeout=300, input=text,
     )
 
 

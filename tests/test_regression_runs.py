@@ -9,7 +9,9 @@ import pytest
 import yaml
 from examples import gpebo
 
-from gpebo_cli import ConfigError, run
+from gpebo_cli import ConfigError, check, run
+from gpebo_cli.regression.text import regression_from_mapping
+from gpebo_cli.regression.text_at_samples import advance
 
 SINE = {"name": "sine", "unknowns": {"a": 2.0, "b": -1.0}, "signals": {"s": "sin(t)"}}
 
@@ -77,3 +79,81 @@ def test_mistakes_name_the_file(tmp_path):
     assert "lp takes two arguments" in done.stderr
     with pytest.raises(ConfigError, match="stands in place of a plant"):
         run("circuit", regression=SINE)
+
+
+OPERATORS = {
+    "name": "operators",
+    "unknowns": {"a": 2.0, "b": -1.0, "c": 0.5, "k": 1.5},
+    "signals": {"s": "sin(3*t) + 0.5*cos(t)"},
+    "psi": [["lp(s, 2)", "hp(s, 0.7)", "integral(s*s)", "delay(lp(s, 1), 0.35)"]],
+}
+
+
+@pytest.mark.parametrize(("hold", "order"), [("zoh", 1), ("linear", 2)])
+def test_at_samples_operators_are_those_of_the_held_signals(hold, order):
+    exact = run(regression=OPERATORS, estimator="least_squares", time={"horizon": 6})
+    error = []
+    for step in (0.05, 0.025, 0.0125):
+        found = run(
+            regression=OPERATORS, estimator="least_squares", time={"horizon": 6},
+            observer={"sample_time": step, "hold": hold},
+        )
+        r, true = found.details.regression, exact.details.regression
+        psi = np.array([np.interp(r.t, true.t, true.psi[:, 0, j]) for j in range(4)])
+        error.append(np.abs(r.psi[:, 0] - psi.T)[-1].max())
+    assert np.log2(error[0] / error[1]) == pytest.approx(order, abs=0.35)
+    assert np.log2(error[1] / error[2]) == pytest.approx(order, abs=0.35)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_samples_may_come_in_any_pieces(hold):
+    text = regression_from_mapping({**OPERATORS, "signals": {"s": None}})
+    t = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, 80))
+    s = np.sin(3 * t)[:, None]
+    Y = np.cos(t)[:, None]
+    _, whole, scale = advance(text, hold, None, t, s, Y)
+    state, rows = None, []
+    for part in (slice(0, 1), slice(1, 2), slice(2, 30), slice(30, 31), slice(31, 80)):
+        state, piece, upto = advance(text, hold, state, t[part], s[part], Y[part])
+        rows.append(piece.rows[1:])
+        np.testing.assert_allclose(upto, scale[part], rtol=1e-12)
+    np.testing.assert_allclose(np.concatenate(rows), whole.rows[1:], rtol=1e-12, atol=1e-14)
+
+
+def test_a_stream_is_the_file_at_its_samples(tmp_path):
+    t = 0.02 * np.arange(400)
+    given = {**OPERATORS, "signals": {"s": None, "y": None}, "unknowns": {"a": 2.0, "b": -1.0},
+             "Y": ["2*lp(y, 1) - lp(s, 2)"], "psi": [["lp(y, 1)", "lp(s, 2)"]]}
+    write(tmp_path, given)
+    rows = np.column_stack([t, np.sin(3 * t), np.cos(t)])
+    np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header="t,s,y", comments="", fmt="%.17g")
+    done = gpebo(
+        "run", "--config-dir", ".", "regression=operators", "data.file=-", "data.hold=linear",
+        "estimator=least_squares", cwd=tmp_path, text=(tmp_path / "r.csv").read_text(),
+    )
+    assert done.returncode == 0, done.stderr
+    last = list(csv.DictReader(done.stdout.splitlines()))[-1]
+    assert float(last["a_hat"]) == pytest.approx(2.0, abs=1e-4)
+    assert float(last["b_hat"]) == pytest.approx(-1.0, abs=1e-4)
+    assert "400 rows" in done.stderr
+
+
+def test_deviations_of_known_noise_of_y_are_those_of_many_seeds():
+    noise = {"name": "gaussian", "outputs": 0.1, "sample_time": 0.05, "seeds": 400}
+    found = run(
+        regression={**SINE, "psi": [["s", 1]]}, estimator="least_squares", time={"horizon": 10},
+        noise=noise,
+    ).details
+    stated = found.estimation.parameters_std[0, -1]
+    np.testing.assert_allclose(found.noise.deviation[0], stated, rtol=0.12)
+
+
+def test_arrays_by_name_and_what_can_be_checked():
+    t = np.linspace(0.0, 10.0, 1001)
+    measured = {**SINE, "signals": {"s": None, "y": None}, "Y": ["y"], "psi": [["s", 1]]}
+    arrays = {"t": t, "s": np.sin(t), "y": 2 * np.sin(t) - 1}
+    found = run(regression=measured, data=arrays, estimator="ls_drem")
+    assert found.estimates["a"][0, -1] == pytest.approx(2.0, abs=1e-9)
+    assert all(a.holds for a in check(regression=measured, data=arrays))
+    constant = {**SINE, "signals": {"s": "1"}, "psi": [["s", 1]]}
+    assert [a.name for a in check(regression=constant) if not a.holds] == ["Assumption 2"]

@@ -66,9 +66,9 @@ def run(
         solver: a name, or a mapping such as ``{"tol": 1e-9}``.
         noise: a name, or a mapping such as ``{"name": "gaussian", "outputs": 0.01, "seed": 1}``.
         data: a recording: the path of a file (CSV, Parquet, MAT), a ``pandas.DataFrame`` with
-            columns ``t`` and those of the signals, or a mapping with a ``file`` or ``frame`` and
-            how to read it (``hold``, ``columns``, ``scale``, ``time_unit``, …); by default the
-            plant is simulated.
+            columns ``t`` and those of the signals, a mapping of such arrays (N,), or one with a
+            ``file`` or ``frame`` and how to read it (``hold``, ``columns``, ``scale``,
+            ``time_unit``, …); by default the plant is simulated.
         time: ``start`` and ``horizon`` in seconds, ``samples`` of the output grid.
         excitation: ``rho`` and ``window`` (seconds) of the evidence.
         config_dir: a folder of yours, with ``plant/NAME.yaml``, ``estimator/NAME.yaml``, …
@@ -89,10 +89,7 @@ def run(
         >>> bool(abs(result.errors["il"][1, -1]) < 1e-6)
         True
     """
-    if regression is not None:
-        if plant is not None or observer is not None:
-            raise ConfigError("run: a regression stands in place of a plant and an observer")
-        plant, observer = _regression(regression, config_dir), "regression"
+    plant, observer = _observed(plant, observer, regression, config_dir)
     own = None if estimator is None or isinstance(estimator, str | Mapping) else _own(estimator)
     sections: dict[str, object] = {
         "observer": observer, "estimator": None if own else estimator, "solver": solver,
@@ -113,6 +110,7 @@ def run(
 def check(
     plant: Plant | None = None,
     *,
+    regression: Plant | None = None,
     observer: Choice | None = None,
     solver: Choice | None = None,
     noise: Choice | None = None,
@@ -125,6 +123,7 @@ def check(
 
     Args:
         plant: as in :func:`run`; the other arguments, too.
+        regression: in place of a plant and an observer.
         observer: a name or a mapping.
         solver: a name or a mapping.
         noise: a name or a mapping.
@@ -142,6 +141,7 @@ def check(
         >>> [a.name for a in check("circuit", observer={"regression": "paper"}) if not a.holds]
         ['Assumption 2']
     """
+    plant, observer = _observed(plant, observer, regression, config_dir)
     sections: dict[str, object] = {
         "observer": observer, "estimator": None, "solver": solver, "noise": noise,
         "data": _recording(data), "time": time, "excitation": excitation,
@@ -150,11 +150,25 @@ def check(
     return assumptions.check(settings, system)
 
 
-def _regression(given: Plant, config_dir: Folder | None) -> Plant:
-    """The content of a regression's file."""
-    if isinstance(given, DescriptorSystem):
-        raise ConfigError("run: regression takes a name, a path or a mapping")
-    return choose("regression", given, config_dir)[0]
+def _observed(
+    plant: Plant | None, observer: Choice | None, regression: Plant | None,
+    config_dir: Folder | None,
+) -> tuple[Plant | None, Choice | None]:
+    """The plant and the observer, or the regression that stands in place of both.
+
+    Raises:
+        ConfigError: both are given, or the regression is none.
+    """
+    if regression is None:
+        return plant, observer
+    named = isinstance(observer, str) or (isinstance(observer, Mapping) and "name" in observer)
+    if plant is not None or named:
+        raise ConfigError("a regression stands in place of a plant and an observer")
+    if isinstance(regression, DescriptorSystem):
+        raise ConfigError("regression takes a name, a path or a mapping")
+    settings = observer if isinstance(observer, Mapping) else {}
+    content = choose("regression", regression, config_dir)[0]
+    return content, {"name": "regression", **settings}
 
 
 def load_plant(plant: Plant, config_dir: Folder | None = None) -> DescriptorSystem:
@@ -239,8 +253,12 @@ def _configure(
 
 
 def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
-    """``data`` as the group has it: a path, a frame, or a mapping with one is a recording."""
+    """``data`` as the group has it: a path, a frame, arrays by name, or a mapping with one."""
     if isinstance(data, Mapping):
+        if "t" in data:
+            from pandas import DataFrame  # a third of a second to import
+
+            return {"name": "csv", "frame": DataFrame(dict(data))}
         return {"name": "csv", **data}
     if data is None or (isinstance(data, str) and data == "none"):
         return data

@@ -17,9 +17,7 @@ from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
 from gpebo_cli.experiment.result import Fit
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.observers._observation import InitialError
-from gpebo_cli.observers.reduced.extension import form_used
-from gpebo_cli.observers.reduced.sampled import TOLERANCE, SampledState
+from gpebo_cli.observers.reduced.sampled import TOLERANCE
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 
@@ -98,7 +96,7 @@ class Online:
         self._tol = max(settings.solver.tol, TOLERANCE)
         self._rho = settings.excitation.rho
         self.start = start
-        self._state: SampledState | None = None
+        self._state: observers.Reached | None = None
         self._root = np.zeros((len(self.parameters) + 1,) * 2)  # S of all data
         self._final = np.zeros((len(self.cases), len(self.parameters)))
         # When parameters could first be told apart, and when well.
@@ -138,14 +136,13 @@ class Online:
             eigenvalues, known, known.states(block.gain), block.extension,
         )
 
-    def truth(self, extension: Array) -> InitialError:
+    def truth(self, extension: Array) -> observers.Truth:
         """What the parameters really are at samples, for those who know the states.
 
         Args:
             extension: [ξ_a | ξ_b | Φ] at the samples it will be asked about, (K, n_w, 1 + q + n_a).
         """
-        o = self._observer
-        return InitialError(o.initial_basis, o.xi_a0, o.basis, lambda _t: extension)
+        return self._observer.truth(extension)
 
     @property
     def requirement(self) -> Requirement:
@@ -153,15 +150,15 @@ class Online:
         return self._recursion.requirement
 
     @property
-    def growth(self) -> float:
-        """Largest entry of Φ so far."""
+    def growth(self) -> float | None:
+        """Largest entry of Φ so far; None: there is no Φ."""
         return self.reached.growth
 
     @property
     def growth_rate(self) -> float | None:
         """In 1/s, the logarithm of the largest entry of Φ over the time so far."""
-        elapsed = self.reached.t - self.start
-        return float(np.log(self.growth)) / elapsed if elapsed > 0 and self.growth > 0 else None
+        elapsed, growth = self.reached.t - self.start, self.growth
+        return float(np.log(growth)) / elapsed if elapsed > 0 and growth else None
 
     @property
     def error_estimate(self) -> float:
@@ -171,17 +168,7 @@ class Online:
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
         """Those of the observer, as far as it got."""
-        return (
-            Assumption(
-                "Rank of E", "rank E(t) is constant", True,
-                {"rank": self._observer.like.split.rank, "states": self._system.n},
-            ),
-            Assumption(
-                "Assumption 1", "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
-                True, {"smallest_singular_value_at_least": self.reached.injectivity,
-                       **form_used(self._observer.form, self._observer.note)},
-            ),
-        )
+        return self._observer.assumptions(self.reached)
 
     def excitation(
         self, made: OnlineEstimates | None = None, shown: IntArray = _NEWEST,
@@ -220,7 +207,7 @@ class Online:
         return Fit(residual, float(np.linalg.norm(root[:, -1]) / np.sqrt(duration)))
 
     @property
-    def reached(self) -> SampledState:
+    def reached(self) -> observers.Reached:
         """Where the observer stands."""
         if self._state is None:
             raise ValueError("there have been no samples")

@@ -19,6 +19,8 @@ from gpebo_cli.observers._base import (
     AtSamples,
     Measurements,
     Observer,
+    Reached,
+    Recursion,
     Sampling,
     SignalNoise,
     initial_extension,
@@ -38,9 +40,9 @@ from gpebo_cli.settings import SolverSettings
 __all__ = [
     "GROUP", "AffineStateMap", "Assumption", "AtSamples", "InitialError", "LinearEquation",
     "LinearProblem", "LinearRegression", "Measurements", "Mesh", "Observation", "Observer",
-    "Sampling", "SignalNoise", "SolverSettings", "StateMap", "Trajectory", "Truth", "able",
-    "build", "initial_extension", "names", "observe", "output_scale", "sampling", "settings_of",
-    "solve",
+    "Reached", "Recursion", "Sampling", "SignalNoise", "SolverSettings", "StateMap", "Trajectory",
+    "Truth", "able", "build", "initial_extension", "names", "observe", "output_scale", "sampling",
+    "settings_of", "solve",
 ]
 
 _OBSERVERS: Registry[Observer] = Registry("observer")

@@ -7,20 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers._observation import Observation
+from gpebo_cli.observers._observation import Observation, Truth
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import SolverSettings
 
 if TYPE_CHECKING:
-    from gpebo_cli.observers.reduced.sampled import SampledObserver
+    from gpebo_cli.observers.reduced.sampled import SampledBlock
 
 ByName = float | Sequence[float] | Mapping[str, float]
 
@@ -91,6 +92,48 @@ class Sampling(NamedTuple):
     hold: str  # what it assumes of u and y in between: zoh or linear
 
 
+class Reached(Protocol):
+    """Where a recursion stands after its last sample."""
+
+    @property
+    def t(self) -> float:
+        """Of that sample."""
+        ...
+
+    @property
+    def growth(self) -> float | None:
+        """Largest entry of Φ so far; None: there is no Φ."""
+        ...
+
+    @property
+    def error_estimate(self) -> float:
+        """Of what is integrated between samples, so far."""
+        ...
+
+
+class Recursion(Protocol):
+    """An observer from one sample to the next; immutable."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Of the regression, p names."""
+        ...
+
+    def advance(
+        self, state: Any, t: Array, u: Array, y: Array
+    ) -> tuple[Reached, SampledBlock]:
+        """Carry ``state`` (None before the first sample) over u (K, m), y (K, r) at t (K,)."""
+        ...
+
+    def assumptions(self, reached: Any) -> tuple[Assumption, ...]:
+        """What was needed so far, with its evidence."""
+        ...
+
+    def truth(self, extension: Array) -> Truth:
+        """What the parameters are, for those who know the states, from a block's extension."""
+        ...
+
+
 @runtime_checkable
 class AtSamples(Observer, Protocol):
     """An observer that can run at samples, as a controller does it."""
@@ -102,7 +145,7 @@ class AtSamples(Observer, Protocol):
     def at_samples(
         self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
         sample: Array,
-    ) -> SampledObserver:
+    ) -> Recursion:
         """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``."""
         ...
 

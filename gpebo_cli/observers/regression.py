@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers._base import Measurements
-from gpebo_cli.observers._observation import AffineStateMap, Observation
+from gpebo_cli.observers._base import Measurements, Sampling
+from gpebo_cli.observers._observation import AffineStateMap, Observation, Truth
+from gpebo_cli.observers.reduced.sampled import SampledBlock
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.text import TextRegression
+from gpebo_cli.regression.text_at_samples import TextState, advance
 from gpebo_cli.settings import SolverSettings
 
 
 @dataclass(frozen=True)
 class Given:
-    """Evaluate Y and ψ along the signals; there is no state to estimate."""
+    """Evaluate Y and ψ along the signals; there is no state to estimate.
+
+    Attributes:
+        sample_time: seconds between samples of a recursion in discrete time; None: continuous.
+        hold: what it assumes between samples.
+    """
+
+    sample_time: float | None = field(default=None, metadata={"positive": True})  # seconds
+    hold: Literal["zoh", "linear"] = "zoh"
 
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
@@ -28,16 +41,14 @@ class Given:
             ConfigError: the system is a plant, or an expression has no finite value at some time.
             SolverError: the tolerance cannot be reached.
         """
-        given = system.regression
-        if not isinstance(given, TextRegression):
-            raise ConfigError(
-                "observer=regression goes with regression=NAME; for a plant choose observer=gpebo"
-            )
+        given = _text_of(system)
         regression, error = given.on(
             signals.inputs, signals.outputs if given.Y is None else None, solver.tol,
             solver.max_elements,
         )
-        points = regression.mesh.points.shape
+        points, errors = regression.mesh.points.shape, None
+        if given.Y is None and (signals.noise is None or not signals.noise.inputs.any()):
+            errors = _errors_of_outputs(system.m, given.rows)
         return Observation(
             regression=regression,
             state_map=AffineStateMap(
@@ -48,7 +59,78 @@ class Given:
             error_estimate=error,
             assumptions=(),
             growth=None,
+            errors=errors,
+            respond=None if errors is None else lambda _u, of_outputs: of_outputs,
         )
+
+
+    def sampling(self) -> Sampling | None:
+        """The samples that ``sample_time`` asks for."""
+        return None if self.sample_time is None else Sampling(self.sample_time, self.hold)
+
+    def at_samples(
+        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,  # noqa: ARG002  protocol
+        sample: Array,  # noqa: ARG002
+    ) -> GivenAtSamples:
+        """The regression's recursion, whose first sample is at ``start``.
+
+        Raises:
+            ConfigError: the system is a plant.
+        """
+        return GivenAtSamples(_text_of(system), hold)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenAtSamples:
+    """A regression's text from one sample to the next."""
+
+    text: TextRegression
+    hold: str
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """η's names."""
+        return self.text.system.unknowns
+
+    def advance(
+        self, state: TextState | None, t: Array, u: Array, y: Array
+    ) -> tuple[TextState, SampledBlock]:
+        """Regression at the samples t (K,) of u (K, m), and y (K, rows) where the text has no Y.
+
+        Raises:
+            ConfigError: an expression without a finite value; names it and the time.
+        """
+        state, regression, scale = advance(self.text, self.hold, state, t, u, y)
+        none = np.zeros((len(t), 0, len(self.parameters)))
+        return state, SampledBlock(regression, none[:, :, 0], none, none, scale)
+
+    def assumptions(self, reached: TextState) -> tuple[Assumption, ...]:  # noqa: ARG002  protocol
+        """None is made."""
+        return ()
+
+    def truth(self, extension: Array) -> Truth:  # noqa: ARG002  protocol
+        """η is θ."""
+        return _constant_truth
+
+
+def _text_of(system: DescriptorSystem) -> TextRegression:
+    given = system.regression
+    if not isinstance(given, TextRegression):
+        raise ConfigError(
+            "observer=regression goes with regression=NAME; for a plant choose observer=gpebo"
+        )
+    return given
+
+
+def _errors_of_outputs(m: int, rows: int) -> ErrorsAt:
+    """Errors of [signals; Y] as a linear system without a state: what they add to Y."""
+
+    def at(t: Array, inside: Array) -> ErrorSystem:  # noqa: ARG001  protocol
+        D = np.concatenate([np.zeros((rows, m)), np.eye(rows)], axis=1)[None]
+        none = np.zeros((1, 0, 0))
+        return ErrorSystem(none, np.zeros((1, 0, m + rows)), np.zeros((1, rows, 0)), D)
+
+    return at
 
 
 def _constant_truth(t: Array, theta: Array, states: Trajectory) -> Array:  # noqa: ARG001  protocol

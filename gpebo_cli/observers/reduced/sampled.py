@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.errors import ModelError
+from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import ByName
-from gpebo_cli.observers.reduced.extension import begin_at, choose_form, start_at
+from gpebo_cli.observers._observation import InitialError
+from gpebo_cli.observers.reduced.extension import begin_at, choose_form, form_used, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import regression_signals, term_sizes
 from gpebo_cli.observers.reduced.split import split_in_frame
@@ -88,6 +90,24 @@ class SampledObserver:
     def basis(self) -> Array:
         """In whose coordinates the extension is integrated, (n, k)."""
         return self.like.split.basis
+
+    def assumptions(self, reached: SampledState) -> tuple[Assumption, ...]:
+        """What the observer needed so far, with its evidence."""
+        return (
+            Assumption(
+                "Rank of E", "rank E(t) is constant", True,
+                {"rank": self.like.split.rank, "states": self.system.n},
+            ),
+            Assumption(
+                "Assumption 1", "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
+                True, {"smallest_singular_value_at_least": reached.injectivity,
+                       **form_used(self.form, self.note)},
+            ),
+        )
+
+    def truth(self, extension: Array) -> InitialError:
+        """What the parameters are, from [ξ_a | ξ_b | Φ] (K, k, 1 + p) at the times to be asked."""
+        return InitialError(self.initial_basis, self.xi_a0, self.basis, lambda _t: extension)
 
     def advance(
         self, state: SampledState | None, t: Array, u: Array, y: Array
