@@ -8,6 +8,8 @@ import numpy as np
 
 from gpebo_cli.kernels.arrays import Array, IntArray
 
+_TINY = float(np.finfo(float).tiny)
+
 
 def element_maps(
     D: Array, h: Array, E: Array | None, A: Array, f: Array, basis: Array | None,
@@ -139,3 +141,72 @@ def chain(
         values[:, 1:] = maps @ values[:, :1] + particular
     finite = np.isfinite(values).all(axis=(1, 2, 3))
     return values, size if finite.all() else int(np.argmin(finite))
+
+
+def carried_errors(
+    values: Array, last: Array, particular: Array, noise: Array, steps: Array, to_legendre: Array,
+    signs: Array, used: int, eps: float, end: float, chance: float, same: float, level: float,
+    renew: Callable[[int, Array], Array] | None = None,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Bounds of the errors (K, n, c) at right ends, of what elements leave out and of rounding.
+
+    Args:
+        values: the solution at the points (K, s + 1, n, c).
+        last: maps from left ends to right ends (K or 1, n, n).
+        particular: right ends from zero (K, n, c).
+        noise: what relative rounding of each component, and of 1, may bring about in an element
+            (K or 1, n, n + c).
+        steps: lengths (K,).
+        to_legendre: (s + 1, s + 1).
+        signs: of errors at the start and the right ends (K + 1, n, 2 S): S choices for what is left
+            out, S for rounding.
+        used: how many of the last Legendre coefficients tell what is left out.
+        eps: unit in the last place.
+        end: units that are lost of what a right end is made of.
+        chance: by how much a sum of independent errors may exceed its root mean square.
+        same: relative difference of rates that are constant.
+        level: coefficients that fall by less than this over two degrees are noise.
+        renew: what becomes of errors (n, 2 S c) at the left end of an element that is not the
+            first.
+
+    Returns:
+        the bounds; and of all elements the largest of what they leave out, of the values, of noise
+        that shows, and of what right ends are made of, (n, c) each.
+    """
+    K, points, n, columns = values.shape
+    s, count = points - 1, signs.shape[2] // 2
+    width = 2 * count * columns
+    sizes = np.abs(values).max(axis=1)
+    size = np.maximum(sizes, _TINY)
+    flat = values.reshape(K, points, n * columns)
+    shown = np.abs(np.matmul(to_legendre[-4:], flat)).reshape(K, -1, n, columns)
+    to_next = points / np.arange(points - used, points)  # (ρ^j)^this = ρ^(s + 1)
+    shares = np.minimum(shown[:, -used:] / size[:, None], 1.0) ** to_next[:, None, None]
+    tail = size * shares.max(axis=1)
+    visible = np.zeros((n, columns))
+    if shown.shape[1] == 4:
+        before, after = shown[:, :2].max(axis=1), shown[:, 2:].max(axis=1)
+        visible = np.where(after >= level * before, after, 0.0).max(axis=0)
+    made_of = np.abs(last) @ np.abs(values[:, 0]) + np.abs(particular)
+    # End points are superconvergent, of order 2s − 1 against s + 1 inside: with ρ the decay per
+    # coefficient their error is about ρ^(s−1) times the tail. Half that exponent is used.
+    left_out = tail * np.minimum(tail / size, 1.0) ** (0.5 - 0.5 / s)
+    rounded = eps * (end * made_of + noise[..., :n] @ sizes + noise[..., n:])
+    kinds = np.stack([left_out, rounded], axis=2).repeat(count, axis=2)
+    added = (signs[1:, :, :, None] * kinds).reshape(K, n, width)
+    error = np.zeros((n, 2 * count, columns))
+    error[:, count:] = signs[0, :, count:, None] * eps * np.abs(values[0, 0])[:, None]
+    error = error.reshape(n, width)
+    ends = np.empty_like(added)
+    for k in range(K):
+        if k and renew is not None:
+            error = renew(k, error)
+        error = last[k if len(last) > 1 else 0] @ error + added[k]
+        ends[k] = error
+    rms = np.sqrt((ends.reshape(K, n, 2, count, columns) ** 2).mean(axis=3))
+    rates = noise[..., :n] / steps[: len(noise), None, None]
+    constant = bool((np.abs(rates - rates[0]) <= same * rates[0]).all())
+    systematic = np.sqrt(np.arange(2, K + 2))[:, None, None]
+    by_chance = systematic if constant else np.minimum(systematic, chance)
+    carried = systematic * rms[:, :, 0] + by_chance * rms[:, :, 1]
+    return carried, tail.max(axis=0), sizes.max(axis=0), visible, made_of.max(axis=0)

@@ -252,16 +252,20 @@ static void hand_over(double *out, Lane *x, npy_intp rows, npy_intp columns, npy
 }
 
 /* The equations at one block of times; 0 where the elimination grows more than `growth` or leaves
-   more than `residual`. */
+   more than `residual`. Matrices that are constant are those of the first block. */
 static int equations(const Model *m, Elimination *el, Forcing *f, npy_intp first, npy_intp used,
-                     double growth, double residual, double *const *out)
+                     npy_intp matrices, double growth, double residual, double *const *out)
 {
     const npy_intp n = m->n, r = el->rank, a = el->a, d = el->d;
     Lane grown, *some = el->e, *f2 = el->M22;
-    fill(m, el, first, used);
+    const npy_intp these = matrices == 1 ? 1 : used;
+    const int fresh = matrices > 1 || first == 0;
     force(m, f, first, used);
-    multipliers(el);
-    eliminate_blocks(m, el);
+    if (fresh) {
+        fill(m, el, first, used);
+        multipliers(el);
+        eliminate_blocks(m, el);
+    }
     for (npy_intp l = 0; l < used; l++)
         if (!(el->residual[l] <= residual * el->of_M[l] && el->of_X[l] <= growth))
             return 0;
@@ -275,22 +279,24 @@ static int equations(const Model *m, Elimination *el, Forcing *f, npy_intp first
     lanes_multiply(some, 1, el->X, r, el->M12, 1, a, r, 1, -1.0);
     lanes_store(out[4], some, 1, a, 0, a, first, used);
     memcpy(f2, some, a * sizeof(Lane));
-    lanes_clear(some, d * n);
-    lanes_from_left(some, n, el->Z1, 1, d, el->A, d, n, n);
-    hand_over(out[1], some, d, n, first, used, m->columns, 1.0);
-    memcpy(some, el->whole, d * n * sizeof(Lane));
-    hand_over(out[0], some, d, n, first, used, m->columns, m->time);
-    hand_over(out[3], el->N2, a, n, first, used, m->columns, 1.0);
-    invert(m, el, grown);
-    for (npy_intp l = 0; l < used; l++)
-        if (!(grown[l] <= growth))
-            return 0;
+    if (fresh) {
+        lanes_clear(some, d * n);
+        lanes_from_left(some, n, el->Z1, 1, d, el->A, d, n, n);
+        hand_over(out[1], some, d, n, first, these, m->columns, 1.0);
+        memcpy(some, el->whole, d * n * sizeof(Lane));
+        hand_over(out[0], some, d, n, first, these, m->columns, m->time);
+        hand_over(out[3], el->N2, a, n, first, these, m->columns, 1.0);
+        invert(m, el, grown);
+        for (npy_intp l = 0; l < used; l++)
+            if (!(grown[l] <= growth))
+                return 0;
+        for (npy_intp i = 0; i < n; i++)
+            memcpy(some + i * d, el->inverse + i * n, d * sizeof(Lane));
+        hand_over(out[5], some, n, d, first, these, NULL, 1.0 / m->time);
+    }
     lanes_clear(some, n);
     lanes_multiply(some, 1, el->inverse + d, n, f2, 1, n, a, 1, -1.0);
     lanes_store(out[6], some, 1, n, 0, n, first, used);
-    for (npy_intp i = 0; i < n; i++)
-        memcpy(some + i * d, el->inverse + i * n, d * sizeof(Lane));
-    hand_over(out[5], some, n, d, first, used, NULL, 1.0 / m->time);
     return 1;
 }
 
@@ -345,8 +351,8 @@ static Outcome eliminated(Call *call)
     if (read_model(call, &m) == ERROR || begin(call, 10, &m, &el) == ERROR)
         return ERROR;
     const npy_intp n = m.n, p = SIZE(m), q = SIZE(q), widest = p > q ? p : q, every = SIZE(e);
-    if (every < 1)
-        return refused("times between looks", every);
+    if (every < 1 || (SIZE(M) != 1 && SIZE(M) != m.times))
+        return refused("times of E and A, or between looks", SIZE(M));
     Forcing f = {series(call, 6, n * p),
                  series(call, 7, n * q),
                  series(call, 8, p),
@@ -366,7 +372,8 @@ static Outcome eliminated(Call *call)
     Lane *room = f.g + m.orders * n;
     for (npy_intp first = 0; first < m.times; first += LANES) {
         const npy_intp used = m.times - first < LANES ? m.times - first : LANES;
-        if (!equations(&m, &el, &f, first, used, call->number[15], call->number[16], call->out))
+        if (!equations(&m, &el, &f, first, used, SIZE(M), call->number[15], call->number[16],
+                       call->out))
             return DECLINED;
     }
     double *most = call->out[7];
@@ -387,7 +394,7 @@ static Outcome eliminated(Call *call)
 
 const Kernel reduction_kernels[] = {
     {"bounds", MODEL "@z @z %r nd z=v*n a=z-r d=n-a", "N3 N Ndd", bounds},
-    {"eliminated", MODEL "oN?nm oN?nq oN?m oN?q @z @z %r nd %e # # z=v*n a=z-r d=n-a",
-     "Ndn Ndn Nd Nan Na Nnd Nn nn+", eliminated},
+    {"eliminated", "oM?nn oM?nn n n # %v oN?nm oN?nq oN?m oN?q @z @z %r nd %e # # z=v*n a=z-r d=n-a",
+     "Mdn Mdn Nd Man Na Mnd Nn nn+", eliminated},
     {NULL, NULL, NULL, NULL},
 };

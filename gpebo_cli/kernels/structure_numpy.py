@@ -303,7 +303,7 @@ def eliminated(
         E1, A1 (N, d, n), f1 (N, d), Â2 (N, a, n), f2 (N, a), T (N, n, d) and offset (N, n) of the
         consistent states T z + offset with z = E1 x, and by how much relative rounding of each
         state, and of 1, reaches each state through the constraints (n, n + 1); None where the
-        elimination fails at some time.
+        elimination fails at some time. Matrices come at one time where E and A do.
     """
     e, a = scaled(E, A, rows, columns, time, orders)
     M, N = derivative_array(e, a, orders - 1)
@@ -319,9 +319,11 @@ def eliminated(
         return None
     found = in_own_states(E[0], A[0], f[0], Z1[None], A2, f2, size, inverse, rows, columns, time,
                           every)
-    return tuple(
-        np.broadcast_to(x, (times, *x.shape[1:])) if len(x) == 1 else x for x in found[:-1]
-    ) + found[-1:]
+    counts = [len(M), len(M), times, len(M), times, len(M), times]
+    return *(
+        np.broadcast_to(x, (count, *x.shape[1:])) if len(x) == 1 else x
+        for x, count in zip(found[:-1], counts, strict=True)
+    ), found[-1]
 
 
 def in_own_states(

@@ -83,8 +83,6 @@ def strangeness_free_form(
     if found is None:
         found = _with_singular_vectors(system, structure, E, A, forcing(c), t, every)
     E1, A1, f1, A2, f2, basis, offset, amplification = found
-    if structure.time_invariant:
-        E1, A1, A2, basis = (matrix[:1] for matrix in (E1, A1, A2, basis))
     none = not structure.a
     return StrangenessFree(
         E1, A1, f1, A2, f2, None if none else basis, None if none else offset, amplification,
