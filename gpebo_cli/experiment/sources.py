@@ -261,4 +261,3 @@ def kept_samples(cases: int, samples: int, max_rows: int) -> IntArray:
     if count == samples:
         return np.arange(samples)
     return np.unique(np.rint(np.linspace(0, samples - 1, count)).astype(np.intp))
-

@@ -138,7 +138,6 @@ class Filtered:
     pair: Trajectory  # (2n, n + g), see the module, with P in units of ``variance``
     variance: float
     error_estimate: float  # relative to each signal's own size
-    smallest_eigenvalue: float  # of P over its trace, over all points: −rounding at least
     extras: tuple[Array, ...]  # of the coefficients, (K, s + 1, …) each
 
     @property
@@ -242,7 +241,4 @@ def run_filter(
             f"t = {solution.trajectory.mesh.edges[k]:.6g} (eigenvalue {relative.min():.1e} of its "
             "trace); lower observer.P0, or raise observer.regularisation"
         )
-    return Filtered(
-        solution.trajectory, variance, solution.error_estimate, float(relative.min()),
-        solution.extras,
-    )
+    return Filtered(solution.trajectory, variance, solution.error_estimate, solution.extras)

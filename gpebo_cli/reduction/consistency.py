@@ -139,6 +139,3 @@ def _refuse_ambiguous_products(
                     "impulse or a jump of its own, and their product is undefined; take the "
                     "conserved quantity (charge, momentum) as the state"
                 )
-
-
-
