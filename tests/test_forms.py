@@ -286,13 +286,44 @@ def test_matrices_along_measured_signals(plant):
     assert found.respond is None  # Y is not affine in noise that is in the matrices, too
 
 
-def test_a_hidden_constraint_along_an_output_is_refused():
-    plant = {**PENDULUM, "A": [*PENDULUM["A"][:2], ["-seen", 0, 0, 0, 1], *PENDULUM["A"][3:]]}
-    system = plant_from_mapping(plant)
+def with_entry(row, column, entry):
+    A = [list(entries) for entries in PENDULUM["A"]]
+    A[row][column] = entry
+    return {**PENDULUM, "A": A}
+
+
+def test_an_output_in_equations_that_nobody_differentiates():
+    """The pendulum's spring follows the measured position: its row stands in no derivative."""
+    found, error, of_states = observed(with_entry(2, 0, "-2 - seen**2"), 5.0)
+    assert "strangeness-free" in found.note
+    assert np.abs(error).max() < 1e-9
+    assert of_states < 1e-9
+
+
+def test_both_forms_agree_along_signals():
+    """Index 1: nothing is differentiated."""
+    plant = {
+        "name": "p", "states": ["a", "z"], "unknowns": {"k": 2}, "outputs": ["y", "w"],
+        "E": [[1, 0], [0, 0]], "A": [["-y", 1], ["y", "-2 - w**2"]], "F": [["sin(t)"], ["-w"]],
+        "C": [[1, 0], [1, 1]], "initial_state": [1, 0],
+    }
+    for form in ("given", "strangeness_free"):
+        _, error, of_states = observed(plant, 5.0, form=form)
+        assert np.abs(error).max() < 1e-9
+        assert of_states < 1e-9
+
+
+@pytest.mark.parametrize("entry", [(4, 0, "sin(a) + seen/50"), (0, 0, "-seen")])
+def test_a_hidden_constraint_that_differentiates_an_output_is_refused(entry):
+    """The rod's constraint is differentiated twice, the positions' equations once."""
+    system = plant_from_mapping(with_entry(*entry))
     mesh = Mesh(np.linspace(0.0, 1.0, 3), radau_rule(5))
     signal = Trajectory(mesh, np.ones((2, 6, 2)))
-    with pytest.raises(ConfigError, match="they contain the output seen, which is measured only"):
-        observe(system, Measurements(signal, Trajectory(mesh, np.ones((2, 6, 1)))), SOLVER)
+    seen = Measurements(
+        signal, Trajectory(mesh, np.ones((2, 6, 1))), None, InputDerivatives.of_signal(signal)
+    )
+    with pytest.raises(ConfigError, match="contains the derivative of the output seen, which is"):
+        observe(system, seen, SOLVER)
 
 
 # Edges ----------------------------------------------------------------------------------------

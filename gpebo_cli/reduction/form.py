@@ -14,13 +14,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import factorial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.kernels.structure_numpy import by_elimination, derivative_array, scaled
-from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem
+from gpebo_cli.model.descriptor import (
+    Array,
+    BoolArray,
+    Coefficients,
+    CoefficientSource,
+    DescriptorSystem,
+)
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.reduction.strangeness_free import _MAX_GROWTH as MAX_GROWTH
@@ -28,6 +34,7 @@ from gpebo_cli.reduction.strangeness_free import _by_singular_vectors as by_sing
 from gpebo_cli.reduction.structure import RESIDUAL, Structure, analyse
 
 _AHEAD = np.linspace(0.0, 1.0, 17)  # seconds
+_MOVED = 1e-8  # of hidden constraints: what derivatives of an output may change by rounding
 _ABSENT = 1e-10  # of the largest coefficient of an input: a derivative with less is not there
 
 
@@ -63,9 +70,8 @@ class InputDerivatives:
     @classmethod
     def of_plant(cls, system: DescriptorSystem, known: BoolArray) -> InputDerivatives | None:
         """Exact ones, of the inputs (m,) that are the plant's own functions of time."""
-        if system.depends_on_outputs:
-            return None  # and then they serve nobody, see ``strangeness_free``
-        return cls(known, lambda t, inside, order: system.coefficients.taylor(t, order, inside).u)
+        source = system.coefficients.of_time
+        return cls(known, lambda t, inside, order: source.taylor(t, order, inside).u)
 
     @classmethod
     def of_signal(cls, inputs: Trajectory) -> InputDerivatives:
@@ -114,15 +120,22 @@ class EquationForm:
             parts.append(np.ones((len(u), 1)))
         return np.concatenate(parts, axis=1)
 
-    def equations(self, t: Array, inside: Array, signals: Array | None) -> Equations:
+    def equations(
+        self, t: Array, inside: Array, signals: Array | None, slopes: Array | float = 0.0
+    ) -> Equations:
         """The matrices at the times t (N,), along the signals [u; y] (N, m + r) if they follow any.
+
+        Derivatives of y count as ``slopes`` (μ, 1, r), which :func:`strangeness_free` shows to be
+        without effect.
 
         Raises:
             ModelError: a rank of the strangeness-free form changes; names the time.
         """
         system, source = self.system, self.system.coefficients
         order = 0 if self.structure is None else self.structure.mu
-        along = self._along(t, inside, signals, order)
+        along = self.along(t, inside, signals, order)
+        if along is not None:
+            along[1:, :, system.m :] = slopes
         c = source.taylor(t, order, inside, along)
 
         def value(name: str) -> Array:
@@ -157,9 +170,10 @@ class EquationForm:
         found: Array = self.system.coefficients.taylor(t, order, inside, along).E[order]
         return found
 
-    def _along(
+    def along(
         self, t: Array, inside: Array, signals: Array | None, order: int
     ) -> Array | None:
+        """Taylor coefficients of [u, y] (order + 1, N, m + r), of y and unknown u's values only."""
         if not self.follows_signals:
             return None
         if signals is None:
@@ -228,6 +242,23 @@ def hidden_constraints(
     )
 
 
+class _Along:
+    """A plant's matrices as functions of time, along signals that are known at some times."""
+
+    def __init__(self, form: EquationForm, t: Array, signals: Array) -> None:
+        self._form, self._t, self._signals = form, t, signals
+
+    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:
+        """At the times t (N,), with the signals between those of theirs that are known."""
+        inside = t if inside is None else inside
+        seen = np.stack([np.interp(t, self._t, signal) for signal in self._signals.T], axis=1)
+        along = self._form.along(t, inside, seen, order)
+        return self._form.system.coefficients.taylor(t, order, inside, along)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._form.system.coefficients, name)
+
+
 def strangeness_free(
     system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
     inputs: InputDerivatives | None, *, max_mu: int, rank_tol: float,
@@ -248,27 +279,27 @@ def strangeness_free(
         ConfigError: a derivative is needed of an input, or of an output, of which it is not known.
     """
     source = system.coefficients
-    if source.signals and system.depends_on_outputs:
-        names = sorted({name for s in source.signals.values() for name in s} & set(system.outputs))
-        raise ConfigError(
-            f"plant {system.name}: observer.form=strangeness_free differentiates the equations, "
-            f"and they contain the output {names[0]}, which is measured only"
-        )
     if len(t) == 1:  # of samples that are still to come nothing is known but the plant
         t = inside = t + _AHEAD
         signals = None if signals is None else np.repeat(signals, len(t), axis=0)
-    structure = analyse(
-        system, float(t[0]), float(t[-1]), max_mu=max_mu, rank_tol=rank_tol
-    )
+    known = system
+    if system.depends_on_outputs and signals is not None:
+        along = cast("CoefficientSource", _Along(EquationForm(system, inputs=inputs), t, signals))
+        known = replace(system, coefficients=along)
+    structure = analyse(known, float(t[0]), float(t[-1]), max_mu=max_mu, rank_tol=rank_tol)
     whole = EquationForm(
         system, structure, tuple((k, j) for k in range(1, structure.mu + 1)
                                  for j in range(system.m)), inputs,
     )
-    if source.signals and structure.mu and (inputs is None or not inputs.known.all()):
-        raise ConfigError(_unknown(system, system.inputs[0], "the equations contain it"))
+    followed = frozenset[str]().union(*source.signals.values())
+    for j, name in enumerate(system.inputs):
+        if name in followed and structure.mu and (inputs is None or not inputs.known[j]):
+            raise ConfigError(_unknown(system, name, "the equations contain it"))
     found = whole.equations(t, inside, signals).hidden
     if found is None:
         return whole
+    if structure.mu and signals is not None:
+        _refuse_slopes(whole, found, t, inside, signals)
     size = np.abs(found.driving).max(axis=(0, 1), initial=0.0)
     m = system.m
     used = []
@@ -285,6 +316,37 @@ def strangeness_free(
                     f"a hidden constraint contains its derivative of order {k}",
                 ))
     return replace(whole, derivatives=tuple(used))
+
+
+def _refuse_slopes(
+    form: EquationForm, found: HiddenConstraints, t: Array, inside: Array, signals: Array
+) -> None:
+    """Refuse hidden constraints that change with the derivatives of an output.
+
+    Raises:
+        ConfigError: names the output.
+    """
+    system, structure = form.system, form.structure
+    followed = frozenset[str]().union(*system.coefficients.signals.values())
+    for j, name in enumerate(system.outputs):
+        if name not in followed or structure is None:
+            continue
+        slopes = np.zeros((structure.mu, 1, system.r))
+        size = float(np.abs(signals[:, system.m + j]).max()) or 1.0
+        slopes[..., j] = size / structure.scaling.time ** np.arange(1, structure.mu + 1)[:, None]
+        try:
+            moved = form.equations(t, inside, signals, slopes).hidden
+            same = moved is not None and all(
+                np.abs(a - b).max(initial=0.0) <= _MOVED * np.abs(a).max(initial=0.0)
+                for a, b in zip(found, moved, strict=True)
+            )
+        except ModelError:  # not even its rank is the same
+            same = False
+        if not same:
+            raise ConfigError(
+                f"plant {system.name}: observer.form=strangeness_free: a hidden constraint "
+                f"contains the derivative of the output {name}, which is measured only"
+            )
 
 
 def _unknown(system: DescriptorSystem, name: str, why: str) -> str:

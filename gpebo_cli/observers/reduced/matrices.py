@@ -227,6 +227,8 @@ def _by_steps(
     of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
     g_signals = joined(of_inputs, of_y, axis=2)
     Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
+    if hidden is not None:
+        Q1[:, Q1.shape[1] - r :] = 0.0  # y has no part in it, nor has its rounding
     Lambda = pinv @ A if split.turn is None else pinv @ A + split.turn  # Λ = E⁺A + Ṗ
     # [A_0 | D_0 | of u and y] = [Λ | E⁺F | E⁺B, 0] − Λ K [𝒜 | G | g_signals]
     direct = joined(
