@@ -42,3 +42,31 @@ def read_text(path: str | os.PathLike[str], limit: int) -> str:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not text in UTF-8 (byte {error.start})") from error
+
+
+def beside(file: str, source: str, where: str) -> str:
+    """Where a file that a plant names is: beside the plant's, in its ``--config-dir``, or here.
+
+    Args:
+        file: its path as the plant has it.
+        source: the plant's file; empty for what a caller gives from Python, who may name any file.
+        where: plant and key, for messages.
+
+    Raises:
+        ConfigError: elsewhere, of a plant from a file, which may be a stranger's.
+    """
+    if not source:
+        return file
+    folder = os.path.dirname(os.path.abspath(source))
+    if os.path.basename(folder) in ("plant", "regression"):
+        folder = os.path.dirname(folder)
+    folders = [os.path.dirname(os.path.abspath(source)), folder, os.getcwd()]
+    paths = [os.path.normpath(os.path.join(place, file)) for place in folders]
+    path = next((found for found in paths if os.path.exists(found)), paths[-1])
+    real = os.path.realpath(path)
+    if not any(os.path.commonpath([real, os.path.realpath(place)]) == os.path.realpath(place)
+               for place in folders):
+        raise ConfigError(
+            f"{where}: {file} lies outside of {folder} and of the current folder; copy it there"
+        )
+    return min(path, os.path.relpath(path), key=len)

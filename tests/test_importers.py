@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +19,7 @@ from scipy.integrate import solve_ivp
 from scipy.io import mmwrite, savemat
 from scipy.linalg import expm
 
-from gpebo_cli import ConfigError, run
+from gpebo_cli import ConfigError, load_plant, run
 from gpebo_cli.importers import from_control, from_file, from_matrices, from_mechanics, from_netlist
 from gpebo_cli.importers.circuit import circuit_from_netlist
 from gpebo_cli.importers.netlist import number, read_netlist
@@ -125,14 +127,19 @@ def test_against_ngspice(name, tmp_path):
         assert np.abs(result[output] - expected)[late].max() < 2e-4 * size, output
 
 
-@pytest.mark.parametrize("cells", [3, 20])
-def test_a_ladder_of_coils_and_capacitors(cells):
-    """Against the matrix exponential of its state equations, with currents first."""
+def ladder(cells, more=""):
+    """Coils and resistors in a row, capacitors to ground, driven by a current."""
     lines, nodes = ["ladder", "I1 0 n0 1"], [f"n{k}" for k in range(cells + 1)]
     lines += [f"C{k} {node} 0 {1 + 0.1 * k:g} ic=0" for k, node in enumerate(nodes)]
     lines += [f"L{k} n{k} m{k} {0.5 + 0.05 * k:g}" for k in range(cells)]
     lines += [f"R{k} m{k} n{k + 1} {1 + 0.2 * k:g}" for k in range(cells)]
-    result = simulated(plant_of("\n".join(lines) + "\n", measure=f"v(n{cells})"), 5.0)
+    return "\n".join([*lines, more, ""])
+
+
+@pytest.mark.parametrize("cells", [3, 20])
+def test_a_ladder_of_coils_and_capacitors(cells):
+    """Against the matrix exponential of its state equations, with currents first."""
+    result = simulated(plant_of(ladder(cells), measure=f"v(n{cells})"), 5.0)
     C, L = 1 + 0.1 * np.arange(cells + 1), 0.5 + 0.05 * np.arange(cells)
     R, D = 1 + 0.2 * np.arange(cells), np.eye(cells, cells + 1) - np.eye(cells, cells + 1, 1)
     A = np.block([
@@ -358,7 +365,101 @@ def test_from_a_file_on_the_command_line(tmp_path):
     assert done.returncode == 0, done.stderr
     done = gpebo(*words[:2], "other", "--measure", "v(a)", cwd=tmp_path)
     assert done.returncode == 2
-    assert "--measure is for a plant from a netlist" in done.stderr
+    assert "--measure is for a plant from a file" in done.stderr
     done = gpebo(*words[:2], "other", "--from", "nothing.cir", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (2, "gpebo: error: nothing.cir: no such file\n")
+    assert done.returncode == 2
+    assert done.stderr == "gpebo: error: nothing.cir cannot be read: No such file or directory\n"
     assert not (tmp_path / "plant" / "other.yaml").exists()
+
+
+def test_a_large_plant_has_its_matrices_in_a_file_beside_it(tmp_path, monkeypatch):
+    """The same numbers as in text; what varies stays there; a run is repeated from its folder."""
+    monkeypatch.chdir(tmp_path)
+    text = ladder(17, "R99 n5 0 {5+sin(time)}")
+    Path("ladder.cir").write_text(text)
+    done = gpebo("new", "plant", "ladder", "--from", "ladder.cir", cwd=tmp_path)
+    assert done.stdout.splitlines()[:2] == ["plant/ladder.npz", "plant/ladder.yaml"]
+    plant = yaml.safe_load(Path("plant/ladder.yaml").read_text())
+    assert plant["matrices"] == "ladder.npz"
+    assert "E" not in plant
+    assert plant["parameters"]["R99"] == "5+sin(t)"
+    assert "C1" not in plant["parameters"]
+    short = {"observer": "none", "time": {"horizon": 0.1, "samples": 20}}
+    result = run("plant/ladder.yaml", **short)
+    expected = run(plant_of(text), **short).to_pandas()
+    assert result.to_pandas().equals(expected)
+    result.save("a", figures=False)
+    words = ("--config-dir", "a", "--config-name", "config", "hydra.run.dir=b")
+    done = gpebo("run", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert Path("b/signals.csv").read_bytes() == Path("a/signals.csv").read_bytes()
+
+
+def archive(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    ({"A": np.eye(3)}, "A is 3 × 3, and there are 2 states (x1, x2) and there are 2 states"),
+    ({"A": np.array([[1, "a"], [0, 1]], dtype=object)}, "not an array of real numbers"),
+    ({"A": np.eye(2), "X": np.eye(2)}, "expected E, A, B, F, C, D, H"),
+    ({"A.row": [0], "A.col": [0], "A.data": [1.0]}, "A.row, A.col, A.data, A.shape make no matrix"),
+    ({"A.row": [5], "A.col": [0], "A.data": [1.0], "A.shape": [2, 2]}, "make no matrix"),
+    ({"A": np.eye(2), "E": np.eye(2)}, "E stands in the plant and in"),
+    ({"A": np.full((2, 2), np.nan)}, "A[0][0]"),
+    ({"A": np.zeros((5001, 5000))}, "unpacks to more than"),
+    (b"PK\x03\x04 no archive", "is no archive of matrices"),
+    (None, "cannot be read"), ("link", "lies outside of"), ("pipe", "is not a regular file"),
+])
+def test_mistakes_in_archives(content, message, tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    path = folder / "m.npz"
+    if isinstance(content, dict):
+        np.savez_compressed(path, **content)
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content == "link":
+        np.savez(tmp_path / "other.npz", A=np.eye(2))
+        path.symlink_to(tmp_path / "other.npz")
+    elif content == "pipe":
+        os.mkfifo(path)
+    plant = {"name": "p", "states": ["x1", "x2"], "E": [[1, 0], [0, 1]], "initial_state": [1, 0]}
+    (folder / "p.yaml").write_text(yaml.safe_dump({**plant, "matrices": "m.npz"}))
+    with pytest.raises(ConfigError) as error:
+        load_plant(folder / "p.yaml")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_files_that_claim_or_unpack_to_too_much(tmp_path):
+    savemat(tmp_path / "bomb.mat", {"A": np.zeros((5001, 5000))}, do_compression=True)
+    assert (tmp_path / "bomb.mat").stat().st_size < 1_000_000
+    head = "%%MatrixMarket matrix array real general\n1000000 1000000\n1\n"
+    (tmp_path / "A.mtx").write_text(head)
+    for path, message in ((tmp_path / "bomb.mat", "unpacks to more"), (tmp_path, "at most 2000")):
+        with pytest.raises(ConfigError, match=message):
+            from_file(path, "p")
+
+
+def test_sparse_matrices_from_python(tmp_path):
+    """As lists are, also in what a run leaves behind."""
+    plant = {"name": "p", "states": ["x1", "x2"], "initial_state": [1, 0]}
+    lists = {**plant, "E": np.eye(2).tolist(), "A": A.tolist()}
+    given = {**plant, "E": sparse.eye_array(2), "A": sparse.csr_array(A)}
+    ours, theirs = simulated(given, 1.0), simulated(lists, 1.0)
+    assert ours.to_pandas().equals(theirs.to_pandas())
+    ours.save(tmp_path, figures=False)
+    config = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert config["plant"]["A"] == A.tolist()
+
+
+def test_what_is_measured_and_unknown_of_matrices(tmp_path):
+    path = archive(tmp_path / "m.npz", A=A, B=B, C=np.ones((2, 2)), D=np.ones((2, 1)))
+    plant = from_file(path, "p", measure="x2", unknown="u1").mapping()
+    assert (plant["C"], plant["F"], plant["unknowns"]) == ([[0, 1]], [[0], [1]], {"u1": 0.0})
+    assert "B" not in plant
+    assert "D" not in plant
+    with pytest.raises(ConfigError, match="measure has 'x3', which is no state"):
+        from_file(path, "p", measure="x3")

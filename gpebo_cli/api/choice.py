@@ -69,6 +69,8 @@ def choose(
 
 def plain(value: object) -> Any:
     """``value`` with arrays, tuples, ranges and paths as the lists and texts of a YAML file."""
+    if hasattr(value, "toarray"):  # SciPy's sparse matrices
+        return value.toarray().tolist()
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, Mapping):

@@ -61,18 +61,20 @@ def main(words: list[str]) -> int:
         return write(name, options.values["--plant"], folder)
     paths = {Path(folder, path): text for path, text in files(kind, name, folder).items()}
     _check_name(kind, name, list(paths))
-    told = ""
+    said, told = _RUNS if len(paths) == 1 else _INSTALLED, ""
+    contents = {path: text.encode() for path, text in paths.items()}
     if "--from" in options.values:
         ((path, _),) = paths.items()
-        paths[path], told = _from_file(name, options)
+        found, told = _from_file(name, options)
+        contents = {path.with_name(file): content for file, content in found.items()}
+        _check_name(kind, name, list(contents))
 
-    from gpebo_cli.results.files import make_folder, write_text
+    from gpebo_cli.results.files import make_folder, write_file
 
-    for path, text in paths.items():
+    for path, content in contents.items():
         make_folder(path.parent)
-        write_text(path, text)
+        write_file(path, [content])
         sys.stdout.write(f"{path}\n")
-    said = _RUNS if len(paths) == 1 else _INSTALLED
     sys.stdout.write(told + said.format(folder=shlex.quote(folder), kind=kind, name=name))
     return 0
 
@@ -92,12 +94,12 @@ def files(kind: str, name: str, folder: str = ".") -> dict[str, str]:
     }
 
 
-def _from_file(name: str, options: Options) -> tuple[str, str]:
-    """The text of a plant made from a file, and what there is to say of it."""
+def _from_file(name: str, options: Options) -> tuple[dict[str, bytes], str]:
+    """The files of a plant made from a file, and what there is to say of it."""
     from gpebo_cli.importers import from_file
     from gpebo_cli.model.plant import plant_from_mapping
+    from gpebo_cli.reduction.structure import analyse
     from gpebo_cli.settings import SolverSettings, TimeSettings
-    from gpebo_cli.simulation.simulate import simulate
 
     given = options.values
     draft = from_file(given["--from"], name, measure=given.get("--measure"),
@@ -105,11 +107,15 @@ def _from_file(name: str, options: Options) -> tuple[str, str]:
     system = plant_from_mapping(draft.mapping())
     said = [*draft.comments[1:]]
     try:
-        index = simulate(system, TimeSettings(), SolverSettings()).structure.index
-        said.append(f"index {index} as computed")
+        time, solver = TimeSettings(), SolverSettings()
+        structure = analyse(
+            system, time.start, time.start + time.horizon,
+            max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol,
+        )
+        said.append(f"index {structure.index} as computed")
     except GpeboError as error:
         said.append(f"it is written, but cannot be simulated yet: {error}")
-    return draft.to_yaml(), "".join(f"{line}\n" for line in said)
+    return draft.files(), "".join(f"{line}\n" for line in said)
 
 
 def _parse(words: list[str]) -> tuple[str, str, Options]:
@@ -138,7 +144,7 @@ def _parse(words: list[str]) -> tuple[str, str, Options]:
         raise ConfigError(f"--from makes a plant; gpebo new {given[0]} has a template of its own")
     for option in ("--measure", "--unknown"):
         if option in options.values and "--from" not in options.values:
-            raise ConfigError(f"{option} is for a plant from a netlist: --from FILE {option} …")
+            raise ConfigError(f"{option} is for a plant from a file: --from FILE {option} …")
     return given[0], given[1].removesuffix(".yaml"), options
 
 
@@ -148,7 +154,7 @@ def _check_name(kind: str, name: str, paths: list[Path]) -> None:
             f"gpebo new {kind}: {shown(name)} cannot be a name; it is a letter, then letters, "
             f"digits, _ and - (80 at most), and none of {', '.join(_WORDS)}"
         )
-    module = len(paths) > 1
+    module = KINDS[kind] is _PACKAGE
     taken = keyword.iskeyword(name) or name in sys.stdlib_module_names
     if module and (taken or not name.isidentifier()):
         raise ConfigError(

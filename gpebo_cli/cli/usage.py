@@ -148,9 +148,10 @@ Writes below DIR, by default the current folder; nothing that exists is overwrit
              units, gaps, as far as they can be guessed; and what was not understood
 
 With --from FILE a plant is made from a SPICE netlist (.cir .net .sp), a mechanical model (.yaml
-with M, D, K, G), or matrices (.mat, a folder of Matrix Market files, an OpenModelica linearisation
-in .py or .m). Of a netlist, --measure "v(out), y=i(L1)+i(V)" says what the outputs are, and
---unknown I5,V3 which constant sources are unknown.
+with M, D, K, G), or matrices (.mat, .npz, a folder of Matrix Market files, an OpenModelica
+linearisation in .py or .m). --measure "v(out), y=i(L1)+i(V)", or names of states, says what the
+outputs are, --unknown I5,V3 which constant inputs are unknown. Of more than 50 states constant
+matrices are written to DIR/plant/NAME.npz.
 
 examples:
   gpebo new plant tank

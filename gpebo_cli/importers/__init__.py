@@ -16,6 +16,8 @@ from gpebo_cli.importers.circuit import circuit_from_netlist
 from gpebo_cli.importers.draft import PlantDraft
 from gpebo_cli.importers.matrices import from_control, from_matrices, read_matrices
 from gpebo_cli.importers.mechanics import from_mechanics
+from gpebo_cli.importers.netlist import split_names
+from gpebo_cli.reading import read_text
 
 __all__ = [
     "PlantDraft", "from_control", "from_file", "from_matrices", "from_mechanics", "from_netlist",
@@ -47,7 +49,7 @@ def from_netlist(
     """
     text, file = fspath(netlist), f"netlist {name}"
     if "\n" not in text:
-        text, file = _text(Path(text)), text
+        text, file = read_text(text, _MAX_TEXT), text
     return circuit_from_netlist(text, name, file, measure, unknown).draft
 
 
@@ -58,10 +60,10 @@ def from_file(
 
     Args:
         path: ``.cir .net .sp .spice .ckt`` is a netlist; ``.yaml`` a mechanical model with M, D, K,
-            G; ``.mat``, ``.py``, ``.m`` and a folder of ``.mtx`` are matrices.
+            G; ``.mat``, ``.npz``, ``.py``, ``.m`` and a folder of ``.mtx`` are matrices.
         name: of the plant.
-        measure: outputs of a netlist.
-        unknown: unknown sources of a netlist.
+        measure: outputs; of a netlist as for :func:`from_netlist`, else names of states.
+        unknown: constant inputs whose values are to be estimated.
 
     Raises:
         ConfigError: names the file, the place in it, and what would be accepted.
@@ -69,35 +71,23 @@ def from_file(
     file = Path(path)
     if file.suffix.lower() in NETLISTS:
         return from_netlist(file, name, measure=measure, unknown=unknown)
-    for option, value in (("--measure", measure), ("--unknown", unknown)):
-        if value is not None:
-            endings = " ".join(NETLISTS)
-            raise ConfigError(f"{option} is for netlists ({endings}), and {path} is none")
     if file.suffix.lower() in (".yaml", ".yml"):
-        return from_mechanics(_yaml(file), name, str(path))
-    found: dict[str, Any] = read_matrices(file)
-    matrices = {key: found.pop(key) for key in "EABCD" if key in found}
-    return from_matrices(matrices, name, reference=str(path), **found)
-
-
-def _text(path: Path) -> str:
-    try:
-        if not path.is_file():
-            raise ConfigError(f"{path}: no such file")
-        if path.stat().st_size > _MAX_TEXT:
-            raise ConfigError(
-                f"{path} has {path.stat().st_size} bytes; at most {_MAX_TEXT} are read"
-            )
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path} is not UTF-8 text") from None
+        draft = from_mechanics(_yaml(file), name, str(path))
+    else:
+        found: dict[str, Any] = read_matrices(file)
+        matrices = {key: found.pop(key) for key in "EABCD" if key in found}
+        draft = from_matrices(matrices, name, reference=str(path), **found)
+    if measure is not None:
+        draft.measure(split_names(measure), f"{path}: ")
+    draft.make_unknown(split_names(unknown))
+    return draft
 
 
 def _yaml(path: Path) -> dict[str, object]:
     import yaml
 
     try:
-        content = yaml.safe_load(_text(path))
+        content = yaml.safe_load(read_text(path, _MAX_TEXT))
     except yaml.YAMLError as error:
         raise ConfigError(f"{path} is not YAML ({' '.join(str(error).split())})") from None
     if not isinstance(content, dict):

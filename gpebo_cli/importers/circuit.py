@@ -81,9 +81,7 @@ def circuit_from_netlist(
     draft = builder.build()
     for output in measured or [q for q in netlist.saved if q.startswith("v(")]:
         builder.output(output)
-    draft.make_unknown(
-        [builder.source(word) for word in split_names(unknown)], builder.constants
-    )
+    draft.make_unknown(builder.source(word) for word in split_names(unknown))
     draft.comments.append(str(topology))
     return Circuit(draft, topology)
 
@@ -231,7 +229,6 @@ class _Builder:
         self.draft = PlantDraft(name, title=netlist.title or f"circuit {name}", reference=file)
         self.draft.comments.append(f"Modified nodal analysis of {file}.")
         self.elements = {e.name.lower(): e for e in netlist.elements}
-        self.constants: dict[str, float] = {}  # of sources, by the input's name
         self._taken: set[str] = set()
         self._turned: set[int] = set()  # rows that are multiplied by −1
         self._called: dict[str, str] = {}  # parameter of an element's value, by lower-case name
@@ -497,8 +494,6 @@ class _Builder:
     def _input(self, e: Element, unit: str) -> str:
         name = self._claim(e.name, f"{e.name}_source")
         self.draft.inputs[name] = (e.value, unit)
-        if isinstance(e.value, float):
-            self.constants[name] = e.value
         return name
 
     def _controlling(self, e: Element) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -9,8 +10,14 @@ import numpy as np
 import yaml
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.archive import ARCHIVE, MATRICES, archive_of
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.schema import nearest, shown
 
 Entry = float | str
+
+MAX_IN_TEXT = 50
+"""States of a plant whose matrices are written as text; those of larger ones are in an archive."""
 
 _WIDTH = 96  # of a written line, where it can be broken
 
@@ -62,12 +69,33 @@ class PlantDraft:
                 if row in rows:
                     terms[:] = [_negative(term) for term in terms]
 
-    def make_unknown(self, names: Iterable[str], numbers: Mapping[str, float]) -> None:
-        """Turn inputs into unknown parameters: their columns of B and D move to F and H.
+    def measure(self, names: Iterable[str], where: str) -> None:
+        """Make states the outputs, in place of those there are.
+
+        Args:
+            names: of the states.
+            where: begins a message.
+
+        Raises:
+            ConfigError: no such state.
+        """
+        self.outputs.clear()
+        for matrix in "CDH":
+            self._terms[matrix].clear()
+        for row, name in enumerate(names):
+            if name not in self.states:
+                raise ConfigError(
+                    f"{where}measure has {shown(name)}, which is no state"
+                    f"{nearest(name, self.states)} (there are {', '.join(self.states)})"
+                )
+            self.outputs[f"y_{name}"] = self.states[name][1]
+            self.add("C", row, name, 1.0)
+
+    def make_unknown(self, names: Iterable[str]) -> None:
+        """Turn constant inputs into unknown parameters: their columns of B and D move to F and H.
 
         Args:
             names: of the inputs.
-            numbers: the constant value of every input that has one.
 
         Raises:
             ConfigError: no such input, or one that is not constant.
@@ -78,12 +106,14 @@ class PlantDraft:
                     f"plant {self.name}: {name} cannot be an unknown, it is no source; sources: "
                     f"{', '.join(self.inputs) or 'none'}"
                 )
-            if name not in numbers:
+            value, unit = self.inputs[name]
+            if isinstance(value, str):
                 raise ConfigError(
                     f"plant {self.name}: {name} varies with time, and an unknown is a constant; "
                     "give the source one number, or leave it an input"
                 )
-            self.unknowns[name] = (numbers[name], self.inputs.pop(name)[1])
+            self.unknowns[name] = (value, unit)
+            del self.inputs[name]
             for known, unknown in (("B", "F"), ("D", "H")):
                 for key in [key for key in self._terms[known] if key[1] == name]:
                     self._terms[unknown][key] = self._terms[known].pop(key)
@@ -115,10 +145,19 @@ class PlantDraft:
         } | {name: unit for name, unit in self.outputs.items() if unit}
         return {key: value for key, value in text.items() if value not in (None, {}, [])}
 
-    def to_yaml(self) -> str:
-        """The text of the plant's file, with a comment for every equation."""
-        plant = self.mapping()
-        lines = [f"# {line}".rstrip() for line in self.comments]
+    def to_yaml(self, archive: str = "") -> str:
+        """The text of the plant's file, with a comment for every equation.
+
+        Args:
+            archive: the file that has the matrices of :meth:`archived`; empty: the text has all.
+        """
+        plant, comments = self.mapping(), self.comments
+        if archive:
+            plant = {key: value for key, value in plant.items() if key not in self.archived()}
+            plant["parameters"] = self._used(plant)
+            plant[ARCHIVE] = archive
+            comments = [*comments, *(f"row {i}: {says}" for i, says in enumerate(self.rows, 1))]
+        lines = [f"# {line}".rstrip() for line in comments]
         for key, value in plant.items():
             if key in ("E", "A", "B", "F", "C", "D", "H"):
                 lines += ["", *self._matrix_lines(key, value)]
@@ -130,6 +169,36 @@ class PlantDraft:
                     lines.append("")
                 lines += _flow(key, value)
         return "\n".join([*lines, ""])
+
+    def files(self) -> dict[str, bytes]:
+        """What to write, by name: the plant's file, with an archive where the plant is large."""
+        matrices = self.archived()
+        archive = f"{self.name}.npz" if matrices else ""
+        text = {f"{self.name}.yaml": self.to_yaml(archive).encode()}
+        return {archive: archive_of(matrices), **text} if matrices else text
+
+    def archived(self) -> Mapping[str, object]:
+        """Matrices of a large plant that are constant, as SciPy's sparse ones, for an archive."""
+        if len(self.states) <= MAX_IN_TEXT:
+            return {}
+        from scipy.sparse import coo_array
+
+        given = self.mapping()
+        coefficients = plant_from_mapping(given).coefficients
+        found = coefficients.taylor(np.zeros(1), 0)
+        constant = [key for key in MATRICES if key in given and key in coefficients.constant]
+        return {key: coo_array(getattr(found, key)[0, 0]) for key in constant}
+
+    def _used(self, plant: Mapping[str, object]) -> dict[str, Entry]:
+        """Parameters that some other text of the plant needs."""
+        texts = [str(value) for key, value in plant.items() if key != "parameters"]
+        words = set(re.findall(r"[A-Za-z_]\w*", " ".join(texts)))
+        used: dict[str, Entry] = {}
+        for name, value in reversed(self.parameters.items()):  # each uses only those above it
+            if name in words:
+                used[name] = value
+                words.update(re.findall(r"[A-Za-z_]\w*", str(value)))
+        return dict(reversed(used.items()))
 
     def _columns(self, matrix: str) -> Iterable[str]:
         if matrix in "BD":

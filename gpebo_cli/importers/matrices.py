@@ -7,19 +7,24 @@ as text; no code in them is run.
 from __future__ import annotations
 
 import ast
+import os
 import re
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
+from gpebo_cli.model.archive import MAX_BYTES, read_archive
+from gpebo_cli.reading import open_regular, read_text
 from gpebo_cli.schema import shown
 
-MAX_BYTES = 200_000_000  # of a file of matrices
 MAX_STATES = 2_000
+_MAX_TEXT = 20_000_000  # bytes of a linearisation
 
 _NAMES = "EABCD"
 
@@ -114,34 +119,32 @@ def from_control(system: Any, name: str, **options: Any) -> PlantDraft:
 def read_matrices(path: Path) -> dict[str, Any]:
     """Matrices and names in a file or folder.
 
-    A ``.mat`` file with E, A, B, C, D; a folder of Matrix Market files whose names end in
-    ``.E.mtx``, ``_A.mtx`` or are ``B.mtx``; a linearisation by OpenModelica or Julia as Python
-    (``.py``) or MATLAB (``.m``) text with ``A = [...]``.
+    A ``.mat`` or ``.npz`` file with E, A, B, C, D; a folder of Matrix Market files whose names end
+    in ``.E.mtx``, ``_A.mtx`` or are ``B.mtx``; a linearisation by OpenModelica as Python (``.py``)
+    or MATLAB (``.m``) text with ``A = [...]``.
 
     Raises:
         ConfigError: nothing that can be read; names the file and what was expected.
     """
     if path.is_dir():
         return _matrix_market(path)
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such file")
-    if path.stat().st_size > MAX_BYTES:
-        raise ConfigError(
-            f"{path} has {path.stat().st_size} bytes; at most {MAX_BYTES} are read"
-        )
     if path.suffix == ".mat":
         return _matlab(path)
+    if path.suffix == ".npz":
+        return read_archive(str(path))
     if path.suffix in (".py", ".m"):
         return _modelica(path)
-    raise ConfigError(f"{path}: expected a .mat, .py or .m file, or a folder of .mtx files")
+    raise ConfigError(f"{path}: expected a .mat, .npz, .py or .m file, or a folder of .mtx files")
 
 
 def _matlab(path: Path) -> dict[str, Any]:
     from scipy.io import loadmat
 
+    with open_regular(path) as stream:
+        _check_unpacked(stream, path)
     try:
         content = loadmat(path, variable_names=list(_NAMES))
-    except (ValueError, NotImplementedError, OSError, TypeError) as error:
+    except (ValueError, NotImplementedError, OSError, TypeError, zlib.error) as error:
         raise ConfigError(
             f"{path} cannot be read ({error}); save it with -v7 and the matrices E, A, B, C, D"
         ) from None
@@ -151,8 +154,27 @@ def _matlab(path: Path) -> dict[str, Any]:
     return found
 
 
+def _check_unpacked(stream: BinaryIO, path: Path) -> None:
+    """Refuse a file whose compressed elements (of type 15) become too large."""
+    size = os.fstat(stream.fileno()).st_size
+    order = "<" if stream.read(128)[126:] == b"IM" else ">"
+    while size <= MAX_BYTES and len(tag := stream.read(8)) == 8:
+        kind, length = struct.unpack(f"{order}II", tag)
+        if kind != 15:  # plain, or no such file at all, which its reader says better
+            break
+        packed, unpacker = stream.read(length), zlib.decompressobj()
+        while packed and size <= MAX_BYTES:
+            try:
+                size += len(unpacker.decompress(packed, 1 << 20))
+            except zlib.error:
+                break
+            packed = unpacker.unconsumed_tail
+    if size > MAX_BYTES:
+        raise ConfigError(f"{path} has more than {MAX_BYTES} bytes, or unpacks to more")
+
+
 def _matrix_market(folder: Path) -> dict[str, Any]:
-    from scipy.io import mmread
+    from scipy.io import mminfo, mmread
 
     found: dict[str, Any] = {}
     for path in sorted(folder.glob("*.mtx")):
@@ -161,11 +183,17 @@ def _matrix_market(folder: Path) -> dict[str, Any]:
             continue
         if match[1] in found:
             raise ConfigError(f"{folder} has two files for {match[1]}; give a folder of one system")
-        if path.stat().st_size > MAX_BYTES:
-            raise ConfigError(f"{path} has more than {MAX_BYTES} bytes")
+        with open_regular(path) as stream:
+            size = os.fstat(stream.fileno()).st_size
         try:
+            rows, columns, entries, *_ = mminfo(path)
+            if size > MAX_BYTES or max(rows, columns) > MAX_STATES or entries > size:
+                raise ConfigError(
+                    f"{path} has {size} bytes with {rows} × {columns} entries; at most {MAX_BYTES} "
+                    f"bytes and {MAX_STATES} rows and columns are read"
+                )
             found[match[1]] = mmread(path)
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise ConfigError(f"{path} is no Matrix Market file ({error})") from None
     if "A" not in found:
         raise ConfigError(f"{folder} has no file A.mtx or NAME.A.mtx")
@@ -174,10 +202,7 @@ def _matrix_market(folder: Path) -> dict[str, Any]:
 
 def _modelica(path: Path) -> dict[str, Any]:
     """``A = [1, 2; 3, 4]`` of MATLAB text, or ``A = [[1, 2], [3, 4]]`` of Python text."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path} is not UTF-8 text") from None
+    text = read_text(path, _MAX_TEXT)
     found: dict[str, Any] = {}
     assigned = r"^\s*([EABCD])\s*=\s*(?:np\.array\()?\s*(\[.*?\])\s*\)?\s*;?\s*$"
     for match in re.finditer(assigned, text, re.MULTILINE | re.DOTALL):

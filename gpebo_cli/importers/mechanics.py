@@ -19,6 +19,7 @@ KEYS = (
     "F", "r", "measure", "initial_positions", "initial_velocities", "units",
 )
 """Keys of a mechanical model; only M is required."""
+MAX_POSITIONS = 1_000
 
 
 def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> PlantDraft:
@@ -89,7 +90,8 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
             for entry, column in zip(rows[i], columns, strict=True):
                 _put(draft, matrix, row, column, entry, sign)
     _constraints(draft, G, _right_hand_side(model, len(G), where), positions)
-    _measure(draft, model, where)
+    measured = model.get("measure")
+    draft.measure([] if measured is None else _list(measured, where), where)
     return draft
 
 
@@ -104,18 +106,6 @@ def _constraints(
         if r[j] != 0:
             draft.inputs[f"r{j + 1}"] = (r[j], "")
             draft.add("B", row, f"r{j + 1}", -1.0)
-
-
-def _measure(draft: PlantDraft, model: Mapping[str, object], where: str) -> None:
-    measured = model.get("measure")
-    for row, label in enumerate([] if measured is None else _list(measured, where)):
-        if label not in draft.states:
-            raise ConfigError(
-                f"{where}measure has {shown(label)}, which is no position, velocity or force"
-                f"{nearest(label, draft.states)} (there are {', '.join(draft.states)})"
-            )
-        draft.outputs[f"y_{label}"] = draft.states[label][1]
-        draft.add("C", row, label, 1.0)
 
 
 def _put(draft: PlantDraft, matrix: str, row: int, column: str, entry: Entry, sign: int) -> None:
@@ -157,6 +147,8 @@ def _matrix(
         value = np.atleast_2d(value).tolist()
     if not isinstance(value, Sequence) or isinstance(value, str):
         raise ConfigError(f"{where}{key} must be a list of rows, got {shown(value)}")
+    if max([len(value), *(len(row) for row in value if isinstance(row, Sequence))]) > MAX_POSITIONS:
+        raise ConfigError(f"{where}{key} has more than {MAX_POSITIONS} rows or columns")
     out = []
     for i, row in enumerate(value):
         if not isinstance(row, Sequence) or isinstance(row, str):

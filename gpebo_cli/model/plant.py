@@ -5,6 +5,7 @@ Every message names the plant, the key and the entry, and where two sizes disagr
 
 from __future__ import annotations
 
+import itertools
 import keyword
 import re
 import reprlib
@@ -12,11 +13,14 @@ from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import prod
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.archive import ARCHIVE, with_archive
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.expressions import (
     RESERVED,
@@ -54,8 +58,12 @@ KEYS = (
     "units",
     "labels",
     "observer_defaults",
+    ARCHIVE,
 )
 """Keys of a plant file; name, states, E, A and initial_state are required."""
+
+# Shape of a matrix, and its entries by position, row after row; what is not there is 0.
+_Entries = tuple[tuple[int, ...], dict[int, Expression]]
 
 # Which signals may stand in what, and why not others.
 _OF_ALL = dict.fromkeys(("an input", "an output"), "")
@@ -215,6 +223,7 @@ def plant_from_mapping(
             raise ConfigError(
                 f"{plant}: unknown key {_show(key)}{hint} (accepted: {', '.join(KEYS)})"
             )
+    mapping = with_archive(mapping, source, plant)
 
     states = _names(plant, "states", _required(mapping, "states", plant))
     if not states and kind == "plant":
@@ -241,8 +250,10 @@ def plant_from_mapping(
         )
     parameters = read_parameters(plant, mapping.get("parameters"), signals, elsewhere)
 
+    everything = {**signals, **parameters}
+
     def read(value: object, where: str, allowed: Mapping[str, str] | None = None) -> Expression:
-        known = parameters if allowed is None else {**signals, **parameters}
+        known = parameters if allowed is None else everything
         expression = parse(value, known, f"{plant}: {where}", elsewhere)
         _check_signals(expression, elsewhere, allowed or {}, where.partition("[")[0])
         return expression
@@ -261,10 +272,10 @@ def plant_from_mapping(
         "B": (rows, driven, _OF_ALL),
     }
     known = _known_term(plant, mapping.get("phi"), rows)
-    entries: dict[str, tuple[tuple[int, ...], list[Expression]]] = {
+    entries: dict[str, _Entries] = {
         "phi": (
             (len(states),),
-            [read(value, f"phi[{i}]", _OF_ALL) for i, value in enumerate(known)],
+            {i: read(value, f"phi[{i}]", _OF_ALL) for i, value in enumerate(known)},
         )
     }
     for key, (down, across, allowed) in sides.items():
@@ -272,24 +283,28 @@ def plant_from_mapping(
         elsewhere_too = {"D", "H"}
         if not _is_empty(mapping.get("H")):
             elsewhere_too.add("F")
-        named = any(not e.node.signals.isdisjoint(inputs) for _, es in entries.values() for e in es)
+        named = any(
+            not e.node.signals.isdisjoint(inputs)
+            for _, given in entries.values() for e in given.values()
+        )
         if named or not _is_empty(mapping.get("D")):
             elsewhere_too.add("B")
         needed = key not in elsewhere_too
         grid = _matrix(plant, key, mapping.get(key), down, across, needed=needed)
-        shape = (len(down.names), len(across.names))
+        width = len(across.names)
         entries[key] = (
-            shape,
-            [
-                read(value, f"{key}[{i}][{j}]", allowed)
+            (len(down.names), width),
+            {
+                i * width + j: read(value, f"{key}[{i}][{j}]", allowed)
                 for i, row in enumerate(grid)
                 for j, value in row
-            ],
+                if type(value) not in (int, float) or value != 0  # most of a large matrix are 0
+            },
         )
-    entries["u"] = (len(inputs),), u
+    entries["u"] = (len(inputs),), dict(enumerate(u))
 
     theta = [read(value, f"unknowns.{label}") for label, value in unknowns.items()]
-    entries["theta"] = (len(unknowns),), theta
+    entries["theta"] = (len(unknowns),), dict(enumerate(theta))
     given = _initial_values(plant, _required(mapping, "initial_state", plant), states)
     initial = [read(value, f"initial_state.{label}").value for label, value in given.items()]
     return DescriptorSystem(
@@ -324,38 +339,41 @@ def _check_signals(
 
 
 def _coefficients(
-    entries: Mapping[str, tuple[tuple[int, ...], Sequence[Expression]]],
+    entries: Mapping[str, _Entries],
     inputs: Sequence[Expression],
     outputs: frozenset[str],
     name: str,
     restricted: TextCoefficients | None = None,
 ) -> TextCoefficients:
     if restricted is None and any(
-        not e.node.signals.isdisjoint(outputs) for _, listed in entries.values() for e in listed
+        not e.node.signals.isdisjoint(outputs)
+        for _, given in entries.values() for e in given.values()
     ):
-        nothing = parse(0, {}, name)
         kept = {
-            key: (shape, [e if e.node.signals.isdisjoint(outputs) else nothing for e in listed])
-            for key, (shape, listed) in entries.items()
+            key: (shape, {k: e for k, e in given.items() if e.node.signals.isdisjoint(outputs)})
+            for key, (shape, given) in entries.items()
         }
         restricted = _coefficients(kept, inputs, outputs, name)
     varying: list[Expression] = []
     layouts: dict[str, _Layout] = {}
-    for key, (shape, expressions) in entries.items():
-        positions = [k for k, e in enumerate(expressions) if not e.is_constant]
+    for key, (shape, given) in entries.items():
+        fixed = np.zeros(prod(shape))
+        constant = {k: e.value for k, e in given.items() if e.is_constant}
+        fixed[list(constant)] = list(constant.values())
+        moving = {k: e for k, e in given.items() if k not in constant}
         layouts[key] = _Layout(
             shape,
-            np.array([e.value if e.is_constant else 0.0 for e in expressions]),
-            np.array(positions, dtype=np.intp),
-            np.arange(len(varying), len(varying) + len(positions), dtype=np.intp),
+            fixed,
+            np.array(list(moving), dtype=np.intp),
+            np.arange(len(varying), len(varying) + len(moving), dtype=np.intp),
         )
-        varying += [expressions[k] for k in positions]
+        varying += moving.values()
     signals = {
-        key: frozenset[str]().union(*(e.node.signals for e in expressions))
-        for key, (_, expressions) in entries.items()
+        key: frozenset[str]().union(*(e.node.signals for e in given.values()))
+        for key, (_, given) in entries.items()
     }
     depending = {key: signals[key] for key in MATRIX_NAMES if signals[key]}
-    truth = record(entries["theta"][1])
+    truth = record(list(entries["theta"][1].values()))
     return TextCoefficients(
         record(varying, inputs), layouts, truth, depending, outputs, name, restricted
     )
@@ -526,11 +544,13 @@ def _matrix(
 ) -> list[list[tuple[int, object]]]:
     """The entries of a matrix by row, each with its column; sizes checked.
 
-    Zeros where there are none and none are ``needed``.
+    None where there are none and none are ``needed``. Of a sparse matrix those that it has.
     """
     n_rows, n_columns = len(down.names), len(across.names)
     if _is_empty(value) and not needed:
-        return [[(j, 0) for j in range(n_columns)] for _ in range(n_rows)]
+        return []
+    if isinstance(value, np.ndarray) or hasattr(value, "tocsr"):
+        return _numbers(plant, key, value, down, across)
     if _is_empty(value):
         if n_rows and n_columns:
             why = across if down.noun == "state" else down
@@ -566,13 +586,33 @@ def _matrix(
     return grid
 
 
+def _numbers(
+    plant: str, key: str, value: Any, down: _Side, across: _Side
+) -> list[list[tuple[int, object]]]:
+    """The same of an array, or of one of SciPy's sparse matrices."""
+    shape = (len(down.names), len(across.names))
+    if value.shape != shape:
+        size = " × ".join(map(str, value.shape))
+        raise ConfigError(
+            f"{plant}: {key} is {size}, and {down} and {across}: expected {shape[0]} × {shape[1]}"
+        )
+    if isinstance(value, np.ndarray):
+        return [list(enumerate(row)) for row in value.tolist()]
+    csr = value.tocsr(copy=True)
+    csr.sum_duplicates()
+    columns, values, starts = csr.indices.tolist(), csr.data.tolist(), csr.indptr.tolist()
+    return [
+        list(zip(columns[a:b], values[a:b], strict=True)) for a, b in itertools.pairwise(starts)
+    ]
+
+
 def _is_empty(value: object) -> bool:
-    return value is None or value == []
+    return value is None or (isinstance(value, list) and not value)
 
 
 def _known_term(plant: str, value: object, rows: _Side) -> list[object]:
     """φ, one entry for each equation."""
-    if value is None or value == []:
+    if _is_empty(value):
         return [0] * len(rows.names)
     entries = _list(value)
     if entries is None:

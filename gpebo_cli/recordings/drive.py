@@ -8,7 +8,6 @@ needs. Elements end at the samples where it jumps or bends.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +17,9 @@ from typing import Literal
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.archive import ARCHIVE
 from gpebo_cli.model.descriptor import Array, Coefficients, CoefficientSource, DescriptorSystem
+from gpebo_cli.reading import beside
 from gpebo_cli.recordings.hold import bends
 from gpebo_cli.recordings.table import TIME, read_table
 from gpebo_cli.schema import read
@@ -167,17 +168,19 @@ def driven(system: DescriptorSystem, found: Mapping[str, Piecewise]) -> Descript
 
 
 def located(mapping: Mapping[str, object], source: str) -> Mapping[str, object]:
-    """A file's mapping with the paths of its tables as they are from here, for ``config.yaml``.
+    """A plant's mapping with the paths of its other files as they are from here.
 
     Raises:
-        ConfigError: a table lies outside of the folders that the file may read from.
+        ConfigError: a file lies outside of the folders that this one may read from.
     """
+    if isinstance(mapping.get(ARCHIVE), str):
+        mapping = {**mapping, ARCHIVE: beside(str(mapping[ARCHIVE]), source, ARCHIVE)}
     key = "signals" if "psi" in mapping else "inputs"
     inputs = mapping.get(key)
     if not isinstance(inputs, Mapping):
         return mapping
     return {**mapping, key: {
-        name: {**given, "file": _path(given["file"], source, f"{key}.{name}.file")}
+        name: {**given, "file": beside(given["file"], source, f"{key}.{name}.file")}
         if isinstance(given, Mapping) and isinstance(given.get("file"), str) else given
         for name, given in inputs.items()
     }}
@@ -185,7 +188,7 @@ def located(mapping: Mapping[str, object], source: str) -> Mapping[str, object]:
 
 def _piecewise(name: str, content: Mapping[str, object], where: str, source: str) -> Piecewise:
     given = read(_Given, content, where)
-    path = _path(given.file, source, f"{where}.file")
+    path = beside(given.file, source, f"{where}.file")
     column = given.column or name
     data = DataSettings(
         name="csv", file=path, columns={TIME: given.time, name: column}, scale={name: given.scale},
@@ -211,26 +214,3 @@ def _piecewise(name: str, content: Mapping[str, object], where: str, source: str
             pieces = np.stack([pieces[0], np.diff(values) / np.diff(t)])
         corners = t[bends(t, values[:, None], given.hold)]
     return Piecewise(f"{where}: {path}", t, np.asarray(pieces), corners)
-
-
-def _path(file: str, source: str, where: str) -> str:
-    """Where a table is: beside the plant's file, in its ``--config-dir``, or here.
-
-    Raises:
-        ConfigError: elsewhere, of a plant from a file, which may be a stranger's.
-    """
-    if not source:
-        return file  # of whoever calls from Python
-    folder = os.path.dirname(os.path.abspath(source))
-    if os.path.basename(folder) in ("plant", "regression"):
-        folder = os.path.dirname(folder)
-    folders = [os.path.dirname(os.path.abspath(source)), folder, os.getcwd()]
-    paths = [os.path.normpath(os.path.join(place, file)) for place in folders]
-    path = next((found for found in paths if os.path.exists(found)), paths[-1])
-    real = os.path.realpath(path)
-    if not any(os.path.commonpath([real, os.path.realpath(place)]) == os.path.realpath(place)
-               for place in folders):
-        raise ConfigError(
-            f"{where}: {file} lies outside of {folder} and of the current folder; copy it there"
-        )
-    return min(path, os.path.relpath(path), key=len)
