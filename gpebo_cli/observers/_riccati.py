@@ -37,7 +37,7 @@ from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, Monitor
 
 _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
-# Standard deviations below this share of the largest one, each relative to that at the start, are
+# Standard deviations below this share of the largest one, each in its unit (see _units), are
 # resolved less: P as a matrix does not hold them, for its rounding is that of its largest entry.
 _SMALLEST = 3e-5
 _FALL = 1e12  # of P over the horizon: beyond, a double does not hold both ends
@@ -135,8 +135,9 @@ def _in_front(lost: BoolArray, found: list[Kind]) -> list[Kind]:
 class Filtered:
     """The filter's covariance and estimates on the mesh that resolves them."""
 
-    pair: Trajectory  # (2n, n + g), see the module, with P in units of ``variance``
-    variance: float
+    pair: Trajectory  # (2n, n + g), see the module, in the units that follow
+    variance: float  # of P
+    unit: Array  # (n,) of ζ
     error_estimate: float  # relative to each signal's own size
     extras: tuple[Array, ...]  # of the coefficients, (K, s + 1, …) each
 
@@ -148,7 +149,8 @@ class Filtered:
     def at(self, t: Array, inside: Array | None = None) -> tuple[Array, Array]:
         """P (M, n, n) and ζ̂ (M, n, g) at the times t (M,); at edges see ``Mesh.sampler``."""
         P, estimate = quotient(self.pair(t, inside))
-        return self.variance * P, estimate
+        unit = self.unit[:, None]
+        return self.variance * unit * P * self.unit, unit * estimate
 
 
 def run_filter(
@@ -179,17 +181,18 @@ def run_filter(
     Raises:
         SolverError: the tolerance cannot be reached, or P is not positive semidefinite.
     """
-    unit = np.sqrt(np.diag(P0))
-    unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
-    unit /= unit.max()
+    m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
+    horizon = float(mesh.edges[-1] - mesh.edges[0])
+    deviation = np.sqrt(np.diag(P0))
+    unit = _units(m.A, deviation, horizon)
+    P0, start = P0 / np.outer(unit, unit), start / unit[:, None]
+    W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0, initial=0.0)
     # A common factor of all covariances changes nothing. It is chosen so that W is of order 1:
     # entries of 1e7 would be taken as pivots, and mix the equations.
-    m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
-    W = unit[:, None] * (transpose(m.c) @ np.linalg.solve(m.V, m.c)) * unit
-    variance = 1.0 / max(float(np.abs(W).max(initial=0.0)), np.finfo(float).tiny)
+    variance = 1.0 / max(float((W * np.outer(unit, unit)).max()), np.finfo(float).tiny)
     if not np.isfinite(variance):
         variance = 1.0
-    fall = float(np.diag(P0).max()) / variance * float(mesh.edges[-1] - mesh.edges[0])
+    fall = float((W * np.outer(deviation, deviation)).max()) * horizon
     if fall > _FALL:
         raise SolverError(
             f"the covariance of the {name} would fall to {1 / fall:.1e} of where it starts, beyond "
@@ -199,23 +202,25 @@ def run_filter(
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         m, extras = model(t, inside)
-        scaled = m._replace(Q=m.Q / variance, N=m.N / variance, V=m.V / variance)
-        H, f = hamiltonian(scaled)
+        column = unit[:, None]
+        H, f = hamiltonian(StateSpace(
+            A=m.A * unit / column, b=m.b / column, c=m.c * unit, z=m.z,
+            Q=m.Q / (variance * column * unit), N=m.N / (variance * column), V=m.V / variance,
+        ))
         return LinearEquation(None, H, f, extras)
 
     def signals(values: Array, extras: tuple[Array, ...]) -> list[Kind]:
         P, estimate = quotient(values)
-        d = np.sqrt(np.maximum(np.einsum("kjii->kji", P).max(axis=1), 0.0)) / unit  # (K, n)
-        d = unit * np.maximum(d, _SMALLEST * d.max(axis=1, initial=1e-100, keepdims=True))
+        d = np.sqrt(np.maximum(np.einsum("kjii->kji", P).max(axis=1), 0.0))  # (K, n)
+        d = np.maximum(d, _SMALLEST * d.max(axis=1, initial=1e-100, keepdims=True))
         own = P / (d[:, None, :, None] * d[:, None, None, :])
         found: list[Kind] = [
             (own.reshape(*own.shape[:2], -1), 0.0), (estimate.reshape(*estimate.shape[:2], -1), 0.0)
         ]
         if monitor is not None:
-            found += monitor(estimate, extras)
+            found += monitor(unit[:, None] * estimate, extras)
         n = P.shape[-1]
-        X1 = unit[:, None] * values[..., :n, :n] / unit
-        return _in_front(np.abs(X1).max(axis=(1, 2, 3)) > _GROWTH, found)
+        return _in_front(np.abs(values[..., :n, :n]).max(axis=(1, 2, 3)) > _GROWTH, found)
 
     problem = LinearProblem(
         coefficients, pair(P0 / variance, start), signals, name, renewal=_Restart()
@@ -241,4 +246,22 @@ def run_filter(
             f"t = {solution.trajectory.mesh.edges[k]:.6g} (eigenvalue {relative.min():.1e} of its "
             "trace); lower observer.P0, or raise observer.regularisation"
         )
-    return Filtered(solution.trajectory, variance, solution.error_estimate, solution.extras)
+    return Filtered(
+        solution.trajectory, variance, unit, solution.error_estimate, solution.extras
+    )
+
+
+def _units(A: Array, deviation: Array, horizon: float) -> Array:
+    """Units (n,) of ζ: deviations at the start, or what those of constants soon make of them.
+
+    Powers of two, so that nothing is rounded. What is constant has a row of zeros in A (N, n, n);
+    it moves the others for as long as these remember. By ``_GROWTH`` X₁ may be out of balance.
+    """
+    unit = np.where(deviation > 0, deviation, deviation.max(initial=0.0) or 1.0)
+    pushes = np.abs(A).max(axis=0, initial=0.0) * unit / unit[:, None]
+    moving = pushes.any(axis=1)
+    rate = max(float(pushes[np.ix_(moving, moving)].max(initial=0.0)), 1.0 / horizon)
+    pushed = np.ones(len(unit))
+    for _ in unit:  # through as many others as there are
+        pushed = np.maximum(pushed, (pushes * pushed).max(axis=1, initial=0.0) / rate)
+    return np.asarray(np.exp2(np.rint(np.log2(unit * np.maximum(pushed / _GROWTH, 1.0)))))
