@@ -185,7 +185,7 @@ def test_the_square_root_form_survives_what_normal_equations_do_not():
     eta = np.array([1.0, -2.0])
     block.rows[..., 2] = block.rows[..., :2] @ eta
     roots, memory = InformationRoot(2, np.zeros(1)).update(block)
-    quotient, usable = quotient_of(spectrum(roots[:, 0], memory[:, 0]))
+    quotient, usable, _ = quotient_of(spectrum(roots[:, 0], memory[:, 0]))
     assert usable[-1]
     np.testing.assert_allclose(quotient[-1], eta, atol=1e-5)
     rows = block.weighted().reshape(-1, 3)
@@ -325,6 +325,8 @@ def test_every_row_is_answered_before_the_next_one_is_there(tmp_path, rows):
         assert header == [
             "t", "e0_e1_hat", "e0_e2_hat", "e0_il_hat",
             *(f"{s}_hat" for s in ("e1", "e2", "il", "ir1", "ir2", "iv")), "lambda_min",
+            *(f"{name}_std" for name in ("e0_e1", "e0_e2", "e0_il")),
+            *(f"{s}_std" for s in ("e1", "e2", "il", "ir1", "ir2", "iv")),
         ]
         assert process.stdout.readline().startswith("0,")
         for row in rows[2:12]:

@@ -12,6 +12,8 @@ from plants import shipped
 from gpebo_cli import run
 from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence.uncertainty import deviations, noise_level
+from gpebo_cli.experiment.pipeline import stream
+from gpebo_cli.settings import DataSettings, NoiseSettings, Settings, TimeSettings
 
 sys.path.insert(0, str(ROOT / "docs"))
 import uncertainty as page
@@ -91,6 +93,58 @@ def test_deviations_are_those_of_the_seeds(name, remedy, chosen):
         assert np.abs(np.log(ratio)).max() < 0.18, settings
         assert abs(np.log(ratio).mean()) < 0.08, settings
         assert one.predicted[~known].max(initial=0.0) < 1e-6
+
+
+def fed(system, estimator, t, u, y, hold="linear", noise=None, cut=0):
+    """Every estimate, deviation and level of a stream, the rows in one batch or in two."""
+    settings = Settings(
+        plant={}, estimator=estimator, data=DataSettings("csv", "-", hold),
+        time=TimeSettings(-np.inf, np.inf, 11), noise=noise or NoiseSettings(),
+    )
+    online = stream(settings, system)(float(t[0]), np.append(u[0], y[0]))
+    parts = [part for part in (slice(0, cut), slice(cut, None)) if len(t[part])]
+    made = [online.feed(t[part], u[part], y[part]) for part in parts]
+    return [
+        np.concatenate([np.concatenate([m.parameters, m.states], axis=2)[0] for m in made]),
+        np.concatenate([m.std[0] for m in made]), np.concatenate([m.level for m in made]),
+    ]
+
+
+@pytest.mark.parametrize(("hold", "estimator"), [
+    ("zoh", {"name": "least_squares"}), ("linear", {"name": "least_squares", "beta": 0.3}),
+    ("linear", {"name": "ls_drem", "beta": 0.2}), ("zoh", {"name": "drem", "gamma": 1e8}),
+    ("linear", {"name": "drem", "gamma": 1e8}),
+])
+def test_at_samples_they_are_what_each_error_by_itself_does(hold, estimator):
+    """Estimates are affine in every sample: the variances of the responses add up, to rounding."""
+    system, generator = shipped("descriptor"), np.random.default_rng(1)
+    t = np.cumsum(generator.uniform(0.2, 0.6, 10))
+    u, y = np.sin(t)[:, None], np.cos(2 * t)[:, None]
+    noise = NoiseSettings(name="gaussian", outputs=0.3, inputs=0.2)
+    base, std, level = fed(system, estimator, t, u, y, hold, noise, cut=4)
+    np.testing.assert_array_equal(level, 1.0)
+    variance = np.zeros_like(std)
+    for j in range(len(t)):
+        one = np.zeros((len(t), 1))
+        one[j] = 1.0
+        for sigma, signals in ((0.3, (u, y + one)), (0.2, (u + one, y))):
+            variance += (sigma * (fed(system, estimator, t, *signals, hold)[0] - base)) ** 2
+    np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_the_level_at_samples_has_no_bias(hold):
+    """E σ̂² = σ² at every row: the squares of what each error by itself would be taken for."""
+    system = shipped("descriptor")
+    t = np.linspace(0.0, 6.0, 11)
+    nothing = np.zeros((len(t), 1))
+    found = 0.0
+    for j in range(len(t)):
+        y = nothing.copy()
+        y[j] = 1.0
+        found = found + fed(system, {"name": "ls_drem"}, t, nothing, y, hold, cut=5)[2] ** 2
+    assert np.isnan(found[:4]).all()  # four parameters explain four rows
+    np.testing.assert_allclose(found[6:], 1.0, rtol=1e-6)
 
 
 def test_they_are_in_tables_and_summary_unless_switched_off(tmp_path):

@@ -38,15 +38,20 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
         rows, wrong = reader.feed(piece, last=not piece)
         if rows and reader.header is not None:
             came = samples(reader.header, np.array(rows), system)
-            head = ""
+            first = online is None
             if online is None:
                 online = begin(float(came.t[0]), np.append(came.inputs[0], came.outputs[0]))
-                names = [f"{name}_hat" for name in (*online.parameters, *system.states)]
-                head = ",".join(["t", *names, "lambda_min"]) + "\n"
             made = online.feed(came.t, came.inputs, came.outputs)
+            names = (*online.parameters, *system.states)
+            header = ["t", *(f"{name}_hat" for name in names), "lambda_min"]
             estimates = np.hstack([made.parameters[0], made.states[0]])
-            table = np.column_stack([came.t, estimates, made.gram_eigenvalues[:, :1]])
-            _write(head + _text(table))
+            columns = [came.t, estimates, made.gram_eigenvalues[:, :1]]
+            if made.std is not None and made.level is not None:
+                header += [f"{name}_std" for name in names]
+                level = made.level[:, None]  # NaN: so far the estimates explain any rows
+                columns.append(np.where(np.isnan(level), np.inf, made.std[0] * level))
+            head = ",".join(header) + "\n" if first else ""
+            _write(head + _text(np.column_stack(columns)))
         if wrong:
             raise ConfigError(wrong)
         if not piece:

@@ -12,12 +12,16 @@ gain and any sample time.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from gpebo_cli.estimators._information import Spectrum
 from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
+from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, transpose
+from gpebo_cli.regression.errors import ErrorRecursion
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.samples import SampledRegression
@@ -67,15 +71,15 @@ def spectrum(root: Array, memory: Array) -> Spectrum:
     return Spectrum(sigma**2, np.swapaxes(Vt, -1, -2), sigma[..., None] * coordinates, memory)
 
 
-def quotient_of(s: Spectrum) -> tuple[Array, BoolArray]:
-    """𝐘/Δ = G_z⁻¹ h_z (K, p), and where it is more than rounding (K,)."""
+def quotient_of(s: Spectrum) -> tuple[Array, BoolArray, Array]:
+    """𝐘/Δ = G_z⁻¹ h_z (K, p), where it is more than rounding (K,), and G_z⁻¹ there (K, p, p)."""
     largest = s.eigenvalues[:, -1:] if s.eigenvalues.shape[1] else np.zeros((len(s.memory), 1))
     usable = (s.eigenvalues > _SINGULAR**2 * largest).all(axis=1) & (largest[:, 0] > 0.0)
     inverse = np.divide(
-        s.rotated, s.eigenvalues[..., None], out=np.zeros_like(s.rotated),
-        where=usable[:, None, None],
+        1.0, s.eigenvalues, out=np.zeros_like(s.eigenvalues), where=usable[:, None]
     )
-    return (s.vectors @ inverse)[..., 0], usable
+    whole = (s.vectors * inverse[:, None]) @ transpose(s.vectors)
+    return (s.vectors @ (inverse[..., None] * s.rotated))[..., 0], usable, whole
 
 
 class ScalarLaw:
@@ -88,9 +92,11 @@ class ScalarLaw:
         self._quotient: Array | None = None
         self._usable = np.zeros((1, groups), dtype=bool)
         self.energy = np.zeros(groups)  # ∫Δ² so far, (D,)
+        self._inverse: list[Array] | None = None  # Q of the last sample of each group
 
     def update(
-        self, regression: SampledRegression, delta: Array, quotient: Array, usable: BoolArray
+        self, regression: SampledRegression, delta: Array, quotient: Array, usable: BoolArray,
+        behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]],
     ) -> SampledEstimates:
         """One closed-form step per sample.
 
@@ -99,6 +105,8 @@ class ScalarLaw:
             delta: Δ (K, D).
             quotient: η̄ = 𝐘/Δ (K, D, p).
             usable: where η̄ is more than rounding (K, D); elsewhere its weight Δ² is nothing.
+            behind: of each group the filter of 𝒴, and what η̄ is of 𝒴 (K, p, p), zero where it is
+                rounding.
         """
         before = quotient[:1] if self._quotient is None else self._quotient
         previous = np.concatenate([before, quotient[:-1]])
@@ -109,19 +117,72 @@ class ScalarLaw:
         x = self._gains * energy[:, :, None, None]  # (K, D, g, 1 or p)
         decay = np.exp(-x)
         new, old = quotient[:, :, None], np.where(had[..., None], previous, quotient)[:, :, None]
-        if regression.hold == "zoh":
-            shift = -np.expm1(-x) * new
-        else:  # η̄ linear in ∫Δ² between the samples
-            mean = mean_decay(x)
-            shift = (1.0 - mean) * new + (mean - decay) * old
-        eta = affine_scan(decay, shift, self._eta)[1:]  # (K, D, g, p)
+        # η̄ is that of the new sample, or linear in ∫Δ² between both.
+        of_new, of_old = _shares(x, decay, regression.hold)
+        eta = affine_scan(decay, of_new * new + of_old * old, self._eta)[1:]  # (K, D, g, p)
         self._eta, self._delta = eta[-1], delta[-1:]
         self._quotient, self._usable = quotient[-1:], usable[-1:]
         self.energy = self.energy + energy.sum(axis=0)
         K, D, g, p = eta.shape
         parameters = np.moveaxis(eta.reshape(K, D * g, p), 0, 1)
         shown = delta.T if D == 1 else np.repeat(delta.T, g, axis=0)
-        return SampledEstimates(parameters, shown)
+        return SampledEstimates(
+            parameters, shown, lambda: self._errors(*behind(), decay, of_new, of_old, had)
+        )
+
+    def _errors(
+        self, filters: Sequence[Filter], quotients: Sequence[Array],
+        decay: Array, of_new: Array, of_old: Array, had: BoolArray,
+    ) -> tuple[ErrorRecursion, ...]:
+        """Of the filters' errors and of η̂ behind them, for each case of an update."""
+        out = []
+        before, self._inverse = self._inverse, [Q[-1:] for Q in quotients]
+        for d, (own, Q) in enumerate(zip(filters, quotients, strict=True)):
+            previous = np.concatenate([Q[:1] if before is None else before[d], Q[:-1]])
+            K, p = own.decay.shape
+            A_f = own.decay[:, :, None] * np.eye(p)
+            for g in range(decay.shape[2]):
+                keep, new, old = (
+                    np.broadcast_to(each[:, d, g], (K, p))[:, :, None]
+                    for each in (decay, of_new, of_old)
+                )
+                both = had[:, d, None, None]
+                on_new, on_old = (new + np.where(both, 0.0, old)) * Q, np.where(both, old, 0.0)
+                A = np.zeros((K, 2 * p, 2 * p))
+                A[:, :p, :p] = A_f
+                A[:, p:, :p] = on_new @ A_f + on_old * previous
+                A[:, p:, p:] = keep * np.eye(p)
+                out.append(ErrorRecursion(
+                    A, np.concatenate([own.old, on_new @ own.old], axis=1),
+                    np.concatenate([own.new, on_new @ own.new], axis=1),
+                    np.broadcast_to(np.eye(p, 2 * p, p), (K, p, 2 * p)),
+                ))
+        return tuple(out)
+
+
+class Filter(NamedTuple):
+    """δ𝒴' = decay δ𝒴 + old δY + new δY' over each step."""
+
+    decay: Array  # (K, p)
+    old: Array  # (K, p, rows)
+    new: Array  # (K, p, rows)
+
+
+def integrating(regression: SampledRegression, beta: float) -> Filter:
+    """That of h_z, with forgetting at the rate β."""
+    p = regression.p
+    into = transpose(regression.rows[..., :p])
+    old, new = (share[:, None, None] for share in regression.shares)
+    decay = np.repeat(np.exp(-beta * regression.steps)[:, None], p, axis=1)
+    return Filter(decay, old * into[:-1], new * into[1:])
+
+
+def _shares(x: Array, decay: Array, hold: str) -> tuple[Array, Array]:
+    """What a first-order lag over x time constants takes of its input's new and old end."""
+    if hold == "zoh":
+        return -np.expm1(-x), np.zeros_like(x)
+    mean = mean_decay(x)
+    return 1.0 - mean, mean - decay
 
 
 class KreisselmeierFilter:
@@ -135,16 +196,33 @@ class KreisselmeierFilter:
         """[Ω | 𝒴] (K, p, p + 1) at the samples."""
         p = regression.p
         outer = outer_products(regression.rows[..., :p], regression.rows[..., p])
-        x = self._rates * regression.steps[:, None, None]  # (K, p, 1)
-        decay = np.exp(-x)
-        if regression.hold == "zoh":
-            shift = -np.expm1(-x) * outer[1:]
-        else:
-            mean = mean_decay(x)
-            shift = (1.0 - mean) * outer[1:] + (mean - decay) * outer[:-1]
-        values = affine_scan(decay, shift, self._value)[1:]
+        decay, of_new, of_old = self._steps(regression)
+        values = affine_scan(decay, of_new * outer[1:] + of_old * outer[:-1], self._value)[1:]
         self._value = values[-1]
         return values
+
+    def _steps(self, regression: SampledRegression) -> tuple[Array, Array, Array]:
+        x = self._rates * regression.steps[:, None, None]  # (K, p, 1)
+        decay = np.exp(-x)
+        return decay, *_shares(x, decay, regression.hold)
+
+    def errors(self, regression: SampledRegression) -> Filter:
+        """What the filter of 𝒴 does to errors of Y."""
+        decay, of_new, of_old = self._steps(regression)
+        into = transpose(regression.rows[..., : regression.p])
+        return Filter(decay[..., 0], of_old * into[:-1], of_new * into[1:])
+
+
+def inverse_sampled(extended: Array) -> Array:
+    """Ω⁻¹ (K, p, p) of [Ω | 𝒴] (K, p, p + 1), zero where it is rounding."""
+    omega = extended[..., :-1]
+    delta, adjugate, reciprocal = determinant_and_adjugate_action(
+        omega, np.broadcast_to(np.eye(omega.shape[1]), omega.shape)
+    )
+    usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))[:, None, None]
+    return np.divide(
+        adjugate, delta[:, None, None], out=np.zeros_like(omega), where=usable
+    )
 
 
 def mix_sampled(extended: Array) -> tuple[Array, Array, BoolArray]:

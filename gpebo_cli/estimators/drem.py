@@ -10,7 +10,12 @@ import numpy as np
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._following import FollowingEstimates, follow
 from gpebo_cli.estimators._mixed import FilteredEstimator, energy_requirement, filter_rates
-from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, mix_sampled
+from gpebo_cli.estimators._recursive import (
+    KreisselmeierFilter,
+    ScalarLaw,
+    inverse_sampled,
+    mix_sampled,
+)
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
@@ -70,7 +75,11 @@ class RecursiveDrem:
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
-        return self._law.update(regression, *mix_sampled(self._filter.update(regression)))
+        extended = self._filter.update(regression)
+        return self._law.update(
+            regression, *mix_sampled(extended),
+            lambda: ([self._filter.errors(regression)], [inverse_sampled(extended)]),
+        )
 
     @property
     def requirement(self) -> Requirement:

@@ -11,12 +11,12 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._following import SolvedEstimates
 from gpebo_cli.estimators._information import Spectrum, information
-from gpebo_cli.estimators._recursive import InformationRoot, spectrum
+from gpebo_cli.estimators._recursive import InformationRoot, integrating, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.dynamics import Dynamics, filtered
-from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
@@ -240,7 +240,20 @@ class RecursiveLeastSquares:
             solution(s, case["alpha"], case["f0"], self._start)
             for case, s in zip(self._cases, spectra, strict=True)
         ]
-        return SampledEstimates(np.array(solved)[..., 0], None)
+
+        def errors() -> tuple[ErrorRecursion, ...]:
+            """δη̂ = αF δh_z."""
+            filters = [integrating(regression, case["beta"]) for case in self._cases]
+            eye = np.eye(regression.p)
+            return tuple(
+                ErrorRecursion(
+                    own.decay[:, :, None] * eye, own.old, own.new,
+                    s.covariance(case["alpha"], case["f0"]),
+                )
+                for own, case, s in zip(filters, self._cases, spectra, strict=True)
+            )
+
+        return SampledEstimates(np.array(solved)[..., 0], None, errors)
 
     @property
     def requirement(self) -> Requirement:

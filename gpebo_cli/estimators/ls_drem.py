@@ -15,7 +15,7 @@ from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._information import Information, Spectrum, information
 from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement, scalar_errors
 from gpebo_cli.estimators._mixing import SINGULAR, filled
-from gpebo_cli.estimators._recursive import ScalarLaw, quotient_of
+from gpebo_cli.estimators._recursive import ScalarLaw, integrating, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares
 from gpebo_cli.findings import Requirement
@@ -132,11 +132,11 @@ class RecursiveLsDrem:
             for s, case in zip(spectra, self._cases, strict=True)
         ]
         found = [quotient_of(s) for s in spectra]
+        quotient, usable, inverse = zip(*found, strict=True)
         return self._law.update(
-            regression,
-            np.stack(delta, axis=1),
-            np.stack([quotient for quotient, _ in found], axis=1),
-            np.stack([usable for _, usable in found], axis=1),
+            regression, np.stack(delta, axis=1), np.stack(quotient, axis=1),
+            np.stack(usable, axis=1),
+            lambda: ([integrating(regression, case["beta"]) for case in self._cases], inverse),
         )
 
     @property

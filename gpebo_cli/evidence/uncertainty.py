@@ -12,20 +12,24 @@ transformations: no variance can become negative, whatever the rounding.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.samples import SampledRegression
 
 _STAGES = 4  # order 7: a deviation needs three digits, and elements end at the samples
 _ELEMENTS = 1000  # about so many at least
 _MOST_PARTS = 8
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
+_LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
 _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
 
 
@@ -145,22 +149,69 @@ def _element_maps(
     observer: ErrorsAt, estimator: ErrorsAt, mesh: Mesh, part: slice, n: int
 ) -> Array:
     """[ζ; s] at each node from that at the left end and from e, (K, stages, d, d + m + r)."""
-    rule, s = mesh.rule, mesh.rule.stages
     joint = _joint(observer, estimator, mesh, part, n)
-    h = mesh.steps[part, None, None, None]
-    count, (d, signals) = len(h), joint.B.shape[-2:]
+    return _maps(mesh, mesh.steps[part], joint.A, joint.B)
+
+
+def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
+    """z at each node from that at the left end and from e, z' = A z + B e; (K, s, d, d + c).
+
+    Args:
+        mesh: its rule has s stages.
+        steps: (K,) seconds.
+        A: (K, s, d, d) at the nodes.
+        B: (K, s, d, c).
+    """
+    rule, s = mesh.rule, mesh.rule.stages
+    h = steps[:, None, None, None]
+    count, (d, signals) = len(h), B.shape[-2:]
     eye, nodes = np.eye(d), np.arange(s)
     operator = np.broadcast_to(
         np.einsum("ij,kl->ikjl", rule.differentiation, eye), (count, s, d, s, d)
     ).copy()
-    operator[:, nodes, :, nodes, :] -= np.swapaxes(h * joint.A, 0, 1)
+    operator[:, nodes, :, nodes, :] -= np.swapaxes(h * A, 0, 1)
     right = np.empty((count, s, d, d + signals))
     right[..., :d] = rule.differentiation.sum(axis=1)[:, None, None] * eye
-    right[..., d:] = h * joint.B
+    right[..., d:] = h * B
     solved = np.linalg.solve(
         operator.reshape(count, s * d, s * d), right.reshape(count, s * d, d + signals)
     )
     return np.asarray(solved.reshape(right.shape))
+
+
+def error_steps(mesh: Mesh, times: Array, hold: str, A: Array, B: Array) -> Array:
+    """ζ at every time but the first from that at the one before and from the errors e at both.
+
+    Args:
+        mesh: of elements between the times, (K + 1,).
+        times: of the samples.
+        hold: what is assumed between them, zoh or linear.
+        A: of ζ' = A ζ + B e at the points of the mesh, (elements or 1, s + 1 or 1, k, k).
+        B: likewise, (…, k, signals).
+
+    Returns:
+        (K, k, k + 2 signals)
+    """
+    points = mesh.points[:, 1:]
+    after = np.searchsorted(times, mesh.edges[1:] - 0.5 * mesh.steps)  # whose step it is part of
+    share = np.zeros(points.shape)  # of the newer of both errors
+    if hold == "linear":
+        share = (points - times[after - 1, None]) / (times[after] - times[after - 1])[:, None]
+    A, B = (
+        np.broadcast_to(each[:, -mesh.rule.stages :], (*points.shape, *each.shape[2:]))
+        for each in (A, B)
+    )
+    share = share[..., None, None]
+    ends = _maps(mesh, mesh.steps, A, np.concatenate([(1.0 - share) * B, share * B], axis=3))[:, -1]
+    if len(ends) == len(times) - 1:
+        return ends
+    k = ends.shape[1]
+    out = np.zeros((len(times) - 1, *ends.shape[1:]))
+    out[:, :, :k] = np.eye(k)
+    for end, step in zip(ends, after - 1, strict=True):
+        out[step] = end[:, :k] @ out[step]
+        out[step, :, k:] += end[:, k:]
+    return out
 
 
 def _joint(
@@ -205,3 +256,130 @@ def _factors(
         out[k] = L
         L[:size] = end @ L
     return out, L
+
+
+class SampledDeviations:
+    """One standard deviation from one sample to the next; it remembers L and no past."""
+
+    def __init__(
+        self, variances: Array, number: Callable[[Array], Array] | None, *, relative: bool
+    ) -> None:
+        """Prepare for the first sample.
+
+        Args:
+            variances: of each sample of [u; y], (m + r,).
+            number: times (K,) to which errors are theirs; None: each sample has errors of its own.
+            relative: whether they have to be multiplied by what :meth:`update` finds.
+        """
+        self._deviations, self._number, self._relative = np.sqrt(variances), number, relative
+        self._factors: list[Array] = []  # L of [ζ; e; s] of each case
+        self._before: tuple[Array, Array] | None = None  # C and D of the last sample
+        self._last = -np.inf
+        self._expected, self._square = 0.0, 0.0  # E∫|δY|² so far, E|δY|² at the last sample
+
+    def update(
+        self, observer: ErrorSteps, cases: Sequence[ErrorRecursion],
+        regression: SampledRegression, gain: Array, roots: Array,
+    ) -> tuple[Array, Array]:
+        """Of η̂ and x̂ of every case at K samples (G, K, p + n), and the factor for them (K,).
+
+        Args:
+            observer: errors of [u; y] to those of Y and of the state's offset.
+            cases: errors of Y to those of η̂.
+            regression: at the samples.
+            gain: of x = offset + gain η, (K, n, p).
+            roots: S of all data so far, without forgetting, (K, p + 1, p + 1).
+        """
+        count, n, p = gain.shape
+        k, rows, signals = observer.step.shape[1], observer.C.shape[1] - n, len(self._deviations)
+        C, D = observer.C, observer.D
+        before = (C[:1], D[:1]) if self._before is None else self._before
+        self._before = C[-1:], D[-1:]
+        C_old, D_old = (
+            np.concatenate([old, new[:-1]])[:, :rows]
+            for old, new in zip(before, (C, D), strict=True)
+        )
+        number = regression.t if self._number is None else self._number(regression.t)
+        fresh = np.diff(number, prepend=self._last) > 0
+        self._last = float(number[-1])
+        Y_new = C[:, :rows] @ observer.step  # δY' of [ζ; e; e'], but for D e'
+        Y_new[:, :, k + signals :] += D[:, :rows]
+        Y_old = np.concatenate([C_old, D_old, np.zeros((count, rows, signals))], axis=2)
+        if self._relative:  # with h as of least squares
+            cases = [_beside(_plain_sums(regression), cases[0]), *cases[1:]]
+        out = np.empty((len(cases), count, p + n))
+        for g, case in enumerate(cases):
+            size = k + signals + case.A.shape[1]
+            M = np.zeros((count, size, size + signals))
+            M[:, :k, : k + signals] = observer.step[..., : k + signals]
+            M[:, :k, size:] = observer.step[..., k + signals :]
+            M[:, k : k + signals, size:] = np.eye(signals)
+            into = case.old @ Y_old + case.new @ Y_new
+            M[:, k + signals :, : k + signals] = into[..., : k + signals]
+            M[:, k + signals :, size:] = into[..., k + signals :]
+            M[:, k + signals :, k + signals : size] = case.A
+            if len(self._factors) <= g:
+                self._factors.append(np.zeros((size, size)))
+            L = self._recursion(g, M, fresh, slice(k, k + signals))
+            eta = case.C @ L[:, k + signals :]
+            own = eta[:, -p:]
+            x = gain @ own + C[:, rows:] @ L[:, :k] + D[:, rows:] @ L[:, k : k + signals]
+            out[g] = np.linalg.norm(np.concatenate([own, x], axis=1), axis=2)
+            if g == 0 and self._relative:
+                of_Y = C[:, :rows] @ L[:, :k] + D[:, :rows] @ L[:, k : k + signals]
+                level = self._level(regression, (of_Y**2).sum(axis=(1, 2)), eta[:, :p], roots)
+        return out, level if self._relative else np.ones(count)
+
+    def _recursion(self, g: int, M: Array, fresh: BoolArray, errors: slice) -> Array:
+        """L of one case at the samples, (K, d, d), from [z; e'] to z' (K, d, d + signals)."""
+        L, size = self._factors[g], M.shape[1]
+        out = np.empty((len(M), size, size))
+        new = np.diag(self._deviations)
+        for i, step in enumerate(M):
+            if fresh[i]:
+                wide = np.hstack([step[:, :size] @ L, step[:, size:] @ new])
+                L = np.asarray(np.linalg.qr(wide.T, mode="r")).T
+            else:  # the errors are those of the sample before
+                same = step[:, :size].copy()
+                same[:, errors] += step[:, size:]
+                L = same @ L
+            out[i] = L
+        self._factors[g] = L
+        return out
+
+    def _level(
+        self, regression: SampledRegression, of_Y: Array, of_h: Array, roots: Array
+    ) -> Array:
+        """σ (K,) from the residual so far, see :func:`noise_level`; NaN where nothing is left."""
+        old, new = regression.shares
+        before = np.append(self._square, of_Y[:-1])
+        expected = self._expected + np.cumsum(old * before + new * of_Y)
+        self._expected, self._square = float(expected[-1]), float(of_Y[-1])
+        _, sigma, Vt = np.linalg.svd(roots[:, :-1, :-1])
+        known = sigma**2 > _SINGULAR * sigma[:, :1] ** 2
+        fitted = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)[..., None] * (Vt @ of_h)
+        left = expected - (fitted**2).sum(axis=(1, 2))
+        left[left <= _LEFT * expected] = np.nan
+        return np.asarray(np.abs(roots[:, -1, -1]) / np.sqrt(left))
+
+
+def _plain_sums(regression: SampledRegression) -> ErrorRecursion:
+    """δh of ∫ψᵀδY."""
+    p = regression.p
+    old, new = (share[:, None, None] for share in regression.shares)
+    into = transpose(regression.rows[..., :p])
+    eye = np.broadcast_to(np.eye(p), (len(old), p, p))
+    return ErrorRecursion(eye, old * into[:-1], new * into[1:], eye)
+
+
+def _beside(a: ErrorRecursion, b: ErrorRecursion) -> ErrorRecursion:
+    """Two of the same errors of Y, one above the other."""
+    def diagonal(x: Array, y: Array) -> Array:
+        out = np.zeros((len(x), x.shape[1] + y.shape[1], x.shape[2] + y.shape[2]))
+        out[:, : x.shape[1], : x.shape[2]], out[:, x.shape[1] :, x.shape[2] :] = x, y
+        return out
+
+    return ErrorRecursion(
+        diagonal(a.A, b.A), np.concatenate([a.old, b.old], axis=1),
+        np.concatenate([a.new, b.new], axis=1), diagonal(a.C, b.C),
+    )

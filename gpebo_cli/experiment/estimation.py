@@ -27,7 +27,7 @@ from gpebo_cli.experiment.online import Online, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
-from gpebo_cli.experiment.uncertainty import standard_deviations
+from gpebo_cli.experiment.uncertainty import sampled_deviations, standard_deviations
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, StateMap
@@ -150,7 +150,11 @@ def at_samples(
         t = sample_times(samples.step, start, stop)
         u, y = source.inputs(t), source.outputs(t)
         first = np.append(u[0], y[0])
-        online = Online(settings, system, samples.hold, start, first, estimator)
+        levels = noise_levels(settings.noise, system)
+        wanted = (
+            sampled_deviations(settings.noise, levels, source) if settings.uncertainty else None
+        )
+        online = Online(settings, system, samples.hold, start, first, estimator, wanted)
         parts = [slice(i, i + _SAMPLES_AT_ONCE) for i in range(0, len(t), _SAMPLES_AT_ONCE)]
         made = joined([online.feed(t[part], u[part], y[part]) for part in parts])
         truth = online.truth(made.extension)(t, source.theta(t), source.states)
@@ -163,6 +167,11 @@ def at_samples(
         )
     chosen = kept_samples(1, len(t), settings.time.samples)
     kept = chosen[kept_samples(len(online.cases), len(chosen), settings.output.max_rows)]
+    std: Array | None = None
+    p = parameters.shape[2]
+    if made.std is not None and made.level is not None:
+        std = made.std[:, kept] * made.level[-1]
+        std[np.isnan(np.concatenate([parameters, states], axis=2)[:, kept])] = np.nan
     estimation = EstimationResult(
         cases=online.cases,
         t=t[kept],
@@ -173,12 +182,14 @@ def at_samples(
         delta=None if made.delta is None else made.delta[:, kept],
         checks={},
         requirement=online.requirement,
+        parameters_std=None if std is None else std[..., :p],
+        states_std=None if std is None else std[..., p:],
     )
     with stage("excitation"):
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
         level = sampled_window_level(made.regression, window)[chosen]
         excitation = online.excitation(made, chosen, level, window)
-    rows, p = made.regression.rows[1:][chosen], len(online.parameters)
+    rows = made.regression.rows[1:][chosen]
     return Estimated(
         online,
         RegressionResult(

@@ -14,7 +14,9 @@ from gpebo_cli import estimators, observers
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.evidence.excitation import WELL, Excitation, excitation
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
+from gpebo_cli.evidence.uncertainty import SampledDeviations
 from gpebo_cli.experiment.result import Fit
+from gpebo_cli.experiment.uncertainty import MOST_CASES
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.observers.reduced.sampled import TOLERANCE
@@ -36,6 +38,8 @@ class OnlineEstimates:
     known: Knowledge  # from all samples so far
     seen: BoolArray  # (K, n) which states are determined
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
+    std: Array | None = None  # (G, K, p + n) deviations, to be multiplied by
+    level: Array | None = None  # (K,) that of the noise so far, 1 where it is known
 
 
 def joined(parts: Sequence[OnlineEstimates]) -> OnlineEstimates:
@@ -56,7 +60,14 @@ def joined(parts: Sequence[OnlineEstimates]) -> OnlineEstimates:
         Knowledge.joined([part.known for part in parts]),
         np.concatenate([part.seen for part in parts]),
         np.concatenate([part.extension for part in parts]),
+        *(_maybe([getattr(part, name) for part in parts], axis)
+          for name, axis in (("std", 1), ("level", 0))),
     )
+
+
+def _maybe(parts: Sequence[Array | None], axis: int) -> Array | None:
+    known = [part for part in parts if part is not None]
+    return np.concatenate(known, axis=axis) if len(known) == len(parts) else None
 
 
 class Online:
@@ -65,6 +76,7 @@ class Online:
     def __init__(
         self, settings: Settings, system: DescriptorSystem, hold: str, start: float, sample: Array,
         estimator: estimators.Estimator | None = None,
+        deviations: SampledDeviations | None = None,
     ) -> None:
         """Prepare for samples of which the first is at ``start``.
 
@@ -75,6 +87,7 @@ class Online:
             start: time of the first sample.
             sample: the first one, [u; y] (m + r,).
             estimator: used instead of the one that the settings name.
+            deviations: of what is estimated; None: nobody asks for them.
 
         Raises:
             ConfigError: the observer or the estimator works in continuous time only.
@@ -102,6 +115,9 @@ class Online:
         # When parameters could first be told apart, and when well.
         self._t_c: list[float | None] = [None, None]
         self._system = system
+        # Where matrices follow the signals, errors are not only added.
+        follows = self._observer.form.follows_signals
+        self._deviations = None if follows or len(self.cases) > MOST_CASES else deviations
         self.count = 0
 
     def feed(self, t: Array, u: Array, y: Array) -> OnlineEstimates:
@@ -111,7 +127,9 @@ class Online:
             ModelError: an assumption of the observer fails.
             SolverError: a step between samples cannot be resolved.
         """
-        self._state, block = self._observer.advance(self._state, t, u, y)
+        self._state, block = self._observer.advance(
+            self._state, t, u, y, errors=self._deviations is not None
+        )
         made = self._recursion.update(block.regression)
         roots, _ = self._gram.update(block.regression)
         self._root, self.count = roots[-1, 0], self.count + len(t)
@@ -127,13 +145,18 @@ class Online:
         for k, holds in enumerate(reached):
             if self._t_c[k] is None and holds.any():
                 self._t_c[k] = float(t[np.argmax(holds)])
+        std, level = None, None
+        if self._deviations is not None and block.errors is not None and made.errors is not None:
+            std, level = self._deviations.update(
+                block.errors, made.errors(), block.regression, block.gain, roots[:, 0]
+            )
         gain = np.einsum("knp,gkp->gkn", block.gain, made.parameters)
         eigenvalues = sigma[:, ::-1] ** 2
         self._final = made.parameters[:, -1].copy()
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
             block.regression, made.parameters, block.offset + gain, made.delta,
-            eigenvalues, known, known.states(block.gain), block.extension,
+            eigenvalues, known, known.states(block.gain), block.extension, std, level,
         )
 
     def truth(self, extension: Array) -> observers.Truth:

@@ -20,6 +20,7 @@ from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
+from gpebo_cli.experiment.uncertainty import sampled_deviations
 from gpebo_cli.experiment.verdict import verdict
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
@@ -115,8 +116,12 @@ def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Arr
             f"the gains of the estimator make {len(estimator.cases)} cases; a stream has room for "
             "one"
         )
+    deviations = None
+    if settings.uncertainty:
+        levels = noise_levels(settings.noise, system)
+        deviations = sampled_deviations(settings.noise, levels, None)
     return lambda start, sample: Online(
-        settings, system, settings.data.hold, start, sample, estimator
+        settings, system, settings.data.hold, start, sample, estimator, deviations
     )
 
 

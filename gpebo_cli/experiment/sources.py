@@ -126,8 +126,11 @@ def check_stream(settings: Settings, system: DescriptorSystem) -> None:
     Raises:
         ConfigError: names the key and what it may be.
     """
-    if not noise_levels(settings.noise, system).silent:
-        raise ConfigError("noise is for simulations; what is streamed has its own")
+    if settings.noise.seeds > 1 or noise_levels(settings.noise, system).steps.any():
+        raise ConfigError(
+            "noise.seeds and noise.quantisation are for simulations; what is streamed has its own "
+            "noise, of which noise.outputs and noise.inputs say how large it is"
+        )
     if settings.data.hold == "cubic":
         raise ConfigError(
             "data.hold=cubic needs to know the samples to come; a stream takes zoh or linear"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpebo_cli.evidence.uncertainty import deviations, noise_level
+from gpebo_cli.evidence.uncertainty import SampledDeviations, deviations, noise_level
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array
@@ -12,7 +12,40 @@ from gpebo_cli.observers._observation import AffineStateMap, Observation
 from gpebo_cli.regression.estimator import Affine, Estimator
 from gpebo_cli.settings import NoiseSettings
 
-_CASES = 32  # each takes a pass of its own; more are a study of gains, not of a measurement
+MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not of a measurement
+
+
+def sampled_deviations(
+    noise: NoiseSettings, levels: NoiseLevels, source: Source | None
+) -> SampledDeviations | None:
+    """Of an observer at samples; None: there is no noise.
+
+    Args:
+        noise: its settings.
+        levels: its levels; zeros mean unknown but for a simulation.
+        source: of the signals; None: a stream, each of whose rows has errors of its own.
+    """
+    recorded = source is None or source.recording is not None
+    if levels.silent and not recorded:
+        return None
+    variances = _variances(noise, levels)
+    if source is None:
+        return SampledDeviations(variances, None, relative=levels.silent)
+    edges = source.inputs.mesh.edges
+    instants = edges[:-1] if recorded else np.arange(edges[0], edges[-1], noise.sample_time)
+    near = 1e-6 * float(np.diff(instants).min(initial=np.inf))
+
+    def number(t: Array) -> Array:
+        return np.searchsorted(instants, t + near, side="right").astype(np.float64)
+
+    return SampledDeviations(variances, number, relative=levels.silent)
+
+
+def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
+    """Of [u; y], (m + r,); of a recording without levels relative to that of all outputs."""
+    if levels.silent:
+        return np.concatenate([np.zeros(len(levels.inputs)), np.ones(len(levels.outputs))])
+    return signal_noise(noise, levels).variances
 
 
 def standard_deviations(
@@ -29,7 +62,7 @@ def standard_deviations(
     state_map, errors = observation.state_map, observation.errors
     if errors is None or not isinstance(state_map, AffineStateMap):
         return None
-    if not isinstance(estimator, Affine) or len(estimator.cases) > _CASES:
+    if not isinstance(estimator, Affine) or len(estimator.cases) > MOST_CASES:
         return None
     regression = observation.regression
     edges = regression.mesh.edges
@@ -37,11 +70,10 @@ def standard_deviations(
         source.inputs.mesh.edges[:-1] if source.recording
         else np.arange(edges[0], edges[-1], noise.sample_time)
     )
-    variances = signal_noise(noise, levels).variances
+    variances = _variances(noise, levels)
     if levels.silent:
         if not source.recording:
             return None
-        variances = np.concatenate([np.zeros(len(levels.inputs)), np.ones(len(levels.outputs))])
         variances *= noise_level(errors, regression, instants, variances) ** 2
     gain = state_map.gain(t)
     found = [

@@ -24,3 +24,23 @@ class ErrorSystem(NamedTuple):
 
 # (times (N,), inside (N,)) -> the system there
 ErrorsAt = Callable[[Array, Array], ErrorSystem]
+
+
+class ErrorSteps(NamedTuple):
+    """The same of an observer at K samples, with the errors e before and e' after each step.
+
+    ζ' = step [ζ; e; e'], o = C ζ' + D e'.
+    """
+
+    step: Array  # (K, S, S + 2 I)
+    C: Array  # (K, O, S)
+    D: Array  # (K, O, I)
+
+
+class ErrorRecursion(NamedTuple):
+    """The same of an estimator: s' = A s + old δY + new δY', δη̂ = C s'."""
+
+    A: Array  # (K, S, S)
+    old: Array  # (K, S, rows)
+    new: Array  # (K, S, rows)
+    C: Array  # (K, p, S)

@@ -7,14 +7,14 @@ move, :class:`Recursive` works at samples.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.errors import ErrorsAt
+from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
@@ -124,6 +124,9 @@ class SampledEstimates:
 
     parameters: Array  # (G, K, p)
     delta: Array | None  # (1 or G, K), None where nothing is mixed
+    # Of every case how errors of Y become errors of η̂, to be asked at every update or never; None:
+    # nobody knows.
+    errors: Callable[[], Sequence[ErrorRecursion]] | None = None
 
 
 class Recursion(Protocol):

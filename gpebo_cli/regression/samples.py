@@ -27,9 +27,16 @@ class SampledRegression:
         """Number of parameters."""
         return int(self.rows.shape[2]) - 1
 
+    @property
+    def shares(self) -> tuple[Array, Array]:
+        """Weights of both ends of a step in an integral over it, (K,) each."""
+        if self.hold == "zoh":
+            return np.zeros_like(self.steps), self.steps
+        return 0.5 * self.steps, 0.5 * self.steps
+
     def weighted(self) -> Array:
         """Rows whose squares add up to ∫[ψ | Y]ᵀ[ψ | Y] over each step, (K, ·, p + 1)."""
+        old, new = (np.sqrt(share)[:, None, None] for share in self.shares)
         if self.hold == "zoh":
-            return np.asarray(np.sqrt(self.steps)[:, None, None] * self.rows[1:])
-        both = np.concatenate([self.rows[:-1], self.rows[1:]], axis=1)
-        return np.asarray(np.sqrt(0.5 * self.steps)[:, None, None] * both)
+            return np.asarray(new * self.rows[1:])
+        return np.concatenate([old * self.rows[:-1], new * self.rows[1:]], axis=1)

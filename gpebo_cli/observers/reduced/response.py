@@ -11,6 +11,7 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers.reduced.extension import ReducedSystem
+from gpebo_cli.observers.reduced.matrices import ObserverMatrices
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 
 _RESPONSE = 1e-6  # error of the response to noise, which is known to no more digits than that
@@ -21,20 +22,19 @@ def errors_of(reduced: ReducedSystem, kept: IntArray) -> ErrorsAt:
 
     ζ' = A_0 ζ + b_0(e),    δY = R (𝒜 ζ + g_y(e)),    δoffset = ζ − K (𝒜 ζ + g_y(e))
     """
-    m = reduced.system.m
+    return lambda t, inside: error_system(reduced.matrices(t, inside), kept, reduced.system.m)
 
-    def at(t: Array, inside: Array) -> ErrorSystem:
-        o = reduced.matrices(t, inside)
-        R, H, Q1 = o.residual[:, kept], o.elimination, transpose(o.range)
-        g = o.of_noise(o.g_signals, m)
-        return ErrorSystem(
-            o.dynamics,
-            o.of_noise(o.from_signals, m),
-            _stacked(R @ o.on_basis, o.split.basis - H @ (Q1 @ o.on_basis)),
-            _stacked(R @ g, -H @ (Q1 @ g)),
-        )
 
-    return at
+def error_system(o: ObserverMatrices, kept: IntArray | slice, inputs: int) -> ErrorSystem:
+    """The same from the matrices at N times, for a number of inputs."""
+    R, H, Q1 = o.residual[:, kept], o.elimination, transpose(o.range)
+    g = o.of_noise(o.g_signals, inputs)
+    return ErrorSystem(
+        o.dynamics,
+        o.of_noise(o.from_signals, inputs),
+        _stacked(R @ o.on_basis, o.split.basis - H @ (Q1 @ o.on_basis)),
+        _stacked(R @ g, -H @ (Q1 @ g)),
+    )
 
 
 def _stacked(upper: Array, lower: Array) -> Array:

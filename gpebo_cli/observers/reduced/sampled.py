@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.errors import ModelError
+from gpebo_cli.evidence.uncertainty import error_steps
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import solve
@@ -29,9 +30,11 @@ from gpebo_cli.observers._observation import InitialError
 from gpebo_cli.observers.reduced.extension import begin_at, choose_form, form_used, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import regression_signals, term_sizes
+from gpebo_cli.observers.reduced.response import error_system
 from gpebo_cli.observers.reduced.split import split_in_frame
 from gpebo_cli.recordings.hold import edges, held
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.regression.errors import ErrorSteps
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import SolverSettings
 
@@ -64,6 +67,7 @@ class SampledBlock:
     gain: Array  # (K, n, p) x = offset + gain η
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
     scale: Array  # (K, p) of the terms of each column of ψ so far
+    errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +114,7 @@ class SampledObserver:
         return InitialError(self.initial_basis, self.xi_a0, self.basis, lambda _t: extension)
 
     def advance(
-        self, state: SampledState | None, t: Array, u: Array, y: Array
+        self, state: SampledState | None, t: Array, u: Array, y: Array, *, errors: bool = False
     ) -> tuple[SampledState, SampledBlock]:
         """Carry the recursion over the samples at the times t (K,).
 
@@ -119,17 +123,20 @@ class SampledObserver:
             t: ascending, after ``state.t``.
             u: (K, m).
             y: (K, r).
+            errors: whether to say what errors of u and y do, where matrices do not follow them.
 
         Raises:
             ModelError: the rank of E changes, or Assumption 1 fails.
             SolverError: a step cannot be resolved.
         """
         if state is None:
-            first = self._block(self.start[None], t[:1], u[:1], y[:1], None)
+            k, signals = len(self.start), u.shape[1] + y.shape[1]
+            known = np.eye(k, k + 2 * signals)[None] if errors else None
+            first = self._block(self.start[None], t[:1], u[:1], y[:1], None, known)
             if len(t) == 1:
                 return first
             state, block = first
-            state, rest = self.advance(state, t[1:], u[1:], y[1:])
+            state, rest = self.advance(state, t[1:], u[1:], y[1:], errors=errors)
             return state, _joined(block, rest)
         times = np.concatenate([[state.t], t])
         signals = np.concatenate([np.append(state.u, state.y)[None], np.hstack([u, y])])
@@ -140,7 +147,8 @@ class SampledObserver:
             f = np.zeros((len(at), *self.start.shape))
             f[:, :, :1] = o.from_signals @ driving
             f[:, :, 1 : 1 + self.system.q] = o.from_unknowns
-            return LinearEquation(None, o.dynamics, f)
+            noise = (o.dynamics, o.of_noise(o.from_signals, self.system.m)) if errors else ()
+            return LinearEquation(None, o.dynamics, f, noise)
 
         cuts = self.system.coefficients.breakpoints(float(times[0]), float(times[-1]))
         solution = solve(
@@ -155,7 +163,8 @@ class SampledObserver:
         ends = np.searchsorted(mesh.edges, t) - 1  # every sample is an edge
         error = max(state.error_estimate, solution.error_estimate)
         after = replace(state, error_estimate=error)
-        return self._block(solution.trajectory.values[ends, -1], t, u, y, after)
+        step = error_steps(mesh, times, self.hold, *solution.extras) if errors else None
+        return self._block(solution.trajectory.values[ends, -1], t, u, y, after, step)
 
     def _matrices(
         self, t: Array, inside: Array, signals: Array
@@ -176,9 +185,13 @@ class SampledObserver:
         return o, np.concatenate([driving, signals[:, m:]], axis=1)[:, :, None]
 
     def _block(
-        self, z: Array, t: Array, u: Array, y: Array, before: SampledState | None
+        self, z: Array, t: Array, u: Array, y: Array, before: SampledState | None,
+        step: Array | None,
     ) -> tuple[SampledState, SampledBlock]:
-        """Regression and state map from [ξ_a | ξ_b | Φ] at the samples, z (K, k, ·)."""
+        """Regression and state map from [ξ_a | ξ_b | Φ] at the samples, z (K, k, ·).
+
+        With what errors become on the way there, ``step`` (K, k, k + 2 (m + r)).
+        """
         system = self.system
         o, driving = self._matrices(t, t, np.hstack([u, y]))
         equations = o.equations(driving)
@@ -201,7 +214,16 @@ class SampledObserver:
         regression = SampledRegression(
             t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]), self.hold
         )
-        return state, SampledBlock(regression, assembled.offset, assembled.gain, z, scale)
+        errors = None
+        if step is not None:
+            own = slice(-system.r, None) if self.regression == "paper" else slice(None)
+            _, _, C, D = error_system(o, own, system.m)
+            errors = ErrorSteps(step, *(
+                np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
+            ))
+        return state, SampledBlock(
+            regression, assembled.offset, assembled.gain, z, scale, errors
+        )
 
 
 def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
@@ -218,6 +240,9 @@ def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
         np.concatenate([first.gain, rest.gain]),
         np.concatenate([first.extension, rest.extension]),
         np.concatenate([first.scale, rest.scale]),
+        None if first.errors is None or rest.errors is None else ErrorSteps(
+            *map(np.concatenate, zip(first.errors, rest.errors, strict=True))
+        ),
     )
 
 
