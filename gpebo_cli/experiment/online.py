@@ -115,9 +115,9 @@ class Online:
         # When parameters could first be told apart, and when well.
         self._t_c: list[float | None] = [None, None]
         self._system = system
-        # Where matrices follow the signals, errors are not only added.
-        follows = self._observer.form.follows_signals
-        self._deviations = None if follows or len(self.cases) > MOST_CASES else deviations
+        self._deviations = None if len(self.cases) > MOST_CASES else deviations
+        if self._deviations is not None and isinstance(self._observer, observers.Responding):
+            self._observer = self._observer.responding()
         self.count = 0
 
     def feed(self, t: Array, u: Array, y: Array) -> OnlineEstimates:
@@ -127,9 +127,7 @@ class Online:
             ModelError: an assumption of the observer fails.
             SolverError: a step between samples cannot be resolved.
         """
-        self._state, block = self._observer.advance(
-            self._state, t, u, y, errors=self._deviations is not None
-        )
+        self._state, block = self._observer.advance(self._state, t, u, y)
         made = self._recursion.update(block.regression)
         roots, _ = self._gram.update(block.regression)
         self._root, self.count = roots[-1, 0], self.count + len(t)

@@ -21,6 +21,7 @@ from gpebo_cli.observers._base import (
     Observer,
     Reached,
     Recursion,
+    Responding,
     Sampling,
     SignalNoise,
     initial_extension,
@@ -40,9 +41,9 @@ from gpebo_cli.settings import SolverSettings
 __all__ = [
     "GROUP", "AffineStateMap", "Assumption", "AtSamples", "InitialError", "LinearEquation",
     "LinearProblem", "LinearRegression", "Measurements", "Mesh", "Observation", "Observer",
-    "Reached", "Recursion", "Sampling", "SignalNoise", "SolverSettings", "StateMap", "Trajectory",
-    "Truth", "able", "build", "initial_extension", "names", "observe", "output_scale", "sampling",
-    "settings_of", "solve",
+    "Reached", "Recursion", "Responding", "Sampling", "SignalNoise", "SolverSettings", "StateMap",
+    "Trajectory", "Truth", "able", "build", "initial_extension", "names", "observe", "output_scale",
+    "sampling", "settings_of", "solve",
 ]
 
 _OBSERVERS: Registry[Observer] = Registry("observer")

@@ -135,6 +135,15 @@ class Recursion(Protocol):
 
 
 @runtime_checkable
+class Responding(Recursion, Protocol):
+    """A recursion that can tell how errors of the signals become errors of Y and of the state."""
+
+    def responding(self) -> Recursion:
+        """The same, whose blocks have ``errors`` where those are linear."""
+        ...
+
+
+@runtime_checkable
 class AtSamples(Observer, Protocol):
     """An observer that can run at samples, as a controller does it."""
 

@@ -84,6 +84,11 @@ class SampledObserver:
     xi_a0: Array  # (n_a,)
     parameters: tuple[str, ...]
     note: str  # which form of the equations is used, where that was not said, and why
+    errors: bool = False  # whether blocks say what errors of u and y do
+
+    def responding(self) -> SampledObserver:
+        """The same with ``errors``, unless matrices follow the signals, too."""
+        return replace(self, errors=not self.form.follows_signals)
 
     @property
     def system(self) -> DescriptorSystem:
@@ -114,7 +119,7 @@ class SampledObserver:
         return InitialError(self.initial_basis, self.xi_a0, self.basis, lambda _t: extension)
 
     def advance(
-        self, state: SampledState | None, t: Array, u: Array, y: Array, *, errors: bool = False
+        self, state: SampledState | None, t: Array, u: Array, y: Array
     ) -> tuple[SampledState, SampledBlock]:
         """Carry the recursion over the samples at the times t (K,).
 
@@ -123,7 +128,6 @@ class SampledObserver:
             t: ascending, after ``state.t``.
             u: (K, m).
             y: (K, r).
-            errors: whether to say what errors of u and y do, where matrices do not follow them.
 
         Raises:
             ModelError: the rank of E changes, or Assumption 1 fails.
@@ -131,12 +135,12 @@ class SampledObserver:
         """
         if state is None:
             k, signals = len(self.start), u.shape[1] + y.shape[1]
-            known = np.eye(k, k + 2 * signals)[None] if errors else None
+            known = np.eye(k, k + 2 * signals)[None] if self.errors else None
             first = self._block(self.start[None], t[:1], u[:1], y[:1], None, known)
             if len(t) == 1:
                 return first
             state, block = first
-            state, rest = self.advance(state, t[1:], u[1:], y[1:], errors=errors)
+            state, rest = self.advance(state, t[1:], u[1:], y[1:])
             return state, _joined(block, rest)
         times = np.concatenate([[state.t], t])
         signals = np.concatenate([np.append(state.u, state.y)[None], np.hstack([u, y])])
@@ -147,7 +151,7 @@ class SampledObserver:
             f = np.zeros((len(at), *self.start.shape))
             f[:, :, :1] = o.from_signals @ driving
             f[:, :, 1 : 1 + self.system.q] = o.from_unknowns
-            noise = (o.dynamics, o.of_noise(o.from_signals, self.system.m)) if errors else ()
+            noise = (o.dynamics, o.of_noise(o.from_signals, self.system.m)) if self.errors else ()
             return LinearEquation(None, o.dynamics, f, noise)
 
         cuts = self.system.coefficients.breakpoints(float(times[0]), float(times[-1]))
@@ -163,7 +167,7 @@ class SampledObserver:
         ends = np.searchsorted(mesh.edges, t) - 1  # every sample is an edge
         error = max(state.error_estimate, solution.error_estimate)
         after = replace(state, error_estimate=error)
-        step = error_steps(mesh, times, self.hold, *solution.extras) if errors else None
+        step = error_steps(mesh, times, self.hold, *solution.extras) if self.errors else None
         return self._block(solution.trajectory.values[ends, -1], t, u, y, after, step)
 
     def _matrices(
