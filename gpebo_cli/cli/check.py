@@ -29,9 +29,10 @@ _ADVICE = {
     "zeros is fine as long as it stays one",
     "Observer": "change the plant as said above, or use observer=gpebo",
     "Assumption 1": "add an output (a row of C) that sees the algebraic states",
-    "Assumption 2": "the direction named is not visible in the outputs, and no input changes that: "
-    "measure more (sensors=all tries every state), lengthen time.horizon, start at another time, "
-    "or leave an unknown out; one that no output depends on cannot be estimated",
+    "Assumption 2": "the direction named is not visible in the outputs: measure more "
+    "(sensors=all tries every state), lengthen time.horizon, start at another time, "
+    "or leave an unknown out; one that no output depends on cannot be estimated. Another input "
+    "helps only where psi_depends_on names one, or an output",
     "Assumption 3": "measure z_a alone with one output, or use observer=gpebo",
     "Assumption 4": "choose a horizon without that zero, or use observer=gpebo",
     "Assumption 5": "as for Assumption 2: measure more, or lengthen time.horizon",

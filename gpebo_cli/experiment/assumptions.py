@@ -98,7 +98,8 @@ def _of_observer(
         excitation, observation.regression.parameters, system.states,
         visible(observation, excitation.known, t, system.n),
     )
-    return Examination((*found, *of_observation(observation, excitation)), times, excitation)
+    found += of_observation(observation, excitation, system)
+    return Examination(tuple(found), times, excitation)
 
 
 def visible(observation: Observation, known: Knowledge, t: Array, n: int) -> BoolArray:
@@ -205,7 +206,16 @@ class Observed(Protocol):
         ...
 
 
-def of_observation(observation: Observed, excitation: Excitation) -> list[Assumption]:
+def designable(system: DescriptorSystem) -> str:
+    """What ψ depends on beside time: inputs and outputs in A, F, C and H, or in none of them."""
+    depends = system.coefficients.signals
+    names = frozenset[str]().union(*(depends.get(name, ()) for name in "AFCH"))
+    return ", ".join(s for s in (*system.inputs, *system.outputs) if s in names) or "time alone"
+
+
+def of_observation(
+    observation: Observed, excitation: Excitation, system: DescriptorSystem
+) -> list[Assumption]:
     """The observer's own assumptions, excitation, and the growth of Φ."""
     number = 5 if any(a.name == "Assumption 3" for a in observation.assumptions) else 2
     found = [
@@ -215,6 +225,7 @@ def of_observation(observation: Observed, excitation: Excitation) -> list[Assump
             "interval excitation: ∫ψᵀψ ≥ ρ I at some t_c",
             excitation.is_ie,
             {
+                "psi_depends_on": designable(system),
                 "t_c": excitation.t_c,
                 "normalised_min": excitation.level,
                 "lambda_min": excitation.lambda_min,

@@ -95,7 +95,9 @@ def run_experiment(
         result, regression=found.regression, excitation=found.excitation,
         estimation=found.estimation, metrics=found.metrics, noise=found.noise, fit=found.fit,
         estimable=found.estimable,
-        assumptions=(*source.assumptions, *of_observation(found.observed, found.excitation)),
+        assumptions=(
+            *source.assumptions, *of_observation(found.observed, found.excitation, system)
+        ),
         verdict="; ".join([told + found.note, *warned]), warnings=warned,
         # What the result is labelled with is what estimated.
         settings=replace(settings, estimator={"name": settings.observer["name"]})
