@@ -124,7 +124,7 @@ _SOLVABILITY = "uniquely solvable, with constant characteristic values (μ, d, a
 
 def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assumption]:
     """Solvability, the consistent start, and for constant systems regularity and D2."""
-    if not system.n:
+    if system.regression is not None:
         return []
     s = simulation.structure
     moved = float(np.abs(simulation.initial_state - system.initial_state).max(initial=0.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -12,9 +13,17 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers._base import Measurements, Sampling
-from gpebo_cli.observers._observation import AffineStateMap, Observation, Truth
+from gpebo_cli.observers._observation import (
+    AffineStateMap,
+    Observation,
+    Reconstruction,
+    StateMap,
+    Truth,
+)
 from gpebo_cli.observers.reduced.sampled import SampledBlock
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.parametrisation import Parametrisation
 from gpebo_cli.regression.text import TextRegression
 from gpebo_cli.regression.text_at_samples import TextState, advance
 from gpebo_cli.settings import SolverSettings
@@ -49,12 +58,15 @@ class Given:
         points, errors = regression.mesh.points.shape, None
         if given.Y is None and (signals.noise is None or not signals.noise.inputs.any()):
             errors = _errors_of_outputs(system.m, given.rows)
+        state_map: StateMap = AffineStateMap(
+            Trajectory(regression.mesh, np.zeros((*points, 0))),
+            Trajectory(regression.mesh, np.zeros((*points, 0, regression.p))),
+        )
+        if given.parametrisation is not None:
+            state_map = FittedMap(given.parametrisation, regression)
         return Observation(
             regression=regression,
-            state_map=AffineStateMap(
-                Trajectory(regression.mesh, np.zeros((*points, 0))),
-                Trajectory(regression.mesh, np.zeros((*points, 0, regression.p))),
-            ),
+            state_map=state_map,
             truth=_constant_truth,
             error_estimate=error,
             assumptions=(),
@@ -75,9 +87,41 @@ class Given:
         """The regression's recursion, whose first sample is at ``start``.
 
         Raises:
-            ConfigError: the system is a plant.
+            ConfigError: the system is a plant, or has a parametrisation S.
         """
-        return GivenAtSamples(_text_of(system), hold)
+        given = _text_of(system)
+        if given.parametrisation is not None:
+            raise ConfigError(
+                f"regression {system.name}: S works in continuous time only; at samples and in "
+                "streams estimate its entries"
+            )
+        return GivenAtSamples(given, hold)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedMap:
+    """θ̂ of η̂ = S(θ̂), see :mod:`gpebo_cli.regression.parametrisation`."""
+
+    parametrisation: Parametrisation
+    regression: LinearRegression
+
+    @property
+    def times(self) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def at(self, t: Array) -> Reconstruction:
+        """θ̂ (g, M, q) of η̂ (g, M, k) at the times t (M,)."""
+        weight = self.regression.gram(t)[..., : self.regression.p]
+
+        def fitted(eta: Array) -> Array:
+            return np.array([self.parametrisation.fitted(of_case, weight) for of_case in eta])
+
+        return fitted
+
+    def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
+        """None, whatever θ̂ (g, M, q)."""
+        return {}
 
 
 @dataclass(frozen=True, eq=False)

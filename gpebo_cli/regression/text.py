@@ -30,13 +30,14 @@ from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.recordings.drive import driven, tables
 from gpebo_cli.reduction.structure import without_equations
 from gpebo_cli.regression.linear import LinearRegression, outer_products
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.regression.parametrisation import Parametrisation, read_box
+from gpebo_cli.schema import nearest, number, shown
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
 
 KEYS = (
-    "name", "title", "reference", "parameters", "unknowns", "signals", "Y", "psi", "units",
-    "labels",
+    "name", "title", "reference", "parameters", "unknowns", "signals", "Y", "psi", "S", "box",
+    "units", "labels",
 )
 """Keys of a regression file; name, unknowns and psi are required."""
 
@@ -76,6 +77,7 @@ class TextRegression:
     operators: tuple[Operator, ...]
     psi: Tape  # rows · p outputs
     Y: Tape | None  # rows outputs
+    parametrisation: Parametrisation | None = None  # θ are the system's states then
 
     @property
     def rows(self) -> int:
@@ -211,7 +213,9 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
     Args:
         mapping: KEYS; ``unknowns`` maps names to true values, ``signals`` names to expressions of
             t (or null: they come from a recording), ``Y`` is a list of expressions of t and the
-            signals (absent: ψ times the truth), ``psi`` has one row for each.
+            signals (absent: ψ times the truth), ``psi`` has one row for each. With ``S``, a list of
+            expressions of the unknowns, ψ has a column for each of them, and ``box`` maps the
+            unknowns to where they may lie.
         source: the file, for messages.
 
     Raises:
@@ -232,19 +236,23 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         raise ConfigError(f"{where}: signals must map names to expressions, such as {{u: sin(t)}}")
     psi_rows, right = _list(mapping, "psi", where), mapping.get("Y")
     count = len(psi_rows)
+    signals = {name: 0 if value is None else value for name, value in signals.items()}
+    parametrisation, own = _parametrisation(mapping, len(signals), count, where)
     system = plant_from_mapping(
         {
-            **{k: v for k, v in mapping.items() if k not in ("signals", "Y", "psi", "parameters")},
-            "inputs": {name: 0 if value is None else value for name, value in signals.items()},
             "states": [], "E": [], "A": [], "initial_state": [],
+            **{k: v for k, v in mapping.items()
+               if k not in ("signals", "Y", "psi", "parameters", "S", "box")},
+            "inputs": signals,
             "outputs": [] if right is not None else [f"Y_{i + 1}" for i in range(count)],
+            **own,
         },
         source, "regression",
     )
     if not system.unknowns:
         raise ConfigError(f"{where}: unknowns is missing; it maps each parameter to its true value")
     named = {name: signal(name, k, "a signal") for k, name in enumerate(system.inputs)}
-    elsewhere = dict.fromkeys(system.unknowns, "an unknown")
+    elsewhere = dict.fromkeys((*system.unknowns, *system.states), "an unknown")
     known = named | read_parameters(where, mapping.get("parameters"), named, elsewhere)
     operators = _Operators(system.m)
 
@@ -265,7 +273,38 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         if len(texts) != count:
             raise ConfigError(f"{where}: Y has {len(texts)} entries and psi has {count} rows")
         Y = record([read(value, f"Y[{i}]") for i, value in enumerate(texts)])
-    return TextRegression(system, tuple(operators.found.values()), record(psi), Y)
+    return TextRegression(
+        system, tuple(operators.found.values()), record(psi), Y, parametrisation
+    )
+
+
+def _parametrisation(
+    mapping: Mapping[str, object], inputs: int, rows: int, where: str
+) -> tuple[Parametrisation | None, dict[str, object]]:
+    """S on its box, and the keys of a system whose states are θ, which do not move: θ' = 0."""
+    if mapping.get("S") is None:
+        if mapping.get("box") is not None:
+            raise ConfigError(f"{where}: box is for S, and there is none")
+        return None, {}
+    unknowns = mapping.get("unknowns")
+    if not isinstance(unknowns, Mapping) or not unknowns:
+        raise ConfigError(f"{where}: unknowns is missing; it maps each parameter to its true value")
+    names = tuple(map(str, unknowns))
+    truth = np.array([number(unknowns[k], f"{where}: unknowns.{k}", "finite") for k in names])
+    low, high = read_box(mapping.get("box"), names, where)
+    known = {name: signal(name, k, "an unknown") for k, name in enumerate(names)}
+    entries = _list(mapping, "S", where)
+    tape = record([parse(text, known, f"{where}: S[{j}]") for j, text in enumerate(entries)])
+    parametrisation = Parametrisation(tape, low, high)
+    size = len(names)
+    eta = parametrisation.values(truth[None])[0]
+    return parametrisation, {
+        "unknowns": {f"eta_{j + 1}": float(value) for j, value in enumerate(eta)},
+        "states": list(names), "initial_state": dict(zip(names, truth.tolist(), strict=True)),
+        "E": np.eye(size).tolist(), "A": np.zeros((size, size)).tolist(),
+        "B": np.zeros((size, inputs)).tolist(), "F": np.zeros((size, len(eta))).tolist(),
+        "C": [] if mapping.get("Y") is not None else np.zeros((rows, size)).tolist(),
+    }
 
 
 def system_from_mapping(mapping: Mapping[str, object], source: str = "") -> DescriptorSystem:
@@ -317,10 +356,10 @@ def simulation_of(
         signals = Trajectory(mesh, signals(mesh.points.ravel(), mesh.inside.ravel()).reshape(
             *mesh.points.shape, system.m
         ))
-    states = Trajectory(mesh, np.zeros((*mesh.points.shape, 0)))
+    theta = np.broadcast_to(system.initial_state, (*mesh.points.shape, system.n))
     return Simulation(
-        Signals(signals, Trajectory(mesh, outputs), states), without_equations(), np.zeros(0), (),
-        solver.tol, bounded=False,
+        Signals(signals, Trajectory(mesh, outputs), Trajectory(mesh, theta)), without_equations(),
+        system.initial_state, (), solver.tol, bounded=False,
     )
 
 

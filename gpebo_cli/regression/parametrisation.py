@@ -1,0 +1,124 @@
+"""η = S(θ): fewer unknowns θ than a regression that is linear in η has parameters.
+
+Estimators work on Y = ψη as on any regression. At every time θ̂ is then what fits η̂ best,
+
+    θ̂ = argmin (η̂ − S(θ))ᵀ G (η̂ − S(θ)),      G = ∫ψᵀψ,
+
+in a box that the user gives. For the least-squares η̂ = G⁻¹h that is the minimum of ∫|Y − ψS(θ)|²,
+that is, nonlinear least squares on the data themselves, whose sums are all in G and h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.expressions import Tape
+from gpebo_cli.schema import number, shown
+
+_ROUNDS = 60  # of Levenberg and Marquardt
+_STILL = 1e-15  # a step of this share of the box changes nothing
+_DAMPING = 1e-3  # at first, relative to the largest singular value squared
+
+
+@dataclass(frozen=True, eq=False)
+class Parametrisation:
+    """S on a box."""
+
+    tape: Tape  # k outputs, of q signals that stand for θ
+    low: Array  # (q,)
+    high: Array  # (q,)
+
+    def values(self, theta: Array) -> Array:
+        """S(θ) (N, k) of θ (N, q).
+
+        Raises:
+            ConfigError: an entry of S without a finite value there.
+        """
+        return np.asarray(self.tape.taylor(np.zeros(len(theta)), 0, None, theta[None])[0])
+
+    def jacobian(self, theta: Array) -> Array:
+        """∂S/∂θ (N, k, q) at θ (N, q): along each axis the first Taylor coefficient, exactly."""
+        along = np.eye(theta.shape[1])[:, None] + np.zeros_like(theta)
+        t = np.zeros(len(theta))
+        columns = [self.tape.taylor(t, 1, None, np.stack([theta, v]))[1] for v in along]
+        return np.stack(columns, axis=2)
+
+    def fitted(self, eta: Array, weight: Array) -> Array:
+        """θ̂ (N, q) of η̂ (N, k) with the weights G (N, k, k); NaN where η̂ is.
+
+        From the middle of the box, by damped Gauss–Newton steps that do not leave it.
+        """
+        found = np.full((len(eta), len(self.low)), np.nan)
+        known = np.isfinite(eta).all(axis=1)
+        eta, L = eta[known], _root(weight[known])
+        width = self.high - self.low
+
+        def at(z: Array) -> tuple[Array, Array]:
+            rest = (L @ (eta - self.values(self.low + width * z))[..., None])[..., 0]
+            return rest, np.einsum("ni,ni->n", rest, rest)
+
+        z = np.full((len(eta), len(width)), 0.5)
+        damping = np.full(len(eta), _DAMPING)
+        rest, cost = at(z)
+        for _ in range(_ROUNDS):
+            J = L @ (self.jacobian(self.low + width * z) * width)
+            down = np.einsum("nji,nj->ni", J, rest)
+            held = ((z == 0.0) & (down < 0.0)) | ((z == 1.0) & (down > 0.0))
+            U, sigma, Vt = np.linalg.svd(np.where(held[:, None], 0.0, J), full_matrices=False)
+            size = np.maximum(sigma[:, :1], 1e-100)  # without excitation all are zero
+            filtered = sigma / (sigma**2 + damping[:, None] * size**2)
+            step = np.einsum("nji,nj,nkj,nk->ni", Vt, filtered, U, rest)
+            tried = np.clip(z + step, 0.0, 1.0)
+            new_rest, new_cost = at(tried)
+            better = new_cost < cost
+            moved = np.abs(np.where(better[:, None], tried - z, 0.0)).max(initial=0.0)
+            z[better], cost[better] = tried[better], new_cost[better]
+            rest[better] = new_rest[better]
+            damping = np.clip(np.where(better, 0.1 * damping, 10.0 * damping), 1e-15, 1e15)
+            if moved <= _STILL and (damping > 1.0).all():
+                break
+        found[known] = self.low + width * z
+        return found
+
+    def gain(self, theta: Array, weight: Array) -> Array:
+        """∂θ̂/∂η̂ (N, q, k) at θ̂ (N, q): what errors of η̂ make of θ̂."""
+        L = _root(weight)
+        return np.asarray(np.linalg.pinv(L @ self.jacobian(theta)) @ L)
+
+
+def _root(weight: Array) -> Array:
+    """L with LᵀL = G/‖G‖ (N, k, k)."""
+    values, vectors = np.linalg.eigh(weight)
+    size = np.maximum(values[:, -1:], np.finfo(float).tiny)
+    scale = np.sqrt(np.maximum(values / size, 0.0))
+    return np.asarray(scale[..., None] * np.swapaxes(vectors, -1, -2))
+
+
+def read_box(given: object, names: tuple[str, ...], where: str) -> tuple[Array, Array]:
+    """Ends (q,) and (q,) of the box: ``{name: [low, high]}`` for every unknown.
+
+    Raises:
+        ConfigError: a name without two ends, or that is not an unknown.
+    """
+    if not isinstance(given, Mapping):
+        raise ConfigError(
+            f"{where}: S needs a box, for each unknown where it may lie: "
+            f"{{{names[0] if names else 'a'}: [0, 10]}}"
+        )
+    ends = np.zeros((2, len(names)))
+    for name in given:
+        if name not in names:
+            raise ConfigError(f"{where}: box.{name} is not an unknown ({', '.join(names)})")
+    for i, name in enumerate(names):
+        pair = given.get(name)
+        if not isinstance(pair, list | tuple) or len(pair) != 2:
+            raise ConfigError(f"{where}: box.{name} must be [low, high], not {shown(pair)}")
+        ends[:, i] = [number(end, f"{where}: box.{name}", "finite") for end in pair]
+        if not ends[0, i] < ends[1, i]:
+            raise ConfigError(f"{where}: box.{name} must be [low, high] with low < high")
+    return ends[0], ends[1]
