@@ -31,6 +31,13 @@ def _mixed(rng, count=37, p=3, c=2):
     return (extended,)
 
 
+def _symmetric(rng, count=37, p=3, c=2):
+    root = rng.normal(size=(count, p, p)) * 10.0 ** rng.integers(-3, 3, size=(count, p, 1))
+    root[1:2], root[-1, 0] = 0.0, root[-1, -1]
+    gram = np.concatenate([np.swapaxes(root, 1, 2) @ root, rng.normal(size=(count, p, c))], axis=2)
+    return (gram * 10.0 ** rng.integers(-300, 200, size=(count, 1, 1)),)
+
+
 def _law(rng, cases=11, gains=1, p=3):
     steps, times = 30, 40
     return (
@@ -215,6 +222,9 @@ CASES: list[tuple[str, str, Case]] = [
     ("signals", "sample", _samples),
     ("signals", "sample", partial(_samples, c=33)),
     ("signals", "low_pass", _filtered),
+    ("laws", "eigenvalues", _symmetric),
+    ("laws", "eigenvalues", partial(_symmetric, p=9, c=0)),
+    ("laws", "eigenvalues", partial(_symmetric, count=1, p=1)),
     ("laws", "mixed", _mixed),
     ("laws", "mixed", lambda rng: _mixed(rng, 8, 1, 1)),
     ("laws", "mixed", lambda rng: _mixed(rng, 1, 6, 1)),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge, smallest_and_margin
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, Requirement
@@ -88,7 +89,7 @@ def assess(
     def reached(at: Array, matrices: Array) -> Array:
         """At least 0 where ψ is exciting; to be read as a distance from that in logarithms."""
         if rho is not None:
-            level = _eigenvalues(matrices)[:, 0] / rho
+            level = kernels.laws.eigenvalues(matrices)[:, 0] / rho
         elif enough:
             smallest, margin = smallest_and_margin(matrices, *beside(at))
             level = np.minimum(smallest / enough, margin)
@@ -99,7 +100,7 @@ def assess(
     values = gram(t)
     return excitation(
         knowledge(values, *beside(t)), t, regression.parameters,
-        np.maximum(_eigenvalues(values), 0.0),
+        np.maximum(kernels.laws.eigenvalues(values), 0.0),
         segment_level(regression, t, window), window, _first_time(gram, reached), rho,
     )
 
@@ -204,7 +205,7 @@ def segment_level(regression: LinearRegression, t: Array, window: float) -> Arra
         here = np.flatnonzero(b > a)
         gram[here] += between(segment.outer, a[here], b[here])
         before = segment
-    level[whole] = np.maximum(_eigenvalues(gram)[:, 0], 0.0)
+    level[whole] = np.maximum(kernels.laws.eigenvalues(gram)[:, 0], 0.0)
     return level
 
 
@@ -229,7 +230,7 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     to_there = mesh.sampler(t)
     to_there = Sampler(to_there.element[whole], to_there.weights[whole])
     sums = _window_sums(outer, from_there, to_there, outer.values.shape[2])
-    level[whole] = np.maximum(_eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
+    level[whole] = np.maximum(kernels.laws.eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
     return level
 
 
@@ -272,7 +273,7 @@ def sampled_window_level(regression: SampledRegression, window: float) -> Array:
     first = np.searchsorted(t, t[whole] - window + slack, side="right")
     pairs = np.stack([first, whole + 1], axis=1).ravel()
     sums = np.add.reduceat(steps, pairs, axis=0)[::2]
-    level[whole] = np.maximum(_eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
+    level[whole] = np.maximum(kernels.laws.eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
     return level
 
 
@@ -302,8 +303,3 @@ def persistent(outer: Trajectory, gain: float) -> Requirement:
             f"{gain * level:.3g}; 1 % of the initial error needs {needed:.3g}"
         ),
     )
-
-
-def _eigenvalues(matrices: Array) -> Array:
-    """Of symmetric matrices (N, p, p), ascending (N, p); further columns are not looked at."""
-    return np.asarray(np.linalg.eigvalsh(matrices[..., : matrices.shape[1]]), dtype=np.float64)

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 
 _UNRESOLVED = 10.0  # tolerances of the terms of a column of ψ: what is smaller says nothing
@@ -125,7 +126,7 @@ def smallest_and_margin(
 ) -> tuple[Array, Array]:
     """``smallest`` and ``margin`` (M,) of :func:`knowledge`, without what takes eigenvectors."""
     normalised, _, level = _normalised(gram, terms, elapsed, tol)
-    spectrum = np.linalg.eigvalsh(normalised)
+    spectrum = kernels.laws.eigenvalues(normalised)
     smallest = np.maximum(spectrum.min(axis=1, initial=1.0), 0.0)
     return smallest, np.asarray(smallest / level.max(axis=1, initial=_SINGULAR))
 

@@ -173,17 +173,9 @@ static Outcome element_maps(Call *call)
     Moving at_points[5];
     for (int i = 0; i < 5; i++)
         at_points[i] = (Moving){call->in[2 + i], call->step[2 + i]};
-    Equation q = {.s = s,
-                  .d = d,
-                  .n = n,
-                  .columns = columns,
-                  .D = call->in[0],
-                  .h = call->in[1],
-                  .E = at_points[0],
-                  .A = at_points[1],
-                  .f = at_points[2],
-                  .T = at_points[3],
-                  .p = at_points[4]};
+    Equation q = {.s = s, .d = d, .n = n, .columns = columns, .D = call->in[0], .h = call->in[1]};
+    q.E = at_points[0], q.A = at_points[1], q.f = at_points[2];
+    q.T = at_points[3], q.p = at_points[4];
     if ((q.T.from == NULL) != (q.p.from == NULL) || (q.T.from == NULL && d != n) ||
         (q.T.from != NULL && q.E.from == NULL))
         return refused("constraints without an offset or E, or rows", d);
@@ -268,9 +260,9 @@ static Outcome chain(Call *call)
 /* A solution whose errors are estimated, and their limits; see elements_numpy.py. */
 typedef struct {
     npy_intp t, n, c, used, shown;
-    const double *to_legendre; /* of the coefficients that are `shown` */
-    double *tail, *own, *noise, *made_of; /* (n, c): the largest of all elements */
-    double *size, *left_out, *rounded, *last, *start; /* memory, (n, c), the last but one (4, n, c) */
+    const double *to_legendre;                /* of the coefficients that are `shown` */
+    double *tail, *own, *noise, *made_of;     /* (n, c): the largest of all elements */
+    double *size, *left_out, *rounded, *last; /* memory, (n, c), the last one (4, n, c) */
 } Errors;
 
 /* What an element with these values leaves out at its end, and all of its own. */
@@ -285,8 +277,7 @@ EVERY_WIDTH static void leave_out(const Errors *q, const double *values, double 
         double exponent = -HUGE_VAL;
         for (npy_intp j = q->shown - q->used; j < q->shown; j++) {
             const double share = last[j * m] / size, power = q->t / (double)(q->t - q->shown + j);
-            exponent = larger(share < 1.0 ? power * log(share) : share != share ? share : 0.0,
-                              exponent);
+            exponent = larger(power * log(share < 1.0 ? share : 1.0), exponent);
         }
         const double tail = size * exp(exponent);
         /* Ends are superconvergent: half the exponent of that is used. */
@@ -349,7 +340,7 @@ static Outcome carried_errors(Call *call)
 {
     const npy_intp K = SIZE(K), n = SIZE(n), c = SIZE(c), t = SIZE(t), m = n * c, S = SIZE(S) / 2;
     const npy_intp width = 2 * S * c, *step = call->step;
-    const double *values = call->in[0], *terms = call->in[3], *h = call->in[4], *signs = call->in[6];
+    const double *values = call->in[0], *terms = call->in[3], *signs = call->in[6];
     Errors q = {.t = t, .n = n, .c = c, .used = SIZE(u), .shown = t > 4 ? 4 : t};
     if (q.used >= t || q.used > q.shown || S < 1)
         return refused("Legendre coefficients, or choices of signs", q.used);
@@ -358,7 +349,6 @@ static Outcome carried_errors(Call *call)
     if (q.size == NULL)
         return ERROR;
     q.left_out = q.size + m, q.rounded = q.left_out + m, q.last = q.rounded + m;
-    q.start = q.last + 4 * m;
     q.tail = call->out[1], q.own = call->out[2], q.noise = call->out[3], q.made_of = call->out[4];
     for (int i = 1; i < 5; i++)
         memset(call->out[i], 0, m * sizeof(double));
@@ -366,14 +356,15 @@ static Outcome carried_errors(Call *call)
     for (npy_intp k = 1; step[3] && k < K; k++)
         for (npy_intp i = 0; i < n; i++)
             for (npy_intp j = i * (n + c); j < i * (n + c) + n; j++) {
-                const double first = terms[j] / h[0];
-                constant &= fabs(terms[k * step[3] + j] / h[k] - first) <= call->number[11] * first;
+                const double first = terms[j] / call->in[4][0];
+                const double change = terms[k * step[3] + j] / call->in[4][k] - first;
+                constant &= fabs(change) <= call->number[11] * first;
             }
-    double *before = q.start, *after = before + n * width;
+    double *before = q.last + 4 * m, *after = before + n * width;
     for (npy_intp i = 0; i < n * width; i++) {
         const npy_intp k = i / c % (2 * S), row = i / width;
-        before[i] = k < S ? 0.0 : signs[row * 2 * S + k] * call->number[8] *
-                                      fabs(values[row * c + i % c]);
+        const double rounded = call->number[8] * fabs(values[row * c + i % c]);
+        before[i] = k < S ? 0.0 : signs[row * 2 * S + k] * rounded;
     }
     for (npy_intp k = 0; k < K; k++) {
         const double *x = values + k * t * m, *last = call->in[1] + k * step[1];
@@ -391,7 +382,7 @@ static Outcome carried_errors(Call *call)
 const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
-    {"carried_errors", "Ktnc K?nn Knc K?nw K tt K+nS %u # # # # # w=n+c",
-     "Knc nc nc nc nc", carried_errors},
+    {"carried_errors", "Ktnc K?nn Knc K?nw K tt K+nS %u # # # # # w=n+c", "Knc nc nc nc nc",
+     carried_errors},
     {NULL, NULL, NULL, NULL},
 };

@@ -11,6 +11,15 @@ stepped_law = _compiled.stepped_law
 squared_errors = _compiled.squared_errors
 
 
+def eigenvalues(matrices: Array) -> Array:
+    """In C for small matrices."""
+    if matrices.shape[1] > min(_SMALL, matrices.shape[2]):
+        return laws_numpy.eigenvalues(matrices)
+    found: Array = _compiled.eigenvalues(matrices)
+    found.sort(axis=1)
+    return found
+
+
 def mixed(extended: Array) -> tuple[Array, Array, Array]:
     """In C for small Ω."""
     if extended.shape[1] > _SMALL:

@@ -20,12 +20,8 @@ typedef struct {
 static Outcome begin(Call *call, int place, const Model *m, Elimination *el)
 {
     const npy_intp n = m->n, size = m->size, r = SIZE(r), a = size - r;
-    *el = (Elimination){.rows = call->index[place],
-                        .columns = call->index[place + 1],
-                        .rank = r,
-                        .a = a,
-                        .d = n - a,
-                        .Z1 = call->in[place + 3]};
+    *el = (Elimination){.rank = r, .a = a, .d = n - a, .Z1 = call->in[place + 3]};
+    el->rows = call->index[place], el->columns = call->index[place + 1];
     for (npy_intp i = 0; i < size; i++)
         if (el->rows[i] < 0 || el->rows[i] >= size || el->columns[i] < 0 || el->columns[i] >= size)
             return refused("a row or a column of M", i);
@@ -353,15 +349,9 @@ static Outcome eliminated(Call *call)
     const npy_intp n = m.n, p = SIZE(m), q = SIZE(q), widest = p > q ? p : q, every = SIZE(e);
     if (every < 1 || (SIZE(M) != 1 && SIZE(M) != m.times))
         return refused("times of E and A, or between looks", SIZE(M));
-    Forcing f = {series(call, 6, n * p),
-                 series(call, 7, n * q),
-                 series(call, 8, p),
-                 series(call, 9, q),
-                 p,
-                 q,
-                 NULL,
-                 NULL,
-                 NULL};
+    Forcing f = {.inputs = p, .unknowns = q};
+    f.B = series(call, 6, n * p), f.F = series(call, 7, n * q);
+    f.u = series(call, 8, p), f.theta = series(call, 9, q);
     const npy_intp wide = el.rank > n ? el.rank : n;
     f.matrix = (Lane *)scratch(call, LANES * (m.orders * (n * widest + widest + n) +
                                               (el.a + wide) * (n + 1)));
@@ -394,7 +384,8 @@ static Outcome eliminated(Call *call)
 
 const Kernel reduction_kernels[] = {
     {"bounds", MODEL "@z @z %r nd z=v*n a=z-r d=n-a", "N3 N Ndd", bounds},
-    {"eliminated", "oM?nn oM?nn n n # %v oN?nm oN?nq oN?m oN?q @z @z %r nd %e # # z=v*n a=z-r d=n-a",
+    {"eliminated",
+     "oM?nn oM?nn n n # %v oN?nm oN?nq oN?m oN?q @z @z %r nd %e # # z=v*n a=z-r d=n-a",
      "Mdn Mdn Nd Man Na Mnd Nn nn+", eliminated},
     {NULL, NULL, NULL, NULL},
 };
