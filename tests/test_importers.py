@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -313,6 +314,56 @@ def test_a_state_space_model():
     system.dt = 0.1
     with pytest.raises(ConfigError, match="discrete time"):
         from_control(system, "oscillator")
+
+
+LEAK = (
+    "leak\nV1 a 0 SIN(0 1 0.5)\nR1 a b 1\nC1 b 0 1 ic=0.2\nL1 b c 1\nR2 c 0 2\nI5 b 0 0.3\n"
+)
+
+
+def test_to_python_control_and_back():
+    """The observer as a state-space model gives the state from measurements, θ and its start."""
+    control = pytest.importorskip("control")
+    plant = plant_of(LEAK, measure="v(b),i(V1)", unknown="I5")
+    result = run(plant, time={"horizon": 1.0})
+    observer = result.to_control()
+    assert observer.input_labels == ["V1", "y_b", "y_iv1", "I5"]
+    given = [*(result[name] for name in observer.input_labels[:-1]), np.full_like(result.t, 0.3)]
+    start = [result[name.removeprefix("w_")][0] for name in observer.state_labels]
+    found = control.forced_response(observer, result.t, np.array(given), start).outputs
+    for name, values in zip(observer.output_labels, found, strict=True):
+        np.testing.assert_allclose(values, result[name.removesuffix("_hat")], atol=2e-6)
+    again = from_control(observer, "again").mapping()
+    assert (again["states"], again["outputs"]) == (["w_b", "w_il1"], observer.output_labels)
+    np.testing.assert_array_equal(again["A"], observer.A)
+
+
+@pytest.mark.parametrize(("plant", "options", "message"), [
+    ("circuit", {}, "E depends on time"), ("boost", {}, "A depends on"),
+    ("motor", {"observer": "kalman_bucy"}, "this run has observer=kalman_bucy"),
+    ("motor", {"observer": {"sample_time": 0.1}}, "sample_time 0.1"),
+])
+def test_what_is_no_state_space_model(plant, options, message):
+    pytest.importorskip("control")
+    with pytest.raises(ConfigError, match=message):
+        run(plant, **options, time={"horizon": 1.0}).to_control()
+
+
+def test_to_xarray():
+    pytest.importorskip("xarray")
+    result = run(plant_of(LEAK, measure="v(b),i(V1)", unknown="I5"), time={"horizon": 1.0})
+    estimates, table = result.to_xarray("estimates"), result.to_pandas("estimates")
+    assert estimates["b_hat"].dims == ("case", "t")
+    np.testing.assert_array_equal(estimates["b_hat"].to_numpy()[0], table["b_hat"])
+    assert result.to_xarray()["b"].attrs == {"units": "V"}
+
+
+@pytest.mark.parametrize("package", ["control", "xarray"])
+def test_what_is_not_installed_is_named(package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    result = run("descriptor", observer="none", time={"horizon": 1.0})
+    with pytest.raises(ConfigError, match=f"pip install {package}"):
+        getattr(result, f"to_{package}")()
 
 
 def test_files_of_matrices(tmp_path):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpebo_cli import estimators
+from gpebo_cli.api import exports
 from gpebo_cli.configs import configuration
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.excitation import Excitation
@@ -228,6 +229,29 @@ class Result:
             ConfigError: no table has that name, or a run without an observer lacks it.
         """
         return frame(self.details, table)
+
+    def to_xarray(self, table: str = "signals") -> Any:
+        """One of the run's tables as an ``xarray.Dataset``, with names as :meth:`to_pandas` has.
+
+        Args:
+            table: as of :meth:`to_pandas`; ``estimates`` has the dimensions ``case`` and ``t``.
+
+        Raises:
+            ConfigError: no table has that name, or xarray is not installed.
+        """
+        return exports.to_xarray(self.details, table)
+
+    def to_control(self) -> Any:
+        """The observer as a ``control.StateSpace``, where plant and observer are time-invariant.
+
+        Its inputs are u, y and the unknowns, by name; its states are those of the observer, and
+        its outputs ``<state>_hat``.
+
+        Raises:
+            ConfigError: another observer than gpebo, a plant that varies with time, or
+                python-control is not installed.
+        """
+        return exports.to_control(self.details)
 
     @property
     def figures(self) -> list[str]:
