@@ -20,6 +20,17 @@ Capability = TypeVar("Capability")
 _DESCRIPTIVE = ("name", "title", "reference")
 
 
+def installed(noun: str, name: str) -> str:
+    """What to say of an estimator or observer that a package brings and no file describes."""
+    if name not in {entry.name for entry in entry_points(group=f"gpebo.{noun}s")}:
+        return ""
+    return (
+        f"; {noun} {name} is installed, and {noun}/{name}.yaml is missing: a file with "
+        f"`name: {name}` and its settings, in the folder given by --config-dir (gpebo new {noun} "
+        f"{name} writes one)"
+    )
+
+
 @dataclass(frozen=True)
 class Registry(Generic[T]):
     """Estimators or observers by name; a module whose name begins with ``_`` is none.

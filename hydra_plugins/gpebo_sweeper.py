@@ -23,6 +23,7 @@ class GpeboSweeperConf:
     resume: str | None = None  # folder of a sweep to go on with
     fail_fast: bool = False
     dry_run: bool = False
+    quiet: bool = False
 
 
 class GpeboSweeper(BasicSweeper):
@@ -39,9 +40,11 @@ class GpeboSweeper(BasicSweeper):
         *,
         fail_fast: bool = False,
         dry_run: bool = False,
+        quiet: bool = False,
     ) -> None:
         super().__init__(max_batch_size, params)
         self._resume, self._fail_fast, self._dry_run = resume, fail_fast, dry_run
+        self._quiet = quiet
 
     def sweep(self, arguments: list[str]) -> Any:
         """Run the jobs of ``arguments`` and of ``params``; arguments win.
@@ -62,7 +65,9 @@ class GpeboSweeper(BasicSweeper):
         parsed = parser.parse_overrides([*stored, *arguments])
         check_number(parsed)
         (jobs,) = self.split_arguments(parsed, None)
-        orders = Orders(self._resume, self._fail_fast, self._dry_run, self.max_batch_size)
+        orders = Orders(
+            self._resume, self._fail_fast, self._dry_run, self.max_batch_size, self._quiet
+        )
         run_sweep(jobs, orders, self.config, self.launcher, loader)
 
 

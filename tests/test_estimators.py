@@ -489,3 +489,21 @@ def test_one_wrong_gain_of_many_is_found():
     gains = [*map(float, range(1, 9)), float("nan")]
     with pytest.raises(ConfigError, match="positive number, got nan"):
         estimators.build({"name": "drem", "gamma": gains})
+
+
+# A plain field as an axis -----------------------------------------------------------------------
+
+
+def test_a_plain_field_is_an_axis_of_separate_estimators():
+    gains = {"gamma": [1.0, 10.0, 100.0]}
+    both = estimators.build({"name": "fct", "mu": "logspace(-2, -1, 2)", **gains})
+    assert [(c["mu"], c["gamma"]) for c in both.cases] == [
+        (mu, gamma) for mu in (0.01, 0.1) for gamma in gains["gamma"]
+    ]
+    found = both.estimate(CLEAN, T)
+    whole = np.concatenate([run("fct", CLEAN, mu=mu, **gains) for mu in (0.01, 0.1)])
+    assert np.array_equal(found.parameters(slice(None)), whole)
+    assert np.array_equal(found.parameters(slice(2, 5)), whole[2:5])
+    assert found.delta(T).shape == (6, len(T))
+    with pytest.raises(ConfigError, match=r"estimator\.mu: expected .*, got 'x'"):
+        estimators.build({"name": "fct", "mu": [0.1, "x"]})

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+import subprocess
 import sys
 import tomllib
 
@@ -63,6 +65,45 @@ def test_an_estimator_passes_its_test_and_is_found_once_it_is_installed(tmp_path
     assert "two_words.py exists already" in again.stderr
 
 
+def test_a_recipe_runs_and_is_drawn(tmp_path):
+    done = gpebo("new", "recipe", "two_gains", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "gpebo run --config-dir . experiment=two_gains" in done.stdout
+    done = gpebo("run", "--config-dir", ".", "experiment=two_gains", "figures=none", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "1e+08" in done.stdout
+    listed = gpebo("list", "experiments", "--config-dir", ".", cwd=tmp_path).stdout
+    assert "the circuit, fast and slow gains" in listed
+    path = tmp_path / "experiment" / "two_gains.yaml"
+    path.write_text(path.read_text().replace("horizon: 20, samples: 1001", "horizon: 2"))
+    done = gpebo("figures", "two_gains", "--config-dir", ".", "--output", "drawn", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "fast and slow gains" in (tmp_path / "drawn" / "index.html").read_text()
+    wrong = gpebo("figures", "two_gain", "--config-dir", ".", cwd=tmp_path)
+    assert "did you mean two_gains?" in wrong.stderr
+
+
+def test_an_installed_estimator_without_its_file_is_said_to_be_one(tmp_path):
+    assert gpebo("new", "estimator", "ridge_of_mine", cwd=tmp_path).returncode == 0
+    info = tmp_path / "ridge_of_mine-0.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ridge-of-mine\nVersion: 0.1\n")
+    (info / "entry_points.txt").write_text(
+        "[gpebo.estimators]\nridge_of_mine = ridge_of_mine:RidgeOfMine\n"
+    )
+    (tmp_path / "estimator" / "ridge_of_mine.yaml").unlink()
+    words = ["run", "estimator=ridge_of_mine"]
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    done = subprocess.run(
+        [sys.executable, "-m", "gpebo_cli", *words], cwd=tmp_path, capture_output=True, text=True,
+        check=False, env={**os.environ, "PYTHONPATH": path},
+    )
+    assert done.returncode == 2
+    said = "estimator ridge_of_mine is installed, and estimator/ridge_of_mine.yaml is missing"
+    assert said in done.stderr
+    assert "gpebo new estimator ridge_of_mine" in done.stderr
+
+
 def test_every_key_is_explained():
     assert set(yaml.safe_load(files("plant", "a")["plant/a.yaml"])) == set(KEYS)
 
@@ -79,7 +120,7 @@ def test_every_key_is_explained():
         (["plant"], "needs one name, as in gpebo new plant tank; got none"),
         (["plant", "a", "b"], "got 'a', 'b'"),
         (["plnt", "a"], "did you mean plant?"),
-        ([], "known: plant, estimator, observer, recording, as in gpebo new plant tank"),
+        ([], "known: plant, estimator, observer, recipe, recording, as in gpebo new plant tank"),
         (["plant", "a", "--confg-dir", "b"], "did you mean --config-dir?"),
         (["plant", "a", "--config-dir"], "--config-dir needs a folder"),
         (["estimator", "ls_drem"], "ls_drem comes with gpebo"),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +16,9 @@ from pathlib import Path
 import pytest
 from scipy.integrate import trapezoid
 
+from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
+from gpebo_cli.cli.progress import Progress
 from gpebo_cli.cli.sweep_folder import (
     JobRecord,
     Plan,
@@ -23,7 +27,7 @@ from gpebo_cli.cli.sweep_folder import (
     table,
     write_record,
 )
-from gpebo_cli.cli.sweep_progress import line
+from gpebo_cli.cli.sweep_progress import Watch
 from gpebo_cli.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -314,11 +318,51 @@ def test_the_table_has_a_row_for_every_job_and_case():
     ]
 
 
-def test_progress_has_counts_failures_and_time_left():
-    assert line(0, 8, 0, 0, 1.0) == "[........................] 0/8 jobs"
-    assert line(4, 8, 1, 2, 30.0) == "[############............] 4/8 jobs, 1 failed, 1:00 left"
-    assert line(8, 8, 0, 8, 9.0) == "[########################] 8/8 jobs"
-    assert line(1, 1001, 0, 1, 4.0).endswith("1:06:40 left")
+def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch):
+    from rich.console import Console
+
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    console = Console(file=io.StringIO(), width=100, color_system=None)
+    jobs = tuple({"estimator.gamma": gain, "plant": "circuit"} for gain in ("1e6", "1e8", "1e9"))
+    with Watch(tmp_path, Plan(jobs, "x"), [0, 1, 2]) as watch:
+        for job, status in enumerate(("done", "failed")):
+            (tmp_path / str(job)).mkdir()
+            cases = [{"seconds_to_1pct_parameters": 5.25}] if status == "done" else []
+            write_record(tmp_path / str(job), JobRecord(job, jobs[job], status, 0.5, "", cases))
+        console.print(watch._look())
+    said = console.file.getvalue()
+    assert "2/3" in said
+    assert "left:" in said
+    assert re.search(r"0 +1e6 +done +0\.5 +5\.25", said)
+    assert re.search(r"1 +1e8 +failed +0\.5", said)
+    assert "plant" not in said, "what is the same for all is left out"
+
+
+def test_stages_are_told_with_their_seconds_and_how_far_they_are(capsys):
+    told = []
+    with Progress(loud=True) as progress:
+        run(
+            "circuit", gamma=list(range(1, 4001)), time={"horizon": 2},
+            progress=lambda stage: (told.append(stage), progress(stage)),
+        )
+    shares = [stage.share for stage in told if hasattr(stage, "share")]
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < shares[-1] < 1
+    lines = capsys.readouterr().err.splitlines()
+    names = list(dict.fromkeys(map(str, told)))
+    assert [line.split(" s  ")[1] for line in lines] == names
+
+
+@pytest.mark.parametrize(("word", "out", "err"), [("-q", False, False), ("-v", True, True)])
+def test_quiet_and_verbose(tmp_path, word, out, err):
+    done = gpebo("run", word, "time.horizon=2", "figures=none", cwd=tmp_path)
+    assert (done.returncode, bool(done.stdout), bool(done.stderr)) == (0, out, err)
+    assert ("error estimates states" in done.stderr) == err
+    words = ["run", "-m", word, "estimator.gamma=1,10", "hydra.sweep.dir=both", *FAST]
+    done = gpebo(*words, cwd=tmp_path)
+    assert (done.returncode, bool(done.stdout), bool(done.stderr)) == (0, out, err)
+    both = gpebo("run", "-q", "-v", cwd=tmp_path)
+    assert (both.returncode, both.stderr) == (2, "gpebo: error: -q and -v: one of them\n")
 
 
 # gpebo compare --------------------------------------------------------------------------------
@@ -426,6 +470,7 @@ def test_a_sweep_that_is_not_finished_is_compared_as_far_as_it_is(tmp_path, unin
         ([".", "--sort"], "--sort needs a column"),
         ([".", "--srt=x"], "did you mean --sort?"),
         (["SWEEP", "--sort", "rms_error"], "did you mean rms_error_states?"),
+        (["SWEEP", "--columns", "run,gama"], "--columns gama: no such column"),
     ],
 )
 def test_wrong_words_of_compare_are_one_line(tmp_path, uninterrupted, words, expected):
@@ -433,6 +478,19 @@ def test_wrong_words_of_compare_are_one_line(tmp_path, uninterrupted, words, exp
     done = gpebo("compare", *words, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert expected in done.stderr
+
+
+def test_a_comparison_has_the_columns_that_are_asked_for(uninterrupted, tmp_path):
+    asked = "gamma,e0_il_hat,seconds_to_1pct_il"
+    words = ["--columns", asked, "--csv", "some.csv", "--no-figures"]
+    done = gpebo("compare", uninterrupted, *words, cwd=tmp_path)
+    assert done.stdout.split("\n")[0].split() == asked.split(",")
+    with (tmp_path / "some.csv").open() as stream:
+        table = list(csv.DictReader(stream))
+    assert list(table[0]) == asked.split(",")
+    with (uninterrupted / "0" / "estimates.csv").open() as stream:
+        *_, last = csv.DictReader(stream)
+    assert last["e0_il_hat"] in [row["e0_il_hat"] for row in table]
 
 
 def test_where_jobs_run_is_no_part_of_the_table(tmp_path):

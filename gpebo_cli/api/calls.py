@@ -72,7 +72,8 @@ def run(
         time: ``start`` and ``horizon`` in seconds, ``samples`` of the output grid.
         excitation: ``rho`` and ``window`` (seconds) of the evidence.
         config_dir: a folder of yours, with ``plant/NAME.yaml``, ``estimator/NAME.yaml``, …
-        progress: called with the name of each stage as it begins.
+        progress: called with the name of each stage as it begins; of a long one again, with an
+            attribute ``share`` of 0 to 1, as it gets on.
         gains: settings of the estimator, as in ``gamma=[1e8, 1e10]``; every combination of
             lists is one case. ``lambda`` is a word of Python's: ``**{"lambda": 0.2}``.
 

@@ -15,6 +15,7 @@ import numpy as np
 from gpebo_cli.configs import files
 from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.registry import installed
 from gpebo_cli.schema import nearest, shown
 
 _WHOLE = ("plant", "regression")  # a mapping or a file of these is all of it
@@ -105,7 +106,7 @@ def _named(
             return files.load(folder, inside), _shortest(path)
     names = sorted(known for folder in folders for known in choices(folder, group))
     text = f"{group}={name}: there is no such {group}; known: {', '.join(names)}"
-    hint = nearest(name, names)
+    hint = installed(group, name) or nearest(name, names)
     if not hint and config_dir is None:
         hint = f" (yours: config_dir=DIR with DIR/{group}/{name}.yaml)"
     raise ConfigError(text + hint)

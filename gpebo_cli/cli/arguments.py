@@ -23,6 +23,8 @@ _SWITCHES = {
     "-r": "--run",
     "--version": "--version",
     "--resolve": "--resolve",
+    "-q": "--quiet",
+    "-v": "--verbose",
     "-sc": "--shell-completion",
 }
 _WITH_VALUE = {
@@ -80,6 +82,16 @@ class Arguments:
         return "fail_fast" if self.fail_fast else ""
 
     @property
+    def quiet(self) -> bool:
+        """Whether only errors and warnings are wanted."""
+        return "--quiet" in self.switches
+
+    @property
+    def loud(self) -> bool:
+        """Whether stages and what the solvers did are wanted, too."""
+        return "--verbose" in self.switches
+
+    @property
     def for_hydra(self) -> list[str]:
         """The overrides that Hydra composes."""
         return [*self.overrides, *self._sweeper]
@@ -94,6 +106,8 @@ class Arguments:
             words.append(f"hydra.sweeper.fail_fast={self.fail_fast}")
         if self.dry_run:
             words.append("hydra.sweeper.dry_run=true")
+        if self.quiet:
+            words.append("hydra.sweeper.quiet=true")
         return words
 
     @property
@@ -151,7 +165,7 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
         if not equals:
             value = next(rest, "")
         values[flag] = _checked(flag, value)
-    config_dir = _config_dir(values.pop("--config-dir", None))
+    config_dir = checked_folder(values.pop("--config-dir", None))
     config_name = _config_name(values.pop("--config-name", None), config_dir)
     overrides = _with_data(overrides, config_name)
     multirun = "--multirun" in switches
@@ -173,6 +187,8 @@ def _check_questions(switches: Collection[str], values: Mapping[str, str]) -> No
     asked = [flag for flag in _ONE_OF if flag in switches or flag in values]
     if len(asked) > 1:
         raise ConfigError(f"only one of {', '.join(asked)} at a time")
+    if {"--quiet", "--verbose"} <= set(switches):
+        raise ConfigError("-q and -v: one of them")
     for flag in ("--resolve", "--package"):
         if (flag in switches or flag in values) and "--cfg" not in values:
             raise ConfigError(f"{flag} is for what --cfg prints; add --cfg job")
@@ -272,7 +288,12 @@ def _checked(flag: str, value: str) -> str:
     return value
 
 
-def _config_dir(given: str | None) -> str | None:
+def checked_folder(given: str | None) -> str | None:
+    """The folder that ``--config-dir`` names, absolute; None: none was given.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
     if given is None:
         return None
     folder = os.path.abspath(os.path.expanduser(given))

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from gpebo_cli.results.comparison import Value
     from gpebo_cli.results.finished import Case
 
-_VALUES = {"--sort": "a column", "--csv": "a file", "--output": "a folder"}
+_VALUES = {
+    "--sort": "a column", "--columns": "names of columns, a,b,c", "--csv": "a file",
+    "--output": "a folder",
+}
 _SWITCHES = ("--reverse", "--no-figures")
 _SHOWN_ROWS = 40
 
@@ -52,10 +55,13 @@ def main(words: list[str]) -> int:
         raise GpeboError("nothing to compare: no run in these folders has estimated anything")
     sort = arguments.values.get("--sort", comparison.SORT)
     known = comparison.names(cases)
-    if sort not in known:
-        raise ConfigError(
-            f"--sort {sort}: no such column; known: {', '.join(known)}" + nearest(sort, known)
-        )
+    asked = [name.strip() for name in arguments.values.get("--columns", "").split(",")]
+    asked = [name for name in asked if name]
+    for option, name in (("--sort", sort), *(("--columns", name) for name in asked)):
+        if name not in known:
+            raise ConfigError(
+                f"{option} {name}: no such column; known: {', '.join(known)}" + nearest(name, known)
+            )
     cases = comparison.ordered(cases, sort, reverse="--reverse" in arguments.switches)
     rows = [comparison.row(case) for case in cases]
 
@@ -63,6 +69,7 @@ def main(words: list[str]) -> int:
     seen = ["run", *several, *comparison.varying(cases), *METRICS]
     if sort not in seen:
         seen.insert(1, sort)
+    seen, known = asked or seen, asked or known
     lines = columns([seen, *([_shown(row.get(n)) for n in seen] for row in rows[:_SHOWN_ROWS])])
     if len(rows) > _SHOWN_ROWS:
         lines.append(f"… {len(rows) - _SHOWN_ROWS} more; --csv FILE has all")

@@ -165,13 +165,20 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
         "list": [*KINDS, "--config-dir", "--help"],
         "figures": [
             *choices(conf_folder(), "experiment"),
-            *("--output", "--check", "--update", "--help"), "figures.formats=",
+            *("--output", "--check", "--update", "--config-dir", "--quiet", "--verbose", "--help"),
+            "figures.formats=",
         ],
-        "compare": ["--sort", "--reverse", "--csv", "--output", "--no-figures", "--help"],
+        "compare": [
+            "--sort", "--reverse", "--columns", "--csv", "--output", "--no-figures", "--help",
+        ],
         "report": ["--output", "--help"],
         "new": [
             "--config-dir", "--from", "--measure", "--unknown", "--plant", "--help",
-            *(["plant", "estimator", "observer", "recording"] if not before else []),
+            *(["plant", "estimator", "observer", "recipe", "recording"] if not before else []),
+        ],
+        "reproduce": [
+            *choices(conf_folder(), "experiment/published"), "--page", "--quiet", "--verbose",
+            "--help",
         ],
         "completion": [*SCRIPTS, "--help"],
     }

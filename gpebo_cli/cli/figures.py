@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpebo_cli.cli.options import Options, parse, unknown
+from gpebo_cli.cli.arguments import Arguments, checked_folder
+from gpebo_cli.cli.options import CONFIG_DIR, PLAIN, VOLUME, Options, parse, unknown
 from gpebo_cli.configs import configuration
 from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
@@ -36,6 +37,7 @@ class _Arguments:
     names: list[str]
     formats: list[str]
     folders: Mapping[str, str]  # --output, --check, --update
+    config_dir: str | None  # absolute
 
 
 def main(words: list[str]) -> int:
@@ -45,7 +47,7 @@ def main(words: list[str]) -> int:
         ConfigError: an unknown recipe, option or format.
         GpeboError: a run failed, a file cannot be written, or ``--check`` found a difference.
     """
-    options = parse("figures", words, _FOLDERS)
+    options = parse("figures", words, {**_FOLDERS, **CONFIG_DIR}, VOLUME)
     if options.help:
         from gpebo_cli.cli.usage import FIGURES_HELP
 
@@ -68,17 +70,19 @@ def main(words: list[str]) -> int:
     make_folder(folder)
     sections: list[Section] = []
     differences: list[str] = []
-    for recipe in run_recipes(names):
+    for recipe in run_recipes(names, options, arguments.config_dir):
         figures = gallery.figures_of(recipe)
         section = gallery.write_recipe(folder / recipe.name, recipe, figures, arguments.formats)
         sections.append(section)
-        sys.stdout.write(f"{recipe.name}: {len(section.pictures)} figures\n")
+        if not options.quiet:
+            sys.stdout.write(f"{recipe.name}: {len(section.pictures)} figures\n")
         if update is not None:
             gallery.write_references(Path(update), recipe.name, figures)
         if check is not None:
             differences += gallery.check_references(Path(check), recipe.name, figures)
     write_text(folder / "index.html", page(sections, provenance()))
-    sys.stdout.write(f"{folder / 'index.html'}\n")
+    if not options.quiet:
+        sys.stdout.write(f"{folder / 'index.html'}\n")
     if differences:
         sys.stdout.writelines(f"{line}\n" for line in differences)
         sys.stdout.flush()  # before what follows on stderr
@@ -91,22 +95,24 @@ def main(words: list[str]) -> int:
 def _arguments(options: Options) -> _Arguments:
     names: list[str] = []
     formats = ["png"]
+    config_dir = checked_folder(options.config_dir)
     for word in options.words:
         key, equals, value = word.partition("=")
         if key == _FORMATS:
             formats = _formats(value)
         elif equals and key != "experiment":
-            raise unknown("figures", key, (*_FOLDERS, _FORMATS, "--help"))
+            raise unknown("figures", key, (*_FOLDERS, *CONFIG_DIR, _FORMATS, "--help"))
         else:
-            names.append(_recipe(word))
+            names.append(_recipe(word, config_dir))
     check = options.values.get("--check")
     if check is not None and not os.path.isdir(check):
         raise ConfigError(f"--check {check}: there is no such folder")
-    return _Arguments(list(dict.fromkeys(names)), formats, options.values)
+    return _Arguments(list(dict.fromkeys(names)), formats, options.values, config_dir)
 
 
-def _recipe(word: str) -> str:
-    known = choices(conf_folder(), "experiment")
+def _recipe(word: str, config_dir: str | None) -> str:
+    folders = [conf_folder(), *([] if config_dir is None else [config_dir])]
+    known = [name for folder in folders for name in choices(folder, "experiment")]
     name = word.removeprefix("experiment=")
     if name not in known:
         raise ConfigError(
@@ -130,8 +136,15 @@ def _formats(text: str) -> list[str]:
     return [name for name in FORMATS if name == "png" or name in given]
 
 
-def run_recipes(names: list[str]) -> Iterator[Recipe]:
+def run_recipes(
+    names: list[str], options: Options = PLAIN, config_dir: str | None = None
+) -> Iterator[Recipe]:
     """Compose and run recipes, one at a time.
+
+    Args:
+        names: of recipes.
+        options: how much to say.
+        config_dir: a folder of one's own.
 
     Raises:
         ConfigError: a recipe is wrong.
@@ -139,17 +152,17 @@ def run_recipes(names: list[str]) -> Iterator[Recipe]:
     """
     from omegaconf import OmegaConf
 
-    from gpebo_cli.cli.arguments import Arguments
     from gpebo_cli.cli.composition import session
     from gpebo_cli.results.gallery import Recipe
 
+    given = Arguments(config_dir=config_dir)
     for name in names:
         runs: dict[str, RunResult] = {}
-        with session(Arguments()) as hydra:
+        with session(given) as hydra:
             jobs = list(recipe_jobs(name, hydra.config_loader))
         for label, cfg in jobs:
             try:
-                runs[label] = run_recipe_job(cfg)
+                runs[label] = run_recipe_job(cfg, given, options)
             except GpeboError as error:
                 where = f"experiment {name}" + (f", {label}" if label else "")
                 raise type(error)(f"{where}: {error}") from error
@@ -181,17 +194,24 @@ def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConf
         yield ", ".join(chosen), loader.load_configuration(PRIMARY, words, RunMode.RUN)
 
 
-def run_recipe_job(cfg: DictConfig) -> RunResult:
+def run_recipe_job(cfg: DictConfig, arguments: Arguments, options: Options) -> RunResult:
     """Run one composed configuration; nothing is written.
+
+    Args:
+        cfg: the configuration.
+        arguments: where files came from.
+        options: how much to say.
 
     Raises:
         GpeboError: it fails.
     """
     from gpebo_cli.cli import composition
+    from gpebo_cli.cli.job import plant_file
     from gpebo_cli.cli.progress import Progress
     from gpebo_cli.experiment.pipeline import run_experiment
     from gpebo_cli.regression.text import system_from_mapping
 
     settings = configuration.settings(composition.plain(cfg), draw=False)
-    with Progress() as progress:
-        return run_experiment(settings, system_from_mapping(settings.plant), progress)
+    source = plant_file(str(cfg.hydra.runtime.choices.get("plant") or ""), arguments)
+    with Progress(quiet=options.quiet, loud=options.loud) as progress:
+        return run_experiment(settings, system_from_mapping(settings.plant, source), progress)

@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gpebo_cli.cli.arguments import Arguments
 from gpebo_cli.configs.files import is_group
 from gpebo_cli.configs.locations import GROUPS, choices
+from gpebo_cli.registry import installed
 from gpebo_cli.schema import nearest, shown
 
 LIBRARY_ERRORS = (HydraException, OmegaConfBaseException)
@@ -62,7 +63,7 @@ def _missing(error: MissingConfigException, arguments: Arguments) -> str:
     chooser = match[1] if match else arguments.config_name
     where = "" if chooser == arguments.config_name else f"{chooser}: "
     text = f"{where}{group}={name}: there is no such {group}; known: {', '.join(known)}"
-    hint = nearest(name, known)
+    hint = installed(group, name) or nearest(name, known)
     if arguments.config_dir is None and os.path.isfile(os.path.join(group, f"{name}.yaml")):
         return f"{text}; yours, {group}/{name}.yaml, is found with --config-dir ."
     if not hint and arguments.config_dir is None and group in GROUPS:

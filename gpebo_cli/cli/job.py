@@ -49,19 +49,22 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     from gpebo_cli.regression.text import system_from_mapping
 
     build(settings.estimator)  # used or not: its name becomes part of a folder's
-    source = _plant_file(arguments)
+    source = plant_file(str(HydraConfig.get().runtime.choices.get("plant") or ""), arguments)
     system = system_from_mapping(settings.plant, source)
     config["plant"] = located(settings.plant, source)
     return Job(settings, system, configuration.complete(config, settings))
 
 
-def run_job(job: Job, folder: str, *, quiet: bool = False) -> RunResult:
+def run_job(
+    job: Job, folder: str, *, quiet: bool = False, loud: bool = False
+) -> RunResult:
     """Run the experiment of ``job`` and write ``folder``.
 
     Args:
         job: what to run.
         folder: where to write.
         quiet: whether to leave the terminal alone: a sweep shows its own progress.
+        loud: whether to say how long each stage took.
 
     Raises:
         GpeboError: the experiment failed, or a file cannot be written.
@@ -74,7 +77,7 @@ def run_job(job: Job, folder: str, *, quiet: bool = False) -> RunResult:
     settings = job.settings
     if isinstance(settings.output.figures, list):
         check_names(settings.output.figures)
-    with Progress(quiet=quiet) as progress:
+    with Progress(quiet=quiet, loud=loud) as progress:
         result = run_experiment(settings, job.system, progress)
         progress("write")
         write_run(result, Path(folder), configuration.config_text(job.config))
@@ -91,10 +94,9 @@ def remove_if_empty(folder: str) -> None:
         return
 
 
-def _plant_file(arguments: Arguments) -> str:
-    """Where the plant was written, for messages."""
-    chosen = HydraConfig.get().runtime.choices.get("plant")
-    inside = os.path.join("plant", str(chosen)) if chosen else arguments.config_name
+def plant_file(chosen: str, arguments: Arguments) -> str:
+    """Where the plant of that name, or that of the primary configuration, was written."""
+    inside = os.path.join("plant", chosen) if chosen else arguments.config_name
     for folder in arguments.folders:
         path = os.path.join(folder, f"{inside}.yaml")
         if os.path.isfile(path):

@@ -17,7 +17,7 @@ from gpebo_cli.schema import nearest, shown
 _PACKAGE = {"{name}.py": "{kind}.py", "{kind}/{name}.yaml": "{kind}.yaml",
             "test_{name}.py": "test_{kind}.py", "pyproject.toml": "pyproject.toml"}
 KINDS = {"plant": {"plant/{name}.yaml": "plant.yaml"}, "estimator": _PACKAGE,
-         "observer": _PACKAGE}
+         "observer": _PACKAGE, "recipe": {"experiment/{name}.yaml": "recipe.yaml"}}
 """For each kind the files that are written, and the template of each."""
 RECORDING = "recording"
 """The kind that is made from a look at a file, and has no template."""
@@ -30,6 +30,7 @@ FROM_FILE = {
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,79}")
 _WORDS = ("null", "true", "false", "yes", "no", "on", "off", "nan", "inf")  # mean more in YAML
+_GROUPS = {"recipe": "experiment"}  # of kinds that are not called as their group
 _RUNS = """\
 it runs as it stands:      gpebo run --config-dir {folder} {kind}={name}
 when you have changed it:  gpebo check --config-dir {folder} {kind}={name}
@@ -75,7 +76,8 @@ def main(words: list[str]) -> int:
         make_folder(path.parent)
         write_file(path, [content])
         sys.stdout.write(f"{path}\n")
-    sys.stdout.write(told + said.format(folder=shlex.quote(folder), kind=kind, name=name))
+    group = _GROUPS.get(kind, kind)
+    sys.stdout.write(told + said.format(folder=shlex.quote(folder), kind=group, name=name))
     return 0
 
 
@@ -161,7 +163,7 @@ def _check_name(kind: str, name: str, paths: list[Path]) -> None:
             f"gpebo new {kind}: {name} cannot be the name of a Python module; it is a letter, then "
             "letters, digits and _, and no word or module of Python's own"
         )
-    if name in choices(conf_folder(), kind):
+    if name in choices(conf_folder(), _GROUPS.get(kind, kind)):
         raise ConfigError(
             f"gpebo new {kind}: {name} comes with gpebo, and yours would be ignored; choose "
             "another name"

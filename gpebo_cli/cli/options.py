@@ -8,6 +8,9 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:  # `gpebo list` loads nothing that Python has not loaded
     from collections.abc import Mapping, Sequence
 
+VOLUME = ("--quiet", "-q", "--verbose", "-v")
+"""Switches of commands that take long: nothing but errors, or how long each stage took."""
+
 CONFIG_DIR = {"--config-dir": "a folder", "-cd": "a folder"}
 """Where files of one's own are, for those commands that look for some."""
 
@@ -34,9 +37,23 @@ class Options:
         return self.values.get("--config-dir", self.values.get("-cd"))
 
     @property
+    def quiet(self) -> bool:
+        """Whether only errors are wanted."""
+        return not {"--quiet", "-q"}.isdisjoint(self.switches)
+
+    @property
+    def loud(self) -> bool:
+        """Whether stages are wanted, too."""
+        return not {"--verbose", "-v"}.isdisjoint(self.switches)
+
+    @property
     def help(self) -> bool:
         """Whether the command's help is wanted."""
         return not {"--help", "-h"}.isdisjoint(self.switches)
+
+
+PLAIN = Options({}, frozenset(), ())
+"""No words."""
 
 
 def parse(
@@ -78,7 +95,7 @@ def unknown(command: str, key: str, known: Sequence[str]) -> ConfigError:
     """The error for an option that the command does not have."""
     from gpebo_cli.schema import nearest, shown
 
-    long = [name for name in known if name != "-cd"]
+    long = [name for name in known if name.startswith("--") or len(name) > 3]
     return ConfigError(
         f"gpebo {command}: {shown(key)} is no option; known: {', '.join(long)}"
         + nearest(key, long)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gpebo_cli.cli.options import Options, parse
+from gpebo_cli.cli.options import PLAIN, VOLUME, Options, parse
 from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.schema import nearest, read, shown
@@ -56,14 +56,15 @@ def main(words: list[str]) -> int:
         ConfigError: there is no such recipe, or one is wrong.
         GpeboError: a run failed, or the page cannot be written.
     """
-    options = parse("reproduce", words, _PAGE)
+    options = parse("reproduce", words, _PAGE, VOLUME)
     if options.help:
         from gpebo_cli.cli.usage import REPRODUCE_HELP
 
         sys.stdout.write(REPRODUCE_HELP)
         return 0
-    findings = [finding for name in _names(options) for finding in reproduced(name)]
-    sys.stdout.writelines(f"{line}\n" for line in table(findings))
+    findings = [finding for name in _names(options) for finding in reproduced(name, options)]
+    if not options.quiet:
+        sys.stdout.writelines(f"{line}\n" for line in table(findings))
     page = options.values.get("--page")
     if page is not None:
         from pathlib import Path
@@ -73,7 +74,8 @@ def main(words: list[str]) -> int:
         write_text(Path(page), atlas(findings))
     off = [finding for finding in findings if not finding.holds]
     count = len({finding.recipe for finding in findings})
-    sys.stdout.write(f"{count} recipes, {len(findings)} numbers, {len(off)} off\n")
+    if off or not options.quiet:
+        sys.stdout.write(f"{count} recipes, {len(findings)} numbers, {len(off)} off\n")
     return 1 if off else 0
 
 
@@ -88,8 +90,12 @@ def _names(options: Options) -> list[str]:
     return list(options.words) or known
 
 
-def reproduced(name: str) -> Iterator[Finding]:
+def reproduced(name: str, options: Options = PLAIN) -> Iterator[Finding]:
     """Run a recipe of ``experiments/published`` and compare.
+
+    Args:
+        name: of the recipe.
+        options: how much to say meanwhile.
 
     Raises:
         ConfigError: its ``expected`` names no quantity of the run.
@@ -105,7 +111,7 @@ def reproduced(name: str) -> Iterator[Finding]:
     with session(Arguments()) as hydra:
         ((_, config),) = recipe_jobs(f"published/{name}", hydra.config_loader)
     try:
-        result = run_recipe_job(config)
+        result = run_recipe_job(config, Arguments(), options)
     except GpeboError as error:
         raise type(error)(f"{where}: {error}") from error
     title, reference = (str(OmegaConf.select(config, key) or "") for key in ("title", "reference"))

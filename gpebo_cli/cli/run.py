@@ -71,17 +71,19 @@ def _once(config: DictConfig, arguments: Arguments) -> int:
     # Its name has parts of the configuration, which has been checked by now.
     folder = os.path.abspath(str(config.hydra.run.dir))
     from gpebo_cli.results.files import make_folder
-    from gpebo_cli.results.report import run_lines
+    from gpebo_cli.results.report import loud_lines, run_lines
 
     make_folder(Path(folder))  # now, and not after an hour, if it cannot be made
     try:
-        result = run_job(job, folder)
+        result = run_job(job, folder, quiet=arguments.quiet, loud=arguments.loud)
     except BaseException:
         remove_if_empty(folder)
         raise
 
-    lines = run_lines(result, os.path.relpath(folder))
+    lines = [] if arguments.quiet else run_lines(result, os.path.relpath(folder))
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     sys.stdout.flush()  # before what follows on stderr
-    sys.stderr.write("".join(f"gpebo: warning: {line}\n" for line in result.warnings))
+    more = loud_lines(result) if arguments.loud else []
+    more += [f"gpebo: warning: {line}" for line in result.warnings]
+    sys.stderr.write("".join(f"{line}\n" for line in more))
     return 0

@@ -35,10 +35,12 @@ from gpebo_cli.cli.sweep_folder import (
     write_record,
     write_table,
 )
-from gpebo_cli.cli.sweep_progress import Bar
+from gpebo_cli.cli.sweep_progress import Watch
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.results.files import make_folder, write_text
+from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.report import case_rows, columns
 from gpebo_cli.schema import shown
 
@@ -60,6 +62,7 @@ class Orders:
     fail_fast: bool
     dry_run: bool
     max_batch_size: int | None
+    quiet: bool = False  # nothing on stdout and on a terminal
 
 
 def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
@@ -84,7 +87,7 @@ def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
     interrupts.check()
     try:
         job = read_job(cfg, arguments, draw=False)
-        rows = case_rows(run_job(job, str(folder), quiet=True))
+        rows = case_rows(run_job(job, str(folder), quiet=True, loud=arguments.loud))
         cases = [{k: v if math.isfinite(v) else None for k, v in row.items()} for row in rows]
     except GpeboError as raised:
         error = str(raised)
@@ -143,7 +146,7 @@ def run_sweep(
     trouble = ""
     finished = False
     try:
-        with Bar(folder, plan, waiting):
+        with Watch(folder, plan, waiting, quiet=orders.quiet):
             trouble = _launch(jobs, waiting, folder, orders, launcher, errors)
         finished = True
     finally:  # also when it is interrupted: what is done is in the table
@@ -152,7 +155,8 @@ def run_sweep(
             for r in read_records(folder, plan)
         ]
         write_table(folder, records)
-        _print_table(records, folder, rows=finished)
+        if not orders.quiet:
+            _print_table(records, folder, rows=finished)
     _raise_failures(records, folder, trouble, stopped=(folder / STOP).exists())
 
 
@@ -328,8 +332,9 @@ def _print_table(records: Sequence[JobRecord], folder: Path, *, rows: bool) -> N
     """The table's beginning (without it when interrupted), where it is, and counts."""
     lines = []
     if rows:
-        cells = [[_shown(cell) for cell in row] for row in table(records)]
-        lines += columns([row[:-1] for row in cells[: _SHOWN_ROWS + 1]])  # errors: below
+        cells = [[_shown(cell) for cell in row[:-1]] for row in table(records)]  # errors: below
+        seen = [k for k, name in enumerate(cells[0]) if name in METRICS or not is_metric(name)]
+        lines += columns([[row[k] for k in seen] for row in cells[: _SHOWN_ROWS + 1]])
         if len(cells) > _SHOWN_ROWS + 1:
             lines.append(f"… {len(cells) - _SHOWN_ROWS - 1} more")
     count = Counter(record.status for record in records)

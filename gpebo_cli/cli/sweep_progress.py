@@ -1,4 +1,4 @@
-"""A line on a terminal while a sweep runs: how many jobs are done, failed and left, and how long.
+"""A table on a terminal that fills while a sweep runs, and how long the rest will take.
 
 The launcher is blocked until all jobs are done, and may run them elsewhere. So the folder is
 looked at from a thread: the same for every launcher, and it shows what really is on disk.
@@ -6,90 +6,79 @@ looked at from a thread: the same for every launcher, and it shows what really i
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from threading import Event, Thread
-from time import monotonic
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from gpebo_cli.cli.sweep_folder import RESULT, Plan, job_folder, read_record
+from gpebo_cli.cli.progress import display
+from gpebo_cli.cli.sweep_folder import RESULT, JobRecord, Plan, job_folder, read_record
 
-_PERIOD = 0.5  # seconds between two looks
-_BAR = 24  # characters
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.table import Table
+
+_LOOKS = 2.0  # a second
+_ROWS = 12  # of jobs that ended last
+_METRICS = ("seconds_to_1pct_parameters", "final_error_states")
+_HEADINGS = ("parameters to 1 % (s)", "final error, states")
 
 
-class Bar:
-    """Shows the jobs in ``waiting`` on stderr, if that is a terminal."""
+class Watch:
+    """Shows the jobs in ``waiting`` on stderr, if that is a terminal and nobody wants silence."""
 
-    def __init__(self, folder: Path, plan: Plan, waiting: Sequence[int]) -> None:
-        self._folder = folder
-        self._plan = plan
-        self._before = len(plan.jobs) - len(waiting)
+    def __init__(
+        self, folder: Path, plan: Plan, waiting: Sequence[int], *, quiet: bool = False
+    ) -> None:
+        self._folder, self._plan = folder, plan
         self._waiting = list(waiting)
-        self._failed = 0
-        self._start = monotonic()
-        self._end = Event()
-        self._thread = Thread(target=self._watch, daemon=True)
-        self._terminal = sys.stderr.isatty()
+        keys = dict.fromkeys(key for job in plan.jobs for key in job)
+        self._varying = [k for k in keys if len({job.get(k) for job in plan.jobs}) > 1]
+        self._ended: list[JobRecord] = []
+        self._terminal = sys.stderr.isatty() and not quiet
 
     def __enter__(self) -> Self:
         if self._terminal:
-            self._thread.start()
+            from rich.live import Live
+            from rich.progress import MofNCompleteColumn
+
+            self._bar = display(MofNCompleteColumn())
+            count = len(self._plan.jobs)
+            self._task = self._bar.add_task(
+                "jobs", total=count, completed=count - len(self._waiting)
+            )
+            self._live = Live(
+                get_renderable=self._look, console=self._bar.console, transient=True,
+                refresh_per_second=_LOOKS,
+            )
+            self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._terminal:
-            self._end.set()
-            self._thread.join()
-            sys.stderr.write("\r\x1b[K")  # what follows begins on a clean line
-            sys.stderr.flush()
+            self._live.stop()
 
-    def _watch(self) -> None:
-        count = len(self._waiting)
-        while True:
-            self._look()
-            ended = count - len(self._waiting)
-            text = line(
-                self._before + ended, len(self._plan.jobs), self._failed, ended,
-                monotonic() - self._start,
-            )
-            width = shutil.get_terminal_size().columns - 1
-            sys.stderr.write(f"\r{text[:width]}\x1b[K")
-            sys.stderr.flush()
-            if self._end.wait(_PERIOD):
-                return
+    def _look(self) -> RenderableType:
+        from rich.console import Group
 
-    def _look(self) -> None:
-        left = []
-        for number in self._waiting:
-            if (job_folder(self._folder, number) / RESULT).exists():
-                record = read_record(self._folder, number, self._plan.jobs[number])
-                self._failed += record.status == "failed"
-            else:
-                left.append(number)
-        self._waiting = left
+        there = [n for n in self._waiting if (job_folder(self._folder, n) / RESULT).exists()]
+        self._ended += [read_record(self._folder, n, self._plan.jobs[n]) for n in there]
+        self._waiting = [number for number in self._waiting if number not in there]
+        self._bar.update(self._task, completed=len(self._plan.jobs) - len(self._waiting))
+        return Group(table(self._ended, self._varying), self._bar)
 
 
-def line(ended: int, total: int, failed: int, now: int, seconds: float) -> str:
-    """The text of the bar.
+def table(ended: Sequence[JobRecord], keys: Sequence[str]) -> Table:
+    """The jobs that ended last: what varies, how long they took, how the first case went."""
+    from rich.table import Table
 
-    Args:
-        ended: jobs with a result, those of earlier attempts included.
-        total: jobs of the sweep.
-        failed: how many failed in this attempt.
-        now: how many ended in this attempt.
-        seconds: how long this attempt has taken.
-    """
-    full = _BAR * ended // total if total else _BAR
-    left = total - ended
-    time = f", {_duration(seconds / now * left)} left" if now and left else ""
-    failures = f", {failed} failed" if failed else ""
-    return f"[{'#' * full}{'.' * (_BAR - full)}] {ended}/{total} jobs{failures}{time}"
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    found = Table("job", *keys, "status", "seconds", *_HEADINGS, box=None)
+    for record in ended[-_ROWS:]:
+        first = (record.cases or [{}])[0]
+        numbers = [record.seconds, *(first.get(name) for name in _METRICS)]
+        found.add_row(
+            str(record.job), *(record.overrides.get(key, "") for key in keys), record.status,
+            *("" if number is None else f"{number:.4g}" for number in numbers),
+            style="red" if record.status == "failed" else None,
+        )
+    return found

@@ -17,7 +17,7 @@ commands:
   figures [NAME …]    the paper's figures and tables, in outputs/paper
   reproduce [NAME …]  published numbers beside ours, from experiments/published
   list [KIND]         what there is: plants, regressions, observers, estimators, …
-  new KIND NAME       a plant, an estimator, an observer of your own, which works as it stands
+  new KIND NAME       a plant, estimator, observer or recipe of yours, which works as it stands
   completion SHELL    completion of commands, groups and names for bash, zsh or fish
 
 options:
@@ -47,15 +47,19 @@ same machine writes the same tables, byte for byte.
 
 options:
   figures.formats=[png,pdf,svg]  formats besides PNG, which is always written
+  --config-dir DIR    a folder of yours with experiment/NAME.yaml, whose recipes can be named, too
   --output DIR        where to write
   --check DIR         compare with the tables in DIR; exit code 1 if a curve differs
   --update DIR        write the tables that --check compares with
+  -q, -v              nothing but errors; how long each stage takes
   -h, --help          this text
 
 examples:
   gpebo figures paper_circuit                        # without a name, all of them
   gpebo figures literal_regressor 'figures.formats=[png,pdf]' --update tables
   gpebo figures literal_regressor --check tables
+  gpebo new recipe mine
+  gpebo figures mine --config-dir .
 """
 
 COMPARE_HELP = """\
@@ -69,6 +73,8 @@ a positive number makes an axis. Of a folder of runs, outputs/runs for instance,
 options:
   --sort COLUMN       seconds_to_1pct_parameters by default; heat maps show it
   --reverse           largest first
+  --columns A,B,…     these columns, in this order: gains, settings, metrics of all or of one
+                      quantity (seconds_to_1pct_x), estimates at the end (x_hat, x_std)
   --csv FILE          the whole table, every digit
   --output DIR        where to draw; outputs/comparisons/<time> by default
   --no-figures        the table only
@@ -77,6 +83,7 @@ options:
 examples:
   gpebo run -m estimator.gamma=1e6,1e8 estimator=drem,lion hydra.sweep.dir=both
   gpebo compare both
+  gpebo compare both --columns run,gamma,e0_il_hat,seconds_to_1pct_il --no-figures
   gpebo compare both/0 both/1 --sort final_error_states --csv best.csv --no-figures
 """
 
@@ -125,7 +132,7 @@ usage: gpebo reproduce [NAME …] [--page FILE]
 
 Runs the recipes of experiments/published, by default all of them, and prints every published
 number beside ours. Exit code 1 if one is off by more than its tolerance. --page writes the table
-as a page of Markdown.
+as a page of Markdown; -q prints nothing but errors, -v how long each stage takes.
 
 examples:
   gpebo reproduce gear_petzold
@@ -134,7 +141,7 @@ examples:
 """
 
 NEW_HELP = """\
-usage: gpebo new {plant|estimator|observer} NAME [--config-dir DIR] [--from FILE …]
+usage: gpebo new {plant|estimator|observer|recipe} NAME [--config-dir DIR] [--from FILE …]
        gpebo new recording FILE.csv --plant NAME [--config-dir DIR]
 
 Writes below DIR, by default the current folder; nothing that exists is overwritten.
@@ -142,8 +149,8 @@ Writes below DIR, by default the current folder; nothing that exists is overwrit
   plant      DIR/plant/NAME.yaml: every key explained; it runs as it stands
   estimator  DIR/NAME.py, its settings DIR/estimator/NAME.yaml, its test DIR/test_NAME.py, and
              DIR/pyproject.toml, by which gpebo finds it once it is installed; the test passes
-  observer   likewise
-
+  observer   the same files for an observer
+  recipe     DIR/experiment/NAME.yaml: an experiment as a file; it runs as it stands
   recording  DIR/data/FILE.yaml: which column of FILE.csv is which signal of the plant, separators,
              units, gaps, as far as they can be guessed; and what was not understood
 
@@ -159,6 +166,8 @@ examples:
   gpebo new plant boiler --config-dir models
   gpebo check --config-dir models plant=boiler
   gpebo new estimator ridge --config-dir ridge
+  gpebo new recipe two_gains
+  gpebo run --config-dir . experiment=two_gains
 """
 
 COMPLETION_HELP = """\
@@ -215,6 +224,8 @@ options:
   launcher=NAME       of a sweep: basic, one after the other; joblib, all cores; ray; slurm
   --config-dir DIR    a folder of yours with plant/NAME.yaml, experiment/NAME.yaml, …
   --config-name NAME  another primary configuration; a run's own is config.yaml in its folder
+  -q, --quiet         nothing but errors and warnings
+  -v, --verbose       how long each stage takes, meshes, error estimates, versions, on stderr
   --cfg job           print the configuration and stop; add --resolve to fill in ${{…}}
   --hydra-help        options of Hydra that are rarely needed
   -h, --help          this text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from gpebo_cli.estimators._several import spread
 from gpebo_cli.registry import Registry
 from gpebo_cli.regression.estimator import Estimator
 
@@ -18,6 +19,6 @@ def build(settings: Mapping[str, object]) -> Estimator:
     Raises:
         ConfigError: unknown name or key, with the nearest known one.
     """
-    built = _ESTIMATORS.build(settings)
+    built = spread(_ESTIMATORS.find(settings), settings, _ESTIMATORS.build)
     _ = built.cases  # gains are read here, so that a wrong one is found before anything is run
     return built

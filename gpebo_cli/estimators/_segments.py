@@ -8,6 +8,7 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator
 from gpebo_cli.estimators._registry import able
+from gpebo_cli.estimators._several import Several
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.estimator import (
@@ -26,9 +27,10 @@ _GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
 
 def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
     """The estimator with numbers for gains that are ``auto``; one of another kind as it is."""
-    if not isinstance(estimator, GainEstimator) or regression.resets or regression.dynamics:
-        return estimator
-    return estimator.tuned(regression)
+    plain = not regression.resets and regression.dynamics is None
+    if plain and isinstance(estimator, GainEstimator | Several):
+        return estimator.tuned(regression)
+    return estimator
 
 
 def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Estimates:

@@ -42,8 +42,9 @@ _PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that counts as this large
 _BATCH = 1 << 19  # numbers held at once while cases are evaluated: what fits the cache
 
+Share = Callable[[float], None]  # told how much of a stage is done
 # name of a stage of the run -> what measures it
-Stage = Callable[[str], AbstractContextManager[None]]
+Stage = Callable[[str], AbstractContextManager[Share]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ def continuous(
         )
     with stage("excitation"):
         excitation = assess(regression, t, settings.excitation, settings.solver.tol)
-    with stage("estimate"):
+    with stage("estimate") as share:
         known = excitation.known
         determined = visible(observation, known, t, system.n)
         estimator = estimators.tuned(estimator, regression)
@@ -101,7 +102,7 @@ def continuous(
         try:
             estimation, metrics = _estimate(
                 settings, system, observation.estimator or estimator, observation, source, known,
-                determined[-1],
+                determined[-1], share,
             )
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
@@ -121,10 +122,10 @@ def continuous(
                 )
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
-        with stage("seeds"):
+        with stage("seeds") as share:
             theta = source.theta(t[-1:])
             noise = over_seeds(
-                observation, observe, source.true, theta, estimator, settings.noise, levels
+                observation, observe, source.true, theta, estimator, settings.noise, levels, share
             )
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
@@ -146,7 +147,7 @@ def at_samples(
     """
     refuse_seeds(settings.noise)
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
-    with stage("observe and estimate"):
+    with stage("observe and estimate") as share:
         t = sample_times(samples.step, start, stop)
         u, y = source.inputs(t), source.outputs(t)
         first = np.append(u[0], y[0])
@@ -156,7 +157,11 @@ def at_samples(
         )
         online = Online(settings, system, samples.hold, start, first, estimator, wanted)
         parts = [slice(i, i + _SAMPLES_AT_ONCE) for i in range(0, len(t), _SAMPLES_AT_ONCE)]
-        made = joined([online.feed(t[part], u[part], y[part]) for part in parts])
+        fed = []
+        for part in parts:
+            fed.append(online.feed(t[part], u[part], y[part]))
+            share(part.stop / len(t))
+        made = joined(fed)
         truth = online.truth(made.extension)(t, source.theta(t), source.states)
         x = source.states(t)
         parameters = made.parameters * _told(made.known.parameters[-1])
@@ -203,7 +208,7 @@ def at_samples(
 
 def _estimate(
     settings: Settings, system: DescriptorSystem, estimator: estimators.Estimator,
-    observation: Observation, source: Source, known: Knowledge, seen: BoolArray,
+    observation: Observation, source: Source, known: Knowledge, seen: BoolArray, share: Share,
 ) -> tuple[EstimationResult, Metrics]:
     """Run every case on the mesh and the samples that are kept; measure on both.
 
@@ -249,6 +254,7 @@ def _estimate(
             eta = whole
         found, parameters[part], estimated[part] = evaluate(eta)
         numbers[:, part] = found[: len(numbers)]
+        share(part.stop / size)
     result = EstimationResult(
         cases=cases,
         t=kept,

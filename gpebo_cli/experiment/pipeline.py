@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from time import perf_counter
+from typing import Self
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment import sources
 from gpebo_cli.experiment.assumptions import of_observation, warnings
-from gpebo_cli.experiment.estimation import at_samples, continuous
+from gpebo_cli.experiment.estimation import Share, at_samples, continuous
 from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
@@ -27,6 +28,20 @@ from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
 
 
+class Stage(str):
+    """The name of a stage that has got on: ``share`` of it is done."""
+
+    __slots__ = ("share",)
+
+    def __new__(cls, name: str, share: float) -> Self:
+        """A name with a share of 0 to 1."""
+        stage = super().__new__(cls, name)
+        stage.share = share
+        return stage
+
+    share: float
+
+
 @dataclass
 class _Clock:
     """Seconds per stage; the only mutable thing in a run."""
@@ -35,10 +50,15 @@ class _Clock:
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
+    def __call__(self, name: str) -> Iterator[Share]:
         since = perf_counter()
         self.progress(name)
-        yield
+
+        def getting_on(share: float) -> None:
+            if share < 1.0:
+                self.progress(Stage(name, share))
+
+        yield getting_on
         self.seconds[name] = perf_counter() - since
 
 
@@ -53,7 +73,8 @@ def run_experiment(
     Args:
         settings: what to do; ``settings.plant`` is not read, ``system`` is it.
         system: the plant.
-        progress: called with the name of each stage as it starts.
+        progress: called with the name of each stage as it starts, and of a long one again with
+            its ``share`` (:class:`Stage`) as it gets on.
         estimator: used instead of the one that ``settings.estimator`` names.
 
     Raises:

@@ -65,6 +65,7 @@ def refuse_seeds(settings: NoiseSettings) -> None:
 def over_seeds(
     observation: Observation, observe: Callable[[Signals], Observation], signals: Signals,
     theta: Array, estimator: Estimator, settings: NoiseSettings, levels: NoiseLevels,
+    share: Callable[[float], None],
 ) -> NoiseStatistics:
     """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, …
 
@@ -76,6 +77,7 @@ def over_seeds(
         estimator: all of its cases are assessed.
         settings: of the noise.
         levels: of the noise.
+        share: told how much is done.
 
     Raises:
         ModelError: an assumption of the observer fails along some noise.
@@ -85,17 +87,19 @@ def over_seeds(
     seeds = range(settings.seed, settings.seed + settings.seeds)
     if observation.respond is None:
         found = []
-        for seed in seeds:
+        for done, seed in enumerate(seeds, 1):
             own = observe(measure(signals, replace(settings, seed=seed), levels))
             eta = estimate(own.estimator or estimator, own.regression, horizon)
             truth = own.truth(horizon, theta, signals.states)[0]
             found.append(eta.parameters(slice(None))[:, 0] - truth)
+            share(done / len(seeds))
         error = np.stack(found, axis=-1)
     else:
-        added = _added(observation, observation.respond, signals, settings, levels)
-        error = np.concatenate([
-            estimator.estimate(many, horizon).parameters(slice(None))[:, 0] for many in added
-        ], axis=-1)
+        added, found = _added(observation, observation.respond, signals, settings, levels), []
+        for many in added:
+            found.append(estimator.estimate(many, horizon).parameters(slice(None))[:, 0])
+            share(sum(part.shape[-1] for part in found) / len(seeds))
+        error = np.concatenate(found, axis=-1)
         error -= observation.truth(horizon, theta, signals.states)[0][:, None]
     return NoiseStatistics(
         seeds=settings.seeds,

@@ -44,7 +44,8 @@ def row(case: Case) -> dict[str, Value]:
 def names(cases: Sequence[Case]) -> list[str]:
     """Columns of the table: of all cases, in order of first appearance, metrics last."""
     known = dict.fromkeys(name for case in cases for name in row(case))
-    return [*(name for name in known if name not in METRICS), *METRICS]
+    last = dict.fromkeys((*METRICS, *(name for case in cases for name in case.metrics)))
+    return [*(name for name in known if name not in last), *last]
 
 
 def varying(cases: Sequence[Case]) -> list[str]:

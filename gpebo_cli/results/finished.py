@@ -30,7 +30,7 @@ class Case:
     number: int  # of the case in that folder
     settings: Mapping[str, str]  # plant, estimator, overrides
     gains: Mapping[str, float]
-    metrics: Mapping[str, float]  # by METRICS; NaN: never
+    metrics: Mapping[str, float]  # METRICS first, NaN: never; NAME_hat and NAME_std at the end
 
 
 @dataclass(frozen=True)
@@ -66,16 +66,30 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
     chosen = {"plant": str(summary.get("plant")), "estimator": _estimator(summary)}
     columns = read_columns(folder / "cases.csv", "case")
     gains = [name for name in columns if name != "case" and not is_metric(name)]
+    metrics = dict.fromkeys((*METRICS, *filter(is_metric, columns)))
     # estimator.gamma=… is in the table already, as the gain.
     told = {k: v for k, v in overrides.items() if k.removeprefix("estimator.") not in gains}
     return [
         Case(
             run, folder, int(number), chosen | told,
             {name: float(columns[name][i]) for name in gains},
-            {name: float(columns[name][i]) if name in columns else np.nan for name in METRICS},
+            {name: float(columns[name][i]) if name in columns else np.nan for name in metrics}
+            | _estimates(summary, int(number)),
         )
         for i, number in enumerate(columns["case"])
     ]
+
+
+def _estimates(summary: Mapping[str, Any], case: int) -> dict[str, float]:
+    """What one case estimated at the end, and its deviation where that is known."""
+    told = summary.get("estimates") or {}
+    told = told.get(str(case), {}) if all(name.isdigit() for name in told) else told
+    found = {}
+    for name, one in told.items():
+        for suffix, key in (("_hat", "value"), ("_std", "std")):
+            if isinstance(one, Mapping) and isinstance(one.get(key), int | float):
+                found[name + suffix] = float(one[key])
+    return found
 
 
 def span(folder: Path) -> tuple[float, float]:

@@ -26,6 +26,21 @@ def case_rows(result: RunResult) -> list[dict[str, float]]:
     ]
 
 
+def loud_lines(result: RunResult) -> list[str]:
+    """What the solvers did, for ``-v``: index, mesh, error estimates, versions."""
+    from gpebo_cli.results.provenance import provenance
+    from gpebo_cli.results.summary import summary
+
+    told = summary(result, provenance())
+    errors = {name: value for name, value in told["error_estimate"].items()
+              if isinstance(value, float)}
+    return [
+        f"index {told['index']}, {told['elements']} elements, error estimates "
+        + ", ".join(f"{name} {value:.2g}" for name, value in errors.items()),
+        ", ".join(f"{name} {version}" for name, version in told["versions"].items()),
+    ]
+
+
 _HEADINGS = {
     "seconds_to_1pct_parameters": "parameters to 1 %",
     "seconds_to_1pct_states": "states to 1 %",
