@@ -80,7 +80,7 @@ class Registry(Generic[T]):
         Raises:
             ConfigError: unknown name, with the nearest known one.
         """
-        return keys(self.find(settings))
+        return list(keys(self.find(settings)))
 
     def able(self, one: T | None, capability: type[Capability], asked: str) -> Capability:
         """``one`` as something that has a capability, a protocol.

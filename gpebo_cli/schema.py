@@ -90,16 +90,18 @@ def read(cls: type[T], mapping: object, where: str) -> T:
     return cls(**values)
 
 
-def keys(cls: type) -> list[str]:
+@lru_cache(maxsize=256)
+def keys(cls: type) -> tuple[str, ...]:
     """The keys that :func:`read` knows for a dataclass, those of what it chooses from included."""
     found: dict[str, None] = {}
     for key, field in _by_key(cls).items():
         found[key] = None
         for option in field.metadata.get("one_of", {}).values():
             found |= dict.fromkeys(keys(option))
-    return list(found)
+    return tuple(found)
 
 
+@lru_cache(maxsize=256)
 def _by_key(cls: Any) -> dict[str, Field[Any]]:
     return {field.metadata.get("key", field.name): field for field in fields(cls)}
 

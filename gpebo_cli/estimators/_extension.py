@@ -36,10 +36,11 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
     fastest = float(np.max(rate))
     for _ in range(_ROUNDS):
         filtered, mesh = signal.low_pass(rate, start), signal.mesh
-        flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
-        poor = unresolved(flat, mesh.rule) > _TOLERANCE
-        poor &= mesh.steps * fastest > 0.5  # else it is the signal, not the filter
-        poor &= mesh.steps > smallest
+        # Where elements are short beside the filter, it is the signal that is not resolved.
+        poor = (mesh.steps * fastest > 0.5) & (mesh.steps > smallest)
+        if poor.any():
+            flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
+            poor &= unresolved(flat, mesh.rule) > _TOLERANCE
         if not poor.any():
             break
         finer, parent = mesh.split(np.where(poor, 4, 1))

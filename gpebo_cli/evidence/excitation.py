@@ -91,8 +91,9 @@ def assess(
         if rho is not None:
             level = kernels.laws.eigenvalues(matrices)[:, 0] / rho
         elif enough:
-            smallest, margin = smallest_and_margin(matrices, *beside(at))
-            level = np.minimum(smallest / enough, margin)
+            same = at is ends
+            level, of = (smallest, margin) if same else smallest_and_margin(matrices, *beside(at))
+            level = np.minimum(level / enough, of)
         else:
             level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
@@ -101,7 +102,7 @@ def assess(
     return excitation(
         knowledge(values, *beside(t)), t, regression.parameters,
         np.maximum(kernels.laws.eigenvalues(values), 0.0),
-        segment_level(regression, t, window), window, _first_time(gram, reached), rho,
+        segment_level(regression, t, window), window, _first_time(gram, ends, reached), rho,
     )
 
 
@@ -147,18 +148,20 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 
 
 def _first_time(
-    gram: Trajectory, reached: Callable[[Array, Array], Array]
+    gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array]
 ) -> float | None:
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
-    Each round looks where the secant points, and at distances around it that fall by fours.
+    Each round looks where the polynomial through the four nearest points, t of the level, points,
+    else the secant, and at distances around it that fall by fours.
 
     Args:
         gram: G (p, p).
+        edges: right ends of its elements (K,).
         reached: of times (M,) and G there.
     """
     mesh, p = gram.mesh, gram.values.shape[2]
-    ends = np.flatnonzero(reached(mesh.edges[1:], gram.values[:, -1]) >= 0.0)
+    ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
     if len(ends) == 0:
         return None
     before = int(ends[0]) + 1  # elements up to the first at whose end it is reached
@@ -175,10 +178,24 @@ def _first_time(
             break
         share = level[j - 1] / (level[j - 1] - level[j])
         guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
+        near = slice(max(j - 2, 0), j + 2)
+        cubic = _where_zero(level[near].tolist(), points[near].tolist())
+        guess = cubic if low < cubic < high else guess
         points = np.unique(np.clip(guess + (high - low) * _AROUND, low, high))
         level = reached(points, piece(points))
         level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
     return high
+
+
+def _where_zero(levels: list[float], t: list[float]) -> float:
+    """Where the polynomial through the times t of different levels is at level 0, else NaN."""
+    found = 0.0
+    for i, (own, time) in enumerate(zip(levels, t, strict=True)):
+        for k, other in enumerate(levels):
+            if k != i:
+                time *= other / (other - own) if other != own else np.nan  # noqa: PLW2901
+        found += time
+    return found
 
 
 def segment_level(regression: LinearRegression, t: Array, window: float) -> Array:

@@ -343,10 +343,14 @@ def _follow_dips(
     for _ in range(_DIP_ROUNDS):
         if not len(column):
             break
-        grid = left[:, None] + (right - left)[:, None] * _CUTS
-        grid[:, -1] = right
+        # Dips of several columns at one time share a grid.
+        _, first, which = np.unique(
+            left + 1j * right, return_index=True, return_inverse=True
+        )
+        grid = (left[:, None] + (right - left)[:, None] * _CUTS)[first]
+        grid[:, -1] = right[first]
         c = system.coefficients.taylor(grid.ravel(), mu)
-        lines = _lines(c, mu, scaling, rank_tol, levels.a, column, reference)
+        lines = _lines(c, mu, scaling, rank_tol, levels.a, column, which, reference)
         dip, best = np.arange(len(lines)), lines.argmin(axis=1)
         before, after = np.maximum(best - 1, 0), np.minimum(best + 1, _DIP_POINTS - 1)
         value = lines[dip, best]
@@ -354,13 +358,13 @@ def _follow_dips(
         lost = lowest <= max(rank_tol, 1e-9)
         if lost.any():
             i = int(np.argmax(lost))
+            where = grid[which[i], best[i]]
             raise ModelError(
-                f"{who(system)}: the rank of the {names[column[i]]} changes at "
-                f"t = {grid[i, best[i]]:.9g} (singular value {lowest[i]:.1e}); choose a horizon "
-                "that avoids this time"
+                f"{who(system)}: the rank of the {names[column[i]]} changes at t = {where:.9g} "
+                f"(singular value {lowest[i]:.1e}); choose a horizon that avoids this time"
             )
         falls = value < 0.5 * np.maximum(lines[dip, before], lines[dip, after])
-        left, right = grid[dip, before][falls], grid[dip, after][falls]
+        left, right = grid[which, before][falls], grid[which, after][falls]
         column, lowest = column[falls], lowest[falls]
 
 
@@ -369,21 +373,22 @@ _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
 
 def _lines(
     c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, a: int, column: IntArray,
-    reference: Pivots,
+    which: IntArray, reference: Pivots,
 ) -> Array:
-    """Columns (D,) of the levels that belong to ``a`` constraints, (D, points) at the times of c.
+    """Columns (D,) of the levels that belong to ``a`` constraints, (D, points).
 
+    Each is looked at in one (D,) of the grids whose times, one after the other, are those of c.
     Bounds of them from below serve as well, where none of them comes near zero.
     """
     model = scaling.rows, scaling.columns, scaling.time, mu + 1
     bounds, left, _ = kernels.structure.bounds(
         c.E, c.A, *model, reference.rows, reference.columns, reference.rank, reference.Z1
     )
-    lines = bounds.reshape(len(column), -1, 3)[np.arange(len(column)), :, column]
+    lines = bounds.reshape(-1, _DIP_POINTS, 3)[which, :, column]
     sound = (lines > max(_PLAIN, 10.0 * rank_tol)).all(axis=1)
-    sound &= (left.reshape(lines.shape) <= RESIDUAL).all(axis=1)
+    sound &= (left.reshape(-1, _DIP_POINTS)[which] <= RESIDUAL).all(axis=1)
     for i in np.flatnonzero(~sound).tolist():
-        some = slice(i * lines.shape[1], (i + 1) * lines.shape[1])
+        some = slice(which[i] * _DIP_POINTS, (which[i] + 1) * _DIP_POINTS)
         E, A = (x if x.shape[1] == 1 else x[:, some] for x in (c.E, c.A))
         lines[i] = kernels.structure.levels(E, A, *model, rank_tol, a)[1][:, column[i]]
     return np.asarray(lines)

@@ -317,7 +317,10 @@ def weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
     H = elimination if len(elimination) > 1 else np.repeat(elimination, len(injectivity), axis=0)
 
     def exact(which: IntArray) -> Array:
-        norms = np.linalg.norm(H[which], axis=(1, 2)) / np.linalg.norm(H[which], 2, axis=(1, 2))
+        # ‖H‖_F/‖H‖₂: the largest eigenvalue of HᵀH has all its digits, and H is of order one.
+        some = H[which] / np.maximum(np.abs(H[which]).max(axis=(1, 2), keepdims=True), TINY)
+        squares = kernels.laws.eigenvalues(transpose(some) @ some)
+        norms = np.sqrt(np.maximum(squares, 0.0).sum(axis=1) / np.maximum(squares[:, -1], TINY))
         return np.asarray(injectivity[which] * norms)
 
     first = np.array([int(np.argmin(injectivity))])
