@@ -29,7 +29,8 @@ class DataSettings:
     """Where u and y come from: the simulated plant, or a recording."""
 
     name: Literal["none", "csv"] = "none"
-    file: str | None = None  # CSV, Parquet or MAT; "-" is standard input, as CSV
+    # CSV, Parquet or MAT; "-" is standard input, as CSV; several are experiments with the same θ.
+    file: str | list[str] | None = None
     hold: Literal["zoh", "linear", "cubic"] = "linear"  # what is assumed between samples
     columns: Mapping[str, str] | None = None  # what a signal (t, V, y) is called in the file
     scale: Mapping[str, float] | None = None  # by signal: from the file's unit to ours

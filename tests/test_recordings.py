@@ -658,3 +658,60 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     found = guess(str(path), shipped("circuit"))
     assert found.lacking == ["V", "y"]
     assert any("no column was found for V" in doubt for doubt in found.doubts)
+
+
+LEAKY = {
+    "name": "leaky", "states": ["h1", "h2"], "inputs": {"V": "0"}, "unknowns": {"k": 0.4, "b": 0.1},
+    "outputs": ["y"], "E": [[1, 0], [0, 1]], "A": [["-0.5 - 0.2*sin(t)", 0], [1, -0.3]],
+    "B": [[1], [0]], "F": [["V", 0], [0, 1]], "C": [[0, 1]], "initial_state": {"h1": 1, "h2": 0},
+}
+
+
+def written(folder, name, start, V, h1, rows=401, noise=0.0, seed=0):
+    """A file of the plant from its own start with its own input."""
+    plant = {**LEAKY, "inputs": {"V": V}, "initial_state": {"h1": h1, "h2": 0.5}}
+    made = run(plant, observer="none", time={"start": start, "horizon": 8, "samples": rows})
+    table = made.to_pandas("signals").reset_index()[["t", "V", "y"]]
+    table["y"] += noise * np.random.default_rng(seed).standard_normal(rows)
+    table.to_csv(folder / name, index=False)
+    return str(folder / name)
+
+
+def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
+    """The plant's time is each file's own; what one file does not excite the other one does."""
+    files = [
+        written(tmp_path, "a.csv", 0.0, "sin(t)", 1.0),
+        written(tmp_path, "b.csv", 3.0, "1 + cos(2*t)", -2.0, 201),
+    ]
+    result = run(LEAKY, data={"file": files, "hold": "cubic"}, time={"samples": 81})
+    end = {name: values[0, -1] for name, values in result.estimates.items()}
+    expected = {"k": 0.4, "b": 0.1, "e0_h1": -1.0, "e0_h2": -0.5, "e0_h1_2": 2.0, "e0_h2_2": -0.5}
+    for name, value in expected.items():
+        assert end[name] == pytest.approx(value, abs=1e-5), name
+    assert result.t[-1] == 16.0
+    assert len(result.t) == 161
+    fit = result.details.fit
+    np.testing.assert_allclose(fit.outputs[:, 0], result.outputs["y"], atol=1e-5)
+    one = run(LEAKY, data={"file": files[1], "hold": "cubic"}, time={"samples": 81})
+    np.testing.assert_allclose(
+        result.estimates["h1"][0, -1], one.estimates["h1"][0, -1], atol=1e-5
+    )
+
+
+def test_deviations_of_several_files_are_those_of_independent_data(tmp_path):
+    """Twice the same experiment: least squares has half the variance, and one level."""
+    noisy = {"noise": 0.02, "rows": 201}
+    files = [
+        written(tmp_path, f"{k}.csv", 0.0, "sin(t)", 1.0, seed=k, **noisy) for k in range(2)
+    ]
+    noise = {"name": "gaussian", "outputs": 0.02}
+    std = [
+        run(LEAKY, estimator="least_squares", data=data, noise=noise,
+            time={"samples": 11}).to_pandas("estimates")["k_std"].iloc[-1]
+        for data in (files[0], files)
+    ]
+    assert std[1] == pytest.approx(std[0] / np.sqrt(2.0), rel=1e-3)
+    found = run(LEAKY, estimator="least_squares", data=files, time={"samples": 11})
+    assert found.to_pandas("estimates")["k_std"].iloc[-1] == pytest.approx(std[1], rel=0.15)
+    with pytest.raises(ConfigError, match="several files"):
+        run(LEAKY, data=files, observer={"sample_time": 0.1})

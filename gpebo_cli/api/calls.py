@@ -263,6 +263,8 @@ def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
         return {"name": "csv", **data}
     if data is None or (isinstance(data, str) and data == "none"):
         return data
+    if isinstance(data, list):
+        return {"name": "csv", "file": [os.fspath(each) for each in data]}
     if not isinstance(data, str | os.PathLike):
         return {"name": "csv", "frame": data}
     return {"name": "csv", "file": os.fspath(data)}

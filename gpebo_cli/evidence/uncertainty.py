@@ -35,7 +35,7 @@ _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a directio
 
 def deviations(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, instants: Array,
-    variances: Array, t: Array,
+    variances: Array, t: Array, starts: Array | None = None,
 ) -> tuple[Array, Array]:
     """One standard deviation of η̂ (M, p) and of x̂ (M, n) at the times t (M,).
 
@@ -47,6 +47,7 @@ def deviations(
         instants: times of the samples; errors are held from one to the next.
         variances: of each sample of [u; y], (m + r,).
         t: ascending.
+        starts: edges at which ζ begins anew, of several experiments; None: at the first one only.
     """
     n, p = gain.shape[1:]
     mesh, fresh = _mesh(edges, instants)
@@ -54,11 +55,17 @@ def deviations(
     of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
     L: Array | None = None
     stretch = _stretch(observer, estimator, mesh, n)
+    anew = np.zeros(mesh.size, dtype=bool)
+    if starts is not None:
+        anew[np.searchsorted(mesh.edges, starts)] = True
     for first in range(0, mesh.size, stretch):
         part = slice(first, first + stretch)
         maps = _element_maps(observer, estimator, mesh, part, n)
         size = maps.shape[2]
-        factors, L = _factors(maps[:, -1], fresh[part], np.sqrt(variances), L)
+        zeta = observer(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]
+        factors, L = _factors(
+            maps[:, -1], fresh[part] | anew[part], np.sqrt(variances), L, anew[part], zeta
+        )
         chosen = (sampler.element >= first) & (sampler.element < first + stretch)
         if not chosen.any():
             continue
@@ -78,6 +85,7 @@ def deviations(
 
 def noise_level(
     observer: ErrorsAt, regression: LinearRegression, instants: Array, outputs: Array,
+    starts: Array | None = None,
 ) -> float:
     """σ of recorded outputs from the residual of least squares; ``outputs`` are their ratios.
 
@@ -92,6 +100,7 @@ def noise_level(
         regression: of the recording, without resets.
         instants: times of its samples.
         outputs: variance of each signal [u; y] relative to σ², (m + r,).
+        starts: as of :func:`deviations`.
     """
     mesh, rows, p = regression.mesh, regression.psi.values.shape[2], regression.p
     final = regression.gram.final
@@ -112,7 +121,7 @@ def noise_level(
 
     t = np.linspace(mesh.edges[0], mesh.edges[-1], _TIMES)
     of_fit, of_rows = deviations(
-        of_Y, of_h, np.zeros((len(t), rows, p)), mesh.edges, instants, outputs, t
+        of_Y, of_h, np.zeros((len(t), rows, p)), mesh.edges, instants, outputs, t, starts
     )
     duration = float(mesh.edges[-1] - mesh.edges[0])
     expected = duration * float((of_rows**2).sum(axis=1).mean()) - float((of_fit[-1] ** 2).sum())
@@ -234,7 +243,7 @@ def _joint(
 
 
 def _factors(
-    ends: Array, fresh: Array, deviations: Array, L: Array | None
+    ends: Array, fresh: Array, deviations: Array, L: Array | None, anew: Array, zeta: int
 ) -> tuple[Array, Array]:
     """L of [ζ; s; e] at the left end of every element (K, d + m + r, d + m + r), and at the end.
 
@@ -243,11 +252,15 @@ def _factors(
         fresh: where another e begins, (K,).
         deviations: of e, (m + r,).
         L: at the start; None: everything is known there.
+        anew: where ζ is zero, (K,).
+        zeta: its size.
     """
     size, signals = ends.shape[1], len(deviations)
     L = np.zeros((size + signals, size + signals)) if L is None else L
     out = np.empty((len(ends), *L.shape))
     for k, end in enumerate(ends):
+        if anew[k]:
+            L[:zeta] = 0.0
         if fresh[k]:  # another e, independent of all before
             L[:size, :size] = np.asarray(np.linalg.qr(L[:size].T, mode="r")).T
             L[:size, size:] = 0.0

@@ -26,6 +26,7 @@ from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.experiment.online import Online, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
+from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
 from gpebo_cli.experiment.uncertainty import sampled_deviations, standard_deviations
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
@@ -78,14 +79,18 @@ def continuous(
     t = source.t
 
     def observe(signals: Source | Signals) -> Observation:
+        known = signals if isinstance(signals, Source) else source
         seen = Measurements(
             signals.inputs, signals.outputs, signal_noise(settings.noise, levels),
-            source.derivatives,
+            known.derivatives,
         )
         return observer.observe(system, seen, settings.solver)
 
     with stage("observe"):
-        observation = observe(source)
+        observation = (
+            joined_observation([observe(each) for each in source.pieces], source.pieces, system.q)
+            if source.pieces else observe(source)
+        )
         regression = observation.regression
         sampler = regression.mesh.sampler(t)
         sampled = RegressionResult(
@@ -146,6 +151,8 @@ def at_samples(
         SolverError: a step between samples cannot be resolved.
     """
     refuse_seeds(settings.noise)
+    if source.pieces:
+        raise ConfigError("data.file: several files need an observer in continuous time")
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
     with stage("observe and estimate") as share:
         t = sample_times(samples.step, start, stop)
@@ -467,7 +474,8 @@ def _explained(
         return fit
     x = state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
     u, y = recording.inputs, recording.outputs
-    c = system.coefficients.taylor(t, 0, signals=np.hstack([u, y])[None])
+    own_t = t if source.own_t is None else source.own_t
+    c = system.coefficients.taylor(own_t, 0, signals=np.hstack([u, y])[None])
     fitted = sum(
         np.matmul(matrix[0], signal[..., None])[..., 0]
         for matrix, signal in ((c.C, x), (c.D, u), (c.H, np.tile(eta[: system.q], (len(t), 1))))

@@ -14,7 +14,7 @@ from typing import Self
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment import sources
+from gpebo_cli.experiment import several, sources
 from gpebo_cli.experiment.assumptions import of_observation, warnings
 from gpebo_cli.experiment.estimation import Share, at_samples, continuous
 from gpebo_cli.experiment.noise import noise_levels
@@ -92,7 +92,11 @@ def run_experiment(
     recorded = settings.data.name == "csv"
     with stage("read" if recorded else "simulate"):
         read = sources.recorded if recorded else sources.simulated
-        source = read(settings, system, levels)
+        files = settings.data.file if isinstance(settings.data.file, list) else [settings.data.file]
+        source = several.joined_source([
+            read(replace(settings, data=replace(settings.data, file=file)), system, levels)
+            for file in files
+        ])
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
         excitation=None, estimation=None, metrics=None, assumptions=source.assumptions,

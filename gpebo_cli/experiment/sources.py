@@ -43,6 +43,8 @@ class Source:
     true: Signals | None = None  # of a simulation, without noise
     simulation: SimulationResult | None = None
     recording: RecordingResult | None = None
+    pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
+    own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
 
 def simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) -> Source:

@@ -74,10 +74,12 @@ def standard_deviations(
     if levels.silent:
         if not source.recording:
             return None
-        variances *= noise_level(errors, regression, instants, variances) ** 2
+        variances *= noise_level(
+            errors, regression, instants, variances, observation.starts
+        ) ** 2
     gain = state_map.gain(t)
     found = [
-        deviations(errors, of_case, gain, edges, instants, variances, t)
+        deviations(errors, of_case, gain, edges, instants, variances, t, observation.starts)
         for of_case in estimator.errors(regression)
     ]
     return np.array([eta for eta, _ in found]), np.array([x for _, x in found])

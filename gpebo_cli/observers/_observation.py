@@ -152,6 +152,7 @@ class Observation:
     errors: ErrorsAt | None = None  # the same as a linear system; its outputs are δY, δoffset
     growth_rate: float | None = None  # 1/s, ln ‖Φ‖₂ over the horizon
     note: str = ""  # what the last line of a run has to say of it, from "; " on
+    starts: Array | None = None  # (k,) of several experiments one after the other; None: of one
     bounds: Mapping[str, Mapping[str, Sequence[float | None]]] | None = None  # ``observer.bounds``
 
     @property

@@ -85,6 +85,8 @@ def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
         return _from_frame("data", data.frame, data, system, "")
     if data.file is None:
         raise ConfigError("data=csv needs data.file=FILE, or data.file=- for standard input")
+    if not isinstance(data.file, str):
+        raise ConfigError("data.file: here one file is needed, not several")
     path, content = data.file, read_file(data.file)
     sha256 = hashlib.sha256(content).hexdigest()
     kind = os.path.splitext(path)[1].lower()

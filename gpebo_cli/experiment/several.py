@@ -1,0 +1,188 @@
+"""Several recordings of one plant as one experiment: the same θ, an initial state of each its own.
+
+On the time axis they follow one another. The regression is about η = (θ, e₀, e₀ of the second, …);
+rows of a recording have zeros in the columns of the others' initial errors. Each is observed by
+itself, at its own times, which the plant's matrices are functions of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import accumulate
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.experiment.result import RecordingResult
+from gpebo_cli.experiment.sources import Source
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.observers import AffineStateMap, Observation
+from gpebo_cli.regression.errors import ErrorSystem
+from gpebo_cli.regression.linear import LinearRegression
+
+
+def joined_source(sources: Sequence[Source]) -> Source:
+    """Recordings one after the other; of each the last sample gives way to the next one's first."""
+    recordings = [source.recording for source in sources if source.recording is not None]
+    if len(recordings) < 2:
+        return sources[0]
+    shifts = _shifts(sources)
+    kept = [slice(None, -1)] * (len(sources) - 1) + [slice(None)]
+    t = np.concatenate([
+        source.t[own] + by for source, own, by in zip(sources, kept, shifts, strict=True)
+    ])
+
+    def together(name: str) -> Array:
+        return np.concatenate([
+            getattr(each, name)[own] for each, own in zip(recordings, kept, strict=True)
+        ])
+
+    known = [set(each.known_states) for each in recordings]
+    recording = RecordingResult(
+        t=t, inputs=together("inputs"), outputs=together("outputs"), states=together("states"),
+        file=", ".join(each.file for each in recordings),
+        sha256=", ".join(each.sha256 for each in recordings),
+        rows=sum(each.rows for each in recordings), hold=recordings[0].hold,
+        first=recordings[0].first, last=recordings[-1].last + shifts[-1],
+        known_states=tuple(
+            name for name in recordings[0].known_states if all(name in each for each in known)
+        ),
+        elements=sum(each.elements for each in recordings),
+    )
+    return replace(
+        sources[0], t=t, recording=recording, derivatives=None, pieces=tuple(sources),
+        own_t=np.concatenate([each.t[own] for each, own in zip(sources, kept, strict=True)]),
+        inputs=_joined([each.inputs for each in sources], shifts),
+        outputs=_joined([each.outputs for each in sources], shifts),
+        states=_joined([each.states for each in sources], shifts),
+    )
+
+
+def joined_observation(
+    observations: Sequence[Observation], sources: Sequence[Source], q: int
+) -> Observation:
+    """One regression about θ (q,) and every initial error, of observations of each recording.
+
+    Raises:
+        ConfigError: an observer or a remedy whose parameters are others.
+    """
+    maps = [each.state_map for each in observations]
+    plain = all(
+        each.estimator is None and each.names is None and not each.regression.resets
+        and each.regression.dynamics is None
+        for each in observations
+    )
+    affine = [each for each in maps if isinstance(each, AffineStateMap)]
+    if len(affine) < len(maps) or not plain:
+        raise ConfigError(
+            "data.file: several files need an observer whose parameters are θ and the initial "
+            "error; accepted are observer=gpebo with the remedies none and output_injection"
+        )
+    shifts, first = _shifts(sources), observations[0]
+    own = [each.regression.p - q for each in observations]
+    places = [q + k for k in accumulate(own, initial=0)]
+    p = places[-1]
+
+    def wide(values: Array, k: int) -> Array:
+        """Columns (…, p_k) of one recording among those of all, (…, p)."""
+        out = np.zeros((*values.shape[:-1], p))
+        out[..., :q], out[..., places[k] : places[k + 1]] = values[..., :q], values[..., q:]
+        return out
+
+    names = [
+        name if not k else f"{name}_{k + 1}"
+        for k, each in enumerate(observations) for name in each.regression.parameters[q:]
+    ]
+    regressions = [each.regression for each in observations]
+    rows = max(each.psi.values.shape[2] for each in regressions)
+    psi = _joined([
+        Trajectory(each.mesh, wide(_filled(each.psi.values, rows), k))
+        for k, each in enumerate(regressions)
+    ], shifts)
+    scale = np.concatenate([
+        wide(np.broadcast_to(each.scale, (each.mesh.size, each.p)), k)
+        for k, each in enumerate(regressions)
+    ])
+    same = all(each.psi.values.shape[2] == rows for each in regressions)
+    errors = [each.errors for each in observations if each.errors is not None]
+    starts = np.array([
+        each.regression.mesh.edges[0] + by for each, by in zip(observations, shifts, strict=True)
+    ])
+
+    def errors_at(t: Array, inside: Array) -> ErrorSystem:
+        piece = np.maximum(np.searchsorted(starts, inside, side="right") - 1, 0)
+        found: list[Array] = []
+        for k in np.unique(piece):
+            chosen = piece == k
+            system = errors[k](t[chosen] - shifts[k], inside[chosen] - shifts[k])
+            for i, part in enumerate(system):
+                if len(found) <= i:
+                    found.append(np.zeros((len(t), *part.shape[1:])))
+                found[i][chosen] = part
+        return ErrorSystem(*found)
+
+    def truth(t: Array, theta: Array, states: Trajectory) -> Array:  # noqa: ARG001  of each its own
+        eta = np.concatenate([
+            theta[0], *(
+                each.truth(source.t[:1], theta[:1], source.states)[0, q:]
+                for each, source in zip(observations, sources, strict=True)
+            ),
+        ])
+        return np.broadcast_to(eta, (len(t), p))
+
+    growth = [each.growth for each in observations if each.growth is not None]
+    rates = [each.growth_rate for each in observations if each.growth_rate is not None]
+    return replace(
+        first,
+        regression=LinearRegression(
+            _joined([
+                Trajectory(each.mesh, _filled(each.Y.values, rows)) for each in regressions
+            ], shifts),
+            psi, (*regressions[0].parameters[:q], *names), np.maximum.accumulate(scale, axis=0),
+        ),
+        state_map=AffineStateMap(
+            _joined([each.offset for each in affine], shifts),
+            _joined([
+                Trajectory(each.gain.mesh, wide(each.gain.values, k))
+                for k, each in enumerate(affine)
+            ], shifts),
+        ),
+        truth=truth, error_estimate=max(each.error_estimate for each in observations),
+        growth=max(growth, default=None), growth_rate=max(rates, default=None), respond=None,
+        errors=errors_at if same and len(errors) == len(observations) else None,
+        starts=starts,
+    )
+
+
+def _shifts(sources: Sequence[Source]) -> list[float]:
+    """What makes of each one's own time that of all."""
+    shifts, end = [], float(sources[0].inputs.mesh.edges[0])
+    for source in sources:
+        edges = source.inputs.mesh.edges
+        shifts.append(end - float(edges[0]))
+        end += float(edges[-1] - edges[0])
+    return shifts
+
+
+def _filled(values: Array, rows: int) -> Array:
+    """Values (K, s + 1, rows_k, …) with rows of zeros below."""
+    missing = rows - values.shape[2]
+    return np.pad(values, [(0, 0), (0, 0), (0, missing), *[(0, 0)] * (values.ndim - 3)])
+
+
+def _joined(signals: Sequence[Trajectory], shifts: Sequence[float]) -> Trajectory:
+    """One after the other, all by the rule with the most stages, in which each is exact."""
+    rule = max((each.mesh.rule for each in signals), key=lambda each: each.stages)
+    edges: list[Array] = []
+    values: list[Array] = []
+    for signal, by in zip(signals, shifts, strict=True):
+        mesh = Mesh(signal.mesh.edges, rule)
+        own = signal.values
+        if signal.mesh.rule.stages != rule.stages:
+            flat = signal(mesh.points.ravel(), mesh.inside.ravel())
+            own = flat.reshape(*mesh.points.shape, *own.shape[2:])
+        values.append(own)
+        edges.append(mesh.edges + by if not edges else (mesh.edges + by)[1:])
+    return Trajectory(Mesh(np.concatenate(edges), rule), np.concatenate(values))
