@@ -82,6 +82,8 @@ def _failed(error: Exception, *, traceback_wanted: bool) -> int:
         _print_traceback()
     if isinstance(error, GpeboError):
         return _report(str(error), error.exit_code)
+    if isinstance(error, MemoryError):
+        return _report(f"there is not enough memory for this: {error}", 1)
     if isinstance(error, OSError):
         _drop_stdout()  # a full disk behind it would be reported again when Python exits
         where = f"{error.filename}: " if error.filename is not None else ""

@@ -78,7 +78,7 @@ def read_plan(folder: Path) -> Plan | None:
         content = json.loads(text)
         jobs = tuple({str(k): str(v) for k, v in job.items()} for job in content["jobs"])
         return Plan(jobs, str(content["configuration"]))
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise ConfigError(f"{folder / PLAN}: not the plan of a sweep of gpebo") from None
 
 
@@ -116,7 +116,7 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
             str(content["error"]),
             [dict(case) for case in content["cases"]],
         )
-    except (ConfigError, OSError, ValueError, KeyError, TypeError):
+    except (ConfigError, OSError, ValueError, KeyError, TypeError, RecursionError):
         return missing
 
 

@@ -43,7 +43,7 @@ _FOLDER = "estimator"  # an observer that estimates by itself: its name again, f
 
 # Accepted ranges, ends included. What a type cannot say; beyond them nothing sensible happens.
 _RANGES = {
-    "time.samples": (2, 2_000_000),
+    "time.samples": (2, 1_000_000),
     "output.dpi": (30, 1200),
     "solver.tol": (1e-15, 0.1),
     "solver.stages": (2, 16),

@@ -64,7 +64,7 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
     if summary.get("estimator") is None:
         return []
     chosen = {"plant": str(summary.get("plant")), "estimator": _estimator(summary)}
-    columns = read_columns(folder / "cases.csv", "case")
+    columns = read_columns(folder / "cases.csv", "case", present=METRICS)
     gains = [name for name in columns if name != "case" and not is_metric(name)]
     metrics = dict.fromkeys((*METRICS, *filter(is_metric, columns)))
     # estimator.gamma=… is in the table already, as the gain.
@@ -73,7 +73,7 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
         Case(
             run, folder, int(number), chosen | told,
             {name: float(columns[name][i]) for name in gains},
-            {name: float(columns[name][i]) if name in columns else np.nan for name in metrics}
+            {name: float(columns[name][i]) for name in metrics}
             | _estimates(summary, int(number)),
         )
         for i, number in enumerate(columns["case"])
@@ -82,14 +82,19 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
 
 def _estimates(summary: Mapping[str, Any], case: int) -> dict[str, float]:
     """What one case estimated at the end, and its deviation where that is known."""
-    told = summary.get("estimates") or {}
-    told = told.get(str(case), {}) if all(name.isdigit() for name in told) else told
+    told = _mapping(summary, "estimates")
+    told = _mapping(told, str(case)) if all(name.isdigit() for name in told) else told
     found = {}
     for name, one in told.items():
         for suffix, key in (("_hat", "value"), ("_std", "std")):
             if isinstance(one, Mapping) and isinstance(one.get(key), int | float):
                 found[name + suffix] = float(one[key])
     return found
+
+
+def _mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    found = content.get(key)
+    return found if isinstance(found, Mapping) else {}
 
 
 def span(folder: Path) -> tuple[float, float]:
@@ -131,9 +136,11 @@ def read_errors(cases: Sequence[Case]) -> list[ErrorCurves]:
 
 
 def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
-    truth: Mapping[str, float | None] = read_summary(folder).get("parameters") or {}
+    truth = _mapping(read_summary(folder), "parameters")
+    # Of a recording, not every true value is known.
+    known = {name: float(v) for name, v in truth.items() if isinstance(v, int | float)}
     path = folder / "estimates.csv"
-    everything = read_columns(path, "case", "t")
+    everything = read_columns(path, "case", "t", present=[f"{name}_hat" for name in known])
     signals = read_columns(folder / "signals.csv", "t")
     middles = 0.5 * (signals["t"][1:] + signals["t"][:-1])
     out = {}
@@ -150,8 +157,6 @@ def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
             s for s in names[len(truth) :]
             if s in signals and not np.isnan(columns[f"{s}_hat"]).all()
         ]
-        # Of a recording, not every true value is known.
-        known = {name: float(value) for name, value in truth.items() if value is not None}
         of_parameters = [
             columns[f"{name}_hat"] - columns.get(f"{name}_true", value)
             for name, value in known.items()
@@ -187,7 +192,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
         content = json.loads(_bytes(path))
     except OSError as error:
         raise GpeboError(f"{path}: {error.strerror or error}") from error
-    except ValueError:
+    except (ValueError, RecursionError):
         raise GpeboError(f"{path}: not JSON") from None
     if not isinstance(content, dict):
         raise GpeboError(f"{path}: not the summary of a run")
@@ -213,8 +218,13 @@ def _opened(path: Path) -> BinaryIO:
         raise GpeboError(f"{path}: {reason}") from error
 
 
-def read_columns(path: Path, *needed: str) -> dict[str, Array]:
+def read_columns(path: Path, *filled: str, present: Sequence[str] = ()) -> dict[str, Array]:
     """A table of numbers that a run wrote, by column; NaN for an empty cell.
+
+    Args:
+        path: of the table.
+        filled: columns that have a number in every row.
+        present: others that it has.
 
     Raises:
         GpeboError: it is missing, or not such a table; the line and the column are named.
@@ -229,9 +239,11 @@ def read_columns(path: Path, *needed: str) -> dict[str, Array]:
         raise GpeboError(f"{path}, line {line}: not UTF-8 text") from None
     except (csv.Error, ValueError):
         raise GpeboError(f"{path}: not a table with a header") from None
-    for name in needed:
+    for name in (*filled, *present):
         if name not in header:
             raise GpeboError(f"{path}, line 1: there is no column {name}")
+    if not rows:
+        raise GpeboError(f"{path}: there are no rows below its header")
     for line, row in enumerate(rows, start=2):
         if len(row) != len(header):
             raise GpeboError(f"{path}, line {line}: {len(row)} cells; the header has {len(header)}")
@@ -239,12 +251,10 @@ def read_columns(path: Path, *needed: str) -> dict[str, Array]:
         numbers = np.array([[float(cell or "nan") for cell in row] for row in rows])
     except ValueError:
         raise GpeboError(_wrong_cell(path, header, rows)) from None
-    for name in needed:
-        for gap in np.flatnonzero(np.isnan(numbers.reshape(len(rows), -1)[:, header.index(name)])):
+    for name in filled:
+        for gap in np.flatnonzero(np.isnan(numbers[:, header.index(name)])):
             raise GpeboError(f"{path}, line {gap + 2}, column {name}: there is no number")
-    return dict(zip(header, numbers.reshape(len(rows), -1).T, strict=True)) if rows else {
-        name: np.zeros(0) for name in header
-    }
+    return dict(zip(header, numbers.T, strict=True))
 
 
 def _wrong_cell(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

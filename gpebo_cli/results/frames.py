@@ -74,5 +74,6 @@ def _estimates(result: RunResult, estimation: EstimationResult) -> DataFrame:
     names = tables.estimates_header(result.system.states, estimation)
     count = len(estimation.cases)
     index = MultiIndex.from_product([range(count), estimation.t], names=names[:2])
-    values = np.concatenate([tables.case_values(estimation, case) for case in range(count)])
+    truth = tables.varying_truth(estimation)
+    values = np.concatenate([tables.case_values(estimation, k, truth) for k in range(count)])
     return DataFrame(values[:, 1:], columns=names[2:], index=index)

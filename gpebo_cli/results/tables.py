@@ -102,8 +102,13 @@ def estimates_header(states: Sequence[str], estimation: EstimationResult) -> lis
     return [*header, *estimation.checks, *(f"{name}_true" for name, _ in varying_truth(estimation))]
 
 
-def case_values(estimation: EstimationResult, case: int) -> Array:
-    """The rows of one case, (M, columns), under :func:`estimates_header` without ``case``."""
+def case_values(
+    estimation: EstimationResult, case: int, truth: Sequence[tuple[str, Array]]
+) -> Array:
+    """The rows of one case, (M, columns), under :func:`estimates_header` without ``case``.
+
+    ``truth`` is what :func:`varying_truth` finds; it is the same for all cases.
+    """
     delta = estimation.delta
     columns = [estimation.t, estimation.parameters[case], estimation.states[case]]
     if delta is not None:
@@ -111,7 +116,7 @@ def case_values(estimation: EstimationResult, case: int) -> Array:
     if estimation.parameters_std is not None and estimation.states_std is not None:
         columns += [estimation.parameters_std[case], estimation.states_std[case]]
     columns += [check[case] for check in estimation.checks.values()]
-    columns += [values for _, values in varying_truth(estimation)]
+    columns += [values for _, values in truth]
     return np.column_stack(columns)
 
 
@@ -178,8 +183,9 @@ def varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
 
 def _estimate_chunks(header: Sequence[str], estimation: EstimationResult) -> Iterator[bytes]:
     yield _header(header)
+    truth = varying_truth(estimation)
     for case in range(len(estimation.cases)):
-        yield from _rows(case_values(estimation, case), prefix=f"{case},")
+        yield from _rows(case_values(estimation, case, truth), prefix=f"{case},")
 
 
 def _lines(table: Table) -> Iterator[bytes]:

@@ -1,0 +1,53 @@
+"""What a run will hold, estimated before it is allocated: a machine that swaps answers nobody."""
+
+from __future__ import annotations
+
+from math import prod
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.experiment.noise import NoiseLevels
+from gpebo_cli.experiment.sources import kept_samples
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.settings import Settings
+
+_MOST = 2.0  # GB
+_HELD = 4  # arrays of every kind that are alive at once; measured
+
+
+def check_memory(
+    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cases: int
+) -> None:
+    """Refuse a run that would need more memory than one run may.
+
+    Args:
+        settings: of the run.
+        system: the plant.
+        levels: of the noise.
+        cases: of the estimator.
+
+    Raises:
+        ConfigError: names the setting, what it would need, and the limit.
+    """
+    time, n, signals = settings.time, system.n, system.m + system.r
+    start = time.start if np.isfinite(time.start) else 0.0  # of a recording: its own
+    E = system.coefficients.taylor(np.array([start]), 0).E[0, 0] if n else np.zeros((0, 0))
+    p = system.q + (int(np.linalg.matrix_rank(E)) if n and np.isfinite(E).all() else n)
+    regression = (p + 1) * (n + p)
+    kept = len(kept_samples(cases, time.samples, settings.output.max_rows))
+    needs: dict[str, tuple[float, ...]] = {
+        f"time.samples = {time.samples}": (time.samples, regression + signals),
+        f"{cases} cases with {kept} samples each (output.max_rows)": (cases, kept, n + p),
+    }
+    if settings.data.name != "csv" and not levels.silent:
+        elements = time.horizon / settings.noise.sample_time
+        needs[f"noise.sample_time = {settings.noise.sample_time:g} s"] = (
+            elements, settings.solver.stages + 1, n**2 + regression + signals * (p + 1),
+        )
+    for what, numbers in needs.items():
+        size = 8e-9 * _HELD * prod(numbers)
+        if size > _MOST:
+            raise ConfigError(
+                f"{what} would take some {size:.3g} GB of memory; a run may take {_MOST:g} GB"
+            )
