@@ -188,6 +188,10 @@ def test_plants_and_horizons_have_figures_of_their_own(inside):
         ("cases.csv", lambda text: text.replace("case,", "csae,", 1), "there is no column case"),
         ("cases.csv", lambda text: text.replace("\n0,", "\n,", 1), "line 2, column case"),
         ("cases.csv", lambda text: "", "not a table with a header"),
+        ("cases.csv", lambda text: text.split("\n")[0], "there are no rows below its header"),
+        ("cases.csv", lambda text: text.replace("rms_error_states", "rms", 1), "no column rms_"),
+        ("estimates.csv", lambda text: text.replace("_hat", "", 1), "line 1: there is no column "),
+        ("summary.json", lambda text: "[" * 100_000, "not JSON"),
         ("estimates.csv", lambda text: text.replace("\n0,", "\n0,x", 1), "line 2, column t: 'x0'"),
     ],
 )
