@@ -81,6 +81,18 @@ def _maps(rng, k=7, s=4, n=3, c=2, one=False):
     )
 
 
+def _swept(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True):
+    """x' = A x + f with a third of the entries, none of them in one row."""
+    i, j = np.nonzero(rng.uniform(size=(d, d)) < 0.35 * (np.arange(d) != 1)[:, None])
+    points = 1 if constant else k * (s + 1)
+    return (
+        radau_rule(s).integration, rng.uniform(0.1, 0.3, size=k),
+        np.searchsorted(i, np.arange(d + 1)), j, rng.normal(size=(points, len(i))),
+        rng.normal(size=(points, d, forced)), rng.normal(size=(k, d, c)) if kicked else None,
+        rng.normal(size=(d, c)), np.ones(d), 1e-15, 1e-3, 60,
+    )
+
+
 def _signal(rng, k=8, s=6, c=5, least=False):
     values = rng.normal(size=(k, s + 1, c)) * 10.0 ** rng.integers(-12, 3, size=c)
     values += 10.0 * np.abs(values).max(axis=(0, 1))  # so that what is left out is not everything
@@ -214,6 +226,10 @@ CASES: list[tuple[str, str, Case]] = [
     ("elements", "carried_errors", _solution),
     ("elements", "carried_errors", partial(_solution, one=True)),
     ("elements", "carried_errors", partial(_solution, k=1, s=3, n=2, c=5)),
+    *(("elements", "sweeps", partial(_swept, **options)) for options in (
+        {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
+        {"k": 1, "d": 1, "c": 3, "forced": 3},
+    )),
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
     ("signals", "tails", partial(_signal, least=True)),

@@ -17,6 +17,7 @@ from gpebo_cli.model.expressions import parse, record
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import _JOINED, Mesh, initial_mesh, joining
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.simulation import known as at_known
 from gpebo_cli.simulation import simulate
 
 pytestmark = needs_kernels
@@ -217,20 +218,22 @@ def known_functions(draw):
 @given(known_functions(), st.sampled_from([1e-3, 1e-6, 1e-10]))
 def test_what_is_overlooked(known, tol):
     system, mesh, c, _ = known
-    one, other = by_both(lambda: simulate._overlooked(system, c, mesh, tol))
+    one, other = by_both(lambda: at_known._overlooked(
+        system, c, lambda t: system.coefficients.taylor(t, 0), mesh, tol
+    ))
     np.testing.assert_array_equal(one, other)
 
 
 def test_a_pulse_between_the_nodes_is_far_from_the_polynomial():
     rule, looks = radau_rule(5), 7
     mesh = initial_mesh(0.0, 1.0, [], 3, rule)
-    places, between = simulate._looks(rule, looks)
+    places, between = at_known._looks(rule, looks)
     nodal = np.sin(mesh.points).reshape(1, -1, 1) * [1.0, 1.0, 2.0]
     t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
     seen = np.sin(t).reshape(1, -1, 1) * [1.0, 1.0, 2.0]
     seen[0, looks + 2, 2] += 4.0
     still = np.ones((1, nodal.shape[1], 1)), np.ones((1, seen.shape[1], 1))
-    far = simulate._missed_between(between, nodal, seen, *still)
+    far = at_known._missed_between(between, nodal, seen, *still)
     np.testing.assert_array_equal(far[1], 0.0)
     np.testing.assert_allclose(far[0], [0.0, 4.0 / seen.max(), 0.0], atol=1e-6)
 

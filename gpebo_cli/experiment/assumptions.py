@@ -24,7 +24,7 @@ from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
-from gpebo_cli.simulation.simulate import Simulation
+from gpebo_cli.simulation.signals import Simulation
 
 _GROWTH = 1e6  # of Φ: above it, the state loses six digits of what the parameters know
 

@@ -35,7 +35,7 @@ from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, S
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
-from gpebo_cli.simulation.simulate import Signals
+from gpebo_cli.simulation.signals import Signals
 
 _SAMPLES_AT_ONCE = 2048
 _LAGS = 20  # of the residual's autocorrelation

@@ -30,7 +30,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers import SignalNoise
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings
-from gpebo_cli.simulation.simulate import Signals
+from gpebo_cli.simulation.signals import Signals
 
 _SAME = 1e-6  # of T_s: an edge this near to an instant takes its place
 _RESOLVED = 1e-10  # of a sample: what a polynomial may miss of the interpolant

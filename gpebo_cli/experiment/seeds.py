@@ -32,7 +32,7 @@ from gpebo_cli.observers._observation import Observation, Response
 from gpebo_cli.regression.estimator import Estimator
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import NoiseSettings
-from gpebo_cli.simulation.simulate import Signals
+from gpebo_cli.simulation.signals import Signals
 
 _NUMBERS = 1 << 20  # in Y of one batch of seeds; estimators hold tens of times that
 

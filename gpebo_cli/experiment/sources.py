@@ -20,7 +20,7 @@ from gpebo_cli.recordings.load import Recording, load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
-from gpebo_cli.simulation.simulate import Signals, Simulation
+from gpebo_cli.simulation.signals import Signals, Simulation
 
 _MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
 _ROUNDING = 1e-12  # by which a sample may miss the end of the horizon

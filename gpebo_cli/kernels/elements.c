@@ -379,10 +379,171 @@ static Outcome carried_errors(Call *call)
     return DONE;
 }
 
+#define MOST_STAGES 16 /* of a rule; its nodes lie side by side, so loops over them have this length */
+#define TOGETHER 4
+#define AT_ONCE 8      /* columns, so that what is swept over fits the cache */
+typedef double Nodes[MOST_STAGES];
+#define EACH_NODE for (int j = 0; j < MOST_STAGES; j++)
+
+/* Everything about one element and some of the columns while sweeping. */
+typedef struct {
+    npy_intp s, d, columns;
+    const npy_intp *row, *column;      /* of the entries of A */
+    const Nodes *R;                    /* h Rᵀ */
+    const Nodes *A, *f;                /* entries; (d, columns) forcing */
+    Nodes *X;                          /* (d, columns) */
+    const double *left, *weight;       /* (d, columns) at the left end; (d,) */
+    double *size, *change;             /* (d,) */
+} Swept;
+
+/* What is not a number is left out: the caller looks for that. */
+#define MAXIMUM(a, b) ((a) > (b) ? (a) : (b))
+
+/* Row i of a sweep in `count` columns from c on; their sums are independent, and done together. */
+INLINE void sweep_row(const Swept *q, npy_intp i, npy_intp c, const npy_intp count)
+{
+    Nodes sum[TOGETHER], next[TOGETHER];
+    for (npy_intp k = 0; k < count; k++)
+        EACH_NODE sum[k][j] = q->f[i * q->columns + c + k][j];
+    for (npy_intp e = q->row[i]; e < q->row[i + 1]; e++) {
+        const double *a = q->A[e];
+        const Nodes *X = (const Nodes *)q->X + q->column[e] * q->columns + c;
+        for (npy_intp k = 0; k < count; k++)
+            EACH_NODE sum[k][j] += a[j] * X[k][j];
+    }
+    for (npy_intp k = 0; k < count; k++)
+        EACH_NODE next[k][j] = q->left[i * q->columns + c + k];
+    for (npy_intp l = 0; l < q->s; l++) {
+        const double *R = q->R[l];
+        for (npy_intp k = 0; k < count; k++) {
+            const double x = sum[k][l];
+            EACH_NODE next[k][j] += R[j] * x;
+        }
+    }
+    Nodes change = {0.0}, size = {0.0};
+    for (npy_intp k = 0; k < count; k++) {
+        double *X = q->X[i * q->columns + c + k];
+        EACH_NODE change[j] = MAXIMUM(fabs(next[k][j] - X[j]), change[j]);
+        EACH_NODE size[j] = MAXIMUM(fabs(next[k][j]), size[j]);
+        EACH_NODE X[j] = next[k][j];
+    }
+    for (npy_intp j = 0; j < q->s; j++) {
+        q->change[i] = larger(change[j], q->change[i]);
+        q->size[i] = larger(size[j], q->size[i]);
+    }
+}
+
+/* One sweep over all rows, from the last to the first if `back`: X_i = x_i + h R (A_i X + f_i). */
+EVERY_WIDTH static void sweep(const Swept *q, int back)
+{
+    for (npy_intp row = 0; row < q->d; row++) {
+        const npy_intp i = back ? q->d - 1 - row : row;
+        npy_intp c = 0;
+        q->change[i] = 0.0;
+        for (; c + TOGETHER <= q->columns; c += TOGETHER)
+            sweep_row(q, i, c, TOGETHER);
+        if (q->columns - c == 3)
+            sweep_row(q, i, c, 3);
+        else
+            for (; c < q->columns; c++)
+                sweep_row(q, i, c, 1);
+    }
+}
+
+/* The largest change of the last sweep, relative to each row's size so far or a share of all. */
+static double largest_change(const Swept *q, double share)
+{
+    double all = DBL_MIN, found = 0.0;
+    for (npy_intp i = 0; i < q->d; i++)
+        all = larger(q->weight[i] * q->size[i], all);
+    for (npy_intp i = 0; i < q->d; i++)
+        found = larger(q->weight[i] * q->change[i] / larger(q->weight[i] * q->size[i], share * all),
+                       found);
+    return found <= DBL_MAX ? found : INFINITY;
+}
+
+/* X' = A X + f over all elements by fixed-point iteration; see elements_numpy.py. */
+static Outcome sweeps(Call *call)
+{
+    const npy_intp K = SIZE(K), s = SIZE(s), d = SIZE(d), entries = SIZE(e), all = SIZE(c);
+    const npy_intp forced = SIZE(f), most = SIZE(m), *row = call->index[2], *column = call->index[3];
+    const double *R = call->in[0], *h = call->in[1], *kicks = call->in[6];
+    const double tol = call->number[9], share = call->number[10];
+    if (s > MOST_STAGES || (SIZE(P) != 1 && SIZE(P) != K * (s + 1)))
+        return refused("stages, or points of all elements", SIZE(P));
+    if (forced > all || (SIZE(Q) != 1 && SIZE(Q) != K * (s + 1)))
+        return refused("columns, or points of the forcing", SIZE(Q));
+    for (npy_intp i = 0; i <= d; i++)
+        if (row[i] < (i ? row[i - 1] : 0) || row[i] > entries)
+            return refused("a row's first entry", row[i]);
+    for (npy_intp e = 0; e < entries; e++)
+        if (column[e] < 0 || column[e] >= d)
+            return refused("a column", column[e]);
+    const npy_intp width = all < AT_ONCE ? all : AT_ONCE, block = d * width;
+    double *memory = scratch(call, (entries + 2 * block + s) * MOST_STAGES + block + 2 * d);
+    if (memory == NULL)
+        return ERROR;
+    Nodes *A = (Nodes *)memory, *f = A + entries, *X = f + block, *hR = X + block;
+    double *left = (double *)(hR + s), *size = left + block, *change = size + d;
+    for (npy_intp k = 0; k < K; k++)
+        call->out[1][k] = 0.0;
+    for (npy_intp first = 0; first < all; first += width) {
+        const npy_intp b = all - first < width ? all - first : width;
+        Swept q = {s, d, b, row, column, (const Nodes *)hR, (const Nodes *)A, (const Nodes *)f, X,
+                   left, call->in[8], size, change};
+        memset(size, 0, d * sizeof(double));
+        for (npy_intp i = 0; i < d; i++)
+            for (npy_intp c = 0; c < b; c++)
+                left[i * b + c] = call->in[7][i * all + first + c];
+        for (npy_intp k = 0; k < K; k++) {
+            double *out = call->out[0] + k * (s + 1) * d * all + first, found = INFINITY;
+            const double *values = call->in[4] + k * (s + 1) * call->step[4];
+            const double *given = call->in[5] + k * (s + 1) * call->step[5] + first;
+            memset(hR, 0, s * sizeof(Nodes));
+            memset(f, 0, d * b * sizeof(Nodes));
+            for (npy_intp j = 0; j < s; j++) {
+                for (npy_intp l = 0; l < s; l++)
+                    hR[l][j] = h[k] * R[j * s + l];
+                for (npy_intp e = 0; e < entries && (k == 0 || call->step[4]); e++)
+                    A[e][j] = values[(j + 1) * call->step[4] + e];
+                for (npy_intp i = 0; i < d; i++)
+                    for (npy_intp c = 0; c < b && first + c < forced; c++)
+                        f[i * b + c][j] = given[(j + 1) * call->step[5] + i * forced + c];
+            }
+            for (npy_intp j = s; k == 0 && j < MOST_STAGES; j++)
+                for (npy_intp e = 0; e < entries; e++)
+                    A[e][j] = 0.0;
+            for (npy_intp i = 0; i < d * b; i++) {
+                EACH_NODE X[i][j] = left[i];
+                size[i / b] = larger(fabs(left[i]), size[i / b]);
+            }
+            for (npy_intp m = 0; m < most && found > tol; m++) {
+                sweep(&q, m & 1);
+                found = largest_change(&q, share);
+                if (!(found <= DBL_MAX))
+                    break;
+            }
+            call->out[1][k] = larger(larger(found, tol), call->out[1][k]);
+            for (npy_intp i = 0; i < d; i++)
+                for (npy_intp c = 0; c < b; c++) {
+                    double *at = out + i * all + c;
+                    at[0] = left[i * b + c];
+                    for (npy_intp j = 0; j < s; j++)
+                        at[(j + 1) * d * all] = X[i * b + c][j];
+                    left[i * b + c] = X[i * b + c][s - 1];
+                    if (kicks != NULL)
+                        left[i * b + c] += kicks[(k * d + i) * all + first + c];
+                }
+        }
+    }
+    return DONE;
+}
+
 const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
     {"carried_errors", "Ktnc K?nn Knc K?nw K tt K+nS %u # # # # # w=n+c", "Knc nc nc nc nc",
      carried_errors},
+    {"sweeps", "ss K @d+ @e P?e Q?df |Kdc dc d # # %m", "Ks+dc K", sweeps},
     {NULL, NULL, NULL, NULL},
 };

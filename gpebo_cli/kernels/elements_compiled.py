@@ -58,3 +58,14 @@ def carried_errors(
         return elements_numpy.carried_errors(*arguments, renew)
     found: tuple[Array, Array, Array, Array, Array] = _compiled.carried_errors(*arguments)
     return found
+
+
+def sweeps(
+    R: Array, h: Array, rows: IntArray, indices: IntArray, entries: Array, f: Array,
+    kicks: Array | None, start: Array, weights: Array, tol: float, share: float, most: int,
+) -> tuple[Array, Array]:
+    """In C, where each row uses those before it."""
+    found: tuple[Array, Array] = _compiled.sweeps(
+        R, h, rows, indices, entries, f, kicks, start, weights, tol, share, most
+    )
+    return found

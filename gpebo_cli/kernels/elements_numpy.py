@@ -210,3 +210,58 @@ def carried_errors(
     by_chance = systematic if constant else np.minimum(systematic, chance)
     carried = systematic * rms[:, :, 0] + by_chance * rms[:, :, 1]
     return carried, tail.max(axis=0), sizes.max(axis=0), visible, made_of.max(axis=0)
+
+
+def sweeps(
+    R: Array, h: Array, rows: IntArray, indices: IntArray, entries: Array, f: Array,
+    kicks: Array | None, start: Array, weights: Array, tol: float, share: float, most: int,
+) -> tuple[Array, Array]:
+    """Values at all points of X' = A X + f by fixed-point iteration, one element after the other.
+
+    ``X ← x_0 + h R (A X + f)`` until nothing changes by more than ``tol``, relative to the largest
+    a row has been so far, or to a ``share`` of the largest of all rows, times their weights.
+
+    Args:
+        R: the integration matrix of the rule (s, s).
+        h: lengths (K,).
+        rows: A by rows (d + 1,), where each begins in
+        indices: the columns of its entries (e,), and
+        entries: them at the K (s + 1) points of all elements, or at one (P or 1, e).
+        f: of the first columns of X (P or 1, d, f).
+        kicks: what is added to X at the end of each element (K, d, c), or None.
+        start: at the first left end (d, c).
+        weights: 1 over the unit of each row (d,).
+        tol: see above.
+        share: see above.
+        most: sweeps over one element.
+
+    Returns:
+        (K, s + 1, d, c), before what is added; and the last relative change of each element (K,),
+        or ``tol``.
+    """
+    s, d, columns = len(R), *start.shape
+    values, changes = np.empty((len(h), s + 1, d, columns)), np.full(len(h), np.inf)
+    all_rows = np.repeat(np.arange(d), np.diff(rows))
+    A = np.zeros((1 if len(entries) == 1 else s, d, d))
+    forcing = np.zeros((s, d, columns))
+    size, state = np.abs(start).max(axis=1, initial=0.0), start
+    for k, step in enumerate(h):
+        points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
+        A[:, all_rows, indices] = entries if len(entries) == 1 else entries[points]
+        forcing[:, :, : f.shape[2]] = f if len(f) == 1 else f[points]
+        X = np.repeat(state[None], s, axis=0)
+        size = np.maximum(size, np.abs(state).max(axis=1, initial=0.0))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(2 * most):  # each row uses the old ones: that is slower by half
+                following = state + step * np.tensordot(R, A @ X + forcing, axes=1)
+                change = weights * np.abs(following - X).max(axis=(0, 2), initial=0.0)
+                X = following
+                size = np.maximum(size, np.abs(X).max(axis=(0, 2), initial=0.0))
+                level = np.maximum(weights * size, share * (weights * size).max(initial=_TINY))
+                changes[k] = (change / level).max(initial=0.0)
+                if not changes[k] > tol:
+                    break
+        changes[k] = max(changes[k], tol) if np.isfinite(changes[k]) else np.inf
+        values[k, 0], values[k, 1:] = state, X
+        state = X[-1] if kicks is None else X[-1] + kicks[k]
+    return values, changes

@@ -28,6 +28,13 @@
 #define EVERY_WIDTH
 #endif
 
+/* A part of such a function: it has the width of the one that it stands in. */
+#ifdef __GNUC__
+#define INLINE static inline __attribute__((always_inline))
+#else
+#define INLINE static inline
+#endif
+
 #define MOST_ARGUMENTS 24
 #define MOST_HELD 64
 

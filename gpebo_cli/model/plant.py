@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import ARCHIVE, with_archive
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.entries import Entries
 from gpebo_cli.model.expressions import (
     RESERVED,
     Assembly,
@@ -151,6 +152,22 @@ class TextCoefficients:
             filled = tuple(self.layouts[k].assemble(values) for k in MATRIX_NAMES)
         found = Coefficients._make(filled)
         return found if signals is None else found.along(signals)
+
+    def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
+        """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
+        moving = self.tape.taylor(np.asarray(t, dtype=np.float64), order, inside)
+        values: dict[str, Array] = {}
+        places: dict[str, tuple[NDArray[np.intp], ...]] = {}
+        for name, layout in self.layouts.items():
+            fixed = np.flatnonzero(layout.fixed)
+            there = np.concatenate([fixed, layout.positions])
+            found = np.zeros((order + 1, len(t) if len(layout.positions) else 1, len(there)))
+            found[0, :, : len(fixed)] = layout.fixed[fixed]
+            if len(layout.positions):
+                found[:, :, len(fixed) :] = moving[:, :, layout.columns]
+            values[name] = found
+            places[name] = np.unravel_index(there, layout.shape)
+        return Entries(Coefficients(**values), places)
 
     @property
     def of_time(self) -> TextCoefficients:

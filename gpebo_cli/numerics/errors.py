@@ -26,10 +26,10 @@ EPS = float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
 _SIGNS = 3  # choices of them for each kind of error
 _CHANCE = 4.0  # by how much a sum of independent errors may exceed its root mean square
-_END = 8.0  # units in the last place of what an end value is made of, lost in solving an element
+END = 8.0  # units in the last place of what an end value is made of, lost in solving an element
 _VALUE = 32.0  # likewise of any value, which are not carried on
 _ROUNDING = 8.0  # units in the last place that cannot be resolved
-_LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
+LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _SAME = 1e-9  # relative difference of rates that are constant
 _FAINT = 1e-6  # of the largest state: errors below that do not end a solution
 _NOTHING = 8.0 * EPS  # of what it is made of: a component that is smaller is rounding itself
@@ -68,9 +68,18 @@ def estimated_errors(
     with np.errstate(over="ignore", invalid="ignore"):
         carried, tail, own, noise, made_of = elements.carried_errors(
             values, last, particular, noise, mesh.steps, rule.to_legendre, signs,
-            used_coefficients(rule), EPS, _END, _CHANCE, _SAME, _LEVEL,
+            used_coefficients(rule), EPS, END, _CHANCE, _SAME, LEVEL,
             None if renewal is None else renew,
         )
+    return judged_errors(problem, carried, tail, own, noise, made_of)
+
+
+def judged_errors(
+    problem: LinearProblem, carried: Array, tail: Array, own: Array, noise: Array, made_of: Array
+) -> Errors:
+    """Errors from what ``kernels.elements.carried_errors`` returns: (K, n, c), and (n, c) each."""
+    K = len(carried)
+    with np.errstate(over="ignore", invalid="ignore"):
         through = _through_constraints(problem, own)
         total = carried.max(axis=0) + tail + noise + EPS * (_VALUE * own + through)
         coupled = np.maximum(np.maximum(made_of, through), problem.floor)
@@ -94,6 +103,11 @@ def _signs(K: int, n: int) -> Array:
     signs: Array = np.where(bits == 1, 1.0, -1.0)
     signs.flags.writeable = False
     return signs
+
+
+def random_signs(K: int, n: int) -> Array:
+    """For errors of one kind at the start and the ends of K elements, (K + 1, n, _SIGNS)."""
+    return _signs(K, n)[:, :, :_SIGNS]
 
 
 def least_sizes(problem: LinearProblem, made_of: Array, tol: float) -> Array:

@@ -33,7 +33,8 @@ from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.regression.parametrisation import Parametrisation, read_box
 from gpebo_cli.schema import nearest, number, shown
 from gpebo_cli.settings import SolverSettings, TimeSettings
-from gpebo_cli.simulation.simulate import Signals, Simulation, simulate
+from gpebo_cli.simulation.signals import Signals, Simulation
+from gpebo_cli.simulation.simulate import simulate
 
 KEYS = (
     "name", "title", "reference", "parameters", "unknowns", "signals", "Y", "psi", "S", "box",

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import replace
 from math import isfinite
 
 import numpy as np
 
 from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import (
-    MATRIX_NAMES,
     Array,
-    BoolArray,
     Coefficients,
     DescriptorSystem,
-    IntArray,
     distinct,
 )
 from gpebo_cli.numerics.collocation import LinearSolution, solve
@@ -29,11 +25,9 @@ from gpebo_cli.numerics.mesh import (
     Mesh,
     Trajectory,
     initial_mesh,
-    unresolved,
 )
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
-from gpebo_cli.numerics.radau import RadauRule, radau_rule
-from gpebo_cli.numerics.refinement import wanted_parts
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
 from gpebo_cli.reduction.strangeness_free import (
     StrangenessFree,
@@ -43,49 +37,15 @@ from gpebo_cli.reduction.strangeness_free import (
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
+from gpebo_cli.simulation.known import MARGIN, SHORT, inputs_resolved, known_joined
+from gpebo_cli.simulation.large import SMALL, large_simulation
 from gpebo_cli.simulation.linearised import Linearised
-from gpebo_cli.simulation.newton import Effort, follow
+from gpebo_cli.simulation.newton import follow
+from gpebo_cli.simulation.signals import Signals, Simulation
 
 _LOOKED_AT = 32  # times at which the mixing of states is looked at
-_MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
-# of them takes more degrees
-_SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
-_LOOKS = 40  # times within each first element at which known functions are looked at once more
-_MOST_LOOKS = 1 << 16
-_SURPRISE = 100.0  # times what the nodes let expect: then something stands between them
-_LOOK_ROUNDS = 8
 _TINY = float(np.finfo(float).tiny)
-_NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
-
-
-@dataclass(frozen=True, eq=False)
-class Signals:
-    """What the observer may see (u, y) and, in a simulation, the truth (x)."""
-
-    inputs: Trajectory  # (m,)
-    outputs: Trajectory  # (r,)
-    states: Trajectory  # (n,)
-
-    @property
-    def mesh(self) -> Mesh:
-        """The mesh all three live on."""
-        return self.states.mesh
-
-
-@dataclass(frozen=True, eq=False)
-class Simulation:
-    """Signals with the evidence of how they were computed."""
-
-    signals: Signals
-    structure: Structure
-    initial_state: Array  # (n,) consistent
-    jumps: tuple[tuple[float, Array, Jump], ...]  # (time, limit from the left, jump)
-    error_estimate: float  # relative to each signal's own size, the largest
-    bounded: bool  # known functions are bounded between the nodes: nothing narrow was missed
-    effort: Effort | None = None  # of Newton's method, where the plant is not linear
-    state_errors: Array | None = None  # (n,) of each state relative to its own largest value
-    lost: float | None = None  # from when on rounding errors exceed a state
 
 
 def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Simulation:
@@ -97,7 +57,11 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         ConfigError: an entry without a finite value.
     """
     if not system.depends_on_outputs:
-        simulation = _simulate_linear(system, time, solver)
+        simulation = None
+        if system.n > SMALL and solver.name == "collocation":
+            simulation = large_simulation(system, time, solver)
+        if simulation is None:
+            simulation = _simulate_linear(system, time, solver)
         if simulation.lost is not None:
             raise SolverError(
                 f"the plant {system.name} grows so that rounding errors are larger than a state "
@@ -129,14 +93,14 @@ def _simulate_linear(
 ) -> Simulation:
     """:func:`simulate` for a plant whose matrices depend on time and inputs only."""
     start, stop = time.start, time.start + time.horizon
-    structure = analyse(
-        system, start, stop, max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol
-    )
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
     edges = system.coefficients.resolved(mesh.edges)
     if edges is not None:
         mesh = Mesh(edges, mesh.rule)
+    structure = analyse(
+        system, start, stop, max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol
+    )
     mesh, c, terms = _known_resolved(
         system, structure, mesh, cuts, solver, bounded=edges is not None
     )
@@ -212,98 +176,21 @@ def _known_resolved(
     def evaluated(mesh: Mesh) -> Coefficients:
         return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
 
-    longest = _SHORT / max(structure.rate, _TINY)
+    longest = SHORT / max(structure.rate, _TINY)
     if solver.name != "ivp" and mesh.steps.max() > longest:
         mesh = _growth_resolved(system, structure, mesh, solver)
     c = evaluated(mesh)
     terms = _beside_inputs(c)
     if solver.name == "ivp":
         return mesh, c, terms
-    given = mesh
-    for _ in range(0 if bounded else _LOOK_ROUNDS):
-        overlooked = _overlooked(system, c, mesh, solver.tol)
-        if not overlooked.any():
-            break
-        mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
-        c = evaluated(mesh)
-    before: Array | float = np.inf
-    beside = terms(np.abs(system.initial_state))
-    while system.m and "u" not in system.coefficients.constant:
-        u = c.u[0].reshape(*mesh.points.shape, -1)
-        tail = unresolved(u, mesh.rule, SHARE * beside)
-        if tail.max() <= solver.tol:
-            break
-        poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
-        parts = wanted_parts(tail, poor, solver.tol, mesh.rule.stages)
-        too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
-        if not poor.any() or too_short.any() or parts.sum() > solver.max_elements:
-            break
-        before = np.repeat(tail, parts)
-        mesh, _ = mesh.split(parts)
-        c = evaluated(mesh)
-    if mesh is not given or not structure.steady or 2.0 * float(mesh.steps.min()) > longest:
-        return mesh, c, terms
-    values, counts = _known_kinds(system, c, mesh)
-    joined = mesh.joined(values, counts, _MARGIN * solver.tol, cuts, longest)
-    return joined, c if joined is mesh else evaluated(joined), terms
-
-
-def _overlooked(
-    system: DescriptorSystem, c: Coefficients, mesh: Mesh, tol: float
-) -> BoolArray:
-    """Elements (K,) with something narrow between their nodes, a pulse of an input for instance.
-
-    What the nodes do not see leaves no trace in Legendre coefficients. So every known function is
-    looked at in between, and an element is suspected where it is far from what the coefficients
-    make one expect.
-    """
-    looks = min(_LOOKS, _MOST_LOOKS // mesh.size)
-    names = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
-    found = np.zeros(mesh.size, dtype=bool)
-    if looks == 0 or not names:
-        return found
-    places, between = _looks(mesh.rule, looks)
-    t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
-    seen = system.coefficients.taylor(t.ravel(), 0)
-    least = max(tol, 1e-12)
-    pairs = [array for name in names for array in (getattr(c, name), getattr(seen, name))]
-    missed = _missed_between(between, *pairs)
-    for name, far in zip(names, missed, strict=True):
-        if far.max(initial=0.0) <= _SURPRISE * least:
-            continue
-        nodal = getattr(c, name)[0].reshape(*mesh.points.shape, -1)
-        nodal = nodal[..., np.ptp(nodal, axis=(0, 1)) > 0.0]
-        found |= far > _SURPRISE * np.maximum(unresolved(nodal, mesh.rule), least)
-    return found
-
-
-def _missed_between(between: Array, *pairs: Array) -> Array:
-    """How far functions are from the polynomials through their nodes, (pairs, K), relative.
-
-    Args:
-        between: the polynomial at the places between, from its points (s + 1, looks).
-        pairs: values (orders, K (s + 1), ...) at the points and (orders, K looks, ...) between, of
-            one function after the other; the first order counts, of entries that move the worst.
-    """
-    points, looks = between.shape
-    found = []
-    for nodal, seen in zip(pairs[::2], pairs[1::2], strict=True):
-        nodes = nodal[0].reshape(nodal.shape[1] // points, points, -1)
-        actual = seen[0].reshape(len(nodes), looks, -1)
-        first = nodes[:1, :1]
-        moves = (nodes != first).any(axis=(0, 1)) | (actual != first).any(axis=(0, 1))
-        nodes, actual = nodes[..., moves], actual[..., moves]
-        size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodes).max(axis=(0, 1)))
-        far = np.abs(between.T @ nodes - actual).max(axis=1) / size
-        found.append(far.max(axis=1, initial=0.0))
-    return np.array(found)
-
-
-@lru_cache(maxsize=16)
-def _looks(rule: RadauRule, looks: int) -> tuple[Array, Array]:
-    """Places (looks,) in an element, and the polynomial there from its points (s + 1, looks)."""
-    places = (np.arange(looks) + 0.5) / looks
-    return places, np.ascontiguousarray(rule.interpolation(places).T)
+    given, beside = mesh, terms(np.abs(system.initial_state))
+    mesh, c = inputs_resolved(
+        system, evaluated, lambda t: system.coefficients.taylor(t, 0), mesh, c, beside, solver,
+        bounded=bounded,
+    )
+    if mesh is given and structure.steady:
+        mesh, c = known_joined(system, evaluated, mesh, c, cuts, MARGIN * solver.tol, longest)
+    return mesh, c, terms
 
 
 def _growth_resolved(
@@ -319,52 +206,21 @@ def _growth_resolved(
     """
     n = structure.d + structure.a
     most = min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements)
-    parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / _SHORT)))
+    parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / SHORT)))
     if parts.sum() > most:
         # Only where it grows.
         form = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel())
         rates = np.broadcast_to(growth_rates(form.E1, form.A1, form.basis), mesh.points.size)
         rates = rates.reshape(mesh.points.shape).max(axis=1)
-        parts = np.maximum(1.0, np.ceil(mesh.steps * (rates / _SHORT)))
+        parts = np.maximum(1.0, np.ceil(mesh.steps * (rates / SHORT)))
         if parts.sum() > most:
             worst = int(np.argmax(rates))
             raise SolverError(
-                f"the plant {system.name} may grow by a factor of e^{_SHORT * parts.sum():.3g}, at "
+                f"the plant {system.name} may grow by a factor of e^{SHORT * parts.sum():.3g}, at "
                 f"{rates[worst]:.3g} 1/s near t = {mesh.edges[worst]:.6g}, which takes more than "
                 f"solver.max_elements = {most:.0f} elements; shorten time.horizon"
             )
     return mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
-
-
-def _known_kinds(
-    system: DescriptorSystem, c: Coefficients, mesh: Mesh
-) -> tuple[Array, IntArray]:
-    """Every function of the model with its derivatives, (K, s + 1, c), and how many of each kind.
-
-    Reciprocals of what E holds are among them: the state sees those, and they may be harder to
-    resolve by far.
-    """
-    parts = [
-        getattr(c, name).reshape(len(c.E), c.E.shape[1], -1)
-        for name in MATRIX_NAMES if name not in system.coefficients.constant
-    ]
-    parts = [part for part in parts if part.shape[2]]
-    if not parts:
-        return np.zeros((*mesh.points.shape, 0)), np.zeros(0, dtype=np.intp)
-    whole = np.concatenate(parts, axis=2)
-    high, low = whole[0].max(axis=0), whole[0].min(axis=0)
-    moving = high > low
-    kinds = list(whole[:, :, moving])
-    counts = np.add.reduceat(moving, np.cumsum([0, *(part.shape[2] for part in parts[:-1])]))
-    counts = np.tile(counts[counts > 0], len(kinds))
-    if "E" not in system.coefficients.constant:
-        first = slice(parts[0].shape[2])
-        size = np.abs([high[first], low[first]])
-        away = (size.min(axis=0) > _NEAR_ZERO * size.max(axis=0)) & (high[first] * low[first] > 0.0)
-        kinds.append(1.0 / parts[0][0][:, moving[first] & away])
-        counts = np.append(counts, kinds[-1].shape[1])
-    values = np.concatenate(kinds, axis=1).reshape(*mesh.points.shape, -1)
-    return values, counts[counts > 0]
 
 
 def _amplification(form: StrangenessFree, step: float) -> Array:

@@ -1,0 +1,226 @@
+"""Large systems that are not stiff, x' = A x + f with few entries: fixed-point sweeps.
+
+An element needs no factorisation where h‖A‖ is modest: ``X ← x_0 + h R (A X + f)`` at its nodes
+converges like (h‖A‖)^k/k!, and a sweep costs as much as the entries of A. The equations that are
+solved are those of collocation, so what holds for their solution holds here. Errors are carried on
+by the same sweeps, to two digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from gpebo_cli.kernels import elements
+from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.numerics.collocation import LinearSolution, unresolved_signals
+from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
+from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, legendre_tail
+from gpebo_cli.numerics.problem import LinearProblem
+from gpebo_cli.numerics.refinement import refine
+
+LENGTH = 4.0  # h‖A‖ of an element at most
+_MOST_SWEEPS = 80
+_MOST_ELEMENTS = 800  # with more of them the system counts as stiff
+_DIGITS = 1e-3  # of the tolerance, to which sweeps go on
+_ROUGH = 0.02  # to which errors are carried
+_DENSE = 0.3  # share of entries, from which on a matrix counts as full
+_TINY = float(np.finfo(float).tiny)
+_FEW_COLUMNS = 4  # whose errors are carried one by one
+
+
+class Sparse(NamedTuple):
+    """Matrices (N or 1, d, d) by their rows."""
+
+    rows: IntArray  # (d + 1,) where each begins
+    columns: IntArray  # (e,) of the entries
+    entries: Array  # (N or 1, e)
+
+    def sizes(self, mesh: Mesh) -> Array:
+        """The largest of each entry in each element, (K or 1, e)."""
+        if len(self.entries) == 1:
+            return np.abs(self.entries)
+        return np.asarray(np.abs(self.entries).reshape(*mesh.points.shape, -1).max(axis=1))
+
+    def product(self, entries: Array, x: Array) -> Array:
+        """Products (K, d, c) of matrices with these entries (K or 1, e) and x (K, d, c)."""
+        terms = entries[:, :, None] * x[:, self.columns]
+        full = np.diff(self.rows) > 0
+        out = np.zeros_like(x)
+        if len(self.columns):
+            out[:, full] = np.add.reduceat(terms, self.rows[:-1][full], axis=1)
+        return out
+
+    def norms(self, entries: Array, units: Array) -> Array:
+        """Bounds (K,) of the spectral radius: norms, in units of the states (d,) and without."""
+        count = np.diff(self.rows)
+        of_row = np.repeat(np.arange(len(count)), count)
+        found = []
+        for scaled in (entries, entries * (units[self.columns] / units[of_row])):
+            for place in (of_row, self.columns):
+                order = np.argsort(place, kind="stable")
+                first = np.flatnonzero(np.diff(place[order], prepend=-1))
+                sums = np.add.reduceat(scaled[:, order], first, axis=1) if len(first) else scaled
+                found.append(sums.max(axis=1, initial=0.0))
+        return np.asarray(np.min(found, axis=0))
+
+
+def sparse(A: Array) -> Sparse | None:
+    """Matrices (N or 1, d, d) by their entries, None where most are not zero."""
+    there = (A != 0.0).any(axis=0)
+    i, j = np.nonzero(there)
+    if len(i) > _DENSE * there.size:
+        return None
+    return Sparse(np.searchsorted(i, np.arange(len(there) + 1)), j, A[:, i, j])
+
+
+def solve(
+    problem: LinearProblem, equation: Callable[[Mesh], tuple[Sparse, Array, tuple[Array, ...]]],
+    mesh: Mesh, *, units: Array, tol: float, max_elements: int,
+    restarts: Mapping[float, Callable[[Array], Array]] | None = None,
+) -> LinearSolution | None:
+    """As :func:`gpebo_cli.numerics.collocation.solve`, or None where sweeps will not do.
+
+    Args:
+        problem: what to solve, but for its coefficients.
+        equation: A, f (P or 1, d, ·) of the first columns and what the monitor needs, at the
+            points of a mesh.
+        mesh: where to start; its edges stay edges.
+        units: of the components (d,).
+        tol: see there.
+        max_elements: see there.
+        restarts: see there.
+
+    Raises:
+        SolverError: ``max_elements`` do not reach ``tol``; names the time.
+    """
+    A, _, _ = equation(mesh)
+    parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh), units) / LENGTH)
+    if not np.maximum(parts, 1.0).sum() <= min(_MOST_ELEMENTS, max_elements):
+        return None
+    if parts.max(initial=1.0) > 1.0:
+        mesh = mesh.split(np.maximum(parts, 1.0).astype(np.intp))[0]
+
+    def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
+        A, f, extras = equation(mesh)
+        values, change = _swept(A, f, problem, mesh, units, tol, restarts or {})
+        made_of, moved = _terms(A, f, mesh, values)
+        found = _Found(A, values, change, made_of, moved, extras)
+        return found, unresolved_signals(
+            problem, mesh, values, extras, made_of.max(axis=0), tol
+        )
+
+    try:
+        mesh, found, tail, rounds = refine(
+            evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name
+        )
+    except _StiffError:
+        return None
+    errors, lost = _errors(problem, mesh, units, found)
+    return LinearSolution(
+        Trajectory(mesh, found.values),
+        max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), rounds, errors,
+        None if lost == mesh.size else float(mesh.edges[lost + 1]), found.extras,
+    )
+
+
+class _StiffError(Exception):
+    """Sweeps do not converge."""
+
+
+class _Found(NamedTuple):
+    """What was found on a mesh."""
+
+    A: Sparse
+    values: Array  # (K, s + 1, d, c)
+    change: Array  # (K,) the last in each element, relative
+    made_of: Array  # (K, d, c) sizes of what right ends are the sum of
+    moved: Array  # (K, d, c) what rounding of the equation's terms moves
+    extras: tuple[Array, ...]
+
+
+def _swept(
+    A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, units: Array, tol: float,
+    restarts: Mapping[float, Callable[[Array], Array]],
+) -> tuple[Array, Array]:
+    """Values (K, s + 1, d, c), and the last change in each element (K,).
+
+    Raises:
+        _StiffError: sweeps do not converge.
+    """
+    edges, state = mesh.edges.tolist(), problem.start
+    cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
+    pieces = []
+    enough = max(_DIGITS * tol, 8.0 * EPS)
+    for first, last in pairwise(cuts):
+        if first:
+            state = restarts[edges[first]](state)
+        part = slice(first * len(mesh.rule.points), last * len(mesh.rule.points))
+        values, change = elements.sweeps(
+            mesh.rule.integration, mesh.steps[first:last], A.rows, A.columns,
+            A.entries if len(A.entries) == 1 else A.entries[part],
+            f if len(f) == 1 else f[part], None, state, 1.0 / units, enough, SHARE, _MOST_SWEEPS,
+        )
+        if not (change <= 8.0 * enough).all() or not np.isfinite(values[-1]).all():
+            raise _StiffError
+        pieces.append((values, change))
+        state = values[-1, -1]
+    if len(pieces) == 1:
+        return pieces[0]
+    return np.concatenate([v for v, _ in pieces]), np.concatenate([c for _, c in pieces])
+
+
+def _terms(A: Sparse, f: Array, mesh: Mesh, values: Array) -> tuple[Array, Array]:
+    """What right ends are made of, and what rounding of the equation's terms moves, (K, d, c)."""
+    K, points, n, _ = values.shape
+    h, late = mesh.steps[:, None, None], np.abs(mesh.edges[1:, None, None])
+    sizes = np.abs(values).max(axis=1)
+    within = A.product(A.sizes(mesh), sizes)
+    moved = np.zeros_like(within)
+    if len(A.entries) > 1:
+        moved += A.product(np.ptp(A.entries.reshape(K, points, -1), axis=1), sizes)
+    forced = slice(0, f.shape[2])
+    if len(f) == 1:
+        within[:, :, forced] += np.abs(f)
+    else:
+        within[:, :, forced] += np.abs(f).reshape(K, points, n, -1).max(axis=1)
+        moved[:, :, forced] += np.ptp(f.reshape(K, points, n, -1), axis=1)
+    return np.abs(values[:, 0]) + h * within, h * within + late * moved
+
+
+def _errors(problem: LinearProblem, mesh: Mesh, units: Array, found: _Found) -> Errors:
+    """Errors of the solution, see :mod:`gpebo_cli.numerics.errors`.
+
+    Of many columns the largest error at each place is carried on, for all of them.
+    """
+    A, values, rule = found.A, found.values, mesh.rule
+    K, points, n, columns = values.shape
+    sizes = np.abs(values).max(axis=1)
+    size, flat = np.maximum(sizes, _TINY), values.reshape(K, points, n * columns)
+    tail = legendre_tail(flat, rule, size.reshape(K, -1)).reshape(sizes.shape)
+    # As in kernels.elements.carried_errors; and what sweeps have not finished.
+    added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * sizes
+    added += EPS * (END * found.made_of + found.moved)
+    start = EPS * np.abs(values[0, 0])
+    noise = np.zeros((n, columns))
+    if points > 4:
+        last = np.abs(rule.to_legendre[-4:] @ flat)
+        before, after = last[:, :2].max(axis=1), last[:, 2:].max(axis=1)
+        noise = np.where(after >= LEVEL * before, after, 0.0).max(axis=0).reshape(n, columns)
+    if columns > _FEW_COLUMNS:
+        added, start = (x.max(axis=-1, keepdims=True) for x in (added, start))
+    signs = random_signs(K, n)[..., None]
+    kicks = (signs[1:] * added[:, :, None]).reshape(K, n, -1)
+    ends, _ = elements.sweeps(
+        rule.integration, mesh.steps, A.rows, A.columns, A.entries, np.zeros((1, n, 0)), kicks,
+        (signs[0] * start[:, None]).reshape(n, -1), 1.0 / units, _ROUGH, SHARE, _MOST_SWEEPS,
+    )
+    squares = ((ends[:, -1] + kicks) ** 2).reshape(K, n, -1, added.shape[2])
+    systematic = np.arange(2, K + 2)[:, None, None]
+    carried = np.sqrt(systematic * squares.mean(axis=2)) + np.zeros(columns)
+    return judged_errors(
+        problem, carried, tail.max(axis=0), sizes.max(axis=0), noise, found.made_of.max(axis=0)
+    )

@@ -1,0 +1,443 @@
+"""From a large sparse descriptor system of any index to x' = M x + g, by elimination.
+
+Row operations bring E to the form [I W; 0 0], x_J + W x_C → x_J takes W away, and then every
+equation without derivatives gives one state by the others. One that has no algebraic state left is
+a constraint: it gives a differential state, whose own equation becomes
+
+    0 = (R_j + f_j) + Σ_k (α_k' x_k + α_k (R_k + f_k)) + φ',        x_j = −Σ_k α_k x_k − φ
+
+with x_k' = R_k + f_k. All entries are Taylor coefficients at many times at once, so these
+derivatives are exact, and entries that are always zero cost nothing. Which pivots may be taken is
+judged over all times: one that comes near zero, or an entry that is neither rounding nor clear of
+it, is left to the derivative array, which has singular values to tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.model.entries import Entries, Places
+from gpebo_cli.reduction.derivative_array import balance
+
+_STEADY = 0.2  # a pivot keeps this share of its largest value at all times
+_SOUND = 0.1  # of the largest entry of its row, in units of the states
+_ROUNDING, _CLEAR = 1e-13, 1e-9  # of what an entry is the difference of: zero below, sure above
+_FILL = 40  # entries per equation; with more of them, a matrix is not sparse
+_BALANCING = 8  # rounds in which units are found
+_TINY = float(np.finfo(float).tiny)
+
+Row = dict[int, Array]
+
+
+class UndecidedError(Exception):
+    """Elimination does not decide the structure."""
+
+
+class MoreOrdersError(UndecidedError):
+    """A derivative is needed of an order that was not evaluated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explicit:
+    """x_I' = M x_I + f at N times, and all other states from these."""
+
+    states: IntArray  # (d,) I
+    rows: IntArray  # (d + 1,) where each row of M begins among
+    columns: IntArray  # (e,) of its entries, in the order of I
+    entries: Array  # (N or 1, e)
+    f: Array  # (N or 1, d)
+    # x_i = −(Σ a_k x_k + φ) one after the other: i, {k: a (N or 1,)}, φ (N or 1,)
+    others: tuple[tuple[int, Row, Array], ...]
+    # x_j = x̃_j − Σ W x_k for those that stand together under a derivative, applied last
+    shifts: tuple[tuple[int, Row], ...]
+    mu: int
+    units: Array  # (n,) of the states
+    pivot: float  # the smallest one at any time, relative to its row
+
+    def at_first(self) -> Explicit:
+        """At the first of the times."""
+        return replace(
+            self, entries=self.entries[:1], f=self.f[:1],
+            others=tuple((i, {k: a[:1] for k, a in row.items()}, phi[:1])
+                         for i, row, phi in self.others),
+            shifts=tuple((i, {k: w[:1] for k, w in row.items()}) for i, row in self.shifts),
+        )
+
+    def states_from(self, z: Array) -> Array:
+        """x (N, n, c) from x_I (N, d, c)."""
+        x = np.zeros((len(self.units), len(z), z.shape[2]))
+        x[self.states] = np.moveaxis(z, 1, 0)
+        for i, row, known in self.others:
+            x[i] = -known[:, None]
+            for k, a in row.items():
+                x[i] -= a[:, None] * x[k]
+        for i, row in self.shifts:
+            for k, w in row.items():
+                x[i] -= w[:, None] * x[k]
+        return np.moveaxis(x, 0, 1)
+
+    def sizes_from(self, size: Array) -> Array:
+        """What states (n, c) are made of at most, from sizes of x_I (d, c)."""
+        x = np.zeros((len(self.units), size.shape[1]))
+        x[self.states] = size
+        for i, row, _ in self.others:
+            for k, a in row.items():
+                x[i] += np.abs(a).max() * x[k]
+        for i, row in self.shifts:
+            for k, w in row.items():
+                x[i] += np.abs(w).max() * x[k]
+        return x
+
+
+def _product(a: Array, b: Array) -> Array:
+    orders = min(len(a), len(b))
+    if orders == 1:
+        return np.asarray(a[:1] * b[:1])
+    return np.array(
+        [sum(a[i] * b[k - i] for i in range(1, k + 1)) + a[0] * b[k] for k in range(orders)]
+    )
+
+
+def _reciprocal(a: Array) -> Array:
+    found = [1.0 / a[0]]
+    for k in range(1, len(a)):
+        found.append(-found[0] * sum(a[i] * found[k - i] for i in range(1, k + 1)))
+    return np.array(found)
+
+
+def _sum(a: Array, b: Array) -> Array:
+    orders = min(len(a), len(b))
+    return np.asarray(a[:orders] + b[:orders])
+
+
+def _derivative(a: Array) -> Array:
+    if len(a) < 2:
+        raise MoreOrdersError
+    return np.asarray(a[1:] * np.arange(1.0, len(a))[:, None])
+
+
+def _one(orders: int) -> Array:
+    return np.eye(orders, 1)
+
+
+def _size(a: Array) -> float:
+    return float(np.abs(a[0]).max())
+
+
+def _divided(values: Array, which: IntArray, factor: Array) -> Array:
+    """Some of the values (e, orders, N or 1) times factors (w, orders, N or 1)."""
+    new = np.moveaxis(
+        _product(np.moveaxis(values[which], 0, 2), np.moveaxis(factor, 0, 2)), 2, 0
+    )
+    count = max(values.shape[2], new.shape[2])
+    out = np.array(np.broadcast_to(values, (*values.shape[:2], count)))
+    out[which] = new
+    return out
+
+
+class _Equations:
+    """Rows of entries; one becomes a mapping where it is touched."""
+
+    def __init__(self, values: Array, places: Places, known: Array, units: Array) -> None:
+        n = len(units)
+        order = np.lexsort(places[::-1])
+        self.values = np.ascontiguousarray(np.moveaxis(values[:, :, order], 2, 0))
+        self.place = [place[order] for place in places]  # rows, and columns
+        self.first = np.searchsorted(self.place[0], np.arange(n + 1))
+        self.given = known  # (n, orders, N or 1)
+        self.units = units
+        self.rows: dict[int, Row] = {}  # those that were touched, and
+        self.known: dict[int, Array] = {}
+        self.least = 1.0  # pivot so far, relative to its row
+        by_column = np.argsort(self.place[1], kind="stable")
+        self._in_column = self.place[0][by_column]
+        self._column = np.searchsorted(self.place[1][by_column], np.arange(n + 1))
+        self._where: dict[int, set[int]] = {}
+
+    def row(self, i: int) -> Row:
+        """Row i, to be changed."""
+        if i not in self.rows:
+            part = slice(self.first[i], self.first[i + 1])
+            self.rows[i] = dict(zip(self.place[1][part].tolist(), self.values[part], strict=True))
+            self.known[i] = self.given[i]
+        return self.rows[i]
+
+    def where(self, k: int) -> set[int]:
+        """The rows that have an entry k, to be changed."""
+        if k not in self._where:
+            part = slice(self._column[k], self._column[k + 1])
+            self._where[k] = set(self._in_column[part].tolist())
+        return self._where[k]
+
+    def divide(self, rows: IntArray, pivots: Array) -> None:
+        """Divide untouched rows (r,) by pivots (r, orders, N or 1)."""
+        count = np.diff(self.first)
+        place = np.zeros(len(count), dtype=np.intp)
+        place[rows] = np.arange(len(rows))
+        divided = np.zeros(len(count), dtype=bool)
+        divided[rows] = True
+        factor = np.moveaxis(_reciprocal(np.moveaxis(pivots, 0, 2)), 2, 0)
+        which = np.flatnonzero(divided[self.place[0]])
+        self.values = _divided(self.values, which, factor[place[self.place[0][which]]])
+        self.given = _divided(self.given, rows, factor)
+
+    def assembled(self, chosen: IntArray, states: IntArray) -> tuple[IntArray, IntArray, Array]:
+        """Rows ``chosen`` (d,): where each begins, its columns among ``states``, its entries."""
+        position = np.full(len(self.units), -1)
+        position[chosen] = np.arange(len(chosen))
+        column = np.full(len(self.units), -1)
+        column[states] = np.arange(len(states))
+        plain = position[self.place[0]] >= 0
+        plain[np.isin(self.place[0], list(self.rows))] = False
+        touched = [
+            (int(position[i]), k, value[0]) for i, row in self.rows.items() if position[i] >= 0
+            for k, value in row.items()
+        ]
+        i = np.concatenate([position[self.place[0][plain]], [t[0] for t in touched]])
+        j = np.concatenate([column[self.place[1][plain]], column[[t[1] for t in touched]]])
+        count = max([1, self.values.shape[2], *(len(t[2]) for t in touched)])
+        entries = np.empty((len(i), count))
+        entries[: plain.sum()] = self.values[plain, 0]
+        for place, (_, _, value) in enumerate(touched, int(plain.sum())):
+            entries[place] = value
+        order = np.argsort(i, kind="stable")
+        rows = np.searchsorted(i[order], np.arange(len(chosen) + 1))
+        return rows, j[order].astype(np.intp), np.ascontiguousarray(entries[order].T)
+
+    def forcing(self, chosen: IntArray) -> Array:
+        """What is known in the rows ``chosen`` (d,), (N or 1, d)."""
+        touched = [(p, self.known[i][0]) for p, i in enumerate(chosen.tolist()) if i in self.known]
+        count = max([self.given.shape[2], *(len(value) for _, value in touched)])
+        f = np.array(np.broadcast_to(self.given[chosen, 0].T, (count, len(chosen))))
+        for p, value in touched:
+            f[:, p] = value
+        return f
+
+    def add(self, i: int, factor: Array, row: Row, known: Array | None) -> None:
+        """Add a multiple of a row to row i."""
+        into = self.row(i)
+        for k, value in row.items():
+            more = _product(factor, value)
+            old = into.get(k)
+            if old is None:
+                into[k] = more
+                self.where(k).add(i)
+                continue
+            new = _sum(old, more)
+            before, after = max(_size(old), _size(more)), _size(new)
+            if after > _CLEAR * before or before == 0.0:
+                into[k] = new
+            elif after <= _ROUNDING * before and np.abs(new).max() <= _ROUNDING * max(
+                np.abs(old).max(), np.abs(more).max()
+            ):
+                del into[k]
+                self.where(k).discard(i)
+            else:
+                raise UndecidedError
+        if len(into) > _FILL + len(self.units) // 4:
+            raise UndecidedError
+        if known is not None:
+            self.known[i] = _sum(self.known[i], _product(factor, known))
+
+    def take_out(self, i: int) -> tuple[Row, Array]:
+        """Row i, which is none of them any more."""
+        row = self.row(i)
+        for k in row:
+            self.where(k).discard(i)
+        self.rows[i] = {}
+        return dict(row), self.known[i]
+
+    def pivot(self, i: int, allowed: Iterable[int]) -> int:
+        """A state among ``allowed`` that row i can give, in as few other rows as possible."""
+        row = self.row(i)
+        sizes = {k: _size(row[k]) * self.units[k] for k in allowed}
+        if not sizes:
+            raise UndecidedError
+        largest = max(sizes.values())
+        smallest = {k: float(np.abs(row[k][0]).min()) * self.units[k] for k in sizes}
+        fit = [
+            k for k, size in sizes.items()
+            if size >= _SOUND * largest and smallest[k] >= _STEADY * size > 0.0
+        ]
+        if not fit:
+            raise UndecidedError
+        chosen = min(fit, key=lambda k: (len(self.where(k)), -sizes[k], k))
+        self.least = min(self.least, smallest[chosen] / largest)
+        return chosen
+
+    def put(self, i: int, k: int) -> Array:
+        """The entry k of row i, which is taken out of it."""
+        self.where(k).discard(i)
+        return self.row(i).pop(k)
+
+
+def units_of(n: int, places: list[tuple[IntArray, ...]], sizes: list[Array]) -> Array:
+    """Units of the states (n,) in which entries of E and A are of comparable size, in their rows.
+
+    Args:
+        n: number of states and equations.
+        places: of the entries of E and A.
+        sizes: of those entries.
+    """
+    rows, columns, logs = [], [], []
+    for (i, j), size in zip(places, sizes, strict=True):
+        there = size > 0.0
+        rows.append(i[there])
+        columns.append(j[there])
+        logs.append(np.log(size[there]))
+    of_E = len(rows[0])
+    i, j, size = (np.concatenate(part) for part in (rows, columns, logs))
+    r, c = np.zeros(n), np.zeros(n)
+    in_row, in_column = (np.maximum(np.bincount(x, minlength=n), 1) for x in (i, j))
+    for _ in range(_BALANCING):
+        rest = size + c[j]
+        if 0 < of_E < len(size):
+            tau = (rest[:of_E] + r[i[:of_E]]).mean() - (rest[of_E:] + r[i[of_E:]]).mean()
+            rest[:of_E] -= tau
+        r = -np.bincount(i, rest, n) / in_row
+        rest += r[i]
+        c -= np.bincount(j, rest, n) / in_column
+    return np.asarray(np.exp(c - np.median(c)))
+
+
+def row_weights(found: Entries) -> Array:
+    """Powers of ten (n,) by which rows of E are comparable, see ``Scaling.weights``."""
+    n = 1 + max(int(place.max(initial=0)) for name in "EA" for place in found.places[name])
+    dense = {}
+    for name in "EA":
+        dense[name] = np.zeros((1, 1, n, n))
+        dense[name][0, 0][found.places[name]] = np.abs(getattr(found.values, name)[0]).max(axis=0)
+    return balance(found.values._replace(**dense)).weights
+
+
+def explicit_form(found: Entries, n: int, f: Array) -> Explicit:
+    """Eliminate.
+
+    Args:
+        found: the model at N times, to some order.
+        n: number of states.
+        f: Taylor coefficients (orders, N or 1, n) of what is known in the equations.
+
+    Raises:
+        MoreOrdersError: derivatives are needed of a higher order.
+        UndecidedError: pivots do not decide the structure.
+    """
+    units = units_of(
+        n, [found.places[name] for name in ("E", "A")],
+        [np.abs(getattr(found.values, name)[0]).max(axis=0) for name in ("E", "A")],
+    )
+    known = np.ascontiguousarray(np.moveaxis(f, 2, 0))
+    A = _Equations(found.values.A, found.places["A"], known, units)
+    E = _Equations(found.values.E, found.places["E"], np.zeros((n, 1, 1)), units)
+    equation_of = _leading(E, A)
+    shifts = _shifted(E, A, equation_of)
+    others, mu = _without_others(A, equation_of)
+    states = np.array(sorted(equation_of), dtype=np.intp)
+    chosen = np.array([equation_of[k] for k in states.tolist()], dtype=np.intp)
+    return Explicit(
+        states, *A.assembled(chosen, states), A.forcing(chosen),
+        tuple((i, {k: a[0] for k, a in row.items()}, phi[0]) for i, row, phi in reversed(others)),
+        tuple((i, {k: w[0] for k, w in row.items()}) for i, row in shifts), mu, units,
+        min(E.least, A.least),
+    )
+
+
+def _leading(E: _Equations, A: _Equations) -> dict[int, int]:
+    """Bring E to [I W; 0 0]; which equation has x_k' alone, by k."""
+    n, (rows, columns) = len(E.units), E.place
+    single = np.bincount(rows, minlength=n)[rows] == 1
+    single &= np.bincount(columns, minlength=n)[columns] == 1
+    size = np.abs(E.values[:, 0])
+    single &= (size.min(axis=1) >= _STEADY * size.max(axis=1)) & (size.max(axis=1) > 0.0)
+    if not ((E.values[single, 0] == 1.0).all() and (E.values[single, 1:] == 0.0).all()):
+        A.divide(rows[single], E.values[single])
+    equation_of = dict(zip(columns[single].tolist(), rows[single].tolist(), strict=True))
+    left: list[int] = sorted(set(rows[~single].tolist()))
+    while left:
+        i = min(left, key=lambda i: len(E.row(i)))
+        left.remove(i)
+        if not E.row(i):
+            continue
+        k = E.pivot(i, [k for k in E.row(i) if k not in equation_of])
+        factor = _reciprocal(E.row(i)[k])
+        E.rows[i] = {j: _product(factor, v) for j, v in E.row(i).items()}
+        A.rows[i] = {j: _product(factor, v) for j, v in A.row(i).items()}
+        A.known[i] = _product(factor, A.known[i])
+        rest = {j: v for j, v in E.rows[i].items() if j != k}
+        for other in [o for o in E.where(k) if o != i]:
+            times = -E.put(other, k)
+            E.add(other, times, rest, None)
+            A.add(other, times, A.rows[i], A.known[i])
+        equation_of[k] = i
+    return equation_of
+
+
+def _shifted(
+    E: _Equations, A: _Equations, equation_of: dict[int, int]
+) -> list[tuple[int, Row]]:
+    """Take W away: x_j = x̃_j − Σ W x_k, x̃_j' = … + W' x_k."""
+    shifts = []
+    for j, i in equation_of.items():
+        W = {k: w for k, w in E.rows.get(i, {}).items() if k != j}
+        if not W:
+            continue
+        shifts.append((j, W))
+        for other in list(A.where(j)):
+            A.add(other, -A.row(other)[j], W, None)
+        moving = {k: _derivative(w) for k, w in W.items() if w.shape[1] > 1 or (w[1:] != 0.0).any()}
+        if moving:
+            A.add(i, _one(len(next(iter(moving.values())))), moving, None)
+    return shifts
+
+
+def _without_others(
+    A: _Equations, equation_of: dict[int, int]
+) -> tuple[list[tuple[int, Row, Array]], int]:
+    """Use every equation without derivatives to express one state by others."""
+    level = dict.fromkeys(set(range(len(A.units))) - set(equation_of.values()), 0)
+    others: list[tuple[int, Row, Array]] = []
+    mu = 0
+    while level:
+        counts = {
+            i: sum(k not in equation_of for k in A.row(i)) or len(A.units) for i in level
+        }
+        least = min(counts.values())
+        for i in [i for i, count in counts.items() if count == least]:
+            if not A.row(i):
+                raise UndecidedError  # an equation that says nothing
+            free = [k for k in A.row(i) if k not in equation_of]
+            if not free and least < len(A.units):
+                continue
+            c = A.pivot(i, free or A.row(i))
+            row, known = A.take_out(i)
+            factor = _reciprocal(row.pop(c))
+            row = {k: _product(factor, v) for k, v in row.items()}
+            known = _product(factor, known)
+            for other in list(A.where(c)):
+                A.add(other, -A.put(other, c), row, known)
+            others.append((c, row, known))
+            own = level.pop(i)
+            mu = max(mu, own)
+            if not free:
+                _differentiated(A, equation_of, c, row, known)
+                level[equation_of.pop(c)] = own + 1
+    return others, mu
+
+
+def _differentiated(
+    A: _Equations, equation_of: dict[int, int], c: int, row: Row, known: Array
+) -> None:
+    """The equation of x_c' becomes one without derivatives."""
+    i = equation_of[c]
+    changes = _derivative(known)
+    A.row(i)
+    A.known[i] = _sum(A.known[i], changes)
+    moving = {k: _derivative(a) for k, a in row.items() if a.shape[1] > 1}
+    A.add(i, _one(len(changes)), moving, None)
+    for k, a in row.items():
+        A.add(i, a, A.row(equation_of[k]), A.known[equation_of[k]])
+

@@ -1,0 +1,172 @@
+"""The mesh that the known functions in E x' = A x + f ask for, before anything is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import (
+    MATRIX_NAMES,
+    Array,
+    BoolArray,
+    Coefficients,
+    DescriptorSystem,
+    IntArray,
+)
+from gpebo_cli.numerics.mesh import SHARE, Mesh, unresolved
+from gpebo_cli.numerics.radau import RadauRule
+from gpebo_cli.numerics.refinement import wanted_parts
+from gpebo_cli.settings import SolverSettings
+
+_LOOKS = 40  # times within each first element at which known functions are looked at once more
+_MOST_LOOKS = 1 << 16
+_SURPRISE = 100.0  # times what the nodes let expect: then something stands between them
+_LOOK_ROUNDS = 8
+_NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
+MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
+# of them takes more degrees
+SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
+
+
+def inputs_resolved(
+    system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients],
+    looked_at: Callable[[Array], Coefficients], mesh: Mesh, c: Coefficients, beside: Array,
+    solver: SolverSettings, *, bounded: bool,
+) -> tuple[Mesh, Coefficients]:
+    """The mesh on which nothing is overlooked and inputs are resolved, and the model there.
+
+    Args:
+        system: the plant.
+        evaluated: the model at the points of a mesh, and
+        looked_at: its values at any times.
+        mesh: where to begin.
+        c: the model there.
+        beside: what each input has to compare with (m,).
+        solver: the tolerance.
+        bounded: nothing narrow hides between the nodes.
+    """
+    for _ in range(0 if bounded else _LOOK_ROUNDS):
+        overlooked = _overlooked(system, c, looked_at, mesh, solver.tol)
+        if not overlooked.any():
+            break
+        mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
+        c = evaluated(mesh)
+    before: Array | float = np.inf
+    while system.m and "u" not in system.coefficients.constant:
+        u = c.u[0].reshape(*mesh.points.shape, -1)
+        tail = unresolved(u, mesh.rule, SHARE * beside)
+        if tail.max() <= solver.tol:
+            break
+        poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
+        parts = wanted_parts(tail, poor, solver.tol, mesh.rule.stages)
+        too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
+        if not poor.any() or too_short.any() or parts.sum() > solver.max_elements:
+            break
+        before = np.repeat(tail, parts)
+        mesh, _ = mesh.split(parts)
+        c = evaluated(mesh)
+    return mesh, c
+
+
+def known_joined(
+    system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients], mesh: Mesh,
+    c: Coefficients, cuts: Array, tol: float, longest: float,
+) -> tuple[Mesh, Coefficients]:
+    """Elements joined where known functions are resolved all the same; the cuts (B,) stay."""
+    if 2.0 * float(mesh.steps.min()) > longest:
+        return mesh, c
+    values, counts = _known_kinds(system, c, mesh)
+    joined = mesh.joined(values, counts, tol, cuts, longest)
+    return joined, c if joined is mesh else evaluated(joined)
+
+
+def _overlooked(
+    system: DescriptorSystem, c: Coefficients, looked_at: Callable[[Array], Coefficients],
+    mesh: Mesh, tol: float,
+) -> BoolArray:
+    """Elements (K,) with something narrow between their nodes, a pulse of an input for instance.
+
+    What the nodes do not see leaves no trace in Legendre coefficients. So every known function is
+    looked at in between, and an element is suspected where it is far from what the coefficients
+    make one expect.
+    """
+    looks = min(_LOOKS, _MOST_LOOKS // mesh.size)
+    names = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
+    found = np.zeros(mesh.size, dtype=bool)
+    if looks == 0 or not names:
+        return found
+    places, between = _looks(mesh.rule, looks)
+    t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
+    seen = looked_at(t.ravel())
+    least = max(tol, 1e-12)
+    pairs = [array for name in names for array in (getattr(c, name), getattr(seen, name))]
+    missed = _missed_between(between, *pairs)
+    for name, far in zip(names, missed, strict=True):
+        if far.max(initial=0.0) <= _SURPRISE * least:
+            continue
+        nodal = getattr(c, name)[0].reshape(*mesh.points.shape, -1)
+        nodal = nodal[..., np.ptp(nodal, axis=(0, 1)) > 0.0]
+        found |= far > _SURPRISE * np.maximum(unresolved(nodal, mesh.rule), least)
+    return found
+
+
+def _missed_between(between: Array, *pairs: Array) -> Array:
+    """How far functions are from the polynomials through their nodes, (pairs, K), relative.
+
+    Args:
+        between: the polynomial at the places between, from its points (s + 1, looks).
+        pairs: values (orders, K (s + 1), ...) at the points and (orders, K looks, ...) between, of
+            one function after the other; the first order counts, of entries that move the worst.
+    """
+    points, looks = between.shape
+    found = []
+    for nodal, seen in zip(pairs[::2], pairs[1::2], strict=True):
+        nodes = nodal[0].reshape(nodal.shape[1] // points, points, -1)
+        actual = seen[0].reshape(len(nodes), looks, -1)
+        first = nodes[:1, :1]
+        moves = (nodes != first).any(axis=(0, 1)) | (actual != first).any(axis=(0, 1))
+        nodes, actual = nodes[..., moves], actual[..., moves]
+        size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodes).max(axis=(0, 1)))
+        far = np.abs(between.T @ nodes - actual).max(axis=1) / size
+        found.append(far.max(axis=1, initial=0.0))
+    return np.array(found)
+
+
+@lru_cache(maxsize=16)
+def _looks(rule: RadauRule, looks: int) -> tuple[Array, Array]:
+    """Places (looks,) in an element, and the polynomial there from its points (s + 1, looks)."""
+    places = (np.arange(looks) + 0.5) / looks
+    return places, np.ascontiguousarray(rule.interpolation(places).T)
+
+
+def _known_kinds(
+    system: DescriptorSystem, c: Coefficients, mesh: Mesh
+) -> tuple[Array, IntArray]:
+    """Every function of the model with its derivatives, (K, s + 1, c), and how many of each kind.
+
+    Reciprocals of what E holds are among them: the state sees those, and they may be harder to
+    resolve by far.
+    """
+    parts = [
+        getattr(c, name).reshape(len(c.E), c.E.shape[1], -1)
+        for name in MATRIX_NAMES if name not in system.coefficients.constant
+    ]
+    parts = [part for part in parts if part.shape[2]]
+    if not parts:
+        return np.zeros((*mesh.points.shape, 0)), np.zeros(0, dtype=np.intp)
+    whole = np.concatenate(parts, axis=2)
+    high, low = whole[0].max(axis=0), whole[0].min(axis=0)
+    moving = high > low
+    kinds = list(whole[:, :, moving])
+    counts = np.add.reduceat(moving, np.cumsum([0, *(part.shape[2] for part in parts[:-1])]))
+    counts = np.tile(counts[counts > 0], len(kinds))
+    if "E" not in system.coefficients.constant:
+        first = slice(parts[0].shape[2])
+        size = np.abs([high[first], low[first]])
+        away = (size.min(axis=0) > _NEAR_ZERO * size.max(axis=0)) & (high[first] * low[first] > 0.0)
+        kinds.append(1.0 / parts[0][0][:, moving[first] & away])
+        counts = np.append(counts, kinds[-1].shape[1])
+    values = np.concatenate(kinds, axis=1).reshape(*mesh.points.shape, -1)
+    return values, counts[counts > 0]

@@ -1,0 +1,285 @@
+"""Simulate a large sparse plant that is not stiff: elimination, then sweeps over its entries."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.entries import Entries, entries
+from gpebo_cli.numerics import sweeps
+from gpebo_cli.numerics.collocation import LinearSolution
+from gpebo_cli.numerics.errors import EPS
+from gpebo_cli.numerics.mesh import (
+    FIRST_ELEMENTS,
+    SHARE,
+    Kind,
+    Mesh,
+    Trajectory,
+    initial_mesh,
+    legendre_tail,
+)
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.reduction.consistency import Jump
+from gpebo_cli.reduction.explicit import (
+    Explicit,
+    MoreOrdersError,
+    UndecidedError,
+    explicit_form,
+    row_weights,
+)
+from gpebo_cli.reduction.structure import without_equations
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.known import MARGIN, inputs_resolved, known_joined
+from gpebo_cli.simulation.signals import Signals, Simulation
+
+SMALL = 8  # states, up to which dense matrices are faster in any case
+_NOTHING = 8.0 * EPS  # of what it is made of: a state that is smaller is rounding itself
+_ROUNDING = 32.0  # units in the last place by which a consistent state may miss one asked for
+_VALUE = 32.0  # units in the last place that any value may be wrong by
+_TINY = float(np.finfo(float).tiny)
+
+
+def forcing(found: Entries, n: int) -> Array:
+    """Taylor coefficients (orders, N, n) of f = B u + F θ + φ."""
+    f = np.zeros((len(found.values.u), max(x.shape[1] for x in found.values[5:8]), n))
+    f = _placed(found, "phi", n) + f
+    for matrix, vector in (("B", "u"), ("F", "theta")):
+        known = found.of(vector)
+        for (i, j), value in found.of(matrix).items():
+            signal = known.get((j,))
+            if signal is not None:
+                product = convolution(value, signal)
+                if product.shape[1] > f.shape[1]:
+                    f = np.repeat(f, product.shape[1], axis=1)
+                f[:, :, i] += product
+    return np.asarray(f)
+
+
+def convolution(a: Array, b: Array) -> Array:
+    """Taylor coefficients of a product, (orders, N or 1)."""
+    return np.array([sum(a[i] * b[k - i] for i in range(k + 1)) for k in range(len(a))])
+
+
+def _placed(found: Entries, name: str, size: int) -> Array:
+    """A vector of the model, (orders, N or 1, size)."""
+    values = getattr(found.values, name)
+    out = np.zeros((*values.shape[:2], size))
+    out[:, :, found.places[name][0]] = values
+    return out
+
+
+class _Plant:
+    """The plant on one mesh after the other: its entries, and what elimination makes of them."""
+
+    def __init__(self, system: DescriptorSystem, most: int) -> None:
+        self.system, self.most, self.order = system, most, 0
+        self.found: Entries
+        self.form: Explicit
+        self.at: Mesh | None = None  # of both, and
+        self.eliminated = False  # whether ``form`` is of ``found``
+
+    def entries(self, mesh: Mesh) -> Coefficients:
+        """Every entry at the points of a mesh."""
+        self.at, self.eliminated = mesh, False
+        self.found = entries(
+            self.system.coefficients, mesh.points.ravel(), self.order, mesh.inside.ravel()
+        )
+        return self.found.values
+
+    def eliminate(self, mesh: Mesh) -> Explicit:
+        """The explicit form from the entries at the points of a mesh.
+
+        Raises:
+            UndecidedError: there is none, or not up to the order that is allowed.
+        """
+        if self.at is not mesh:
+            self.entries(mesh)
+        while not self.eliminated:
+            f = forcing(self.found, self.system.n)
+            try:
+                self.form = explicit_form(self.found, self.system.n, f)
+            except MoreOrdersError:
+                if self.order == self.most:
+                    raise
+                self.order += 1
+                self.entries(mesh)
+            else:
+                self.eliminated = True
+        return self.form
+
+    def matrix(self) -> sweeps.Sparse:
+        """M."""
+        return sweeps.Sparse(self.form.rows, self.form.columns, self.form.entries)
+
+
+def large_simulation(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
+) -> Simulation | None:
+    """:func:`gpebo_cli.simulation.simulate.simulate`, or None where elimination or sweeps fail."""
+    start, stop = time.start, time.start + time.horizon
+    cuts = system.coefficients.breakpoints(start, stop)
+    mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
+    edges = system.coefficients.resolved(mesh.edges)
+    bounded = edges is not None
+    if edges is not None:
+        mesh = Mesh(edges, mesh.rule)
+    plant = _Plant(system, solver.max_strangeness_index + 1)
+    try:
+        with np.errstate(all="ignore"):
+            return _simulated(plant, mesh, cuts, solver, bounded=bounded)
+    except UndecidedError:
+        return None
+
+
+def _simulated(
+    plant: _Plant, mesh: Mesh, cuts: Array, solver: SolverSettings, *, bounded: bool
+) -> Simulation | None:
+    system, tol = plant.system, solver.tol
+    plant.entries(mesh)
+    form = plant.eliminate(mesh)
+    if len(cuts) and (form.mu or form.shifts):
+        return None  # what jumps then is for the derivative array to say
+    M, units = plant.matrix(), form.units
+    longest = sweeps.LENGTH / max(M.norms(M.sizes(mesh), units[form.states]).max(), _TINY)
+    parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
+    if not parts.sum() <= solver.max_elements:
+        return None
+    given = mesh = mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
+    c = plant.entries(mesh)
+    used = plant.found.places["u"][0]
+
+    def looked_at(t: Array) -> Coefficients:
+        return entries(system.coefficients, t, 0).values
+
+    beside = _beside_inputs(plant.found, np.abs(system.initial_state))[used]
+    mesh, c = inputs_resolved(
+        system, plant.entries, looked_at, mesh, c, beside, solver, bounded=bounded
+    )
+    if mesh is given:
+        mesh, c = known_joined(system, plant.entries, mesh, c, cuts, MARGIN * tol, longest)
+    form = plant.eliminate(mesh)
+    x0, z0 = _start(plant)
+    floor = form.sizes_from(SHARE * np.abs(x0[form.states, None]))
+
+    def equation(mesh: Mesh) -> tuple[sweeps.Sparse, Array, tuple[Array, ...]]:
+        form = plant.eliminate(mesh)
+        return plant.matrix(), form.f[:, :, None], ()
+
+    def monitor(values: Array, _extras: tuple[Array, ...]) -> list[Kind]:
+        x, y, u = _signals(plant, values)
+        size = np.abs(x).max(axis=(0, 1))
+        least = np.maximum(SHARE * plant.form.sizes_from(np.abs(values).max(axis=(0, 1))), floor)
+        C = plant.found.values.C[0]
+        of_y = np.zeros((system.r, 1))
+        np.add.at(of_y, plant.found.places["C"][0],
+                  np.abs(C).max(axis=0)[:, None] * least[plant.found.places["C"][1]])
+        shares = SHARE * _beside_inputs(plant.found, size)
+        return [(x, least[:, 0]), (y, of_y[:, 0]), (u, shares)]
+
+    problem = LinearProblem(
+        _no_coefficients, z0[:, None], monitor, f"plant {system.name}",
+        floor[form.states], apart=True,
+    )
+    solution = sweeps.solve(
+        problem, equation, mesh, units=units[form.states], tol=tol,
+        max_elements=solver.max_elements,
+    )
+    if solution is None:
+        return None
+    return _result(plant, solution, x0, cuts, bounded=bounded)
+
+
+def _no_coefficients(t: Array, inside: Array) -> LinearEquation:
+    raise NotImplementedError  # sweeps get the equation by mesh
+
+
+def _beside_inputs(found: Entries, size: Array) -> Array:
+    """Sizes that the inputs (m,) have to compare with, beside states of some size (n,).
+
+    An input whose share of every equation is rounding of the others' is rounding itself.
+    """
+    (i, j), (row, column) = found.places["A"], found.places["B"]
+    terms = np.bincount(i, np.abs(found.values.A[0]).max(axis=0) * size[j], len(size))
+    B = np.abs(found.values.B[0]).max(axis=0)
+    m = 1 + max([-1, *found.places["u"][0].tolist(), *column.tolist()])
+    least = np.full(m, np.inf)
+    np.minimum.at(least, column[B > 0.0], (terms[row] / np.maximum(B, _TINY))[B > 0.0])
+    return np.where(np.isfinite(least), least, 0.0)
+
+
+def _signals(plant: _Plant, z: Array) -> tuple[Array, Array, Array]:
+    """x (K, s + 1, n), y (K, s + 1, r) and u (K, s + 1, m) from z (K, s + 1, d, 1)."""
+    system, found = plant.system, plant.found
+    points = z.shape[:2]
+    N = points[0] * points[1]
+    x = plant.form.states_from(z.reshape(N, -1, 1))[:, :, 0]
+    u, theta = (
+        np.broadcast_to(_placed(found, name, size)[0], (N, size))
+        for name, size in (("u", system.m), ("theta", system.q))
+    )
+    y = np.zeros((system.r, N))
+    for name, signal in (("C", x), ("D", u), ("H", theta)):
+        for (i, j), value in found.of(name).items():
+            y[i] += value[0] * signal[:, j]
+    return tuple(s.reshape(*points, -1) for s in (x, y.T, u))  # type: ignore[return-value]
+
+
+def _start(plant: _Plant) -> tuple[Array, Array]:
+    """The consistent state (n,) at the start, and those of it that are integrated (d,).
+
+    Without hidden constraints these are as they were asked for. With them the differential part
+    is kept as far as it may be: ‖W E (x − x_0)‖ is least.
+    """
+    form, x0 = plant.form, plant.system.initial_state
+    shifted = x0.copy()
+    for j, row in form.shifts:
+        shifted[j] += sum(w[0] * x0[k] for k, w in row.items())
+    z = shifted[form.states]
+    first = form.at_first()
+
+    def differential(z: Array) -> Array:
+        """E (x − x_0) of the state that z gives, (n,)."""
+        off = first.states_from(z[None, :, None])[0, :, 0] - x0
+        (i, j), values = plant.found.places["E"], plant.found.values.E[0, 0]
+        return np.asarray(np.bincount(i, values * off[j], len(x0)))
+
+    missed = differential(z)
+    size = np.abs(form.sizes_from(np.abs(z)[:, None])[:, 0]).max(initial=0.0)
+    if np.abs(missed).max(initial=0.0) > _ROUNDING * EPS * max(size, np.abs(x0).max(initial=0.0)):
+        weights = row_weights(plant.found)
+        moves = np.array([weights * (differential(z + e) - missed) for e in np.eye(len(z))]).T
+        z = z - np.linalg.lstsq(moves, weights * missed, rcond=None)[0]
+    x = first.states_from(z[None, :, None])[0, :, 0]
+    known = np.abs(x - x0) <= _ROUNDING * EPS * (first.sizes_from(np.abs(z)[:, None])[:, 0]
+                                                 + np.abs(x0))
+    return np.where(known, x0, x), z
+
+
+def _result(
+    plant: _Plant, solution: LinearSolution, x0: Array, cuts: Array, *, bounded: bool
+) -> Simulation:
+    mesh, z = solution.trajectory.mesh, solution.trajectory.values
+    form, (x, y, u) = plant.form, _signals(plant, z)
+    own_z, own = np.abs(z).max(axis=(0, 1)), np.abs(x).max(axis=(0, 1))
+    made_of = np.maximum(form.sizes_from(own_z)[:, 0], own)
+    tail = legendre_tail(x, mesh.rule, np.maximum(np.abs(x).max(axis=1), _TINY)).max(axis=0)
+    wrong = form.sizes_from(solution.errors * own_z)[:, 0] + tail + _VALUE * EPS * made_of
+    scale = np.maximum(np.where(own > _NOTHING * made_of, own, made_of), _TINY)
+    state_errors = np.where(wrong > 0.0, wrong / scale, 0.0)
+    structure = replace(
+        without_equations(), mu=form.mu, a=len(x0) - len(form.states), d=len(form.states),
+        smallest_singular_value=form.pivot, time_invariant=len(form.entries) == 1,
+    )
+    jumps = []
+    for cut in map(float, cuts):
+        k = int(np.searchsorted(mesh.edges, cut))
+        jumps.append((cut, x[k - 1, -1], Jump(x[k, 0], np.zeros((0, len(x0))))))
+    return Simulation(
+        signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
+        structure=structure, initial_state=x0, jumps=tuple(jumps),
+        error_estimate=max(solution.error_estimate, float(state_errors.max(initial=0.0))),
+        bounded=bounded, state_errors=state_errors, lost=solution.lost,
+    )

@@ -1,0 +1,171 @@
+"""Large sparse plants: elimination and sweeps against derivative array and dense collocation."""
+
+import numpy as np
+import pytest
+
+from gpebo_cli import load_plant
+from gpebo_cli.numerics.mesh import SHARE
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation import large, simulate
+
+CELLS = 6
+TIME = TimeSettings(horizon=8.0)
+
+
+def ladder(cells):
+    """E, A, B, C of an RLC ladder of index 1: voltages, currents, and the source's current."""
+    n = 2 * cells + 1
+    E, A, B, C = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 1)), np.zeros((2, n))
+    E[range(n - 1), range(n - 1)] = 1.0
+    for k in range(cells):
+        A[k, cells + k], A[cells + k, k], A[cells + k, cells + k] = 1.0, -1.0, -0.1
+        if k + 1 < cells:
+            A[k, cells + k + 1], A[cells + k + 1, k] = -1.0, 1.0
+    A[cells - 1, cells - 1] = A[-1, -1] = -1.0
+    B[cells, 0] = A[-1, cells] = C[0, -1] = C[1, cells - 1] = 1.0
+    return E, A, B, C
+
+
+def source_on_a_node(cells):
+    """Index 2: a capacitor in a loop with the source."""
+    E, A, B, C = ladder(cells)
+    A[-1], B[:] = 0.0, 0.0
+    A[-1, 0], B[-1, 0], A[0, -1] = 1.0, -1.0, 1.0
+    return E, A, B, C
+
+
+def current_source(cells):
+    """Index 2: an inductor in series with a source of current."""
+    E, A, B, C = ladder(cells)
+    A[-1], B[:] = 0.0, 0.0
+    A[-1, cells + 1], B[-1, 0], A[cells + 1, -1] = 1.0, -1.0, 1.0
+    return E, A, B, C
+
+
+def floating(cells):
+    """Capacitors between nodes, too: E is no diagonal."""
+    E, A, B, C = ladder(cells)
+    for k in range(cells - 1):
+        E[k : k + 2, k : k + 2] += [[0.5, -0.5], [-0.5, 0.5]]
+    return E, A, B, C
+
+
+def ungrounded(cells):
+    """A singular block of E: only the difference of two states is differentiated."""
+    E, A, B, C = ladder(cells)
+    E[:2, :2] = [[0.5, -0.5], [-0.5, 0.5]]
+    return E, A, B, C
+
+
+def chain(cells):
+    """Index 3: masses and springs, of which the last has its position prescribed."""
+    n = 2 * cells + 1
+    E, A, B, C = np.eye(n), np.zeros((n, n)), np.zeros((n, 1)), np.zeros((2, n))
+    E[-1, -1] = 0.0
+    for k in range(cells):
+        A[k, cells + k], A[cells + k, cells + k], A[cells + k, k] = 1.0, -0.1, -2.0
+        if k + 1 < cells:
+            A[cells + k, k + 1] = A[cells + k + 1, k] = 1.0
+    A[-2, -1] = A[-1, cells - 1] = C[0, 0] = C[1, -1] = 1.0
+    B[-1, 0] = -1.0
+    return E, A, B, C
+
+
+PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, chain]
+
+
+def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0):
+    E, A, B, C = build(cells)
+    n = len(E)
+
+    def text(matrix, factor):
+        return [[f"{v}*({factor.format(i)})" if v and varying else v for v in row]
+                for i, row in enumerate(matrix.tolist())]
+
+    return load_plant({
+        "name": build.__name__, "states": [f"x{k}" for k in range(n)], "inputs": {"u": u},
+        "outputs": ["y1", "y2"], "E": text(E, "1 + 0.3*cos(t + {})"),
+        "A": text(rate * A, "1 + 0.2*sin(t + {})"), "B": B.tolist(), "C": C.tolist(),
+        "initial_state": [1.0, 0.5, *[0.1] * (n - 2)],
+    })
+
+
+def both(system, tol=1e-9):
+    solver = SolverSettings(tol=tol)
+    found = large.large_simulation(system, TIME, solver)
+    assert found is not None
+    return found, simulate._simulate_linear(system, TIME, SolverSettings(tol=1e-11))
+
+
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize("build", PLANTS)
+def test_structure_start_and_solution_are_those_of_the_derivative_array(build, varying):
+    found, dense = both(plant(build, varying=varying))
+    one, other = found.structure, dense.structure
+    assert (one.index, one.mu, one.a, one.d) == (other.index, other.mu, other.a, other.d)
+    np.testing.assert_allclose(found.initial_state, dense.initial_state, atol=1e-13)
+    t = np.linspace(0.0, TIME.horizon, 41)
+    x, true = found.signals.states(t), dense.signals.states(t)
+    size = np.abs(true).max(axis=0)
+    wrong = np.abs(x - true).max(axis=0) / np.maximum(size, SHARE * size.max())
+    assert (wrong < 10.0 * found.state_errors + 1e-12).all()
+    assert found.state_errors.max() < 1e-8
+    np.testing.assert_allclose(found.signals.outputs(t), dense.signals.outputs(t), atol=1e-8)
+
+
+def test_a_jump_of_the_input_moves_algebraic_states_only():
+    found, dense = both(plant(ladder, varying=True, u="sin(t) + step(t - 3)"))
+    (t, before, jump), (when, _, other) = found.jumps[0], dense.jumps[0]
+    assert t == when == 3.0
+    np.testing.assert_allclose(jump.after, other.after, atol=1e-9)
+    np.testing.assert_allclose(jump.after[:-1], before[:-1], atol=1e-12)
+
+
+def test_a_narrow_pulse_is_not_overlooked():
+    found, dense = both(plant(ladder, u="exp(-((t - 4)/0.01)**2)"))
+    end = found.signals.states.final
+    np.testing.assert_allclose(end, dense.signals.states.final, atol=1e-8)
+
+
+@pytest.mark.parametrize("build", PLANTS)
+def test_errors_are_not_larger_than_they_are_said_to_be(build):
+    system = plant(build, varying=True)
+    fine = large.large_simulation(system, TIME, SolverSettings(tol=1e-12))
+    t = np.linspace(0.0, TIME.horizon, 41)
+    true = fine.signals.states(t)
+    for tol in (1e-4, 1e-7):
+        found = large.large_simulation(system, TIME, SolverSettings(tol=tol))
+        off = np.abs(found.signals.states(t) - true).max(axis=0)
+        assert (off <= 10.0 * found.state_errors * np.abs(true).max(axis=0)).all()
+
+
+def test_a_change_of_units_changes_nothing():
+    system, found = plant(ladder, varying=True), []
+    for power in (0.0, 1.0):
+        units = 10.0 ** (power * np.linspace(-9, 6, system.n))
+        E, A, B, C = ladder(CELLS)
+        found.append(units * large.large_simulation(load_plant({
+            "name": "units", "states": list(system.states), "inputs": {"u": "sin(t)"},
+            "outputs": ["y1", "y2"], "E": (E * units).tolist(), "B": B.tolist(),
+            "A": [[f"{v!r}*(1 + 0.1*sin(t))" for v in row] for row in (A * units).tolist()],
+            "C": (C * units).tolist(), "initial_state": (system.initial_state / units).tolist(),
+        }), TIME, SolverSettings()).signals.states.final)
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-7)
+
+
+@pytest.mark.parametrize("factor", ["sin(t - 4)", "(0.01 + (t - 4)**2)"])
+def test_pivots_that_come_near_zero_are_left_to_the_derivative_array(factor):
+    E, A, B, C = ladder(CELLS)
+    rows = A.tolist()
+    rows[-1][-1] = factor
+    system = load_plant({
+        "name": "near", "states": [f"x{k}" for k in range(len(E))], "inputs": {"u": "sin(t)"},
+        "outputs": ["y1", "y2"], "E": E.tolist(), "A": rows, "B": B.tolist(), "C": C.tolist(),
+        "initial_state": [0.0] * len(E),
+    })
+    assert large.large_simulation(system, TIME, SolverSettings()) is None
+
+
+def test_what_is_stiff_is_left_to_dense_collocation():
+    system = plant(ladder, rate=1e5)
+    assert large.large_simulation(system, TIME, SolverSettings()) is None
