@@ -103,7 +103,9 @@ def errors_over_seeds(
             eta = estimator.estimate(only_noise, t).parameters(slice(0, 1))[0]
             own.append(np.concatenate([eta, offset + gain @ eta], axis=1))
     for own, estimator in zip(found, built, strict=True):
-        deviations = standard_deviations(observation, estimator, source, noise, levels, t)
+        deviations = standard_deviations(
+            observation, estimator, source, noise, levels, t, source.states(t)[None]
+        )
         if deviations is None:
             raise ValueError(f"{estimator} has no deviations")
         predicted = np.concatenate([each[0] for each in deviations], axis=1)

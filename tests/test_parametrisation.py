@@ -74,6 +74,35 @@ def test_least_squares_then_means_nonlinear_least_squares_on_the_data():
     assert abs(found.estimates["b"][0, -1] - 0.5) > 1e-4
 
 
+def test_small_errors_of_the_parameters_go_on_to_the_unknowns():
+    p = regression_from_mapping(TEXT).parametrisation
+    rng = np.random.default_rng(3)
+    theta = np.array([[2.0, 0.5]])
+    root = rng.normal(size=(4, 4))
+    weight = (root.T @ root)[None]
+    step = 1e-5
+    slopes = [
+        (p.fitted(S(theta) + d, weight) - p.fitted(S(theta) - d, weight))[0] / (2 * step)
+        for d in step * np.eye(4)[:, None]
+    ]
+    np.testing.assert_allclose(p.gain(theta, weight)[0], np.transpose(slopes), atol=1e-6)
+
+
+def test_deviations_of_the_unknowns_follow_from_those_of_the_parameters():
+    noise = {"name": "gaussian", "outputs": 0.05, "sample_time": 0.05}
+    found = run(regression=TEXT, estimator="least_squares", time={"horizon": 10}, noise=noise)
+    stated = found.details.estimation.states_std[0]
+    assert found.to_pandas("estimates")["a_std"].iloc[-1] == stated[-1, 0]
+    # The same regression with its own parameters alone, linearised by hand at the truth.
+    r = found.details.regression
+    J = regression_from_mapping(TEXT).parametrisation.jacobian(np.array([[2.0, 0.5]]))[0]
+    psi = r.psi[:, 0] @ J
+    step = 0.05  # every sample of Y has its own error, held for so long
+    G = psi.T @ psi * (r.t[1] - r.t[0])
+    by_hand = 0.05 * np.sqrt(step * np.diag(np.linalg.inv(G)))
+    np.testing.assert_allclose(stated[-1], by_hand, rtol=0.05)
+
+
 @pytest.mark.parametrize(("change", "message"), [
     ({"box": None}, "S needs a box"),
     ({"box": {"a": [0, 1]}}, "box.b must be [low, high]"),

@@ -138,14 +138,16 @@ def test_a_stream_is_the_file_at_its_samples(tmp_path):
     assert "400 rows" in done.stderr
 
 
-def test_deviations_of_known_noise_of_y_are_those_of_many_seeds():
+@pytest.mark.parametrize("psi", [[["s", 1]], [["s", 1], [1, "s"]]])
+def test_deviations_of_known_noise_of_y_are_those_of_many_seeds(psi):
     noise = {"name": "gaussian", "outputs": 0.1, "sample_time": 0.05, "seeds": 400}
-    found = run(
-        regression={**SINE, "psi": [["s", 1]]}, estimator="least_squares", time={"horizon": 10},
-        noise=noise,
-    ).details
+    given = {"regression": {**SINE, "psi": psi}, "estimator": "least_squares",
+             "time": {"horizon": 10}}
+    found = run(**given, noise=noise).details
     stated = found.estimation.parameters_std[0, -1]
     np.testing.assert_allclose(found.noise.deviation[0], stated, rtol=0.12)
+    at_samples = run(**given, noise={**noise, "seeds": 1}, observer={"sample_time": 0.05}).details
+    np.testing.assert_allclose(at_samples.estimation.parameters_std[0, -1], stated, rtol=0.02)
 
 
 def test_arrays_by_name_and_what_can_be_checked():

@@ -78,7 +78,9 @@ def deviations(
         o, e = observer(t[chosen], inside), estimator(t[chosen], inside)
         zeta = o.A.shape[1]
         eta = e.C @ reached[:, zeta:]
-        x = gain[chosen] @ eta + o.C[:, -n:] @ reached[:, :zeta] + o.D[:, -n:] @ factors[own, size:]
+        rows = o.C.shape[1] - n  # of Y; those of the offset stand below
+        x = gain[chosen] @ eta
+        x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ factors[own, size:]
         of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
     return of_eta, of_x
 

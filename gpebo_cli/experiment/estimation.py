@@ -115,7 +115,8 @@ def continuous(
         with stage("uncertainty"):
             reduced, columns = _reduced(observation, known.independent)
             found = standard_deviations(
-                reduced, estimator, source, settings.noise, levels, estimation.t
+                reduced, estimator, source, settings.noise, levels, estimation.t,
+                estimation.states,
             )
             if found is not None:
                 deviations = np.full(estimation.parameters.shape, np.nan)

@@ -8,7 +8,7 @@ from gpebo_cli.evidence.uncertainty import SampledDeviations, deviations, noise_
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.observers._observation import AffineStateMap, Observation
+from gpebo_cli.observers._observation import Differentiable, Observation
 from gpebo_cli.regression.estimator import Affine, Estimator
 from gpebo_cli.settings import NoiseSettings
 
@@ -50,9 +50,9 @@ def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
 
 def standard_deviations(
     observation: Observation, estimator: Estimator, source: Source, noise: NoiseSettings,
-    levels: NoiseLevels, t: Array,
+    levels: NoiseLevels, t: Array, states: Array,
 ) -> tuple[Array, Array] | None:
-    """Of parameters (G, M, p) and states (G, M, n) at the times t (M,).
+    """Of parameters (G, M, p) and ``states`` (G, M, n) at the times t (M,).
 
     None where they are not known: an observer that cannot tell how it responds to noise, an
     estimator that is not ``Affine``, more than 32 cases, a simulation without noise. Rounding to
@@ -60,7 +60,7 @@ def standard_deviations(
     all outputs share is that of the residual.
     """
     state_map, errors = observation.state_map, observation.errors
-    if errors is None or not isinstance(state_map, AffineStateMap):
+    if errors is None or not isinstance(state_map, Differentiable):
         return None
     if not isinstance(estimator, Affine) or len(estimator.cases) > MOST_CASES:
         return None
@@ -77,9 +77,10 @@ def standard_deviations(
         variances *= noise_level(
             errors, regression, instants, variances, observation.starts
         ) ** 2
-    gain = state_map.gain(t)
     found = [
         deviations(errors, of_case, gain, edges, instants, variances, t, observation.starts)
-        for of_case in estimator.errors(regression)
+        for of_case, gain in zip(
+            estimator.errors(regression), state_map.gains(t, states), strict=True
+        )
     ]
     return np.array([eta for eta, _ in found]), np.array([x for _, x in found])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -42,6 +42,15 @@ class StateMap(Protocol):
         ...
 
 
+@runtime_checkable
+class Differentiable(StateMap, Protocol):
+    """A map that tells what small errors of the estimates become."""
+
+    def gains(self, t: Array, states: Array) -> Array:
+        """∂x̂/∂η̂ at the times t (M,), where the estimates are x̂ (g, M, n): (g, M, n, p)."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class AffineStateMap:
     """x = offset + gain η at every time."""
@@ -63,6 +72,11 @@ class AffineStateMap:
             return np.asarray(offset + np.matmul(gain, eta[..., None])[..., 0])
 
         return reconstruct
+
+    def gains(self, t: Array, states: Array) -> Array:
+        """The gain at the times t (M,) for every case of x̂ (g, M, n)."""
+        gain = self.gain(t)
+        return np.broadcast_to(gain, (len(states), *gain.shape))
 
     def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
         """None, whatever x̂ (g, M, n)."""

@@ -21,7 +21,7 @@ from gpebo_cli.observers._observation import (
     Truth,
 )
 from gpebo_cli.observers.reduced.sampled import SampledBlock
-from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.parametrisation import Parametrisation
 from gpebo_cli.regression.text import TextRegression
@@ -57,7 +57,7 @@ class Given:
         )
         points, errors = regression.mesh.points.shape, None
         if given.Y is None and (signals.noise is None or not signals.noise.inputs.any()):
-            errors = _errors_of_outputs(system.m, given.rows)
+            errors = _errors_of_outputs(system, given.rows)
         state_map: StateMap = AffineStateMap(
             Trajectory(regression.mesh, np.zeros((*points, 0))),
             Trajectory(regression.mesh, np.zeros((*points, 0, regression.p))),
@@ -110,6 +110,11 @@ class FittedMap:
         """None."""
         return np.zeros(0)
 
+    def gains(self, t: Array, states: Array) -> Array:
+        """∂θ̂/∂η̂ (g, M, q, k) at the times t (M,) and estimates θ̂ (g, M, q)."""
+        weight = self.regression.gram(t)[..., : self.regression.p]
+        return np.array([self.parametrisation.gain(of_case, weight) for of_case in states])
+
     def at(self, t: Array) -> Reconstruction:
         """θ̂ (g, M, q) of η̂ (g, M, k) at the times t (M,)."""
         weight = self.regression.gram(t)[..., : self.regression.p]
@@ -145,8 +150,13 @@ class GivenAtSamples:
             ConfigError: an expression without a finite value; names it and the time.
         """
         state, regression, scale = advance(self.text, self.hold, state, t, u, y)
-        none = np.zeros((len(t), 0, len(self.parameters)))
-        return state, SampledBlock(regression, none[:, :, 0], none, none, scale)
+        count, none = len(t), np.zeros((len(t), 0, len(self.parameters)))
+        errors = None
+        if self.text.Y is None:
+            o = _errors_of_outputs(self.text.system, self.text.rows)(t, t)
+            whole = (np.broadcast_to(part, (count, *part.shape[1:])) for part in (o.C, o.D))
+            errors = ErrorSteps(np.zeros((count, 0, 2 * o.D.shape[2])), *whole)
+        return state, SampledBlock(regression, none[:, :, 0], none, none, scale, errors)
 
     def assumptions(self, reached: TextState) -> tuple[Assumption, ...]:  # noqa: ARG002  protocol
         """None is made."""
@@ -166,15 +176,13 @@ def _text_of(system: DescriptorSystem) -> TextRegression:
     return given
 
 
-def _errors_of_outputs(m: int, rows: int) -> ErrorsAt:
+def _errors_of_outputs(system: DescriptorSystem, rows: int) -> ErrorsAt:
     """Errors of [signals; Y] as a linear system without a state: what they add to Y."""
-
-    def at(t: Array, inside: Array) -> ErrorSystem:  # noqa: ARG001  protocol
-        D = np.concatenate([np.zeros((rows, m)), np.eye(rows)], axis=1)[None]
-        none = np.zeros((1, 0, 0))
-        return ErrorSystem(none, np.zeros((1, 0, m + rows)), np.zeros((1, rows, 0)), D)
-
-    return at
+    D = np.zeros((1, rows + system.n, system.m + rows))
+    D[0, :rows, system.m :] = np.eye(rows)
+    none = np.zeros((1, 0, 0))
+    found = ErrorSystem(none, np.zeros((1, 0, D.shape[2])), np.zeros((1, D.shape[1], 0)), D)
+    return lambda _t, _inside: found
 
 
 def _constant_truth(t: Array, theta: Array, states: Trajectory) -> Array:  # noqa: ARG001  protocol

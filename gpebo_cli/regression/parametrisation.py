@@ -22,6 +22,7 @@ from gpebo_cli.schema import number, shown
 
 _ROUNDS = 60  # of Levenberg and Marquardt
 _STILL = 1e-15  # a step of this share of the box changes nothing
+_STUCK = 1e3  # damping from which on no shorter step helps: what is left is rounding
 _DAMPING = 1e-3  # at first, relative to the largest singular value squared
 
 
@@ -54,17 +55,16 @@ class Parametrisation:
         From the middle of the box, by damped Gauss–Newton steps that do not leave it.
         """
         found = np.full((len(eta), len(self.low)), np.nan)
-        known = np.isfinite(eta).all(axis=1)
-        eta, L = eta[known], _root(weight[known])
+        left = np.flatnonzero(np.isfinite(eta).all(axis=1))  # those that still move
         width = self.high - self.low
+        eta, L = eta[left], _root(weight[left])
 
-        def at(z: Array) -> tuple[Array, Array]:
-            rest = (L @ (eta - self.values(self.low + width * z))[..., None])[..., 0]
-            return rest, np.einsum("ni,ni->n", rest, rest)
+        def rest_at(z: Array) -> Array:
+            return np.asarray((L @ (eta - self.values(self.low + width * z))[..., None])[..., 0])
 
-        z = np.full((len(eta), len(width)), 0.5)
-        damping = np.full(len(eta), _DAMPING)
-        rest, cost = at(z)
+        z = np.full((len(left), len(width)), 0.5)
+        damping = np.full(len(left), _DAMPING)
+        rest = rest_at(z)
         for _ in range(_ROUNDS):
             J = L @ (self.jacobian(self.low + width * z) * width)
             down = np.einsum("nji,nj->ni", J, rest)
@@ -72,17 +72,18 @@ class Parametrisation:
             U, sigma, Vt = np.linalg.svd(np.where(held[:, None], 0.0, J), full_matrices=False)
             size = np.maximum(sigma[:, :1], 1e-100)  # without excitation all are zero
             filtered = sigma / (sigma**2 + damping[:, None] * size**2)
-            step = np.einsum("nji,nj,nkj,nk->ni", Vt, filtered, U, rest)
-            tried = np.clip(z + step, 0.0, 1.0)
-            new_rest, new_cost = at(tried)
-            better = new_cost < cost
-            moved = np.abs(np.where(better[:, None], tried - z, 0.0)).max(initial=0.0)
-            z[better], cost[better] = tried[better], new_cost[better]
-            rest[better] = new_rest[better]
-            damping = np.clip(np.where(better, 0.1 * damping, 10.0 * damping), 1e-15, 1e15)
-            if moved <= _STILL and (damping > 1.0).all():
+            tried = np.clip(z + np.einsum("nji,nj,nkj,nk->ni", Vt, filtered, U, rest), 0.0, 1.0)
+            new = rest_at(tried)
+            better = (new**2).sum(axis=1) < (rest**2).sum(axis=1)
+            moves = np.where(better, np.abs(tried - z).max(axis=1) > _STILL, damping < _STUCK)
+            z[better], rest[better] = tried[better], new[better]
+            damping = np.maximum(np.where(better, 0.1, 10.0) * damping, 1e-15)
+            found[left] = self.low + width * z
+            if not moves.any():
                 break
-        found[known] = self.low + width * z
+            left, eta, L, z, rest, damping = (
+                kept[moves] for kept in (left, eta, L, z, rest, damping)
+            )
         return found
 
     def gain(self, theta: Array, weight: Array) -> Array:
