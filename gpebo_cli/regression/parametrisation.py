@@ -81,9 +81,8 @@ class Parametrisation:
             found[left] = self.low + width * z
             if not moves.any():
                 break
-            left, eta, L, z, rest, damping = (
-                kept[moves] for kept in (left, eta, L, z, rest, damping)
-            )
+            left, eta, L = left[moves], eta[moves], L[moves]
+            z, rest, damping = z[moves], rest[moves], damping[moves]
         return found
 
     def gain(self, theta: Array, weight: Array) -> Array:
