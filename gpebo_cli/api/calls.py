@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, cast, overload
 
 from gpebo_cli import observers
@@ -243,7 +244,8 @@ def _configure(
     else:
         content, source = choose("plant", plant, config_dir)
         config["plant"] = plain(located(content, source))
-        system = system_from_mapping(content, source)
+        ours = config_dir is None and isinstance(plant, str) and plant in _shipped_plants()
+        system = _shipped(str(plant)) if ours else system_from_mapping(content, source)
     for name in _CHOSEN:
         config[name], _ = choose(name, sections[name], config_dir)
     _check_gains(gains, config["estimator"])
@@ -251,6 +253,18 @@ def _configure(
     settings = configuration.settings(config, draw=True)
     config["data"].pop("frame", None)  # no data of a configuration
     return configuration.complete(config, settings), system, settings
+
+
+@cache
+def _shipped_plants() -> frozenset[str]:
+    return frozenset(choices(conf_folder(), "plant"))
+
+
+@cache
+def _shipped(name: str) -> DescriptorSystem:
+    """A plant that comes with gpebo: it is parsed once, and what is recorded of it is kept."""
+    content, source = choose("plant", name, None)
+    return system_from_mapping(content, source)
 
 
 def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:

@@ -11,6 +11,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from itertools import product
 from math import prod
 from typing import Any, Self
@@ -87,7 +88,7 @@ class GainEstimator(ABC):
                 axes[own.name] = axis(value, where, declared.accept)
         return axes
 
-    @property
+    @cached_property
     def cases(self) -> tuple[Mapping[str, float], ...]:
         """Every combination of the gains; the last one that is declared varies fastest."""
         return combinations(self.axes())

@@ -101,15 +101,17 @@ def law_variation(energy: Array, quotient: Array, gain: float) -> tuple[float, f
 
 
 def _known_variation(path: ScalarPath, gain: float, size: float) -> float:
-    """:func:`law_variation` of what is more than the rounding of 𝐘/Δ."""
+    """:func:`law_variation` of what is more than the rounding of 𝐘/Δ, where there is much of it."""
     mesh = path.mesh
-    digits = path.signals(mesh.points.ravel(), mesh.inside.ravel())[2].reshape(mesh.points.shape)
-    rounding = _SLACK * _ROUNDING / np.maximum(digits, _ROUNDING)
     length = np.maximum(np.diff(path.energy, axis=1), 0.0)
     weight = np.minimum(1.0, gain * length)[..., None]
     change = np.abs(np.diff(path.quotient, axis=1))
-    known = change - size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
-    return float((weight * known).max(initial=0.0))
+    much = (weight * change > _CONSTANT * size).any(axis=(1, 2))
+    points, inside = mesh.points[much], mesh.inside[much]
+    digits = path.signals(points.ravel(), inside.ravel())[2].reshape(points.shape)
+    rounding = _SLACK * _ROUNDING / np.maximum(digits, _ROUNDING)
+    change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
+    return float((weight * change).max(initial=0.0))
 
 
 def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:

@@ -41,7 +41,7 @@ _SAMPLES_AT_ONCE = 2048
 _LAGS = 20  # of the residual's autocorrelation
 _PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that counts as this large
-_BATCH = 1 << 19  # numbers held at once while cases are evaluated: what fits the cache
+_BATCH = 1 << 21  # numbers held at once while cases are evaluated: beyond it calls cost little
 
 Share = Callable[[float], None]  # told how much of a stage is done
 # name of a stage of the run -> what measures it
