@@ -16,10 +16,10 @@ import numpy as np
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.collocation import LinearSolution, unresolved_signals
+from gpebo_cli.numerics.collocation import LinearSolution, at_points, unresolved_signals
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, legendre_tail
-from gpebo_cli.numerics.problem import LinearProblem
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.refinement import refine
 
 LENGTH = 4.0  # h‖A‖ of an element at most
@@ -125,6 +125,36 @@ def solve(
         max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), rounds, errors,
         None if lost == mesh.size else float(mesh.edges[lost + 1]), found.extras,
     )
+
+
+def solve_dense(
+    problem: LinearProblem, mesh: Mesh, *, tol: float, max_elements: int,
+    known: LinearEquation | None = None,
+) -> LinearSolution | None:
+    """:func:`solve` for x' = A x + f with full arrays, of which most entries are zero.
+
+    ``f`` may be of the first columns only. None also where too few entries are zero.
+    """
+    given = mesh
+
+    def equation(mesh: Mesh) -> tuple[Sparse, Array, tuple[Array, ...]]:
+        if mesh is given and known is not None:
+            c = known
+        else:
+            c = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel())
+        A = sparse(c.A)
+        if A is None:
+            raise _StiffError
+        extras = (at_points(e, mesh.size, mesh.rule.stages) for e in c.extras)
+        return A, c.f, tuple(extras)
+
+    try:
+        return solve(
+            problem, equation, mesh, units=np.ones(len(problem.start)), tol=tol,
+            max_elements=max_elements,
+        )
+    except _StiffError:
+        return None
 
 
 class _StiffError(Exception):

@@ -11,6 +11,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
@@ -35,6 +36,7 @@ from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness
 from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
+_SMALL = 8  # coordinates of w, up to which dense collocation is faster
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 
 
@@ -315,9 +317,12 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     """
     system, solver, basis = reduced.system, reduced.solver, reduced.basis
     q, columns = system.q, start.shape[1]
+    large = len(start) > _SMALL and solver.name != "ivp" and sweeps.sparse(
+        reduced.first.dynamics
+    ) is not None
 
     def equations(o: ObserverMatrices, v: Array, y: Array) -> LinearEquation:
-        f, g_y = _driven(o, v, y, columns)
+        f, g_y = _driven(o, v, y, 1 + q if large else columns)
         seen = AlgebraicEquations(
             o.on_basis, g_y, o.G, o.range, o.elimination, o.injectivity
         )
@@ -353,6 +358,13 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
             u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
             points, inside = _over_time(mesh.points), _over_time(mesh.inside)
             known = equations(reduced.first, reduced.form.driving(points, inside, u), y)
+        swept = sweeps.solve_dense(
+            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
+        ) if large else None
+        if swept is not None:
+            return Extension(swept, latest[0])
+        if large:
+            large, known = False, None
         solution = solve(
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         )
