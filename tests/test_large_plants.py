@@ -1,9 +1,13 @@
 """Large sparse plants: elimination and sweeps against derivative array and dense collocation."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
 
-from gpebo_cli import load_plant
+from gpebo_cli import load_plant, system_from_functions
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.numerics.mesh import SHARE
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import large, simulate
@@ -169,3 +173,75 @@ def test_pivots_that_come_near_zero_are_left_to_the_derivative_array(factor):
 def test_what_is_stiff_is_left_to_dense_collocation():
     system = plant(ladder, rate=1e5)
     assert large.large_simulation(system, TIME, SolverSettings()) is None
+
+
+def by_place(matrix, rows, columns):
+    return {f"{rows[i]},{columns[j]}": float(matrix[i, j]) for i, j in zip(*np.nonzero(matrix),
+                                                                           strict=True)}
+
+
+def test_entries_by_name_are_those_of_rows():
+    E, A, B, C = ladder(CELLS)
+    states, outputs = [f"x{k}" for k in range(len(E))], ["y1", "y2"]
+    common = {"name": "l", "states": states, "inputs": {"u": "sin(t)"}, "outputs": outputs,
+              "initial_state": [0.0] * len(E)}
+    rows = {"E": E.tolist(), "A": A.tolist(), "B": B.tolist(), "C": C.tolist()}
+    named = {"E": by_place(E, states, states), "A": by_place(A, range(len(A)), states),
+             "B": {states[CELLS]: {"u": 1.0}}, "C": by_place(C, outputs, states)}
+    one, other = (load_plant(common | m).coefficients.taylor(np.zeros(1), 0) for m in (rows, named))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(("A", "says"), [
+    ({"x1,x2": 1, "x9,x1": 2}, "row 'x9' is no state"),
+    ({"x1": None, "x2": -1}, "in braces with quotation marks"),
+    ({"x1,x2": 1, "0": {"x2": 3}}, "twice"),
+    ({"x1,7": 1}, "number from 0 to 1"),
+])
+def test_entries_that_are_nowhere(A, says):
+    with pytest.raises(ConfigError, match=says):
+        load_plant({"name": "p", "states": ["x1", "x2"], "E": {"x1,x1": 1, "x2,x2": 1}, "A": A,
+                    "initial_state": [0, 0]})
+
+
+@pytest.mark.parametrize("varying", [False, True])
+def test_sparse_matrices_from_python(varying):
+    E, A, B, C = ladder(CELLS)
+    given = {"B": B, "u": lambda t: np.sin(t)[:, None], "initial_state": np.eye(len(E))[0]}
+
+    def full(t):
+        return np.cos(t)[:, None, None] * A
+
+    def few(t):
+        return [csr_matrix(np.cos(x) * A) for x in t]
+
+    plants = [
+        system_from_functions("full", E, full if varying else A, C=C, **given),
+        system_from_functions("few", csr_matrix(E), few if varying else csr_matrix(A),
+                              C=csr_matrix(C), **given),
+    ]
+    one, other = (simulate.simulate(plant, TIME, SolverSettings()) for plant in plants)
+    np.testing.assert_allclose(one.signals.states.final, other.signals.states.final, atol=1e-12)
+    c, d = (plant.coefficients.taylor(np.ones(2), 1) for plant in plants)
+    np.testing.assert_allclose(c.A, d.A, atol=1e-13)
+
+
+def test_a_thousand_states_take_no_square_of_memory():
+    n = 1201
+    states = [f"x{k}" for k in range(n)]
+    A = {f"x{k},x{j}": "0.1*cos(t)" if j == k else 1.0 if j < k else -1.0
+         for k in range(n - 1) for j in (k - 1, k, k + 1) if 0 <= j < n - 1}
+    plant = load_plant({
+        "name": "wave", "states": states, "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": {f"x{k},x{k}": 1.0 for k in range(n - 1)}, "B": {"x0,u": 1.0},
+        "A": A | {f"x{n - 1},x{n - 1}": -1.0, f"x{n - 1},x0": 1.0}, "C": {"y,x0": 1.0},
+        "initial_state": [0.0] * n,
+    })
+    tracemalloc.start()
+    found = simulate.simulate(plant, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * n * n * 20  # one matrix at all points would be ten times as much
+    x = found.signals.states.values
+    np.testing.assert_allclose(x[..., -1], x[..., 0], atol=1e-12)

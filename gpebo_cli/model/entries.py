@@ -42,13 +42,23 @@ def entries(
     if own is not None:
         found: Entries = own(t, order, inside)
         return found
-    c = source.taylor(t, order, inside)
-    places: dict[str, Places] = {}
-    values: dict[str, Array] = {}
-    for name in MATRIX_NAMES:
-        whole = getattr(c, name)
-        if name in source.constant:
-            whole = whole[:, :1]
-        places[name] = np.nonzero((whole != 0.0).any(axis=(0, 1)))
-        values[name] = whole[:, :, *places[name]]
-    return Entries(Coefficients(**values), places)
+    return entries_of(source.taylor(t, order, inside), source.constant)
+
+
+def entries_of(c: Coefficients, constant: frozenset[str]) -> Entries:
+    """Those of full matrices, of which some are constant."""
+    found = {
+        name: not_zero(getattr(c, name)[:, :1] if name in constant else getattr(c, name))
+        for name in MATRIX_NAMES
+    }
+    return Entries(
+        Coefficients(**{name: values for name, (_, values) in found.items()}),
+        {name: places for name, (places, _) in found.items()},
+    )
+
+
+def not_zero(whole: Array) -> tuple[Places, Array]:
+    """Places of the entries of (orders, N, ...) that are not always zero, and these."""
+    places = np.nonzero((whole != 0.0).any(axis=(0, 1)))
+    flat = whole.reshape(*whole.shape[:2], -1)
+    return places, flat[:, :, np.ravel_multi_index(places, whole.shape[2:])]

@@ -24,6 +24,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.entries import Entries, Places, entries_of, not_zero
 
 # (t), (t, u) or (t, u, y), t (N,), u (N, m) and y (N, r), real or complex -> (N, rows, columns), or
 # (N, m) for u, (N, n) for phi
@@ -33,6 +34,7 @@ Entry = Array | Sequence[Any] | Function | Sequence[Function]
 # Of t, u and y; one where not said.
 _MOST_ARGUMENTS = {"A": 3, "B": 3, "F": 3, "phi": 3, "C": 2, "D": 2, "H": 2}
 _POINTS = 32  # on the circle
+_PROBES = np.array([0.0, 0.3819660112501051, 1.618033988749895])  # times to see what is stored
 _NOT_ANALYTIC = 1e-8  # difference between the circle's mean and the value at its centre
 
 
@@ -47,6 +49,23 @@ class FunctionCoefficients:
     signals: Mapping[str, frozenset[str]]  # what a function is a function of, by its name
     outputs: int  # r
     name: str = ""
+    # Where the entries of functions are that return sparse matrices; their shape is (entries,)
+    places: Mapping[str, Places] = field(default_factory=dict)
+    whole: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # shapes of those matrices
+
+    def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:  # noqa: ARG002
+        """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
+        values: dict[str, Array] = {}
+        places: dict[str, Places] = {}
+        for name in MATRIX_NAMES:
+            if name in self.signals:
+                return entries_of(self.taylor(t, order), self.constant)
+            found = self._values(name, t[:1] if name in self.fixed else t, order, None)
+            if name in self.places:
+                values[name], places[name] = found, self.places[name]
+            else:
+                places[name], values[name] = not_zero(found)
+        return Entries(Coefficients(**values), places)
 
     @property
     def constant(self) -> frozenset[str]:
@@ -85,6 +104,10 @@ class FunctionCoefficients:
                 )
             if name not in found:
                 found[name] = self._values(name, t, order, along if depends else None)
+        for name, (i, j) in self.places.items():
+            values = found[name]
+            found[name] = np.zeros((*values.shape[:2], *self.whole[name]))
+            found[name][:, :, i, j] = values
         c = Coefficients(**found)
         return c if signals is None else c.along(signals)
 
@@ -151,6 +174,18 @@ class FunctionCoefficients:
         for k in range(len(given), len(values)):
             values[k] = spectrum[:, k].real / self.radius**k
 
+    def _picked(self, name: str, matrices: Any) -> list[Any]:
+        """The entries of sparse matrices, (entries,) each."""
+        i, j = self.places[name]
+        found = [np.asarray(matrix.tocsr()[i, j]).ravel() for matrix in matrices]
+        for matrix, values in zip(matrices, found, strict=True):
+            if matrix.count_nonzero() != np.count_nonzero(values):
+                raise ConfigError(
+                    f"plant {self.name}: {name} has entries where it had none at other times; "
+                    "return them all each time, those that are zero stored as such"
+                )
+        return found
+
     def _call(
         self, name: str, function: Function, t: Any, signals: Array | None, away: Any
     ) -> Any:
@@ -163,7 +198,10 @@ class FunctionCoefficients:
             arguments = [there[:, : self.shapes["u"][0]], there[:, self.shapes["u"][0] :]]
         t = t + away[:, 0] if np.iscomplexobj(away) else t
         try:
-            value = np.asarray(function(t, *arguments[: _arguments(function) - 1]))
+            value = function(t, *arguments[: _arguments(function) - 1])
+            value = np.asarray(
+                self._picked(name, value) if name in self.places else value
+            )
         except TypeError as error:
             if not np.iscomplexobj(t):
                 raise
@@ -215,7 +253,8 @@ def system_from_functions(
     Args:
         name: of the plant, for messages and folders.
         E: an array (n, n), a function of times (N,) returning (N, n, n), or a list of such
-            functions: E, its first derivative, its second, … Likewise for the others. Functions
+            functions: E, its first derivative, its second, … Likewise for the others. Matrices may
+            be SciPy's sparse ones, also in a list of N that a function returns. Functions
             for A, B, F and phi may also take (t, u, y), those for C, D and H (t, u): the inputs
             (N, m) and outputs (N, r) at these times.
         A: (n, n).
@@ -262,6 +301,8 @@ def system_from_functions(
     fixed: dict[str, Array] = {}
     functions: dict[str, tuple[Function, ...]] = {}
     signals: dict[str, frozenset[str]] = {}
+    places: dict[str, Places] = {}
+    whole: dict[str, tuple[int, ...]] = {}
     entries = {
         "E": E, "A": A, "B": B, "F": F, "C": C, "u": u, "theta": theta, "phi": phi, "D": D, "H": H
     }  # fmt: skip
@@ -271,6 +312,12 @@ def system_from_functions(
             fixed[key] = np.zeros(shapes[key])
         elif listed and all(callable(item) for item in listed):
             functions[key] = tuple(listed)
+            probe = listed[0](_PROBES) if _arguments(listed[0]) == 1 else None
+            if isinstance(probe, list | tuple) and all(hasattr(m, "tocsr") for m in probe):
+                stored = np.concatenate([np.ravel_multi_index(m.tocoo().coords, m.shape)
+                                         for m in probe])
+                places[key] = np.unravel_index(np.unique(stored), shapes[key])
+                whole[key], shapes[key] = shapes[key], (len(places[key][0]),)
             count = max(map(_arguments, listed))
             if count > _MOST_ARGUMENTS.get(key, 1):
                 raise ConfigError(
@@ -280,7 +327,10 @@ def system_from_functions(
             if count > 1:
                 signals[key] = frozenset(inputs if count == 2 else (*inputs, *outputs))
         else:
-            value = np.asarray(entry, dtype=np.float64)
+            given: Any = entry
+            value = np.asarray(
+                given.toarray() if hasattr(given, "tocsr") else given, dtype=np.float64
+            )
             if value.shape != shapes[key]:
                 raise ConfigError(
                     f"plant {name}: {key} has shape {value.shape}, expected {shapes[key]} "
@@ -289,7 +339,9 @@ def system_from_functions(
             fixed[key] = value
     return DescriptorSystem(
         name=name,
-        coefficients=FunctionCoefficients(shapes, fixed, functions, radius, signals, r, name),
+        coefficients=FunctionCoefficients(
+            shapes, fixed, functions, radius, signals, r, name, places, whole
+        ),
         initial_state=x0,
         theta=fixed.get("theta", np.full(q, np.nan)),
         states=_labels(names.states, "x", n, name),
@@ -313,7 +365,9 @@ def _rows(entry: Entry | None, inputs: int = 0) -> int:
         first = first[0]
     if callable(first):
         signals = [np.zeros((1, inputs))] * (_arguments(first) - 1)
-        first = np.asarray(first(np.zeros(1), *signals))[0]
+        first = first(np.zeros(1), *signals)[0]
+    if hasattr(first, "tocsr"):
+        return int(first.shape[0])
     return 0 if first is None else len(np.asarray(first))
 
 

@@ -568,6 +568,8 @@ def _matrix(
         return []
     if isinstance(value, np.ndarray) or hasattr(value, "tocsr"):
         return _numbers(plant, key, value, down, across)
+    if isinstance(value, Mapping) and value:
+        return _by_place(plant, key, value, down, across)
     if _is_empty(value):
         if n_rows and n_columns:
             why = across if down.noun == "state" else down
@@ -601,6 +603,45 @@ def _matrix(
     if widths[0] != n_columns:
         raise ConfigError(f"{plant}: {key} has {_count(widths[0], 'column')} but {across}")
     return grid
+
+
+def _by_place(
+    plant: str, key: str, value: Mapping[Any, object], down: _Side, across: _Side
+) -> list[list[tuple[int, object]]]:
+    """The entries of a mapping, by row and column: ``e1,il: -1`` or ``e1: {il: -1}``."""
+    grid: list[dict[int, object]] = [{} for _ in down.names]
+    places = [{name: i for i, name in enumerate(side.names)} for side in (down, across)]
+    for label, given in value.items():
+        row, comma, column = str(label).partition(",")
+        if comma:
+            given = {column: given}  # noqa: PLW2901  the same, written otherwise
+        if not isinstance(given, Mapping):
+            raise ConfigError(
+                f"{plant}: {key} has {_show(label)}: {_show(given)}; write entries as "
+                f"'row,column': value (in braces with quotation marks) or row: {{column: value}}"
+            )
+        i = _place(plant, f"{key}: row", row, down, places[0])
+        for name, entry in given.items():
+            j = _place(plant, f"{key}: column", str(name), across, places[1])
+            if j in grid[i]:
+                raise ConfigError(f"{plant}: {key} has the entry {row.strip()},{name} twice")
+            grid[i][j] = entry
+    return [sorted(row.items()) for row in grid]
+
+
+def _place(
+    plant: str, where: str, label: str, side: _Side, places: Mapping[str, int]
+) -> int:
+    """Of a row or column by its name, or by its number from 0 on."""
+    label = label.strip()
+    if label in places:
+        return places[label]
+    if label.isdecimal() and int(label) < len(side.names):
+        return int(label)
+    raise ConfigError(
+        f"{plant}: {where} {_show(label)} is no {side.noun}{nearest(label, side.names)}, and no "
+        f"number from 0 to {len(side.names) - 1}; {side}"
+    )
 
 
 def _numbers(
