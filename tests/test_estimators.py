@@ -15,10 +15,12 @@ from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
 from gpebo_cli.estimators._extension import kreisselmeier, lion
+from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import observe
-from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 T = np.linspace(0, 10, 101)
@@ -507,3 +509,20 @@ def test_a_plain_field_is_an_axis_of_separate_estimators():
     assert found.delta(T).shape == (6, len(T))
     with pytest.raises(ConfigError, match=r"estimator\.mu: expected .*, got 'x'"):
         estimators.build({"name": "fct", "mu": [0.1, "x"]})
+
+
+@pytest.mark.parametrize(("slower", "expected"), [(1.0, 10.0), (1e-3, 10.0 * np.log(100.0))])
+def test_a_gain_that_nobody_set_is_raised_where_it_is_too_small(slower, expected):
+    """Δ is nearly one: γ∫Δ² = γ T, and what it needs is ln 100, whatever the unit of time."""
+    horizon = 20.0 * slower
+    system = plant_from_mapping({
+        "name": "p", "states": ["x"], "unknowns": {"a": 2}, "outputs": ["y"], "E": [[1]],
+        "A": [[0]], "F": [["1e6"]], "C": [["1e6"]], "initial_state": [1],
+    })  # fmt: skip
+    found = run_experiment(Settings(
+        plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(horizon=horizon, samples=11)
+    ), system).estimation
+    least = expected / horizon if slower < 1.0 else expected
+    assert found.cases[0]["gamma"] == pytest.approx(least, rel=0.05)
+    assert found.requirement.holds
+    np.testing.assert_allclose(found.parameters[0, -1, 0], 2.0, rtol=1e-9)

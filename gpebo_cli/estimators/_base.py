@@ -19,6 +19,7 @@ from typing import Any, Self
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.errors import ErrorSystem
 from gpebo_cli.regression.estimator import Estimates, ResumableEstimates
@@ -39,11 +40,12 @@ class _Gain:
     accept: Accepted
     by_parameter: bool
     auto: bool
+    default: float
 
 
 def gain(
-    default: object, accept: Accepted = "positive", *, by_parameter: bool = False,
-    auto: bool = False,
+    default: float, accept: Accepted = "positive", *, by_parameter: bool = False,
+    auto: bool = False, raised: bool = False,
 ) -> Any:
     """A field of an estimator that is a gain: a number, a list, or ``logspace(a, b, n)``.
 
@@ -53,8 +55,11 @@ def gain(
         by_parameter: whether it may also be a mapping by parameter, which makes one case.
         auto: whether it may be ``auto``, which :meth:`GainEstimator.tuned` replaces: the larger the
             gain the faster, and the requirement says which one is the least.
+        raised: whether nothing said (None) is the default, and more where that turns out to be too
+            little, see :meth:`GainEstimator.raised`.
     """
-    return field(default=default, metadata={"gain": _Gain(accept, by_parameter, auto)})
+    declared = _Gain(accept, by_parameter, auto, default)
+    return field(default=None if raised else default, metadata={"gain": declared})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +89,8 @@ class GainEstimator(ABC):
                     axes[f"{own.name}_{key}"] = (number(of_one, f"{where}.{key}", declared.accept),)
             elif declared.auto and is_auto(value):
                 axes[own.name] = (float("nan"),)
+            elif value is None:
+                axes[own.name] = (declared.default,)
             else:
                 axes[own.name] = axis(value, where, declared.accept)
         return axes
@@ -105,8 +112,25 @@ class GainEstimator(ABC):
                 once: dict[str, Any] = {own.name: 1.0}
                 found = replace(self, **once).estimate(regression, regression.mesh.edges[-1:])
                 least = found.requirement.gain
-                chosen[own.name] = _AMPLE * least if 0.0 < least < np.inf else own.default
+                default = own.metadata["gain"].default
+                chosen[own.name] = _AMPLE * least if 0.0 < least < np.inf else default
         return replace(self, **chosen)
+
+    def raised(self, requirement: Requirement) -> Self:
+        """Itself, or with ten times the least gain that would do.
+
+        The latter where nothing was said of the gain and the default is less than that.
+
+        Args:
+            requirement: what the estimates with the default turned out to need.
+        """
+        enough = _AMPLE * requirement.gain
+        unsaid = [
+            own.name for own in fields(self)
+            if own.default is None and getattr(self, own.name) is None and "gain" in own.metadata
+            and own.metadata["gain"].default < enough < np.inf
+        ]
+        return replace(self, **dict.fromkeys(unsaid, enough)) if unsaid else self
 
     def gains(self, name: str, parameters: Sequence[str]) -> Array:
         """The values of one gain, shape (g, 1), or (1, p) where it is a mapping by parameter.
@@ -115,6 +139,8 @@ class GainEstimator(ABC):
             ConfigError: a mapping that does not name every parameter.
         """
         value, where = getattr(self, name), f"estimator.{name}"
+        if value is None:
+            value = type(self).__dataclass_fields__[name].metadata["gain"].default
         if is_auto(value):
             raise ConfigError(
                 f"{where}: auto needs to know the signals to their end; give a number at samples, "

@@ -33,6 +33,11 @@ def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
     return estimator
 
 
+def raised(estimator: Estimator, requirement: Requirement) -> Estimator:
+    """The estimator with higher gains where nothing was said of them; itself where they do."""
+    return estimator.raised(requirement) if isinstance(estimator, GainEstimator) else estimator
+
+
 def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Estimates:
     """``estimator.estimate`` from segment to segment, at the times t (M,), ascending.
 

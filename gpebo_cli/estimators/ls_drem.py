@@ -37,7 +37,8 @@ class LsDrem(ResumableEstimator):
     Δ is not square integrable: a γ of order 1 does what 1e10 does behind fading filters.
 
     Attributes:
-        gamma: γ; a number, a list, ``logspace(a, b, n)``, or a mapping by parameter.
+        gamma: γ; a number, a list, ``logspace(a, b, n)``, or a mapping by parameter; None: 10, or
+            ten times the least that turns out to be needed, where that is more.
         alpha, f0, beta, bound: of the least-squares part, see ``least_squares``.
         initial: η̂ (and ĝ) at the start.
     """
@@ -46,7 +47,7 @@ class LsDrem(ResumableEstimator):
     f0: object = gain(1e-4)
     beta: object = gain(0.0, "nonnegative")
     bound: object = None
-    gamma: object = gain(10.0, by_parameter=True, auto=True)
+    gamma: object = gain(10.0, by_parameter=True, auto=True, raised=True)
 
     @property
     def least_squares(self) -> LeastSquares:

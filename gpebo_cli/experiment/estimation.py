@@ -104,11 +104,18 @@ def continuous(
         determined = visible(observation, known, t, system.n)
         estimator = estimators.tuned(estimator, regression)
         times = estimable(excitation, regression.parameters, system.states, determined)
-        try:
-            estimation, metrics = _estimate(
-                settings, system, observation.estimator or estimator, observation, source, known,
-                determined[-1], share,
+
+        def estimated(by: estimators.Estimator) -> tuple[EstimationResult, Metrics]:
+            return _estimate(
+                settings, system, by, observation, source, known, determined[-1], share
             )
+
+        try:
+            estimation, metrics = estimated(observation.estimator or estimator)
+            if observation.estimator is None:
+                raised = estimators.raised(estimator, estimation.requirement)
+                if raised is not estimator:
+                    estimator, (estimation, metrics) = raised, estimated(raised)
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
     if settings.uncertainty and observation.estimator is None:

@@ -1,0 +1,163 @@
+"""The observer along measured signals: simulated, recorded, at samples, with every remedy."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plants import DATA, seen
+
+from gpebo_cli import run
+from gpebo_cli.experiment.pipeline import stream
+from gpebo_cli.model.functions import Names, system_from_functions
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.observers import SignalNoise, observe
+from gpebo_cli.settings import DataSettings, Settings, SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
+
+PROBLEMS = ("boost", "lorenz")
+
+
+def problem(name):
+    return json.loads((DATA / "state_affine" / f"{name}.json").read_text("utf-8"))
+
+
+def of(result, system):
+    """Largest error of θ and x(0) at the end; ξ_a starts at zero, so e₀ = −x(0)."""
+    truth = np.concatenate([system.theta, -system.initial_state])
+    return np.abs(result.details.estimation.parameters[0, -1] - truth).max()
+
+
+def signals_of(name, horizon):
+    system = plant_from_mapping(problem(name)["plant"])
+    return system, simulate(system, TimeSettings(horizon=horizon), SolverSettings()).signals
+
+
+def recording(path, system, signals, horizon, rate):
+    """A CSV of the signals, ``rate`` rows per second."""
+    t = np.arange(round(horizon * rate) + 1) / rate
+    rows = np.column_stack([t, signals.inputs(t), signals.outputs(t)])
+    names = ",".join(["t", *system.inputs, *system.outputs])
+    np.savetxt(path, rows, "%.17g", ",", header=names, comments="")
+    return str(path)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_states_are_those_of_the_reference(name):
+    given = problem(name)
+    until = given["judge_until"]
+    _, signals = signals_of(name, until)
+    for point in given["at"]:
+        if point["t"] <= until:
+            found = signals.states(np.array([point["t"]]))[0]
+            np.testing.assert_allclose(found, point["x"], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_unknowns_and_start_are_found_with_nothing_tuned(name):
+    given = problem(name)
+    found = run(
+        given["plant"], estimator="ls_drem", time={"horizon": given["judge_until"], "samples": 11}
+    )
+    assert of(found, plant_from_mapping(given["plant"])) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "hold", "rate", "order"),
+    [("boost", "zoh", 100, 1), ("boost", "linear", 100, 2), ("boost", "cubic", 50, 4),
+     ("lorenz", "cubic", 250, 4)],
+)  # fmt: skip
+def test_a_recording_is_as_good_as_its_hold(name, hold, rate, order, tmp_path):
+    """Four times as many rows, and errors fall by 4 to the order of the hold."""
+    horizon = problem(name)["judge_until"]
+    system, signals = signals_of(name, horizon)
+    errors = []
+    for k in (rate, 4 * rate):
+        file = recording(tmp_path / f"{k}.csv", system, signals, horizon, k)
+        data = {"name": "csv", "file": file, "hold": hold}
+        found = run(problem(name)["plant"], estimator="ls_drem", data=data, time={"samples": 11})
+        errors.append(of(found, system))
+    assert errors[1] < errors[0] / (0.5 * 4**order)
+    if (hold, 4 * rate) == ("cubic", 1000):
+        assert errors[1] < 1e-8
+
+
+@pytest.mark.parametrize(("hold", "order"), [("zoh", 1), ("linear", 2)])
+def test_at_samples_estimates_converge_with_the_order_of_the_hold(hold, order):
+    given = problem("boost")
+    errors = [
+        of(run(given["plant"], estimator="ls_drem", time={"horizon": 3.0, "samples": 11},
+               observer={"sample_time": step, "hold": hold}), plant_from_mapping(given["plant"]))
+        for step in (0.02, 0.005)
+    ]  # fmt: skip
+    assert errors[1] < errors[0] / (0.5 * 4**order)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_a_stream_gives_what_a_run_at_samples_gives(hold):
+    system, signals = signals_of("lorenz", 1.0)
+    t = np.arange(101) / 100
+    u, y = signals.inputs(t), signals.outputs(t)
+    estimator = {"name": "least_squares", "f0": 1e-9}
+    online = stream(Settings(
+        plant={}, estimator=estimator, observer={"name": "gpebo"}, data=DataSettings(hold=hold),
+        time=TimeSettings(np.nan, np.nan),
+    ), system)(0.0, np.append(u[0], y[0]))  # fmt: skip
+    rows = [online.feed(t[k : k + 1], u[k : k + 1], y[k : k + 1]).parameters for k in range(101)]
+    batch = run(
+        problem("lorenz")["plant"], estimator=estimator, time={"horizon": 1.0, "samples": 101},
+        observer={"sample_time": 0.01, "hold": hold},
+    ).details.estimation.parameters
+    np.testing.assert_allclose(np.concatenate(rows, axis=1)[:, 5:], batch[:, 5:], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("remedy", "estimator"),
+    [("output_injection", "ls_drem"), ("reset", "ls_drem"), ("current_coordinates", "mre"),
+     ("noise_free", "ls_drem")],
+)  # fmt: skip
+@pytest.mark.parametrize(("name", "horizon"), [("lorenz", 1.0), ("generator", 3.0)])
+def test_every_remedy_is_exact_along_signals(name, horizon, remedy, estimator):
+    more = {"reset_interval": horizon / 5} if remedy == "reset" else {}
+    found = run(
+        name, observer={"remedy": remedy, **more}, time={"horizon": horizon, "samples": 11},
+        estimator={"name": estimator, **({"gamma": 1e8} if estimator == "mre" else {})},
+    ).details
+    of_states = np.abs(found.estimation.states[0, -1] - found.simulation.states[-1])
+    size = np.abs(found.simulation.states).max(axis=0)
+    assert (of_states < 1e-7 * size).all()
+    q = found.system.q
+    of_theta = found.estimation.parameters[0, -1, :q] - found.system.theta
+    assert (np.abs(of_theta) < 1e-6 * np.abs(found.system.theta)).all()
+
+
+def test_the_kalman_bucy_filter_is_that_of_the_linear_plant_along_the_signals():
+    """The same estimates as for a plant whose A and F are those functions of time."""
+    system, signals = signals_of("lorenz", 2.0)
+
+    def A(t):
+        y, zero, one = signals.outputs(t)[:, 0], 0 * t, 1 + 0 * t
+        return np.moveaxis(np.array([
+            [-10 * one, 10 * one, zero], [zero, -one, -y], [zero, y, -8 / 3 * one]
+        ]), 2, 0)  # fmt: skip
+
+    def F(t):
+        y = signals.outputs(t)[:, 0]
+        return np.stack([0 * y, y, 0 * y], axis=1)[:, :, None]
+
+    linear = system_from_functions(
+        "linear", np.eye(3), A, F=F, theta=[28.0], C=[[1.0, 0, 0]], initial_state=[1, 1, 20],
+        names=Names(outputs=["y"]),
+    )
+    t = np.linspace(0.0, 2.0, 21)
+    noise = SignalNoise(np.zeros(0), np.array([0.1]), 0.01)
+    measured = replace(seen(signals), noise=noise)
+    estimates = []
+    for plant in (system, linear):
+        found = observe(plant, measured, SolverSettings(tol=1e-8), name="kalman_bucy")
+        estimates.append(found.estimator.estimate(found.regression, t).parameters(slice(None)))
+    np.testing.assert_allclose(estimates[0], estimates[1], rtol=1e-6, atol=1e-6)
+    truth = np.concatenate([[28.0], signals.states(t[-1:])[0]])
+    assert np.abs(estimates[0][0, -1] - truth).max() < 0.01 * 28
