@@ -32,7 +32,7 @@ def check_memory(
     """
     time, n, signals = settings.time, system.n, system.m + system.r
     start = time.start if np.isfinite(time.start) else 0.0  # of a recording: its own
-    E = system.coefficients.taylor(np.array([start]), 0).E[0, 0] if n else np.zeros((0, 0))
+    E = system.coefficients.of_time.taylor(np.array([start]), 0).E[0, 0] if n else np.zeros((0, 0))
     p = system.q + (int(np.linalg.matrix_rank(E)) if n and np.isfinite(E).all() else n)
     regression = (p + 1) * (n + p)
     kept = len(kept_samples(cases, time.samples, settings.output.max_rows))
