@@ -11,6 +11,7 @@ from plants import shipped
 
 from gpebo_cli import run
 from gpebo_cli.estimators import ErrorSystem, LinearRegression
+from gpebo_cli.evidence.metrics import standing_since
 from gpebo_cli.evidence.uncertainty import deviations, noise_level
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.settings import DataSettings, NoiseSettings, Settings, TimeSettings
@@ -180,3 +181,29 @@ def test_of_a_recording_with_levels_and_without(tmp_path):
     assert std[0] == pytest.approx(std[1], rel=0.15)
     with pytest.raises(Exception, match=r"noise\.seeds and noise\.quantisation are for simul"):
         run("descriptor", data=data, noise={**noise, "seeds": 3})
+
+
+def test_settled_is_within_two_deviations_of_the_end_from_then_on():
+    """Not when an error happens to be small; other samples of the noise say nearly the same."""
+    found = []
+    for seed in range(3):
+        result = run(
+            "descriptor", estimator="ls_drem", time={"samples": 401},
+            noise={"name": "gaussian", "outputs": 0.05, "sample_time": 0.2, "seed": seed},
+        )
+        metrics, estimation = result.details.metrics, result.details.estimation
+        for i, name in enumerate(estimation.names):
+            since = metrics.seconds_to_settled[name][0]
+            away = np.abs(estimation.parameters[0, :, i] - estimation.parameters[0, -1, i])
+            late = estimation.t > since + 1e-9
+            assert (away[late] <= 2.0 * estimation.parameters_std[0, -1, i]).all()
+            assert away[~late][-1] > 2.0 * estimation.parameters_std[0, -1, i] * 0.5
+        found.append(max(times[0] for times in metrics.seconds_to_settled.values()))
+        assert f"all within ±2σ of the end after {found[-1]:.4g} s" in result.verdict
+    assert max(found) < 19.0
+    silent = run("descriptor", estimator="ls_drem", time={"horizon": 5}).details.metrics
+    assert not silent.seconds_to_settled
+    assert standing_since(
+        np.array([0.0, 1.0, 2.0]), np.array([[[5.0], [1.0], [0.5]]]), np.zeros((1, 1, 1)),
+        np.array([[0.5]]),
+    )[0, 0] == 1.0

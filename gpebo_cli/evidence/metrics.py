@@ -28,6 +28,15 @@ class Metrics:
     final_error_states: Array  # (G,) max abs
     rms_error_states: Array  # (G,)
     seconds_to_1pct: Mapping[str, Array] = field(default_factory=dict)  # of each quantity, (G,)
+    # With noise: from when on it is within ±2σ of what it is at the end; of each quantity, (G,).
+    seconds_to_settled: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def settled(self) -> Array:
+        """When the last quantity has settled, (G,); NaN where nobody knows of any."""
+        each = np.array([*self.seconds_to_settled.values(), 0.0 * self.final_error_states - np.inf])
+        last = np.where(np.isnan(each), -np.inf, each).max(axis=0)
+        return np.where(np.isfinite(last), last, np.nan)
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -35,16 +44,17 @@ class Metrics:
         return {
             **{name: getattr(self, name) for name in NAMES},
             **{f"{SECONDS}{name}": times for name, times in self.seconds_to_1pct.items()},
+            **{f"{STANDING}{name}": times for name, times in self.seconds_to_settled.items()},
         }
 
 
-NAMES = tuple(f.name for f in fields(Metrics) if f.name != "seconds_to_1pct")
-SECONDS = "seconds_to_1pct_"
+NAMES = tuple([f.name for f in fields(Metrics)][:5])
+SECONDS, STANDING = "seconds_to_1pct_", "seconds_to_settled_"
 
 
 def is_metric(name: str) -> bool:
     """Whether a column of ``cases.csv`` is a metric, and no gain."""
-    return name in NAMES or name.startswith(SECONDS)
+    return name in NAMES or name.startswith((SECONDS, STANDING))
 
 
 def measure_squares(
@@ -82,6 +92,23 @@ def settling_times(t: Array, error: Array, size: Array) -> Array:
     out = settling_time(t, absolute.reshape(-1, len(t)), level=level.ravel()).reshape(level.shape)
     out[np.isnan(absolute[..., -1])] = np.nan
     return out
+
+
+def standing_since(t: Array, value: Array, final: Array, deviation: Array) -> Array:
+    """From when on c values (g, M, c) are within ±2σ of the final ones, (g, c), in seconds.
+
+    What is below a deviation is chance: that an error happens to be small at the end, too.
+
+    Args:
+        t: times (M,).
+        value: estimates.
+        final: what they are by the parameters at the end, (g, M, c) or (g, 1, c).
+        deviation: σ at the end, (g, c), NaN where it is not known.
+    """
+    away = np.abs(np.moveaxis(value - final, 2, 1))
+    level = 2.0 * deviation
+    since = settling_time(t, away.reshape(-1, len(t)), level=level.ravel()).reshape(level.shape)
+    return np.where(np.isnan(level), np.nan, since)
 
 
 def settling_time(

@@ -19,7 +19,14 @@ from gpebo_cli.evidence.excitation import (
 )
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
-from gpebo_cli.evidence.metrics import Metrics, levels, measure_squares, settled, settling_times
+from gpebo_cli.evidence.metrics import (
+    Metrics,
+    levels,
+    measure_squares,
+    settled,
+    settling_times,
+    standing_since,
+)
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
@@ -133,6 +140,7 @@ def continuous(
                 estimation = replace(
                     estimation, parameters_std=deviations, states_std=of_states
                 )
+                metrics = _standing(estimation, metrics, reduced.state_map, columns, system)
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds") as share:
@@ -215,9 +223,37 @@ def at_samples(
         RegressionResult(
             t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
         ),
-        excitation, estimation, _metrics(numbers, online.parameters, system),
+        excitation, estimation,
+        _standing(
+            estimation, _metrics(numbers, online.parameters, system), None,
+            np.arange(len(online.parameters)), system,
+        ),
         online.fit() if source.recording else None,
         estimable(excitation, online.parameters, system.states, made.seen[chosen]),
+    )
+
+
+def _standing(
+    estimation: EstimationResult, metrics: Metrics, state_map: StateMap | None, columns: IntArray,
+    system: DescriptorSystem,
+) -> Metrics:
+    """With the times from which on estimates are within ±2σ of what the final ones say.
+
+    A state is compared with what the final parameters make of the same signals, whose noise is then
+    in both.
+    """
+    t, eta = estimation.t, estimation.parameters
+    if estimation.parameters_std is None or estimation.states_std is None:
+        return metrics
+    times = [standing_since(t, eta, eta[:, -1:], estimation.parameters_std[:, -1])]
+    names: Sequence[str] = estimation.names
+    if isinstance(state_map, AffineStateMap):
+        away = np.nan_to_num(eta - eta[:, -1:])[..., columns]
+        of_x = np.einsum("mnp,gmp->gmn", state_map.gain(t), away)
+        times.append(standing_since(t, of_x, 0.0 * of_x[:, :1], estimation.states_std[:, -1]))
+        names = [*names, *system.states]
+    return replace(
+        metrics, seconds_to_settled=dict(zip(names, np.hstack(times).T, strict=True))
     )
 
 

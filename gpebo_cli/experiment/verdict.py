@@ -42,8 +42,11 @@ def verdict(
         parts.append(f"not determined by the data: {', '.join(unknown)}")
     best = None if metrics is None else _best_case(metrics)
     if metrics is not None and best is not None:
-        seconds = metrics.seconds_to_1pct_states[best]
-        reached = f"below 1 % after {seconds:.4g} s" if isfinite(seconds) else "never below 1 %"
+        if isfinite(metrics.settled[best]):  # that an error is small just now is chance
+            reached = f"all within ±2σ of the end after {metrics.settled[best]:.4g} s"
+        else:
+            seconds = metrics.seconds_to_1pct_states[best]
+            reached = f"below 1 % after {seconds:.4g} s" if isfinite(seconds) else "never below 1 %"
         parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end, {reached}")
     elif fit is not None:
         best = fit.best

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gpebo_cli.evidence.metrics import STANDING
+
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import NoiseStatistics, RunResult
 
@@ -56,14 +58,24 @@ _TIMES = {
 
 def case_table(rows: Sequence[Mapping[str, float]], gains: Sequence[str]) -> list[str]:
     """The lines of a table with one row per case; the middle of a long one is left out."""
-    head = [*gains, *_HEADINGS.values()]
     count = len(rows)
+    settled = [name for name in rows[0] if name.startswith(STANDING)]
+    headings = dict(_HEADINGS)
+    if any(math.isfinite(rows[0][name]) for name in settled):  # with noise 1 % is chance
+        for name in _TIMES:
+            del headings[name]
+        headings = {"settled": "within ±2σ of the end", **headings}
+    head = [*gains, *headings.values()]
+    rows = [
+        {**row, "settled": max((row[n] for n in settled if row[n] == row[n]), default=math.nan)}
+        for row in rows
+    ]
     chosen = list(range(count))
     if count > _SHOWN_CASES:
         half = _SHOWN_CASES // 2
         chosen = [*range(half), *range(count - half, count)]
     body = [
-        [*(f"{rows[i][g]:g}" for g in gains), *(_cell(n, rows[i]) for n in _HEADINGS)]
+        [*(f"{rows[i][g]:g}" for g in gains), *(_cell(n, rows[i]) for n in headings)]
         for i in chosen
     ]
     lines = columns([head, *body])
@@ -96,7 +108,9 @@ def estimate_table(result: RunResult) -> list[str]:
     case = result.fit.best if result.fit is not None else 0
     over_time = np.concatenate([estimation.states[case], estimation.parameters[case]], axis=1)
     names = [*result.system.states, *estimation.names]
-    rows = [["", "estimate", "± std", "unit", "within 1 % of the end since"]]
+    standing = {} if result.metrics is None else result.metrics.seconds_to_settled
+    near = "±2σ" if standing else "1 %"
+    rows = [["", "estimate", "± std", "unit", f"within {near} of the end since"]]
     for name, told in estimates_at_end(result, case).items():
         value, std = told["value"], told["std"]
         if not math.isfinite(value):
@@ -104,7 +118,8 @@ def estimate_table(result: RunResult) -> list[str]:
             continue
         away = np.abs(over_time[:, names.index(name)] - value) > 0.01 * abs(value)
         first = int(len(away) - np.argmax(away[::-1])) if away.any() else 0
-        since = f"{estimation.t[first]:.4g} s" if name in estimation.names else ""
+        when = estimation.t[0] + standing[name][case] if standing else estimation.t[first]
+        since = f"{when:.4g} s" if name in estimation.names else ""
         deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
         rows.append([name, f"{value:.6g}", deviation, told["unit"] or "", since])
     return columns(rows)
@@ -121,6 +136,8 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def _cell(name: str, row: Mapping[str, float]) -> str:
     value = row[name]
+    if name == "settled":
+        return f"after {value:.3f} s"
     if math.isnan(row[_TIMES.get(name, name)]):
         return "unknown"
     if name in _TIMES:
