@@ -14,6 +14,7 @@ from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence.metrics import standing_since
 from gpebo_cli.evidence.uncertainty import deviations, noise_level
 from gpebo_cli.experiment.pipeline import stream
+from gpebo_cli.results.report import run_lines
 from gpebo_cli.settings import DataSettings, NoiseSettings, Settings, TimeSettings
 
 sys.path.insert(0, str(ROOT / "docs"))
@@ -207,3 +208,15 @@ def test_settled_is_within_two_deviations_of_the_end_from_then_on():
         np.array([0.0, 1.0, 2.0]), np.array([[[5.0], [1.0], [0.5]]]), np.zeros((1, 1, 1)),
         np.array([[0.5]]),
     )[0, 0] == 1.0
+
+
+def test_a_recording_at_samples_is_told(tmp_path):
+    """Its table has states whose time to settle nobody knows."""
+    noise = {"name": "gaussian", "outputs": 0.02, "sample_time": 0.1}
+    made = run("descriptor", noise=noise, time={"samples": 201}).to_pandas("signals")
+    measured = made.filter(regex="measured").rename(columns=lambda c: c.removesuffix("_measured"))
+    measured.to_csv(tmp_path / "rows.csv")
+    result = run("descriptor", data=str(tmp_path / "rows.csv"), observer={"sample_time": 0.1})
+    line = next(line for line in run_lines(result.details) if line.strip().startswith("theta1"))
+    value, std = (float(cell) for cell in line.split()[1:3])
+    assert abs(value - 1.5) < 5 * std < 0.5

@@ -118,7 +118,8 @@ def estimate_table(result: RunResult) -> list[str]:
             continue
         away = np.abs(over_time[:, names.index(name)] - value) > 0.01 * abs(value)
         first = int(len(away) - np.argmax(away[::-1])) if away.any() else 0
-        when = estimation.t[0] + standing[name][case] if standing else estimation.t[first]
+        known = standing.get(name)
+        when = estimation.t[first] if known is None else estimation.t[0] + known[case]
         since = f"{when:.4g} s" if name in estimation.names else ""
         deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
         rows.append([name, f"{value:.6g}", deviation, told["unit"] or "", since])
