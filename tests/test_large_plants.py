@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
 
-from gpebo_cli import load_plant, system_from_functions
+from gpebo_cli import load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.numerics.mesh import SHARE
+from gpebo_cli.observers.reduced import extension
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import large, simulate
 
@@ -245,3 +246,43 @@ def test_a_thousand_states_take_no_square_of_memory():
     assert peak < 8 * n * n * 20  # one matrix at all points would be ten times as much
     x = found.signals.states.values
     np.testing.assert_allclose(x[..., -1], x[..., 0], atol=1e-12)
+
+
+def observed(unknown, n=CELLS, **observer):
+    system = plant(ladder, varying=True, cells=n)
+    return run(
+        system, observer={"name": "gpebo", "unknown_initial": unknown, **observer},
+        estimator={"name": "least_squares", "f0": 1e-12}, time={"horizon": 8.0, "samples": 41},
+    )
+
+
+def test_only_unknown_initial_values_are_estimated():
+    result = observed(["x1", "x9"], xi_a0={"x1": 0.1, "x9": 0.0})
+    assert list(result.parameters) == ["e0_x1", "e0_x9"]
+    np.testing.assert_allclose(list(result.parameters.values()), [0.1 - 0.5, -0.1], atol=1e-9)
+    for name in ("x0", "x5", "x12"):
+        np.testing.assert_allclose(result.errors[name][0, -1], 0.0, atol=1e-9)
+    everything = observed(None)
+    assert len(everything.parameters) == 2 * CELLS
+
+
+@pytest.mark.parametrize(("observer", "says"), [
+    ({"unknown_initial": ["x99"]}, "'x99' is no differential state"),
+    ({"unknown_initial": ["x12"]}, "'x12' is no differential state"),
+    ({"unknown_initial": ["x1"], "remedy": "reset"}, "accepted remedies"),
+    ({"unknown_initial": ["x1"], "sample_time": 0.1}, "continuous time only"),
+])
+def test_initial_values_that_cannot_be_the_unknown_ones(observer, says):
+    with pytest.raises(ConfigError, match=says):
+        observed(observer.pop("unknown_initial"), **observer)
+
+
+def test_the_swept_extension_is_that_of_dense_elements(monkeypatch):
+    found = observed(None)
+    monkeypatch.setattr(extension.sweeps, "sparse", lambda A: None)
+    dense = observed(None)
+    for name in ("x3", "x12"):  # before the end parameters are hardly told apart
+        one, other = found.estimates[name][0, -1], dense.estimates[name][0, -1]
+        np.testing.assert_allclose(one, other, atol=1e-7)
+    psi, other = found.details.regression.psi, dense.details.regression.psi
+    np.testing.assert_allclose(psi, other, atol=1e-9)

@@ -31,6 +31,8 @@ class Gpebo:
         regression: the whole residual, or its last r rows as the paper has it.
         xi_a0: where the dynamic extension starts: by state name, or a list of n_a numbers; None:
             what the plant proposes, else zero.
+        unknown_initial: states whose initial values are not known; the others start where the
+            plant's ``initial_state`` says, or ``xi_a0``. None: all.
         weights: how much each output counts, by order or name (absent: 1); only ratios matter.
             None: equally.
         sample_time: seconds between samples of an observer in discrete time; None: continuous.
@@ -43,6 +45,7 @@ class Gpebo:
     form: Literal["auto", "given", "strangeness_free"] = "auto"
     regression: Literal["projected", "paper"] = "projected"
     xi_a0: Mapping[str, float] | list[float] | None = None
+    unknown_initial: list[str] | None = None
     weights: Mapping[str, float] | list[float] | None = None
     sample_time: float | None = field(default=None, metadata={"positive": True})  # seconds
     hold: Literal["zoh", "linear"] = "zoh"
@@ -58,6 +61,13 @@ class Gpebo:
                 "are none and output_injection"
             )
 
+        keeps = isinstance(self.remedy, Plain | OutputInjection)
+        if self.unknown_initial is not None and not keeps:
+            raise ConfigError(
+                "observer.unknown_initial: with this remedy the parameters are about later states, "
+                "which are all unknown; accepted remedies are none and output_injection"
+            )
+
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
     ) -> Observation:
@@ -71,6 +81,7 @@ class Gpebo:
         return replace(self.remedy.observe(reduced_system(
             system, signals, solver,
             xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=self.form,
+            unknown=self.unknown_initial,
         )), bounds=self.bounds)
 
     def sampling(self) -> Sampling | None:
@@ -94,6 +105,11 @@ class Gpebo:
         )
 
     def _refuse_what_needs_the_past(self) -> None:
+        if self.unknown_initial is not None:
+            raise ConfigError(
+                "observer.unknown_initial works in continuous time only; at samples "
+                "(observer.sample_time, streams) all initial values are unknown"
+            )
         if self.bounds:
             raise ConfigError(
                 "observer.bounds works in continuous time only: at samples (observer.sample_time, "

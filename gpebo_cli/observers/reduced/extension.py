@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -33,6 +33,7 @@ from gpebo_cli.observers.reduced.matrices import (
 from gpebo_cli.observers.reduced.regression import Assembled, regression_signals, term_sizes
 from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
+from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
@@ -94,6 +95,44 @@ def begin_at(
     """
     V1, names = initial_basis(o.split.projector[0], o.split.rank, system.states)
     return np.asarray(begin.basis.T @ V1 @ initial_extension(xi_a0, system, names))
+
+
+def with_unknown(
+    begin: Start, xi_a0: Array, unknown: Sequence[str], given: ByName | None,
+    system: DescriptorSystem,
+) -> tuple[Start, Array]:
+    """The start with errors of some states only, and ξ_a0 of these.
+
+    The others start where the plant's ``initial_state`` says, or ``observer.xi_a0``, and e₀ has no
+    component for them: Φ has fewer columns.
+
+    Args:
+        begin: the start with all of them.
+        xi_a0: of all of them (d,).
+        unknown: names of states.
+        given: ``observer.xi_a0``.
+        system: the plant.
+
+    Raises:
+        ConfigError: no differential state, or errors that are not those of single states.
+    """
+    names = [name.removeprefix("e0_") for name in begin.names]
+    for name in unknown:
+        if name not in names:
+            raise ConfigError(
+                f"observer.unknown_initial: {shown(name)} is no differential state"
+                f"{nearest(name, names)} (differential states: {', '.join(names[:8])}"
+                f"{', …' if len(names) > 8 else ''})"
+            )
+    chosen = np.array([name in unknown for name in names], dtype=bool)
+    said = set(given) if isinstance(given, Mapping) else set(names if given is not None else ())
+    own = np.array([name in said for name in names], dtype=bool)
+    start = np.where(own, xi_a0, begin.basis.T @ system.initial_state)
+    known = begin.basis[:, ~chosen] @ start[~chosen]
+    return begin._replace(
+        basis=begin.basis[:, chosen], offset=begin.offset + known,
+        names=tuple(name for name, used in zip(begin.names, chosen, strict=True) if used),
+    ), xi_a0[chosen]
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +227,7 @@ def reduced_system(
     weights: ByName | None = None,
     regression: str = "projected",
     form: str = "auto",
+    unknown: Sequence[str] | None = None,
 ) -> ReducedSystem:
     """The reduced system on measured signals.
 
@@ -199,6 +239,7 @@ def reduced_system(
         weights: of the outputs, ``observer.weights``.
         regression: which rows of the residual to keep.
         form: given, strangeness_free, or auto: as given where Assumption 1 holds.
+        unknown: ``observer.unknown_initial``, None for all.
 
     Raises:
         ModelError: rank of E not constant, or Assumption 1 violated.
@@ -214,7 +255,10 @@ def reduced_system(
         used, signals, solver, mesh, first,
         start_at(used, *_beginning(used, first, signals, solver)), np.zeros(0), regression, note,
     )
-    return replace(whole, xi_a0=begin_at(xi_a0, system, first, whole.begin))
+    begin, start = whole.begin, begin_at(xi_a0, system, first, whole.begin)
+    if unknown is not None:
+        begin, start = with_unknown(begin, start, unknown, xi_a0, system)
+    return replace(whole, begin=begin, xi_a0=start)
 
 
 def _beginning(
