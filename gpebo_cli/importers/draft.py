@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import yaml
@@ -119,7 +120,7 @@ class PlantDraft:
                     self._terms[unknown][key] = self._terms[known].pop(key)
 
     def mapping(self) -> dict[str, object]:
-        """The plant as the plain data of its file."""
+        """The plant as the plain data of its file; large matrices of numbers are SciPy's sparse."""
         text: dict[str, object] = {
             "name": self.name,
             "title": self.title or None,
@@ -143,7 +144,7 @@ class PlantDraft:
             for name, (_, unit) in group.items()
             if unit
         } | {name: unit for name, unit in self.outputs.items() if unit}
-        return {key: value for key, value in text.items() if value not in (None, {}, [])}
+        return {key: value for key, value in text.items() if not _is_nothing(value)}
 
     def to_yaml(self, archive: str = "") -> str:
         """The text of the plant's file, with a comment for every equation.
@@ -211,15 +212,27 @@ class PlantDraft:
     def _size(self, matrix: str) -> int:
         return self._height(matrix) * len(list(self._columns(matrix)))
 
-    def _grid(self, matrix: str) -> list[list[Entry]]:
+    def _grid(self, matrix: str) -> object:
         terms, columns = self._terms[matrix], list(self._columns(matrix))
+        if len(self.states) > MAX_IN_TEXT and not any(
+            isinstance(term, str) for given in terms.values() for term in given
+        ):
+            from scipy.sparse import coo_array
+
+            place = {name: k for k, name in enumerate(columns)}
+            rows, names = zip(*terms, strict=True) if terms else ((), ())
+            return coo_array(
+                ([float(_sum(given)) for given in terms.values()],
+                 (rows, [place[name] for name in names])),
+                shape=(self._height(matrix), len(columns)),
+            )
         return [
             [_sum(terms.get((row, column), [])) for column in columns]
             for row in range(self._height(matrix))
         ]
 
-    def _matrix_lines(self, matrix: str, grid: object) -> list[str]:
-        assert isinstance(grid, list)  # noqa: S101  made by _grid
+    def _matrix_lines(self, matrix: str, given: Any) -> list[str]:
+        grid = given if isinstance(given, list) else given.toarray().tolist()
         notes = list(self.outputs) if matrix in "CDH" else self.rows
         written = ["  - [" + ", ".join(map(_scalar, row)) + "]" for row in grid]
         longest = max((len(line) for line in written), default=0)
@@ -246,6 +259,10 @@ def _nonzero(values: object) -> Iterable[tuple[int, int, Entry]]:
         for j, value in enumerate(row):
             if isinstance(value, str) or value != 0:
                 yield i, j, value if isinstance(value, str) else float(value)
+
+
+def _is_nothing(value: object) -> bool:
+    return value is None or (isinstance(value, dict | list) and not value)
 
 
 def _negative(term: Entry) -> Entry:

@@ -7,6 +7,7 @@ full row rank the index is 3, without constraints 0.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -93,6 +94,52 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
     measured = model.get("measure")
     draft.measure([] if measured is None else _list(measured, where), where)
     return draft
+
+
+def linearise(
+    equations: Sequence[Any], constraints: Sequence[Any], motion: Mapping[Any, Any],
+    multipliers: Sequence[Any],
+) -> dict[str, object]:
+    """The keys ``positions``, M, D, K and G of a multibody model about a motion, by SymPy.
+
+    With q = q₀ + δq, λ = λ₀ + δλ in equations(q'', q', q, t) = Gᵀλ and constraints(q, t) = 0, G the
+    constraints' derivative, small δ follow M δq'' + D δq' + K δq = Gᵀ δλ and G δq = 0.
+
+    Args:
+        equations: k SymPy expressions of the coordinates (functions of ``t``) and derivatives.
+        constraints: c expressions of the coordinates.
+        motion: each coordinate q_i(t) and the expression of ``t`` that it follows, q₀.
+        multipliers: c expressions of ``t``, λ₀.
+
+    Raises:
+        ImportError: SymPy, which made the expressions, is not installed.
+    """
+    import sympy  # type: ignore[import-untyped]
+
+    t = sympy.Symbol("t")
+    levels = [[coordinate.diff(t, order) for coordinate in motion] for order in (2, 1, 0)]
+    followed = [
+        (variable, sympy.diff(path, t, order))
+        for order, level in zip((2, 1, 0), levels, strict=True)
+        for variable, path in zip(level, motion.values(), strict=True)
+    ]
+    # Derivatives stand as symbols, so that each can be differentiated by alone.
+    plain = {variable: sympy.Dummy() for level in levels for variable in level}
+
+    def derivative(what: Any, order: int) -> list[list[str]]:
+        variables = [plain[variable] for variable in levels[2 - order]]
+        found = what.subs(list(plain.items())).jacobian(variables)
+        back = found.subs([(symbol, variable) for variable, symbol in plain.items()])
+        return [[str(entry) for entry in row] for row in back.subs(followed).tolist()]
+
+    held = sympy.Matrix(constraints)
+    reaction = held.jacobian(list(motion)).T * sympy.Matrix(multipliers)
+    rest = sympy.Matrix(equations) - reaction
+    return {
+        "positions": [str(coordinate.func) for coordinate in motion],
+        "M": derivative(rest, 2), "D": derivative(rest, 1), "K": derivative(rest, 0),
+        "G": derivative(held, 0),
+    }
 
 
 def _constraints(
