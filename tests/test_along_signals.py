@@ -10,6 +10,7 @@ import pytest
 from plants import DATA, seen
 
 from gpebo_cli import run
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.functions import Names, system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
@@ -161,3 +162,37 @@ def test_the_kalman_bucy_filter_is_that_of_the_linear_plant_along_the_signals():
     np.testing.assert_allclose(estimates[0], estimates[1], rtol=1e-6, atol=1e-6)
     truth = np.concatenate([[28.0], signals.states(t[-1:])[0]])
     assert np.abs(estimates[0][0, -1] - truth).max() < 0.01 * 28
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear", "cubic"])
+@pytest.mark.parametrize("sample_time", [None, 0.05])
+def test_a_divisor_that_passes_through_zero_is_named_with_its_time(hold, sample_time, tmp_path):
+    """Also where no sample is zero; simulations end there (test_state_affine)."""
+    t = np.arange(41) / 20
+    duty, y = 0.5 + 0.1 * np.sin(3 * t), 18 * (1.021 - t)
+    np.savetxt(tmp_path / "r.csv", np.column_stack([t, duty, y]), "%.17g", ",",
+               header="t,duty,y", comments="")  # fmt: skip
+    data = {"name": "csv", "file": str(tmp_path / "r.csv"), "hold": hold}
+    entry = r"F\[1\]\[0\] = '-1/y' divides by something that passes through zero near t = 1\.0"
+    with pytest.raises(ConfigError, match=entry):
+        run(problem("boost")["plant"], data=data, observer={"sample_time": sample_time})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"E": [["0.5", 0], [0, "y"]]}, r"E\[1\]\[1\] = 'y': y is an output and may not"),
+        ({"A": [["-power", -1], [1, 0]]}, r"A\[0\]\[0\] = '-power': power is an unknown"),
+        ({"A": [["-i", -1], [1, 0]]}, r"A\[0\]\[0\] = '-i': i is a state"),
+        ({"C": [[0, "y"]]}, r"C\[0\]\[1\] = 'y': y is an output and may not stand in C"),
+    ],
+)
+def test_names_that_may_not_stand_there_are_refused(change, message):
+    with pytest.raises(ConfigError, match=message):
+        plant_from_mapping({**problem("boost")["plant"], **change})
+
+
+def test_a_recording_without_a_column_is_refused_by_its_name(tmp_path):
+    (tmp_path / "r.csv").write_text("t,duty\n0,1\n1,1\n", "utf-8")
+    with pytest.raises(ConfigError, match="there is no column y; plant boost needs t, duty, y"):
+        run(problem("boost")["plant"], data={"name": "csv", "file": str(tmp_path / "r.csv")})

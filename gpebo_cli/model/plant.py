@@ -30,6 +30,7 @@ from gpebo_cli.model.expressions import (
     Expression,
     Tape,
     breakpoints_of_tape,
+    divisors_of,
     parse,
     record,
     resolved,
@@ -118,6 +119,7 @@ class TextCoefficients:
     outputs: frozenset[str]
     name: str
     restricted: TextCoefficients | None = None  # ``of_time``, where that is something else
+    divisors: tuple[Expression, ...] = ()  # continuous ones of outputs, with the text they stand in
 
     @cached_property
     def constant(self) -> frozenset[str]:
@@ -151,7 +153,30 @@ class TextCoefficients:
             values = self.tape.taylor(t, order, inside, signals)
             filled = tuple(self.layouts[k].assemble(values) for k in MATRIX_NAMES)
         found = Coefficients._make(filled)
-        return found if signals is None else found.along(signals)
+        if signals is None:
+            return found
+        if self.divisors:
+            self._refuse_crossings(t, inside, signals)
+        return found.along(signals)
+
+    @cached_property
+    def _divisors(self) -> Tape:
+        return record(self.divisors)
+
+    def _refuse_crossings(self, t: Array, inside: Array | None, signals: Array) -> None:
+        """Refuse a divisor whose sign differs at two times that follow each other."""
+        ascending = np.argsort(t, kind="stable")
+        values = self._divisors.taylor(t, 0, inside, signals[:1])[0][ascending]
+        crossed = np.argwhere(values[1:] * values[:-1] < 0.0)
+        if len(crossed):
+            k, j = crossed[0]
+            where, (before, after) = self.divisors[j], values[k : k + 2, j]
+            first, then = t[ascending][k : k + 2]
+            at = first + (then - first) * before / (before - after)
+            raise ConfigError(
+                f"{where.where} = {shorten(where.text)} divides by something that passes through "
+                f"zero near t = {at:.6g}"
+            )
 
     def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
@@ -391,8 +416,12 @@ def _coefficients(
     }
     depending = {key: signals[key] for key in MATRIX_NAMES if signals[key]}
     truth = record(list(entries["theta"][1].values()))
+    divisors = tuple(
+        Expression(node, e.text, e.where) for e in varying for node in divisors_of(e.node)
+        if not node.signals.isdisjoint(outputs)
+    )
     return TextCoefficients(
-        record(varying, inputs), layouts, truth, depending, outputs, name, restricted
+        record(varying, inputs), layouts, truth, depending, outputs, name, restricted, divisors
     )
 
 

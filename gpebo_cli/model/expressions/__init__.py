@@ -15,6 +15,7 @@ intermediate value that overflows is refused even where the end result would be 
 
 from gpebo_cli.model.expressions.bounds import Bounds, resolved
 from gpebo_cli.model.expressions.breakpoints import breakpoints, breakpoints_of_tape
+from gpebo_cli.model.expressions.nodes import divisors_of
 from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten, signal
 from gpebo_cli.model.expressions.tape import Assembly, Tape, record, taylor
 
@@ -26,6 +27,7 @@ __all__ = [
     "Tape",
     "breakpoints",
     "breakpoints_of_tape",
+    "divisors_of",
     "parse",
     "record",
     "resolved",

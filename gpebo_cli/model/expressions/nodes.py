@@ -252,3 +252,19 @@ def derivative(a: Node) -> Node:
     if a.derivatives >= MAX_DERIVATIVES:
         raise FoldError(f"more than {MAX_DERIVATIVES} d(.) inside each other")
     return Node("derivative", (a,), 0.0, None, a.derivatives + 1, a.smooth - 1)
+
+
+def divisors_of(a: Node) -> list[Node]:
+    """What a divides by, directly or by a negative power; only what does not jump."""
+    found: dict[int, Node] = {}
+    seen: set[int] = set()
+    stack = [a]
+    while stack:
+        node = stack.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        stack.extend(node.arguments)
+        if node.operation == "divide" or (node.operation == "power" and node.value < 0.0):
+            found[id(node.arguments[-1])] = node.arguments[-1]
+    return [node for node in found.values() if node.smooth > 0]
