@@ -96,7 +96,7 @@ class ScalarLaw:
 
     def update(
         self, regression: SampledRegression, delta: Array, quotient: Array, usable: BoolArray,
-        behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]],
+        behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]] | None = None,
     ) -> SampledEstimates:
         """One closed-form step per sample.
 
@@ -127,7 +127,8 @@ class ScalarLaw:
         parameters = np.moveaxis(eta.reshape(K, D * g, p), 0, 1)
         shown = delta.T if D == 1 else np.repeat(delta.T, g, axis=0)
         return SampledEstimates(
-            parameters, shown, lambda: self._errors(*behind(), decay, of_new, of_old, had)
+            parameters, shown,
+            behind and (lambda: self._errors(*behind(), decay, of_new, of_old, had)),
         )
 
     def _errors(
