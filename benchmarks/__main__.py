@@ -18,7 +18,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks import circuit, cold, floor, gains, growth, problems, sweeps
+from benchmarks import circuit, cold, floor, gains, growth, ladders, problems, sweeps
 from benchmarks import kernels as ablation
 from benchmarks.measure import Row
 from benchmarks.page import PARTS, page
@@ -37,7 +37,7 @@ Measured = tuple[list[Row], dict[str, Any]]
 def _growth() -> Measured:
     axes = growth.table()
     growth.plot(axes, PLOT)
-    return [], {"axes": axes}
+    return [], {"axes": axes, "ladders": ladders.table()}
 
 
 MEASURE: dict[str, Callable[[], Measured]] = {

@@ -25,7 +25,7 @@ from gpebo_cli.numerics.refinement import refine
 LENGTH = 4.0  # h‖A‖ of an element at most
 _MOST_SWEEPS = 80
 _MOST_ELEMENTS = 800  # with more of them the system counts as stiff
-_DIGITS = 1e-3  # of the tolerance, to which sweeps go on
+_DIGITS = 1e-2  # of the tolerance, to which sweeps go on
 _ROUGH = 0.02  # to which errors are carried
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
 _TINY = float(np.finfo(float).tiny)

@@ -143,7 +143,7 @@ def _simulated(
     if len(cuts) and (form.mu or form.shifts):
         return None  # what jumps then is for the derivative array to say
     M, units = plant.matrix(), form.units
-    longest = sweeps.LENGTH / max(M.norms(M.sizes(mesh), units[form.states]).max(), _TINY)
+    longest = 0.75 * sweeps.LENGTH / max(M.norms(M.sizes(mesh), units[form.states]).max(), _TINY)
     parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
     if not parts.sum() <= solver.max_elements:
         return None
