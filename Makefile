@@ -6,7 +6,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
 	&& { command -v $$p; break; }; done)
 
-.PHONY: help run test lint types layers kernels wheel docs bench clean
+.PHONY: help run test lint types layers kernels wheel sdist docs docs-version bench clean
 .DELETE_ON_ERROR:
 
 help:
@@ -15,6 +15,7 @@ help:
 	@echo 'make lint types layers    ruff and clang-format, mypy, import-linter'
 	@echo 'make kernels  compile gpebo_cli/kernels again, after a change of the C'
 	@echo 'make wheel    dist/gpebo-*.whl'
+	@echo 'make sdist    dist/gpebo-*.tar.gz, which is built and tested from itself'
 	@echo 'make docs     site/index.html, the documentation; the notebook is run'
 	@echo 'make bench    docs/benchmarks.md, measured afresh; about ten minutes'
 	@echo 'make clean    remove .venv and what tools leave behind; outputs/ is kept'
@@ -43,10 +44,18 @@ kernels: $(VENV)/installed-dev
 wheel: $(VENV)/installed-dev
 	$(BIN)/python -m build --wheel --no-isolation
 
+sdist:
+	.ci/sdist dist
+
 # The notebook is executed, so that it cannot say what is not so; --strict: no warnings.
 docs: $(VENV)/installed-docs
 	$(BIN)/python docs/notebook.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The pages of one version on the branch gh-pages, beside those of others: make docs-version VERSION=1.2
+docs-version: docs
+	$(BIN)/mike deploy --push --update-aliases $(VERSION) latest
+	$(BIN)/mike set-default --push latest
 
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m benchmarks

@@ -5,14 +5,17 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
-from gpebo_cli import kernels
+from gpebo_cli import __version__, kernels
 
 ROOT = Path(__file__).parents[1]
 
@@ -138,3 +141,35 @@ def test_errors_are_one_line(gpebo):
     done = gpebo("run", "plant=circut")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "did you mean circuit?" in done.stderr
+
+
+# What is published ----------------------------------------------------------------------------
+
+
+def test_metadata_names_pages_versions_and_licence(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        (path,) = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
+        metadata = archive.read(path).decode()
+    for url in ("Homepage", "Documentation", "Source", "Issues", "Changelog"):
+        assert f"Project-URL: {url}, https://" in metadata
+    stated = set(re.findall(r"Python :: (3\.\d+)$", metadata, re.MULTILINE))
+    ci = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
+    assert stated == set(ci["jobs"]["check"]["strategy"]["matrix"]["python"])
+    assert min(stated, key=lambda v: int(v[2:])) in metadata.partition("Requires-Python: >=")[2]
+
+
+def test_lowest_versions_are_those_that_are_tested():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    tested = dict(re.findall(r"'?([a-z-]+)==([\d.]+?)(?:\.\*)?'? ", (ROOT / ".ci/run").read_text()))
+    for requirement in project["dependencies"]:
+        name, lowest = re.match(r"([a-z-]+)>=([\d.]+)", requirement).groups()
+        assert tested[name] == lowest
+
+
+def test_recipes_of_other_packagers_have_the_same_dependencies_and_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    recipe = yaml.safe_load((ROOT / "packaging/conda/recipe.yaml").read_text())
+    needed = {line.replace("matplotlib-base", "matplotlib").replace(" ", "")
+              for line in recipe["requirements"]["run"]}
+    assert needed == {*project["dependencies"], f"python{project['requires-python']}"}
+    assert recipe["context"]["version"] == __version__
