@@ -85,6 +85,7 @@ $(VENV)/installed-bench: pyproject.toml | $(VENV)/bin/pip
 
 $(VENV)/installed-docs: pyproject.toml | $(VENV)/bin/pip
 	$(BIN)/pip install --quiet --editable '.[docs]'
+	$(BIN)/pip install --quiet --no-deps 'sphinxcontrib-katex>=0.9.11,<0.10' # KaTeX alone
 	@touch $@
 
 $(VENV)/bin/pip:

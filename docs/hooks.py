@@ -7,17 +7,26 @@ from __future__ import annotations
 
 import base64
 import re
+import sys
+from importlib.metadata import files as files_of
 from pathlib import Path
 from typing import Any
 
 import nbformat
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 from gpebo_cli.cli import usage
 
+sys.path.insert(0, str(Path(__file__).parent))
+import messages
+from tex import typeset
+
 DOCS = Path(__file__).parent
 NOTEBOOK = DOCS / "first_run.ipynb"
+
+_TYPESET = ("index", "theory", "errata", "glossary", "decisions", "howto/", "tutorial")
 
 # Sphinx's roles in docstrings, which mkdocstrings shows as they stand.
 _ROLE = re.compile(r":(?:func|class|data|meth|attr|mod):(?=<code>)")
@@ -39,6 +48,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made here."""
     files.append(File.generated(config, "commands.md", content=commands_page()))
+    files.append(File.generated(config, "messages.md", content=messages.page()))
+    katex = next(p for p in files_of("sphinxcontrib-katex") or [] if p.name == "katex.min.js")
+    files.append(File.generated(config, "katex.min.js", abs_src_path=str(katex.locate())))
     text, pictures = notebook_page()
     files.append(File.generated(config, "notebook.md", content=text))
     for name, content in pictures.items():
@@ -46,8 +58,16 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_content(html: str, **_: Any) -> str:
-    """Take the roles out of what mkdocstrings has rendered; let names in tables break at dots."""
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Offer a tutorial as a notebook, too, where that has been made."""
+    path = f"notebooks/{Path(page.file.src_uri).stem}.ipynb"
+    told = f"\n\nThis page as a notebook with its outputs: [{path}]({path}).\n"
+    return markdown + (told if (DOCS / path).is_file() else "")
+
+
+def on_page_content(html: str, page: Page, **_: Any) -> str:
+    """Set formulas, take roles out of what mkdocstrings has rendered, let names break at dots."""
+    html = typeset(html) if page.url.startswith(_TYPESET) else html
     html = _CODE_PATH.sub(r"<code>\1</code>", _ROLE.sub("", html))
     return _CELL_CODE.sub(lambda match: _DOT.sub(".<wbr>", match[0]), html)
 
@@ -59,6 +79,7 @@ def commands_page() -> str:
         "gpebo run": usage.run_help(),
         "gpebo check": usage.CHECK_HELP,
         "gpebo compare": usage.COMPARE_HELP,
+        "gpebo report": usage.REPORT_HELP,
         "gpebo figures": usage.FIGURES_HELP,
         "gpebo reproduce": usage.REPRODUCE_HELP,
         "gpebo list": usage.LIST_HELP,

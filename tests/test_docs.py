@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import shlex
@@ -20,8 +19,13 @@ from gpebo_cli.cli import usage
 from gpebo_cli.cli.app import COMMANDS
 
 README = ROOT / "README.md"
-TUTORIAL = ROOT / "docs" / "tutorial.md"
+sys.path.insert(0, str(ROOT / "docs"))
+import messages  # noqa: E402  in docs, of which the site is made
+import tex  # noqa: E402
+import tutorials  # noqa: E402
+
 NOTEBOOK = ROOT / "docs" / "first_run.ipynb"
+MADE = ("notebook.md", "commands.md", "messages.md")  # with the site
 HELP = {
     "": usage.HELP, "check": usage.CHECK_HELP, "compare": usage.COMPARE_HELP,
     "report": usage.REPORT_HELP,
@@ -71,19 +75,58 @@ def test_the_readme_runs(tmp_path):
     assert "interval-exciting" in shell("gpebo run --config-dir . plant=mine", tmp_path)
 
 
-def test_the_first_hour(tmp_path):
-    """Commands and Python blocks in the order of the page; outputs that it shows are real."""
-    text = TUTORIAL.read_text()
+@pytest.mark.parametrize("page", tutorials.PAGES)
+def test_a_tutorial_runs_as_it_stands(page, tmp_path):
+    """Its commands, Python and edits in their order; its figures are made by them."""
+    text = (ROOT / "docs" / f"{page}.md").read_text()
     said = ""
-    for language, body in re.findall(r"^```(sh|python)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
-        said += (shell if language == "sh" else python)(body, tmp_path)
-    for shown in ("did you mean k? (defined: P, y, k, Cap, t, pi)", "exit code 2", "exit code 1",
-                  "to do: every state needs an equation of its own"):
-        assert shown in text
-        assert shown in said
-    with (tmp_path / "sweep" / "results.csv").open() as stream:
-        assert [row["status"] for row in csv.DictReader(stream)] == ["done"] * 6
-    assert list((tmp_path / "compared").glob("*.png"))
+    for kind, body in tutorials.parts(text):
+        words = body.replace("python -m pytest", f"{shlex.quote(sys.executable)} -m pytest")
+        said += {"sh": shell, "python": python, "text": lambda *_: ""}[kind](words, tmp_path)
+    for shown in re.findall(r"^```text\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        for line in shown.splitlines()[1:]:
+            if "gpebo: error" in line or "FAILS" in line or "exit code" in line:
+                assert line in said
+    figures = tutorials.figures(text)
+    assert figures
+    for name, (run, figure) in figures.items():
+        assert list((tmp_path / run).rglob(figure)), name
+        assert (ROOT / "docs" / "img" / "tutorial" / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_words_are_defined_where_they_are_met_first():
+    text = (ROOT / "docs" / "tutorial.md").read_text()
+    for word in ("**case**", "**recipe**", "**remedy**", "γ (`gamma`)", '"To 1 %" is',
+                 "`e0_x` always means", "d is the number", "a is the number", "μ says"):
+        assert word in text, word
+
+
+def test_every_refusal_of_the_program_is_on_the_page_of_messages():
+    page = messages.page()
+    assert page.count("\n| `") > 200
+    assert "was given no meaning" not in page
+    for path in messages.PACKAGE.rglob("*.py"):
+        for message in messages.messages(path):
+            assert message.meaning, f"{path.name}: {message.text}"
+    assert "there is no such folder" in page
+    assert all(f"| {name} |" in page for name in messages._ADVICE)
+
+
+@pytest.mark.parametrize(("text", "expected"), [
+    ("Z2⊤M = 0", r"Z_{2}^{\top}M = 0"),
+    ("η̂' = Γ", r"\hat{η}' = Γ"),
+    ("Σ_{k≥j} (−1)^{k−j} C(k, k−j)", r"\sum _{k\ge j} (-1)^{k-j} C(k, k-j)"),
+    ("w_{μ+1} = 0      (eq. 7, xa)", r"w_{μ+1} = 0 \quad  \text{(eq. 7, xa)} "),
+    ("rank(𝒜Q) = n_b", r"\operatorname{rank} (𝒜Q) = n_b"),
+])
+def test_formulas_become_tex(text, expected):
+    assert tex.is_formula(text)
+    assert " ".join(tex.tex(text).split()) == " ".join(expected.split())
+
+
+def test_commands_and_names_are_no_formulas():
+    for text in ("gpebo run plant=circuit", "estimator.gamma=1e8", "summary.json", "e0_e1", "a-b"):
+        assert not tex.is_formula(text), text
 
 
 def test_the_plant_page_runs(tmp_path):
@@ -127,7 +170,7 @@ def test_the_notebook_runs_and_its_outputs_are_real(tmp_path):
 def test_links_between_files_lead_somewhere():
     for page in [README, *sorted((ROOT / "docs").rglob("*.md")), ROOT / "CONTRIBUTING.md"]:
         for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
-            if target.startswith(("http", "notebook.md", "commands.md")):  # made with the site
+            if target.startswith(("http", *MADE)):
                 continue
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
@@ -191,7 +234,7 @@ def test_the_citation_file_is_complete_and_of_this_version():
 def test_the_navigation_names_pages_that_exist():
     text = (ROOT / "mkdocs.yml").read_text()
     for page in re.findall(r": (\S+\.md)$", text, re.MULTILINE):
-        made = page in ("notebook.md", "commands.md")
+        made = page in MADE
         assert made or (ROOT / "docs" / page).is_file(), page
     assert "font: false" in text
 
