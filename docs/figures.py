@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import yaml
@@ -12,8 +17,9 @@ from gpebo_cli.configs.locations import conf_folder
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.numerics.collocation import Coefficients, LinearProblem, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.canonical import (
     canonical_blocks,
@@ -51,7 +57,7 @@ def error_matrices(t: Array, inside: Array) -> tuple[Array, Array]:
 def transition_norm(M: Trajectory, t: Array) -> Array:
     """‖Φ_w(t)‖₂ of φ̇ = M φ from the identity at the start, shape (N,)."""
     problem = LinearProblem(
-        lambda t, inside: Coefficients(None, M(t, inside), np.zeros((len(t), 2, 2))),
+        lambda t, inside: LinearEquation(None, M(t, inside), np.zeros((len(t), 2, 2))),
         np.eye(2), name="M_w",
     )
     solution = solve(problem, M.mesh, tol=1e-11, max_elements=10_000)
@@ -123,8 +129,21 @@ def unbounded(path: Path) -> None:
     save(compose([Panel("relative error of x", tuple(curves), log=True, legend=True)]), path)
 
 
+def leakage(images: Path) -> None:
+    """Copy the figures of the run of docs/howto/leakage.md, whose blocks are run one by one."""
+    page = (Path(__file__).parent / "howto" / "leakage.md").read_text("utf-8")
+    runners = {"sh": ["bash", "-e", "-c"], "python": [sys.executable, "-c"]}
+    with TemporaryDirectory() as folder:
+        for language, block in re.findall(r"(?ms)^```(sh|python)\n(.*?)^```", page):
+            subprocess.run([*runners[language], block], cwd=folder, check=True)  # noqa: S603
+        for name in ("fit", "parameters"):
+            figure = Path(folder, "found", "figures", f"{name}.png")
+            shutil.copy(figure, images / f"leakage_{name}.png")
+
+
 if __name__ == "__main__":
     make_folder(IMAGES)
+    leakage(IMAGES)
     unbounded(IMAGES / "unbounded.png")
     errata_assumption7(IMAGES / "errata_assumption7.png")
     sampled_orders(IMAGES / "sampled.png")

@@ -139,6 +139,19 @@ def test_the_plant_page_runs(tmp_path):
     assert python(source, tmp_path) == shown
 
 
+def test_the_leakage_page_runs(tmp_path):
+    """From a netlist and an oscilloscope's file to a current with its deviation."""
+    text = (ROOT / "docs" / "howto" / "leakage.md").read_text()
+    said = ""
+    for language, body in re.findall(r"^```(sh|python)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        said += (shell if language == "sh" else python)(body, tmp_path)
+    shown = blocks(text, "text")
+    assert len(shown) == 2
+    assert all(line.strip() in said for line in shown)
+    assert "the estimates explain the data up to white noise" in said
+    assert "the residual is not white" in said
+
+
 def test_the_estimator_page_runs(tmp_path):
     text = (ROOT / "docs" / "howto" / "estimator.md").read_text()
     (script,) = blocks(text, "sh")
