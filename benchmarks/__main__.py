@@ -2,7 +2,8 @@
 
 Writes ``benchmarks/benchmarks.json`` and, from it, ``docs/benchmarks.md``. Parts that are not
 measured keep what they had. Without words all parts are, but for ``sweeps``, which takes half an
-hour. ``python -m benchmarks kernels`` prints what each compiled kernel is worth and writes nothing.
+hour. ``python -m benchmarks kernels`` prints what each compiled kernel is worth and writes
+it into ``docs/decisions.md``.
 """
 
 from __future__ import annotations
@@ -110,7 +111,9 @@ def write(data: dict[str, Any]) -> None:
 def main(words: list[str]) -> int:
     """Measure the parts named by ``words`` and write after each, so that nothing is lost."""
     if words == ["kernels"]:
-        sys.stdout.write(ablation.table() + "\n")
+        found = ablation.table()
+        ablation.write(found)
+        sys.stdout.write(found + "\n")
         return 0
     unknown = [word for word in words if word not in PARTS]
     if unknown:

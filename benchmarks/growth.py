@@ -25,7 +25,7 @@ AXES: dict[str, tuple[str, tuple[int, ...]]] = {
     "descriptor": ("the descriptor experiment, horizon in s", (20, 200, 2_000, 20_000)),
     "lti": ("a chain with constant elements, states", (3, 10, 30, 60, 100, 200)),
     "ltv": ("a chain with time-varying elements, states", (3, 10, 20, 40)),
-    "gains": ("the circuit experiment, gains", (1, 10, 100, 1_000, 10_000, 100_000, 1_000_000)),
+    "gains": ("the circuit experiment, gains", (1, 10, 100, 1_000, 10_000, 100_000, 200_000)),
     "samples": ("the circuit experiment, samples", (1_000, 10_000, 100_000, 1_000_000)),
 }
 PATIENCE = 200.0  # seconds for one point, of its own work

@@ -1,8 +1,10 @@
 """What each compiled kernel is worth: switched off in turn, its NumPy twin does its work.
 
 A kernel that no workload needs by ADMITTED is not worth its lines of C. ``python -m benchmarks
-kernels`` prints the table; CPU time, with and without alternating, the shortest of several runs.
-Run it with one BLAS thread (``OPENBLAS_NUM_THREADS=1``) on a machine that does nothing else.
+kernels`` prints the table and writes it into ``docs/decisions.md``; CPU time, with and without
+alternating, the shortest of several runs. Of long workloads one pair is run, and only without
+kernels in which they spend some time. Run it with one BLAS thread (``OPENBLAS_NUM_THREADS=1``) on a
+machine that does nothing else.
 """
 
 from __future__ import annotations
@@ -11,12 +13,17 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
+from benchmarks.measure import say
 from gpebo_cli import kernels
 
 ADMITTED = 0.05  # share of a workload's time
 _AGAIN, _ENOUGH = 25, 2.0  # most pairs of runs, and seconds of them
+_FELT = 0.005  # of a long workload's time is spent in a kernel: then it is tried without it
+DECISIONS = Path(__file__).parent.parent / "docs" / "decisions.md"
+BEGIN, END = "<!-- made by `python -m benchmarks kernels` -->\n", "\n<!-- to here -->"
 
 
 def twins() -> dict[str, tuple[Any, Any, str]]:
@@ -50,7 +57,7 @@ def without(*names: str) -> Iterator[None]:
 
 
 def workloads() -> dict[str, Callable[[], object]]:
-    """The circuit, many gains, a long horizon, published problems, and ladders."""
+    """The circuit, many gains, long horizons, published problems, and ladders."""
     from benchmarks import circuit, growth, problems
 
     published = [problems.ours(problem)(1e-9) for problem in problems.problems()]
@@ -61,12 +68,43 @@ def workloads() -> dict[str, Callable[[], object]]:
 
     return {
         "circuit": circuit.ours(1e-9),
+        "published problems": all_published,
         "5,000 gains": growth.experiment(gains=5_000),
+        "200,000 gains": growth.experiment(gains=200_000),
         "1,000 s": growth.experiment(1_000.0),
-        "published": all_published,
-        "ladder 25": growth.chain(25, varying=True),
-        "ladder 101": growth.chain(101, varying=False),
+        "20,000 s": growth.experiment(20_000.0),
+        "ladder, n = 25": growth.chain(25, varying=True),
+        "ladder, n = 101": growth.chain(101, varying=False),
     }
+
+
+def shares(solve: Callable[[], object]) -> tuple[float, dict[str, float]]:
+    """Seconds of one run of a workload, and which share of them each kernel takes."""
+    spent = dict.fromkeys(twins(), 0.0)
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            begin = time.process_time()
+            try:
+                return function(*arguments, **named)
+            finally:
+                spent[name] += time.process_time() - begin
+
+        return call
+
+    kernels_of = twins().items()
+    functions = {name: getattr(bound, attribute) for name, (bound, _, attribute) in kernels_of}
+    for name, (bound, _, attribute) in kernels_of:
+        if not attribute.isupper():
+            setattr(bound, attribute, timed(name, functions[name]))
+    begin = time.process_time()
+    try:
+        solve()
+    finally:
+        for name, (bound, _, attribute) in kernels_of:
+            setattr(bound, attribute, functions[name])
+    whole = time.process_time() - begin
+    return whole, {name: seconds / whole for name, seconds in spent.items()}
 
 
 def loss(solve: Callable[[], object], name: str) -> float:
@@ -90,14 +128,25 @@ def loss(solve: Callable[[], object], name: str) -> float:
 
 def table() -> str:
     """One row per kernel: percent by which each workload is slower without it."""
+    cells: dict[str, list[str]] = {
+        name: [] for name, (_, _, attribute) in twins().items()
+        if not attribute.isupper()  # that says what a module can do
+    }
     work = workloads()
-    for solve in work.values():
-        solve()
-    lines = ["| kernel | " + " | ".join(work) + " |", "|---|" + "---|" * len(work)]
-    for name, (_, _, attribute) in twins().items():
-        if attribute.isupper():  # says what a module can do
-            continue
-        losses = [loss(solve, name) for solve in work.values()]
-        cells = [f"{100 * x:.0f}" if x >= ADMITTED else "" for x in losses]
-        lines.append(f"| `{name}` | " + " | ".join(cells) + " |")
+    for what, solve in work.items():
+        say(f"kernels: {what}")
+        seconds, share = shares(solve)
+        for name, row in cells.items():
+            tried = share[name] > (_FELT if 2.0 * seconds > _ENOUGH else 0.0)
+            lost = loss(solve, name) if tried else 0.0
+            row.append(f"{100 * lost:.0f}" if lost >= ADMITTED else "")
+    lines = [f"| kernel | {' | '.join(work)} |", "|---|" + "---|" * len(work)]
+    lines += [f"| `{name}` | {' | '.join(row)} |" for name, row in cells.items()]
     return "\n".join(lines)
+
+
+def write(found: str) -> None:
+    """The table into its place in ``docs/decisions.md``."""
+    before, _, rest = DECISIONS.read_text("utf-8").partition(BEGIN)
+    _, _, after = rest.partition(END)
+    DECISIONS.write_text(before + BEGIN + "\n" + found + "\n" + END + after, "utf-8")

@@ -87,10 +87,11 @@ def spread(
     Raises:
         ConfigError: a value is not a number.
     """
-    hints: dict[str, Any] = get_type_hints(cls)
+    several = {key: value for key, value in settings.items() if _is_axis(value)}
+    hints: dict[str, Any] = get_type_hints(cls) if several else {}
     axes = {
-        key: axis(value, f"estimator.{key}", "finite") for key, value in settings.items()
-        if hints.get(key) in (float, int) and _is_axis(value)
+        key: axis(value, f"estimator.{key}", "finite") for key, value in several.items()
+        if hints.get(key) in (float, int)
     }
     if not axes:
         return build(settings)

@@ -30,10 +30,27 @@ def check_memory(
     Raises:
         ConfigError: names the setting, what it would need, and the limit.
     """
+    for what, size in _needs(settings, system, levels, cases, system.n).items():
+        if size <= _MOST:
+            continue
+        start = settings.time.start
+        start = start if np.isfinite(start) else 0.0  # of a recording: its own
+        source, at = system.coefficients.of_time, np.array([start])
+        E = source.taylor(at, 0).E[0, 0] if system.n else np.zeros(0)
+        rank = int(np.linalg.matrix_rank(E)) if E.size and np.isfinite(E).all() else system.n
+        size = _needs(settings, system, levels, cases, rank)[what]  # noqa: PLW2901
+        if size > _MOST:
+            raise ConfigError(
+                f"{what} would take some {size:.3g} GB of memory; a run may take {_MOST:g} GB"
+            )
+
+
+def _needs(
+    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cases: int, rank: int
+) -> dict[str, float]:
+    """Gigabytes by the setting that asks for them, where E has so large a rank."""
     time, n, signals = settings.time, system.n, system.m + system.r
-    start = time.start if np.isfinite(time.start) else 0.0  # of a recording: its own
-    E = system.coefficients.of_time.taylor(np.array([start]), 0).E[0, 0] if n else np.zeros((0, 0))
-    p = system.q + (int(np.linalg.matrix_rank(E)) if n and np.isfinite(E).all() else n)
+    p = system.q + rank
     regression = (p + 1) * (n + p)
     kept = len(kept_samples(cases, time.samples, settings.output.max_rows))
     needs: dict[str, tuple[float, ...]] = {
@@ -45,9 +62,4 @@ def check_memory(
         needs[f"noise.sample_time = {settings.noise.sample_time:g} s"] = (
             elements, settings.solver.stages + 1, n**2 + regression + signals * (p + 1),
         )
-    for what, numbers in needs.items():
-        size = 8e-9 * _HELD * prod(numbers)
-        if size > _MOST:
-            raise ConfigError(
-                f"{what} would take some {size:.3g} GB of memory; a run may take {_MOST:g} GB"
-            )
+    return {what: 8e-9 * _HELD * prod(numbers) for what, numbers in needs.items()}

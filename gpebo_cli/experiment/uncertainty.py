@@ -60,6 +60,8 @@ def standard_deviations(
     all outputs share is that of the residual.
     """
     state_map, errors = observation.state_map, observation.errors
+    if levels.silent and not source.recording:
+        return None
     if errors is None or not isinstance(state_map, Differentiable):
         return None
     if not isinstance(estimator, Affine) or len(estimator.cases) > MOST_CASES:
@@ -72,8 +74,6 @@ def standard_deviations(
     )
     variances = _variances(noise, levels)
     if levels.silent:
-        if not source.recording:
-            return None
         variances *= noise_level(
             errors, regression, instants, variances, observation.starts
         ) ** 2
