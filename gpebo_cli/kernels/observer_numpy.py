@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpebo_cli.kernels.arrays import Array
+from gpebo_cli.kernels.arrays import Array, IntArray
 
 _TINY = float(np.finfo(float).tiny)
 
 
-@np.errstate(invalid="ignore")  # of times at which E or K does not exist; the caller looks
+@np.errstate(invalid="ignore", divide="ignore")  # where E⁺ or K does not exist; the caller looks
 def in_frame(
     E: Array, A: Array, B: Array, F: Array, C: Array, rows: Array, scale: Array, domain: Array,
     range_: Array, kernel: Array, equations: Array,
@@ -40,37 +40,71 @@ def in_frame(
     E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
     C = scale[:, None] * C
     m, q, d, e, r = B.shape[2], F.shape[2], domain.shape[1], len(equations), len(scale)
-    inner = range_.T @ E @ domain
-    inverse = _inverse(inner)
+    inner = _across(_down(range_.T, E), domain)
+    diagonal = np.einsum("nii->ni", inner)
+    alone = np.count_nonzero(inner) == np.count_nonzero(diagonal)
+    inverse = (1.0 / diagonal)[:, :, None] * np.eye(d) if alone else _inverse(inner)
     sizes = np.array([
-        max(float(np.abs(part).max(initial=0.0)) for part in (E @ kernel, equations @ E)),
+        max(float(np.abs(part).max(initial=0.0))
+            for part in (_across(E, kernel), _down(equations, E))),
         *(float(np.sqrt((x**2).sum(axis=(1, 2)).max())) for x in (inner, inverse)),
     ])
-    pinv = inverse @ range_.T
-    algebraic = joined(equations @ A, C, axis=1)  # 𝒜 = [Π A; C]
+
+    def from_left(matrix: Array) -> Array:
+        """BᵀE⁺ times a matrix."""
+        part = _down(range_.T, matrix)
+        return part / diagonal[:, :, None] if alone else inverse @ part
+
+    pinv = from_left(np.eye(E.shape[1])[None])
+    algebraic = joined(_down(equations, A), C, axis=1)  # 𝒜 = [Π A; C]
     of_y = np.zeros((1, e + r, r))
     of_y[0, e:] = -np.diag(scale)
     below = np.zeros((1, r, m + q))
-    of_u_theta = joined(joined(equations @ B, equations @ F, axis=2), below, axis=1)
+    of_u_theta = joined(
+        joined(_down(equations, B), _down(equations, F), axis=2), below, axis=1
+    )
     g_signals, G = joined(of_u_theta[:, :, :m], of_y, axis=2), of_u_theta[:, :, m:]
-    Q1, R1 = np.linalg.qr(algebraic @ kernel)
+    Q1, R1 = np.linalg.qr(_across(algebraic, kernel))
     X1 = _inverse(R1)
     size = np.maximum(np.sqrt((algebraic**2).sum(axis=(1, 2))), _TINY)
     with np.errstate(divide="ignore"):
         injectivity = 1.0 / (np.sqrt((X1**2).sum(axis=(1, 2))) * size)
     H = kernel @ X1
-    Lambda = pinv @ A
+    Lambda, on_basis = from_left(A), _across(algebraic, domain)
     # [A_0 | D_0 | of u and y] = [Λ B | E⁺F | E⁺B, 0] − Λ H Q1ᵀ [𝒜 B | G | g_signals]
-    direct = joined(Lambda @ domain, pinv @ F, pinv @ B, np.zeros((1, d, r)), axis=2)
-    through = joined(algebraic @ domain, G, g_signals, axis=2)
-    whole = direct - (Lambda @ H) @ (np.swapaxes(Q1, 1, 2) @ through)
+    whole = joined(
+        _across(Lambda, domain), from_left(F), from_left(B), np.zeros((1, d, r)), axis=2
+    )
+    through = joined(on_basis, G, g_signals, axis=2)
+    back = _across(Lambda, kernel) @ X1
+    if back.any():
+        whole = whole - back @ (np.swapaxes(Q1, 1, 2) @ through)
     times = max(map(len, (E, A, B, F, C)))
     whole = np.broadcast_to(whole, (times, *whole.shape[1:]))
     of_dynamics = slice(1 if len(E) == len(A) == len(C) == 1 else times)
     return (
-        sizes, pinv, algebraic, algebraic @ domain, g_signals, G, Q1, H, injectivity,
+        sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity,
         whole[of_dynamics, :, :d], whole[:, :, d : d + q], whole[:, :, d + q :],
     )
+
+
+def _axes(columns: Array) -> IntArray | None:
+    """Which coordinate axes columns (n, d) are, None where they are something else."""
+    if np.count_nonzero(columns) != columns.shape[1] or not (columns.sum(axis=0) == 1.0).all():
+        return None
+    return np.asarray(columns.argmax(axis=0))
+
+
+def _across(matrix: Array, columns: Array) -> Array:
+    """The product with columns (n, d), of which coordinate axes only choose."""
+    axes = _axes(columns)
+    return matrix @ columns if axes is None else matrix[:, :, axes]
+
+
+def _down(rows: Array, matrix: Array) -> Array:
+    """The product of rows (d, n) with a matrix, likewise."""
+    axes = _axes(rows.T)
+    return rows @ matrix if axes is None else matrix[:, axes]
 
 
 def joined(*parts: Array, axis: int) -> Array:
@@ -121,6 +155,13 @@ def regression_signals(
     sizes[1:] = np.abs(terms[:, :, 1:]).max(axis=(0, 1), initial=0.0)
     seen = np.swapaxes(range_, 1, 2) @ terms
     left = terms - range_ @ seen  # R (…)
-    state = basis @ signed - elimination @ seen  # w − K (…): the state, signed likewise
+    axes = _axes(basis)
+    if axes is None:
+        state = basis @ signed
+    else:
+        state = np.zeros((len(z), len(basis), z.shape[2]))
+        state[:, axes] = signed
+    given = elimination.any(axis=(0, 2))
+    state[:, given] -= elimination[:, given] @ seen  # w − K (…): the state, signed likewise
     # the gain is [X_w ξ_b + X_θ | −X_w Φ]
     return left[:, :, 0], left[:, :, 1:], state[:, :, 0], -state[:, :, 1:], sizes
