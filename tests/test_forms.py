@@ -75,6 +75,73 @@ TANKS = {
     "initial_state": [1, 1, 0],
 }
 
+# Crank, coupler and rocker about their motion, index 3: three angles, two forces of the loop.
+FOUR_BAR = {
+    "name": "four_bar",
+    "parameters": {
+        "l1": 1, "l2": 3, "l3": 2.5, "l4": 3.2,
+        "a": "1.1 + 0.6*sin(t) + 0.2*t",
+        "gx": "l4 - l1*cos(a)", "gy": "-l1*sin(a)",   # from the crank's pin to the rocker's bearing
+        "g": "sqrt(gx**2 + gy**2)",
+        "b": "atan(gy/gx) + acos((g**2 + l2**2 - l3**2)/(2*g*l2))",
+        "px": "l1*cos(a) + l2*cos(b) - l4", "py": "l1*sin(a) + l2*sin(b)",
+        "c": "atan(py/px) + pi*(1 - sign(px))/2",
+    },
+    "states": ["da", "db", "dc", "wa", "wb", "wc", "fx", "fy"],
+    "inputs": {"drive": "sin(2*t)", "wind": "cos(3*t)"},
+    "unknowns": {"load": 0.8},
+    "outputs": ["crank"],
+    "E": [[1, 0, 0, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0, 0, 0],
+          [0, 0, 0, 4, "1.5*cos(a-b)", 0, 0, 0], [0, 0, 0, "1.5*cos(a-b)", 3, 0, 0, 0],
+          [0, 0, 0, 0, 0, 2, 0, 0], [0] * 8, [0] * 8],
+    "A": [[0, 0, 0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 1, 0, 0],
+          [-2, 0, 0, -0.3, "-3*sin(a-b)*d(b)", 0, "-l1*sin(a)", "l1*cos(a)"],
+          [0, -1, 0, "3*sin(a-b)*d(a)", -0.2, 0, "-l2*sin(b)", "l2*cos(b)"],
+          [0, 0, -1.5, 0, 0, -0.4, "l3*sin(c)", "-l3*cos(c)"],
+          ["-l1*sin(a)", "-l2*sin(b)", "l3*sin(c)", 0, 0, 0, 0, 0],
+          ["l1*cos(a)", "l2*cos(b)", "-l3*cos(c)", 0, 0, 0, 0, 0]],
+    "B": [[0, 0], [0, 0], [0, 0], [1, 0], [0, 0], [0, 1], [0, 0], [0, 0]],
+    "F": [[0], [0], [0], [0], [0], ["1+cos(t)/2"], [0], [0]],
+    "C": [[1, 0, 0, 0, 0, 0, 0, 0]],
+    "initial_state": [0.1, 0, 0, 0, 0, 0, 0, 0],
+}
+# Trolley and load on a rope of varying length about a swing, index 3; θ are friction and wind.
+CRANE = {
+    "name": "crane",
+    "parameters": {"s": "0.5*sin(1.3*t)", "L": "3 + 0.5*cos(t/2)"},
+    "states": ["x", "px", "pz", "vx", "vpx", "vpz", "tension"],
+    "inputs": {"push": "sin(t)", "hoist": "0.1*sin(t)**2"},
+    "unknowns": {"friction": 0.5, "wind": -0.3},
+    "outputs": ["y"],
+    "E": np.diag([1, 1, 1, 2, 1, 1, 0]).tolist(),
+    "A": [[0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1, 0],
+          ["-3/L", "3/L", 0, -0.3, 0, 0, "sin(s)"], ["3/L", "-3/L", 0, 0, -0.1, 0, "-sin(s)"],
+          [0, 0, "-3/L", 0, 0, -0.1, "cos(s)"],
+          ["-sin(s)", "sin(s)", "-cos(s)", 0, 0, 0, 0]],
+    "B": [[0, 0], [0, 0], [0, 0], [1, 0], [0, 0], [0, 0], [0, -1]],
+    "F": [[0, 0], [0, 0], [0, 0], ["cos(t)", 0], [0, 1], [0, 0], [0, 0]],
+    "C": [[1, 0, 0, 0, 0, 0, 0]],
+    "initial_state": [0, 0.2, 0, 0, 0, 0, 0],
+}
+# Two capacitors and a source in one loop, index 2, and a coil; θ is a leak.
+LC_LOOP = {
+    "name": "lc_loop",
+    "parameters": {"C1": "2 + sin(t)/2", "C2": "1 + cos(t)/3", "L": "1.5 + sin(2*t)/2"},
+    "states": ["v1", "v2", "v3", "i", "is"],
+    "inputs": {"V": "3*sin(t) + cos(2*t)"},
+    "unknowns": {"leak": 0.4},
+    "outputs": ["y"],
+    "E": [["C1", 0, 0, 0, 0], [0, "C2", 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, "L", 0],
+          [0, 0, 0, 0, 0]],
+    "A": [["-d(C1)", 0, 0, 0, 1], [0, "-d(C2)", 0, -1, 1], [0, 0, -0.5, 1, 0],
+          [0, 1, -1, "-0.2-d(L)", 0],
+          [-1, -1, 0, 0, 0]],
+    "B": [[0], [0], [0], [0], [1]],
+    "F": [[0], [0], [1], [0], [0]],
+    "C": [[0, 0, 1, 0, 0]],
+    "initial_state": [0, 1, 0, 0, 0],
+}
+
 
 def observed(plant, horizon=10.0, noisy=(), **settings):
     """η − truth and the largest error of the states, by least squares over the whole horizon."""
@@ -93,7 +160,10 @@ def observed(plant, horizon=10.0, noisy=(), **settings):
     return found, eta - truth, float(np.abs(x - signals.states(t)).max())
 
 
-@pytest.mark.parametrize("plant", [CAPACITORS, PENDULUM, TANKS], ids=lambda p: p["name"])
+CONSTRAINED = [CAPACITORS, PENDULUM, TANKS, FOUR_BAR, CRANE, LC_LOOP]
+
+
+@pytest.mark.parametrize("plant", CONSTRAINED, ids=lambda p: p["name"])
 def test_constrained_plants_from_one_output(plant):
     with pytest.raises(ModelError, match=r"Assumption 1 .* observer\.form=strangeness_free"):
         observed(plant, form="given")
@@ -113,6 +183,45 @@ def test_the_states_are_those_in_closed_form():
                   .replace("exp", "np.exp"), {"np": np, "t": t}) for text in CAPACITORS_STATES]
     for name, values in zip(system.states, exact, strict=True):
         assert np.abs(result.estimates[name][0, -1] - values[-1]) < 1e-9
+
+
+def test_the_loop_of_the_four_bar_linkage_closes():
+    """Its angles are those of a linkage: l1 e^{ia} + l2 e^{ib} = l4 + l3 e^{ic}, at all times."""
+    t = np.linspace(0.0, 10.0, 101)
+    system = plant_from_mapping({**FOUR_BAR, "phi": [*"abc", *["0"] * 5]})
+    a, b, c = system.coefficients.taylor(t, 0, t).phi[0, :, :3].T
+    loop = np.exp(1j * a) + 3.0 * np.exp(1j * b) - 3.2 - 2.5 * np.exp(1j * c)
+    assert np.abs(loop).max() < 1e-12
+
+
+@pytest.mark.parametrize("plant", CONSTRAINED, ids=lambda p: p["name"])
+def test_deviations_agree_with_seeds(plant):
+    result = run(
+        plant, estimator={"name": "least_squares", "f0": 1e-9}, time={"horizon": 5},
+        noise={"name": "gaussian", "outputs": 0.01, "sample_time": 0.05, "seeds": 100},
+    ).details
+    ratio = result.noise.deviation[0] / result.estimation.parameters_std[0, -1]
+    np.testing.assert_allclose(ratio, 1.0, atol=4 / np.sqrt(2 * 100))
+
+
+@pytest.mark.parametrize("plant", CONSTRAINED, ids=lambda p: p["name"])
+def test_forms_agree_with_each_other_where_both_exist(plant):
+    """With every state measured, Assumption 1 holds as given, too."""
+    n, m = len(plant["states"]), len(plant["inputs"])
+    plant = {**plant, "outputs": [f"y{i}" for i in range(n)], "C": np.eye(n).tolist()}
+    system, found = plant_from_mapping(plant), []
+    signals = simulate(system, TimeSettings(horizon=5.0), SOLVER).signals
+    seen = Measurements(signals.inputs, signals.outputs, None,
+                        InputDerivatives.of_plant(system, np.ones(m, dtype=bool)))
+    t = np.linspace(0.0, 5.0, 51)
+    for form in ("given", "strangeness_free"):
+        one = observe(system, seen, SOLVER, form=form)
+        gram = one.regression.gram.final
+        eta = np.linalg.solve(gram[:, :-1], gram[:, -1])
+        x = one.state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
+        found.append((eta[: system.q], x))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-11)
 
 
 @pytest.mark.parametrize("name", ["circuit", "descriptor"])

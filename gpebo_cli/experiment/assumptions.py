@@ -254,6 +254,6 @@ def warnings(observation: Observed) -> tuple[str, ...]:
     text = (
         f"Φ has grown to {growth:.2g}, at {rate:.3g} 1/s: of its 16 digits the state estimate "
         f"loses {np.log10(growth):.0f}; a remedy is needed, observer.remedy=output_injection, "
-        "reset or current_coordinates"
+        "reset or current_coordinates; observer.form=strangeness_free feeds no output back"
     )
     return (text,)

@@ -230,12 +230,16 @@ static Outcome regression_signals(Call *call)
         lanes_multiply(terms, columns, at[3], k, z, columns, rows, k, columns, 1.0);
         for (npy_intp i = 0; i < rows; i++) {
             Lane *row = terms + i * columns;
-            most[0] = largest(largest(most[0], row, 1), at[4] + i, 1);
-            EACH row[0][l] += at[4][i][l];
-            for (npy_intp j = 0; j < q; j++)
-                EACH row[1 + j][l] -= G[i * q + j][l];
-            for (npy_intp j = 1; j < columns; j++)
-                most[j] = largest(most[j], row + j, 1);
+            for (npy_intp j = 0; j < columns; j++) {
+                Lane direct = {0.0}, whole;
+                if (j < 1 + q)
+                    EACH direct[l] = j == 0 ? at[4][i][l] : -G[i * q + j - 1][l];
+                EACH whole[l] = fabs(direct[l]);
+                for (npy_intp c = 0; c < k; c++)
+                    EACH whole[l] += fabs(at[3][i * k + c][l] * z[c * columns + j][l]);
+                EACH row[j][l] += direct[l];
+                most[j] = largest(most[j], &whole, 1);
+            }
         }
         lanes_clear(seen, b * columns);
         lanes_multiply_transposed(seen, columns, Q1, b, terms, columns, b, rows, columns, 1.0);

@@ -148,11 +148,12 @@ def regression_signals(
     signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
     signed = z * signs
     terms = algebraic @ signed  # [𝒜 ξ_a + g_y | −𝒜 ξ_b − G | 𝒜 Φ]
-    sizes = np.empty(z.shape[2])
-    sizes[0] = max(float(np.abs(part).max(initial=0.0)) for part in (terms[:, :, 0], g_y))
+    whole = np.abs(algebraic) @ np.abs(z)
+    whole[:, :, 0] += np.abs(g_y)
+    whole[:, :, 1 : 1 + q] += np.abs(G)
+    sizes = whole.max(axis=(0, 1), initial=0.0)
     terms[:, :, 0] += g_y
     terms[:, :, 1 : 1 + q] -= G
-    sizes[1:] = np.abs(terms[:, :, 1:]).max(axis=(0, 1), initial=0.0)
     seen = np.swapaxes(range_, 1, 2) @ terms
     left = terms - range_ @ seen  # R (…)
     axes = _axes(basis)

@@ -12,6 +12,24 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array, BoolArray
 
+_CANCELLED = 1e-13  # of the terms of an entry: what is left is rounding
+
+
+def without_rounding(found: Array, terms: Array | None = None) -> Array:
+    """``found`` (N, i, j) with zeros for entries that are the rounding of their terms at all times.
+
+    An equation that says nothing of a quantity must not seem to say a little: what is computed from
+    it would be noise, which no mesh resolves.
+
+    Args:
+        found: overwritten.
+        terms: size of what each entry is the sum of, (N or 1, i, j); None: that of the largest.
+    """
+    size = np.abs(found).max(axis=0)
+    whole = size.max(initial=0.0) if terms is None else terms.max(axis=0)
+    found[:, size <= _CANCELLED * whole] = 0.0
+    return found
+
 
 def transpose(a: Array) -> Array:
     """Transpose the last two axes, (…, a, b) to (…, b, a)."""
@@ -25,6 +43,15 @@ def joined(*parts: Array, axis: int) -> Array:
         [p if len(p) == count else np.broadcast_to(p, (count, *p.shape[1:])) for p in parts],
         axis=axis,
     )
+
+
+def exact_product(left: Array, right: Array) -> Array:
+    """left @ right (N, i, k), for matrices (N or 1, i, j) and (N or 1, j, k), without rounding.
+
+    What is not zero in a row of ``left`` counts as being of that row's size.
+    """
+    size = np.abs(left).max(axis=(0, 2), initial=0.0)[:, None]
+    return without_rounding(left @ right, size * ((left != 0.0) @ np.abs(right)))
 
 
 def frobenius_norm(matrix: Array) -> Array:

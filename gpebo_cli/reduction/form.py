@@ -27,10 +27,9 @@ from gpebo_cli.model.descriptor import (
     CoefficientSource,
     DescriptorSystem,
 )
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.reduction.strangeness_free import _MAX_GROWTH as MAX_GROWTH
-from gpebo_cli.reduction.strangeness_free import _by_singular_vectors as by_singular_vectors
+from gpebo_cli.reduction.strangeness_free import MAX_GROWTH, by_singular_vectors
 from gpebo_cli.reduction.structure import RESIDUAL, Structure, analyse
 
 _AHEAD = np.linspace(0.0, 1.0, 17)  # seconds
@@ -106,6 +105,11 @@ class EquationForm:
     def known_term(self) -> bool:
         """Whether there is a φ."""
         return "phi" not in self.system.coefficients.zero
+
+    @property
+    def scales(self) -> Array | None:
+        """Sizes of the states (n,), in units of which M is a projector; None: as given."""
+        return None if self.structure is None else self.structure.scaling.columns
 
     def driving(self, t: Array, inside: Array, u: Array) -> Array:
         """v (N, ·) at the times t (N,), from the measured inputs u (N, m)."""
@@ -234,11 +238,13 @@ def hidden_constraints(
         A2[poor], f2[everywhere] = transpose(Z2) @ N[poor], transpose(Z2) @ g[everywhere]
     # Rows of equal size first: they are of any size, and the factors below are then of order one.
     size = np.maximum(np.abs(A2).max(axis=2, keepdims=True), np.finfo(float).tiny)
-    Q, R = np.linalg.qr(transpose(A2 / size))
-    inward = Q @ np.linalg.solve(transpose(R), f2 / size)  # Â2⁺ [f̂_v | f̂_θ], Â2 = RᵀQᵀ
+    f2 = without_rounding(f2 / size, np.abs(g).max(axis=1, keepdims=True))
+    Q, R = np.linalg.qr(transpose(without_rounding(A2 / size)))  # Â2 = RᵀQᵀ
+    inward = exact_product(Q @ transpose(np.linalg.inv(R)), f2)  # Â2⁺ [f̂_v | f̂_θ]
     driving = (mu + 1) * system.m + 1
     return HiddenConstraints(
-        (Q @ transpose(Q)) / s.columns, inward[:, :, :driving], inward[:, :, driving:]
+        without_rounding(Q @ transpose(Q)) / s.columns,
+        inward[:, :, :driving], inward[:, :, driving:],
     )
 
 

@@ -19,7 +19,7 @@ from gpebo_cli.numerics.linalg import inverse_or_none, joined, transpose
 from gpebo_cli.reduction.derivative_array import forcing, who
 from gpebo_cli.reduction.structure import RESIDUAL, Structure
 
-_MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
+MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
 _LOOKS = 32  # times at which the sensitivity to rounding is looked at
 
 
@@ -78,7 +78,7 @@ def strangeness_free_form(
     model = (scaling.rows, scaling.columns, scaling.time, mu + 1)
     every = max(1, len(t) // _LOOKS)
     found = kernels.structure.eliminated(
-        E, A, *model, c.B, F, c.u, theta, *pivots, every, _MAX_GROWTH, RESIDUAL
+        E, A, *model, c.B, F, c.u, theta, *pivots, every, MAX_GROWTH, RESIDUAL
     )
     if found is None:
         found = _with_singular_vectors(system, structure, E, A, forcing(c), t, every)
@@ -105,10 +105,10 @@ def _with_singular_vectors(
     some = slice(0, None, every)
     A2, f2, size, inverse, poor = by_elimination(
         e[0], M, N, g, reference.rows, reference.columns, reference.rank, reference.Z1, every,
-        _MAX_GROWTH, RESIDUAL,
+        MAX_GROWTH, RESIDUAL,
     )
     Z1 = np.repeat(reference.Z1[None], len(M), axis=0)
-    Z1[poor], Z2 = _by_singular_vectors(
+    Z1[poor], Z2 = by_singular_vectors(
         system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
     )
     # What the elimination made grow there is not used, and amplifies nothing.
@@ -141,10 +141,10 @@ def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
     return _apply(c.D[0], c.u[0]) + _apply(c.H[0], c.theta[0])
 
 
-def _by_singular_vectors(
+def by_singular_vectors(
     system: DescriptorSystem, structure: Structure, E: Array, M: Array, N: Array, t: Array
 ) -> tuple[Array, Array]:
-    """Orthonormal Z1 and Z2 at times where the reference pivots will not do."""
+    """Orthonormal Z1 (N, n, d) and Z2 (N, ·, a) where the reference pivots will not do."""
     a = structure.a
     r = M.shape[1] - a
     U, sigma, _ = np.linalg.svd(M)

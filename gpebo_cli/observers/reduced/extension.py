@@ -13,6 +13,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution, solve
+from gpebo_cli.numerics.linalg import exact_product
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import (
@@ -30,7 +31,12 @@ from gpebo_cli.observers.reduced.matrices import (
     observer_matrices,
     weakest,
 )
-from gpebo_cli.observers.reduced.regression import Assembled, regression_signals, term_sizes
+from gpebo_cli.observers.reduced.regression import (
+    Assembled,
+    regression_signals,
+    resolved,
+    term_sizes,
+)
 from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.schema import nearest, shown
@@ -81,7 +87,8 @@ def start_at(
     known = (Vt[: rank - d].T / sigma[: rank - d]) @ U[:, : rank - d].T @ R
     free = V1 @ Vt[rank - d :].T
     basis, names = initial_basis(free @ free.T, d, states)
-    return Start(basis, names, -V1 @ known @ seen.g_y[0], -V1 @ known @ seen.G[0])
+    inward = V1 @ known
+    return Start(basis, names, -inward @ seen.g_y[0], exact_product(inward[None], -seen.G)[0])
 
 
 def begin_at(
@@ -412,7 +419,11 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         solution = solve(
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         )
-    return Extension(solution, latest[0])
+    z, *seen = map(_over_time, (solution.trajectory.values, *solution.extras))
+    offset, gain = resolved(
+        latest[0], z, system, basis, AlgebraicEquations(*seen), reduced.form.scales
+    )
+    return Extension(solution, replace(latest[0], offset=offset, gain=gain))
 
 
 def _driven(o: ObserverMatrices, v: Array, y: Array, columns: int) -> tuple[Array, Array]:

@@ -11,7 +11,13 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import joined, orthonormal_complement, transpose
+from gpebo_cli.numerics.linalg import (
+    exact_product,
+    joined,
+    orthonormal_complement,
+    transpose,
+    without_rounding,
+)
 from gpebo_cli.observers.reduced.split import (
     TINY,
     Frame,
@@ -27,7 +33,6 @@ from gpebo_cli.observers.reduced.split import (
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
 
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
-_SMALL = 24  # states, up to which NumPy's calls cost more than the kernels' plain loops
 
 
 class NotObservableError(ModelError):
@@ -214,7 +219,7 @@ def _by_steps(
 
     L, pinv, basis = split.equations, split.pinv, split.basis
     # 0 = 𝒜 x + g_y + G θ: equations without derivatives, hidden constraints, outputs.
-    exact = [L @ A], [L @ B], [L @ F]
+    exact = [exact_product(L, A)], [exact_product(L, B)], [exact_product(L, F)]
     if hidden is not None:
         for part, more in zip(exact, hidden, strict=True):
             part.append(more)
@@ -229,13 +234,19 @@ def _by_steps(
     Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
     if hidden is not None:
         Q1[:, Q1.shape[1] - r :] = 0.0  # y has no part in it, nor has its rounding
-    Lambda = pinv @ A if split.turn is None else pinv @ A + split.turn  # Λ = E⁺A + Ṗ
+    Lambda = exact_product(pinv, A)  # Λ = E⁺A + Ṗ
+    if split.turn is not None:
+        Lambda = Lambda + split.turn
     # [A_0 | D_0 | of u and y] = [Λ | E⁺F | E⁺B, 0] − Λ K [𝒜 | G | g_signals]
     direct = joined(
-        Lambda @ basis, pinv @ F, pinv @ B, np.zeros((1, len(basis.T), r)), axis=2
+        Lambda @ basis, exact_product(pinv, F), exact_product(pinv, B),
+        np.zeros((1, len(basis.T), r)), axis=2,
     )
     through = joined(on_basis, G, g_signals, axis=2)
-    whole = direct - (Lambda @ K) @ (transpose(Q1) @ through)
+    inward = Lambda @ K, transpose(Q1) @ through
+    whole = without_rounding(
+        direct - inward[0] @ inward[1], np.abs(direct) + np.abs(inward[0]) @ np.abs(inward[1])
+    )
     k = basis.shape[1]
     dynamics = whole[:, :, :k]
     return ObserverMatrices(
@@ -264,9 +275,11 @@ def _seen_through(
     kernel, so no output takes part in the elimination: they are all left to the regression.
     """
     through = C @ kernel @ np.linalg.pinv(hidden.states @ kernel)
-    return (
-        C - through @ hidden.states, D - through @ hidden.driving, H - through @ hidden.unknowns
-    )
+    left = [
+        without_rounding(part - through @ more, np.abs(part) + np.abs(through) @ np.abs(more))
+        for part, more in zip((C, D, H), hidden, strict=True)
+    ]
+    return left[0], left[1], left[2]
 
 
 def _eliminate(

@@ -8,13 +8,13 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import orthonormal_complement
+from gpebo_cli.numerics.linalg import orthonormal_complement, transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.regression.linear import outer_products
 
-_SMALL = 24  # states, up to which NumPy's calls cost more than the kernels' plain loops
 _ROUNDING = 1e-3  # of a projection, in terms of what is resolved
+_NOISE = 1e-11  # of the terms of a gain: beyond what extensions are resolved to
 _VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
 
 
@@ -86,6 +86,37 @@ def regression_signals(
     return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity)
 
 
+def resolved(
+    found: Assembled, z: Array, system: DescriptorSystem, basis: Array,
+    equations: AlgebraicEquations, scales: Array | None,
+) -> tuple[Array, Array]:
+    """The state's offset (N, n) and gain (N, n, p), on hidden constraints and without noise.
+
+    Hidden constraints 0 = M x + … hold but for what has gathered in z, which is taken from the
+    state; entries of the gain that are rounding of their terms are zero. Whether a state is
+    determined must not hang on noise. Some arguments are those of :func:`regression_signals`.
+
+    Args:
+        found: what that gave.
+        z: of the extension.
+        system: the plant.
+        basis: of z.
+        equations: at the same times.
+        scales: sizes of the states (n,) by which M was made a projector; None: there is no M.
+    """
+    n, r, q = system.n, system.r, system.q
+    offset, gain, z = found.offset, found.gain, np.abs(z[:, :, 1:])
+    seen = np.abs(equations.on_basis) @ z
+    seen[:, :, :q] += np.abs(equations.G)
+    terms = np.abs(basis) @ z
+    terms += np.abs(equations.elimination) @ (np.abs(transpose(equations.range)) @ seen)
+    if scales is not None:
+        rows = slice(-(n + r), -r)
+        offset = offset - scales * found.Y[:, rows]
+        gain = gain + scales[:, None] * found.psi[:, rows]
+    return offset, np.where(np.abs(gain) <= _NOISE * terms, 0.0, gain)
+
+
 def term_sizes(z: Array, q: int, equations: AlgebraicEquations) -> Array:
     """Size of the terms that each column of ψ is made of, at N times, (N, p).
 
@@ -97,7 +128,7 @@ def term_sizes(z: Array, q: int, equations: AlgebraicEquations) -> Array:
         q: number of unknown parameters.
         equations: at the same times.
     """
-    terms = np.abs(equations.on_basis @ z[:, :, 1:])
+    terms = np.abs(equations.on_basis) @ np.abs(z[:, :, 1:])
     terms[:, :, :q] += np.abs(equations.G)
     projected = np.abs(orthonormal_complement(equations.range)) @ terms
     return np.asarray(np.maximum(projected, _ROUNDING * terms).max(axis=1))

@@ -29,7 +29,7 @@ from gpebo_cli.observers._base import ByName
 from gpebo_cli.observers._observation import InitialError
 from gpebo_cli.observers.reduced.extension import begin_at, choose_form, form_used, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
-from gpebo_cli.observers.reduced.regression import regression_signals, term_sizes
+from gpebo_cli.observers.reduced.regression import regression_signals, resolved, term_sizes
 from gpebo_cli.observers.reduced.response import error_system
 from gpebo_cli.observers.reduced.split import split_in_frame
 from gpebo_cli.recordings.hold import edges, held
@@ -225,9 +225,8 @@ class SampledObserver:
             errors = ErrorSteps(step, *(
                 np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
             ))
-        return state, SampledBlock(
-            regression, assembled.offset, assembled.gain, z, scale, errors
-        )
+        offset, gain = resolved(assembled, z, system, self.basis, equations, self.form.scales)
+        return state, SampledBlock(regression, offset, gain, z, scale, errors)
 
 
 def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:

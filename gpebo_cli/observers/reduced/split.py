@@ -10,7 +10,7 @@ import numpy as np
 
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.linalg import orthonormal_complement, transpose
+from gpebo_cli.numerics.linalg import orthonormal_complement, transpose, without_rounding
 
 _TURNED = 8 * float(np.finfo(float).eps)  # of E outside the frame, relative: rounding
 _PROJECTOR_TURNED = 1e-13
@@ -82,7 +82,8 @@ def constant_split(E: Array, states: tuple[str, ...], rank_tol: float) -> Split 
     rank = int((sigma > rank_tol * np.linalg.norm(E, axis=(1, 2)).max()).sum())
     U1, V2 = U[:, :rank], Vt[rank:].T
     domain, _ = initial_basis(Vt[:rank].T @ Vt[:rank], rank, states)
-    return split_in_frame(E, Frame(domain, U1, V2, orthonormal_complement(U1)), rank_tol)
+    equations = without_rounding(orthonormal_complement(U1)[None])[0]
+    return split_in_frame(E, Frame(domain, U1, V2, equations), rank_tol)
 
 
 def split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
@@ -178,8 +179,9 @@ def split_by_svd(
                 "and nowhere else; start a run there, or make E smooth"
             )
     return Split(
-        rank=n_a, basis=basis, pinv=basis.T @ pinv_E, turn=basis.T @ (S + transpose(S)),
-        equations=orthonormal_complement(U1), kernel=V2, projector=P, frame=None,
+        rank=n_a, basis=basis, pinv=without_rounding(basis.T @ pinv_E),
+        turn=basis.T @ (S + transpose(S)), equations=without_rounding(orthonormal_complement(U1)),
+        kernel=V2, projector=P, frame=None,
     )
 
 
