@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,13 +15,10 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers._observation import Observation, Truth
+from gpebo_cli.observers._observation import Observation, SampledBlock, Truth
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import SolverSettings
-
-if TYPE_CHECKING:
-    from gpebo_cli.observers.reduced.sampled import SampledBlock
 
 ByName = float | Sequence[float] | Mapping[str, float]
 

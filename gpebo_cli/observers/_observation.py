@@ -12,9 +12,10 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import spectral_norm
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.regression.errors import ErrorsAt
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps
 from gpebo_cli.regression.estimator import Estimator
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.samples import SampledRegression
 
 # η̂ (g, M, p) at fixed times -> x̂ (g, M, n), NaN for a state the observer does not see
 Reconstruction = Callable[[Array], Array]
@@ -173,3 +174,15 @@ class Observation:
     def parameters(self) -> tuple[str, ...]:
         """Names of what is estimated, (p,)."""
         return self.regression.parameters if self.names is None else self.names
+
+
+@dataclass(frozen=True, eq=False)
+class SampledBlock:
+    """The regression at K samples, and how parameters give the state there."""
+
+    regression: SampledRegression
+    offset: Array  # (K, n)
+    gain: Array  # (K, n, p) x = offset + gain η
+    extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
+    scale: Array  # (K, p) of the terms of each column of ψ so far
+    errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset

@@ -17,10 +17,10 @@ from gpebo_cli.observers._observation import (
     AffineStateMap,
     Observation,
     Reconstruction,
+    SampledBlock,
     StateMap,
     Truth,
 )
-from gpebo_cli.observers.reduced.sampled import SampledBlock
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.parametrisation import Parametrisation

@@ -26,7 +26,7 @@ from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import ByName
-from gpebo_cli.observers._observation import InitialError
+from gpebo_cli.observers._observation import InitialError, SampledBlock
 from gpebo_cli.observers.reduced.extension import begin_at, choose_form, form_used, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import regression_signals, resolved, term_sizes
@@ -56,18 +56,6 @@ class SampledState:
     growth: float  # largest entry of Φ so far
     injectivity: float  # bound of Assumption 1's singular value so far
     error_estimate: float  # of the integration between samples, so far
-
-
-@dataclass(frozen=True, eq=False)
-class SampledBlock:
-    """The regression at K samples, and how parameters give the state there."""
-
-    regression: SampledRegression
-    offset: Array  # (K, n)
-    gain: Array  # (K, n, p) x = offset + gain η
-    extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
-    scale: Array  # (K, p) of the terms of each column of ψ so far
-    errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset
 
 
 @dataclass(frozen=True, eq=False)
