@@ -60,8 +60,8 @@ def regression(K=40, r=2, p=3, hold="zoh", steps=None):
     ("plant", "estimator"),
     [
         ("circuit", {"name": "least_squares"}),
-        ("circuit", {"name": "ls_drem"}),
-        ("circuit", {"name": "ls_drem", "beta": 0.2}),
+        ("circuit", {"name": "ls_drem", "gamma": 10}),
+        ("circuit", {"name": "ls_drem", "gamma": 10, "beta": 0.2}),
         ("circuit", {"name": "drem"}),
         ("descriptor", {"name": "ls_drem", "gamma": 5}),
     ],
