@@ -196,3 +196,13 @@ def test_a_recording_without_a_column_is_refused_by_its_name(tmp_path):
     (tmp_path / "r.csv").write_text("t,duty\n0,1\n1,1\n", "utf-8")
     with pytest.raises(ConfigError, match="there is no column y; plant boost needs t, duty, y"):
         run(problem("boost")["plant"], data={"name": "csv", "file": str(tmp_path / "r.csv")})
+
+
+def test_a_plant_that_amplifies_errors_says_how_accurate_it_is():
+    """Lorenz, exponent 0.9/s: after 9 s three thousand times the error of a step."""
+    long, short = (
+        run("lorenz", estimator="least_squares", time={"horizon": horizon, "samples": 11}).details
+        for horizon in (9.0, 1.0)
+    )
+    assert "amplifies errors: its simulation is good to" in long.verdict
+    assert "amplifies" not in short.verdict

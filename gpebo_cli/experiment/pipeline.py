@@ -23,7 +23,7 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.uncertainty import sampled_deviations
-from gpebo_cli.experiment.verdict import verdict
+from gpebo_cli.experiment.verdict import amplified, verdict
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
@@ -125,7 +125,10 @@ def run_experiment(
         assumptions=(
             *source.assumptions, *of_observation(found.observed, found.excitation, system)
         ),
-        verdict="; ".join([told + found.note, *warned]), warnings=warned,
+        verdict="; ".join([
+            told + found.note + amplified(source.simulation, settings.solver.tol), *warned
+        ]),
+        warnings=warned,
         # What the result is labelled with is what estimated.
         settings=replace(settings, estimator={"name": settings.observer["name"]})
         if found.by_observer else settings,

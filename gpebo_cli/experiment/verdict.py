@@ -14,6 +14,7 @@ from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
+_AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that says so
 
 
 def verdict(
@@ -85,6 +86,16 @@ def simulation_verdict(simulated: SimulationResult) -> str:
     return (
         f"simulated: index {simulated.index}, {simulated.differential} differential and "
         f"{simulated.algebraic} algebraic equations, error estimate "
+        f"{simulated.error_estimate:.1e} of each state's size"
+    )
+
+
+def amplified(simulated: SimulationResult | None, tol: float) -> str:
+    """What the last line of a run has to say of a plant that amplifies errors, from "; " on."""
+    if simulated is None or simulated.error_estimate <= _AMPLIFIED * tol:
+        return ""
+    return (
+        "; the plant amplifies errors: its simulation is good to "
         f"{simulated.error_estimate:.1e} of each state's size"
     )
 
