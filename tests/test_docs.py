@@ -139,6 +139,12 @@ def test_the_plant_page_runs(tmp_path):
     assert python(source, tmp_path) == shown
 
 
+def test_the_mechanism_page_runs(tmp_path):
+    text = (ROOT / "docs" / "howto" / "mechanism.md").read_text()
+    (source,), (shown,) = blocks(text, "python"), blocks(text, "text")
+    assert python(source, tmp_path) == shown
+
+
 def test_the_leakage_page_runs(tmp_path):
     """From a netlist and an oscilloscope's file to a current with its deviation."""
     text = (ROOT / "docs" / "howto" / "leakage.md").read_text()

@@ -79,6 +79,9 @@ def test_a_run_goes_on_without_what_is_not_determined(half_seen):
                  "hydra.run.dir=out", cwd=half_seen)
     assert done.returncode == 0, done.stderr
     assert "not determined by the data: c, k2, e0_c" in done.stdout.splitlines()[-1]
+    column = {line.split()[0]: line.split()[-1] for line in done.stdout.splitlines()[3:]}
+    assert {name: column[name] for name in UNSEEN} == dict.fromkeys(UNSEEN, "no")
+    assert all(column[name] == "s" for name in SEEN)  # from … s
     summary = json.loads((half_seen / "out" / "summary.json").read_text())
     assert {name for name, known in summary["estimable"].items() if known} == SEEN
     for name, told in summary["estimates"].items():

@@ -99,7 +99,7 @@ def noise_table(noise: NoiseStatistics) -> list[str]:
 
 
 def estimate_table(result: RunResult) -> list[str]:
-    """Each estimate of a recording with its deviation and unit, and since when it stands."""
+    """Each estimate with its deviation and unit, since when it stands, and can be known at all."""
     from gpebo_cli.results.summary import estimates_at_end
 
     estimation = result.estimation
@@ -110,11 +110,12 @@ def estimate_table(result: RunResult) -> list[str]:
     names = [*result.system.states, *estimation.names]
     standing = {} if result.metrics is None else result.metrics.seconds_to_settled
     near = "±2σ" if standing else "1 %"
-    rows = [["", "estimate", "± std", "unit", f"within {near} of the end since"]]
+    rows = [["", "estimate", "± std", "unit", f"within {near} of the end since", "estimable"]]
     for name, told in estimates_at_end(result, case).items():
-        value, std = told["value"], told["std"]
+        value, std, from_when = told["value"], told["std"], result.estimable.get(name)
+        estimable = "no" if from_when is None else f"from {from_when:.4g} s"
         if not math.isfinite(value):
-            rows.append([name, "not determined", "", told["unit"] or "", ""])
+            rows.append([name, "not determined", "", told["unit"] or "", "", estimable])
             continue
         away = np.abs(over_time[:, names.index(name)] - value) > 0.01 * abs(value)
         first = int(len(away) - np.argmax(away[::-1])) if away.any() else 0
@@ -122,7 +123,7 @@ def estimate_table(result: RunResult) -> list[str]:
         when = estimation.t[first] if known is None else estimation.t[0] + known[case]
         since = f"{when:.4g} s" if name in estimation.names else ""
         deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
-        rows.append([name, f"{value:.6g}", deviation, told["unit"] or "", since])
+        rows.append([name, f"{value:.6g}", deviation, told["unit"] or "", since, estimable])
     return columns(rows)
 
 
@@ -152,7 +153,7 @@ def run_lines(result: RunResult, folder: str = "") -> list[str]:
     lines: list[str] = []
     if rows and result.estimation is not None:
         lines += case_table(rows, list(result.estimation.cases[0]))
-    if result.recording is not None:
+    if result.recording is not None or None in result.estimable.values():
         lines += estimate_table(result)
     if result.noise is not None:
         lines += noise_table(result.noise)
