@@ -100,7 +100,7 @@ def page() -> str:
         if rows:
             name = folder.relative_to(PACKAGE).as_posix()
             about = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or ""
-            title = about.partition("\n")[0].rstrip(".") or "General"
+            title = about.partition("\n")[0].partition(":")[0].rstrip(".") or name.capitalize()
             lines += ["", f"## {title if name != '.' else 'Reading and choosing'}", "",
                       "| message | exit code | meaning |", "|---|---|---|", *rows]
     return "\n".join(lines) + "\n"
