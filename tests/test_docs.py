@@ -256,7 +256,7 @@ def test_the_navigation_names_pages_that_exist():
         made = page in MADE
         assert made or (ROOT / "docs" / page).is_file(), page
     assert "font: false" in text
-    assert "polyfills: [iframe-worker.js]" in text, "the search works from a file, without a network"
+    assert "polyfills: [iframe-worker.js]" in text, "a search from a file, without a network"
 
 
 def test_the_figure_of_the_readme_is_a_picture():
