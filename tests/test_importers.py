@@ -450,20 +450,32 @@ def test_files_of_matrices(tmp_path):
         assert {**from_file(path, "p").mapping(), "reference": None} == {
             **expected, "reference": None
         }
+    # as OpenModelica 1.2x writes them
     (tmp_path / "m.m").write_text(
-        "x0 = [1, 0];\nA = [0, 1; -2, -0.3];\nB = [0; 1];\nC = [1, 0];\n"
-        "stateVars  = {'mass.s','mass.v'};\ninputVars  = {'force'};\noutputVars = {'s'};\n"
+        "function [A, B, C, D, stateVars, inputVars, outputVars] = linearized_model()\n"
+        "% mass\n% der(x) = A * x + B * u\n  n = 2; % number of states\n\n  x0 = [1, 0];\n"
+        "  u0 = [0];\n\n  A =\t[0, 1;\n\t-2, -0.3];\n\n  B =\t[0;\n\t1];\n\n  C =\t[1, 0];\n\n"
+        "  stateVars  = {'mass[1,1].s','der(v)'};\n  inputVars  = {'force'};\n"
+        "  outputVars = {'s'};\n  Ts = 1; % stop time\n\nend"
     )
     (tmp_path / "m.py").write_text(
-        "x0 = [1, 0]\nA = [[0, 1],\n     [-2, -0.3]]\nB = [[0], [1]]\nC = [[1, 0]]\n"
-        "stateVars = ['mass.s', 'mass.v']\ninputVars = ['force']\noutputVars = ['s']\n"
+        "def linearized_model():\n    # mass\n    # der(x) = A * x + B * u\n    n = 2\n\n"
+        "    x0 = [1, 0]\n    u0 = [0]\n\n    A = [[0, 1], [-2, -0.3]]\n\n    B = [[0], [1]]\n\n"
+        "    C = [[1, 0]]\n\n    D = []\n\n    stateVars  = ['mass[1,1].s','der(v)']\n"
+        "    inputVars  = ['force']\n    outputVars = ['s']\n\n    return (n, A, B, C, D)\n"
     )
-    made = [from_file(tmp_path / f"m.{ending}", "p").mapping() for ending in ("m", "py")]
+    (tmp_path / "m.jl").write_text(
+        "function linearized_model()\n  # mass #\n  local n = 2 # number of states\n\n"
+        "  local x0 = [1, 0]\n  local u0 = [0]\n\n  local A = [0 1; -2 -0.3]\n"
+        '  local B = [0; 1]\n  local C = [1 0]\n\n  stateVars  = ["mass[1,1].s","der(v)"]\n'
+        '  inputVars  = ["force"]\n  outputVars = ["s"]\n  return (n, A)\nend'
+    )
+    made = [from_file(tmp_path / f"m.{ending}", "p").mapping() for ending in ("m", "py", "jl")]
     for plant in made:
         plant.pop("reference")
-    assert made[0] == made[1]
-    assert made[0]["states"] == ["mass_s", "mass_v"]
-    assert made[0]["initial_state"] == {"mass_s": 1.0, "mass_v": 0.0}
+    assert made[0] == made[1] == made[2]
+    assert made[0]["states"] == ["mass_1_1_s", "der_v"]
+    assert made[0]["initial_state"] == {"mass_1_1_s": 1.0, "der_v": 0.0}
     assert made[0]["A"] == [[0, 1], [-2, -0.3]]
 
 

@@ -156,7 +156,7 @@ Writes below DIR, by default the current folder; nothing that exists is overwrit
 
 With --from FILE a plant is made from a SPICE netlist (.cir .net .sp), a mechanical model (.yaml
 with M, D, K, G), or matrices (.mat, .npz, a folder of Matrix Market files, an OpenModelica
-linearisation in .py or .m). --measure "v(out), y=i(L1)+i(V)", or names of states, says what the
+linearisation, .py .m .jl). --measure "v(out), y=i(L1)+i(V)", or names of states, says what the
 outputs are, --unknown I5,V3 which constant inputs are unknown. Of more than 50 states constant
 matrices are written to DIR/plant/NAME.npz.
 

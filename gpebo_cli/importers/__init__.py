@@ -60,7 +60,7 @@ def from_file(
 
     Args:
         path: ``.cir .net .sp .spice .ckt`` is a netlist; ``.yaml`` a mechanical model with M, D, K,
-            G; ``.mat``, ``.npz``, ``.py``, ``.m`` and a folder of ``.mtx`` are matrices.
+            G; ``.mat``, ``.npz``, ``.py``, ``.m``, ``.jl`` and a folder of ``.mtx`` are matrices.
         name: of the plant.
         measure: outputs; of a netlist as for :func:`from_netlist`, else names of states.
         unknown: constant inputs whose values are to be estimated.

@@ -120,8 +120,8 @@ def read_matrices(path: Path) -> dict[str, Any]:
     """Matrices and names in a file or folder.
 
     A ``.mat`` or ``.npz`` file with E, A, B, C, D; a folder of Matrix Market files whose names end
-    in ``.E.mtx``, ``_A.mtx`` or are ``B.mtx``; a linearisation by OpenModelica as Python (``.py``)
-    or MATLAB (``.m``) text with ``A = [...]``.
+    in ``.E.mtx``, ``_A.mtx`` or are ``B.mtx``; a linearisation by OpenModelica as Python (``.py``),
+    MATLAB (``.m``) or Julia (``.jl``) text with ``A = [...]``.
 
     Raises:
         ConfigError: nothing that can be read; names the file and what was expected.
@@ -132,9 +132,11 @@ def read_matrices(path: Path) -> dict[str, Any]:
         return _matlab(path)
     if path.suffix == ".npz":
         return read_archive(str(path))
-    if path.suffix in (".py", ".m"):
+    if path.suffix in (".py", ".m", ".jl"):
         return _modelica(path)
-    raise ConfigError(f"{path}: expected a .mat, .npz, .py or .m file, or a folder of .mtx files")
+    raise ConfigError(
+        f"{path}: expected a .mat, .npz, .py, .m or .jl file, or a folder of .mtx files"
+    )
 
 
 def _matlab(path: Path) -> dict[str, Any]:
@@ -201,25 +203,27 @@ def _matrix_market(folder: Path) -> dict[str, Any]:
 
 
 def _modelica(path: Path) -> dict[str, Any]:
-    """``A = [1, 2; 3, 4]`` of MATLAB text, or ``A = [[1, 2], [3, 4]]`` of Python text."""
+    """``A = [1, 2; 3, 4]`` of MATLAB or Julia text, or ``A = [[1, 2], [3, 4]]`` of Python text."""
     text = read_text(path, _MAX_TEXT)
     found: dict[str, Any] = {}
-    assigned = r"^\s*([EABCD])\s*=\s*(?:np\.array\()?\s*(\[.*?\])\s*\)?\s*;?\s*$"
+    assigned = r"^\s*(?:local\s+)?([EABCD])\s*=\s*(?:np\.array\()?\s*(\[.*?\])\s*\)?\s*;?\s*$"
     for match in re.finditer(assigned, text, re.MULTILINE | re.DOTALL):
-        found[match[1]] = _bracketed(match[2], f"{path}: {match[1]}")
+        matrix = _bracketed(match[2], f"{path}: {match[1]}")
+        if matrix.size:  # without inputs, B is []
+            found[match[1]] = matrix
     names = (("states", "stateVars"), ("inputs", "inputVars"), ("outputs", "outputVars"),
              ("initial_state", "x0"))
     for key, word in names:
         line = re.search(
-            rf"^\s*{word}\s*=\s*[\[{{](.*?)[\]}}]\s*;?\s*$", text, re.MULTILINE | re.DOTALL
+            rf"(?ms)^\s*(?:local\s+)?{word}\s*=\s*[\[{{](.*?)[\]}}]\s*;?\s*$", text
         )
         if line is None:
             continue
-        items = re.findall(r"[^,;\s'\"]+(?:\([^)]*\))?", line[1])
         if key == "initial_state":
+            items = re.split(r"[,;\s]+", line[1].strip())
             found[key] = [_float(item, f"{path}: {word}") for item in items]
         else:
-            found[key] = [_identifier(item) for item in items]
+            found[key] = [_identifier(item) for _, item in re.findall(r"(['\"])(.*?)\1", line[1])]
     if "A" not in found:
         raise ConfigError(f"{path} has no line A = [...]; expected the text of a linear model")
     return found
