@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -168,6 +169,35 @@ def test_the_estimator_page_runs(tmp_path):
     for name in set(re.findall(r"`(\w+)`", text.partition("## What there is")[2])):
         if re.match(r"[A-Z]\w+[a-z]", name):
             assert name in estimators.__all__, name
+
+
+def test_the_session_from_a_loggers_file_to_deviations(tmp_path):
+    """The page's three commands, on fewer rows; what the file was made with is within 4σ."""
+    sys.path.insert(0, str(ROOT / "docs"))
+    import recording
+
+    page = (ROOT / "docs" / "howto" / "recording.md").read_text(encoding="utf-8")
+    for command in recording.COMMANDS:
+        assert f"$ {command}\n" in page
+    assert recording.PLANT in page
+    recording.session(tmp_path, 800, ("figures=false",))
+    summary = json.loads((tmp_path / "result" / "summary.json").read_text())
+    for name, true in recording.TRUE.items():
+        found = summary["estimates"][name]
+        assert abs(found["value"] - true) < 4.0 * found["std"] < 2.0 * true
+    assert "up to white noise" in summary["verdict"]
+
+
+VANADIUM = os.environ.get("GPEBO_VANADIUM", "")  # where crossover_data.mat is
+
+
+@pytest.mark.skipif(not os.path.isdir(VANADIUM), reason="GPEBO_VANADIUM names no folder with data")
+def test_the_vanadium_battery():
+    page = (ROOT / "docs" / "howto" / "recording.md").read_text(encoding="utf-8")
+    (source,) = blocks(page, "python")
+    said = python(source, VANADIUM)
+    assert said.startswith("k_mt = 3.434e-06 l/s\n")
+    assert "not white" in said
 
 
 def test_the_notebook_runs_and_its_outputs_are_real(tmp_path):

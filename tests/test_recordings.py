@@ -21,10 +21,11 @@ from test_cli import gpebo
 
 from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.evidence.metrics import STANDING
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.recordings.guess import guess
+from gpebo_cli.recordings.guess import _factor, guess
 from gpebo_cli.recordings.hold import edges, held, on_mesh, recording_mesh
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import LineReader, read_table
@@ -133,8 +134,8 @@ def test_without_states_nothing_is_compared_and_the_fit_is_told(tmp_path):
     columns = signals_of(simulated())
     path = write(tmp_path / "r.csv", {k: columns[k] for k in ("V", "t", "y")})
     result = recorded(path, hold="cubic")
-    for values in result.metrics.columns.values():
-        assert np.isnan(values).all()
+    for name, values in result.metrics.columns.items():
+        assert np.isnan(values).all() != name.startswith(STANDING)  # which needs no truth
     assert np.isnan(result.estimation.true_parameters).all()
     assert np.isfinite(result.estimation.states).all()
     assert result.fit.residual[0] < 1e-7 * result.fit.size
@@ -658,6 +659,14 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     found = guess(str(path), shipped("circuit"))
     assert found.lacking == ["V", "y"]
     assert any("no column was found for V" in doubt for doubt in found.doubts)
+
+
+@pytest.mark.parametrize(("written", "unit", "factor"), [
+    ("mV", "V", 1e-3), ("l/min", "l/s", 1 / 60), ("ml/min", "l/h", 0.06), ("A", "V", None),
+    ("m/s", "m", None), ("kg/V", "kg/s", None),
+])
+def test_units_are_converted_where_that_is_plain(written, unit, factor):
+    assert _factor(written, unit) == (None if factor is None else pytest.approx(factor))
 
 
 LEAKY = {

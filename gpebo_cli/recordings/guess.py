@@ -21,6 +21,7 @@ _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "k": 1e3, 
 _TIMES = ("t", "time", "zeit", "timestamp", "datetime", "date", "temps", "tiempo")
 _UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "minutes": "min",
           "h": "h", "hours": "h"}
+_RATES = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _LOOKED_AT = 50  # rows below the header
 
 
@@ -193,7 +194,12 @@ def _units(name: str) -> list[str]:
 
 
 def _factor(written: str, unit: str) -> float | None:
-    """From a unit with a prefix to the unit; None: it is another one."""
+    """From a unit with a prefix, or one per minute, to the unit; None: it is another one."""
     if written == unit:
         return 1.0
+    if "/" in written and "/" in unit:
+        (top, _, below), (wanted, _, per) = written.partition("/"), unit.partition("/")
+        factor = _factor(top, wanted)
+        if factor is not None and below in _RATES and per in _RATES:
+            return factor * _RATES[per] / _RATES[below]
     return _PREFIXES.get(written.removesuffix(unit)) if written.endswith(unit) else None
