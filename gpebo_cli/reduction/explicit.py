@@ -145,7 +145,7 @@ class _Equations:
     def __init__(self, values: Array, places: Places, known: Array, units: Array) -> None:
         n = len(units)
         order = np.lexsort(places[::-1])
-        self.values = np.ascontiguousarray(np.moveaxis(values[:, :, order], 2, 0))
+        self.values = np.take(np.moveaxis(values, 2, 0), order, axis=0)
         self.place = [place[order] for place in places]  # rows, and columns
         self.first = np.searchsorted(self.place[0], np.arange(n + 1))
         self.given = known  # (n, orders, N or 1)
@@ -199,14 +199,16 @@ class _Equations:
         ]
         i = np.concatenate([position[self.place[0][plain]], [t[0] for t in touched]])
         j = np.concatenate([column[self.place[1][plain]], column[[t[1] for t in touched]]])
-        count = max([1, self.values.shape[2], *(len(t[2]) for t in touched)])
-        entries = np.empty((len(i), count))
-        entries[: plain.sum()] = self.values[plain, 0]
-        for place, (_, _, value) in enumerate(touched, int(plain.sum())):
-            entries[place] = value
+        count = max([self.values.shape[2], *(len(t[2]) for t in touched)])
         order = np.argsort(i, kind="stable")
+        place = np.empty(len(i), dtype=np.intp)  # of each entry in the end
+        place[order] = np.arange(len(i))
+        entries = np.empty((count, len(i)))
+        entries[:, place[: plain.sum()]] = self.values[plain, 0].T
+        for k, (_, _, value) in zip(place[plain.sum() :].tolist(), touched, strict=True):
+            entries[:, k] = value
         rows = np.searchsorted(i[order], np.arange(len(chosen) + 1))
-        return rows, j[order].astype(np.intp), np.ascontiguousarray(entries[order].T)
+        return rows, j[order].astype(np.intp), entries
 
     def forcing(self, chosen: IntArray) -> Array:
         """What is known in the rows ``chosen`` (d,), (N or 1, d)."""
