@@ -451,6 +451,8 @@ def test_files_of_matrices(tmp_path):
             **expected, "reference": None
         }
     # as OpenModelica 1.2x writes them
+    savemat(tmp_path / "second.mat", {"A": A, "M": np.eye(1), "K": np.eye(1), "D": np.eye(1)})
+    assert "D" not in from_file(tmp_path / "second.mat", "p").mapping()
     (tmp_path / "m.m").write_text(
         "function [A, B, C, D, stateVars, inputVars, outputVars] = linearized_model()\n"
         "% mass\n% der(x) = A * x + B * u\n  n = 2; % number of states\n\n  x0 = [1, 0];\n"

@@ -145,12 +145,14 @@ def _matlab(path: Path) -> dict[str, Any]:
     with open_regular(path) as stream:
         _check_unpacked(stream, path)
     try:
-        content = loadmat(path, variable_names=list(_NAMES))
+        content = loadmat(path, variable_names=[*_NAMES, "M", "K"])
     except (ValueError, NotImplementedError, OSError, TypeError, zlib.error) as error:
         raise ConfigError(
             f"{path} cannot be read ({error}); save it with -v7 and the matrices E, A, B, C, D"
         ) from None
     found = {key: content[key] for key in _NAMES if key in content}
+    if {"M", "K"} <= content.keys():  # of a second-order system beside it, whose damping is D
+        found.pop("D", None)
     if "A" not in found:
         raise ConfigError(f"{path} has no matrix A; expected A and, if there are any, E, B, C, D")
     return found
