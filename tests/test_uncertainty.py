@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 from examples import ROOT
 from plants import shipped
 
@@ -221,3 +222,27 @@ def test_a_recording_at_samples_is_told(tmp_path):
     line = next(line for line in run_lines(result.details) if line.strip().startswith("theta1"))
     value, std = (float(cell) for cell in line.split()[1:3])
     assert abs(value - 1.5) < 6 * std < 0.5
+
+
+def test_the_residual_is_compared_with_the_noise_that_is_given(tmp_path):
+    """χ²: one where the level is right, two where it is half of it; a wrong plant is noticed."""
+    noise = {"name": "gaussian", "outputs": 0.01, "sample_time": 0.05}
+    made = run("descriptor", noise=noise, time={"samples": 401}).to_pandas("signals")
+    measured = made.filter(regex="measured").rename(columns=lambda c: c.removesuffix("_measured"))
+    measured.to_csv(tmp_path / "rows.csv")
+    data, told = str(tmp_path / "rows.csv"), []
+    for level, plant in ((0.01, "descriptor"), (0.005, "descriptor"), (0.01, WRONG)):
+        result = run(plant, data=data, noise={**noise, "outputs": level})
+        told.append((result.details.fit.ratio, result.verdict))
+    assert told[0][0] == pytest.approx(1.0, abs=0.12)
+    assert told[1][0] == pytest.approx(2.0 * told[0][0], rel=1e-6)
+    assert "explain the data up to white noise" in told[0][1]
+    assert "noisier sensor" in told[1][1]
+    assert "is not white" in told[2][1] or told[2][0] > 1.2
+
+
+WRONG = {
+    **yaml.safe_load((ROOT / "conf" / "plant" / "descriptor.yaml").read_text()),
+    "A": [["-1.05", "1/2 + sin(t)/4", 1], ["-1/2", "-1/2 - cos(t)/4", "1/2"],
+          ["1/2", -1, "2 + sin(t)"]],
+}

@@ -35,7 +35,11 @@ from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, 
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
-from gpebo_cli.experiment.uncertainty import sampled_deviations, standard_deviations
+from gpebo_cli.experiment.uncertainty import (
+    residual_ratio,
+    sampled_deviations,
+    standard_deviations,
+)
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, StateMap
@@ -141,6 +145,9 @@ def continuous(
                     estimation, parameters_std=deviations, states_std=of_states
                 )
                 metrics = _standing(estimation, metrics, reduced.state_map, columns, system)
+    fit = _fit(observation, estimation, system, source) if source.recording else None
+    if fit is not None and settings.uncertainty and not levels.silent:
+        fit = replace(fit, ratio=residual_ratio(observation, source, settings.noise, levels))
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds") as share:
@@ -150,7 +157,7 @@ def continuous(
             )
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
-        _fit(observation, estimation, system, source) if source.recording else None, times, noise,
+        fit, times, noise,
         observation.estimator is not None, observation.note,
     )
 

@@ -177,6 +177,7 @@ class Fit:
     outputs: Array | None = None  # (N, r) ŷ of the best case at the times of the signals
     correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
     band: float = np.nan  # 95 % of the correlations of white noise are within
+    ratio: float | None = None  # of the residual to what the sensors' noise makes of it, √χ²/dof
 
     @property
     def white(self) -> bool | None:

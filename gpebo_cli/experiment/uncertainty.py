@@ -41,6 +41,23 @@ def sampled_deviations(
     return SampledDeviations(variances, number, relative=levels.silent)
 
 
+def residual_ratio(
+    observation: Observation, source: Source, noise: NoiseSettings, levels: NoiseLevels
+) -> float | None:
+    """√(χ² per degree of freedom) of a recording's residual, for levels that are given.
+
+    One where the sensors' noise is all that the estimates leave; None: nobody can tell.
+    """
+    if observation.errors is None or levels.silent or source.recording is None:
+        return None
+    if observation.regression.resets or observation.regression.dynamics is not None:
+        return None
+    return noise_level(
+        observation.errors, observation.regression, source.inputs.mesh.edges[:-1],
+        _variances(noise, levels), observation.starts,
+    )
+
+
 def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
     """Of [u; y], (m + r,); of a recording without levels relative to that of all outputs."""
     if levels.silent:

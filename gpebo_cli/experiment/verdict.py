@@ -13,6 +13,7 @@ from gpebo_cli.experiment.result import ActiveBound, Fit, SimulationResult
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 
+_MORE = 1.2  # times the sensors' noise: more than that is something else
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
 _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that says so
 
@@ -73,10 +74,18 @@ def _explains(fit: Fit, case: int) -> str:
         return ""
     if fit.residual[case] <= _EXACT * fit.size:
         return ": the estimates explain the data"
+    noise = ""
+    if fit.ratio is not None:
+        noise = f", {fit.ratio:.2f} times what the sensors' noise makes"
+    if fit.white and (fit.ratio is None or fit.ratio < _MORE):
+        return f": the estimates explain the data up to white noise{noise}"
     if fit.white:
-        return ": the estimates explain the data up to white noise"
+        return (
+            f": the residual is white{noise}, which suggests a noisier sensor than was said"
+        )
     return (
-        f": the residual is not white (its correlation is {np.abs(fit.correlation).max():.2f}), "
+        f": the residual{noise and noise + ','} is not white (its correlation is "
+        f"{np.abs(fit.correlation).max():.2f}), "
         "which suggests a missing or wrong parameter, a drifting sensor, or a delay"
     )
 

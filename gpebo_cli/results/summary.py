@@ -148,6 +148,7 @@ def _fit(fit: Fit | None) -> dict[str, Any] | None:
         "rms_residual": listed,
         "least_rms_residual": finite.min() if finite.size else None,
         "white": fit.white,
+        "noise_ratio": fit.ratio,
     }
 
 
