@@ -15,6 +15,8 @@ from test_cli import gpebo
 
 from gpebo_cli import run
 from gpebo_cli.evidence.knowledge import knowledge
+from gpebo_cli.experiment.assumptions import examine
+from gpebo_cli.settings import Settings
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -185,3 +187,16 @@ def test_a_change_of_units_changes_no_evidence(plant):
             assert other.excitation.weakest_direction.components[name] == pytest.approx(
                 part, abs=1e-9
             )
+
+
+def test_check_tells_the_deviation_that_a_run_with_noise_has():
+    """Per unit of noise: times σ it is that of least squares in a run."""
+    settings = Settings({}, {"name": "least_squares", "f0": 1e-12})
+    examined = examine(settings, shipped("descriptor"))
+    assert set(examined.deviations) == {n for n, at in examined.estimable.items() if at is not None}
+    result = run("descriptor", estimator={"name": "least_squares", "f0": 1e-12},
+                 noise={"name": "gaussian", "outputs": 0.02}).details.estimation
+    names = [*shipped("descriptor").states, *result.names]
+    stds = np.concatenate([result.states_std[0, -1], result.parameters_std[0, -1]])
+    for name, std in zip(names, stds, strict=True):
+        assert 0.02 * examined.deviations[name] == pytest.approx(std, rel=1e-3)

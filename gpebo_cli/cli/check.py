@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gpebo_cli.cli import arguments as command_line
 from gpebo_cli.errors import ConfigError
 
 if TYPE_CHECKING:
+    from gpebo_cli.experiment.assumptions import Examination
     from gpebo_cli.experiment.sensors import Sensor
     from gpebo_cli.findings import Assumption
 
@@ -87,18 +88,22 @@ def main(words: list[str]) -> int:
     found = examined.assumptions
     title = f"plant {job.system.name}, observer {job.settings.observer['name']}"
     sys.stdout.write(
-        _json(found, examined.estimable, tried) if as_json
-        else _table(title, found, [*_knowledge(examined.estimable), *_sensors(tried)])
+        _json(examined, tried) if as_json
+        else _table(title, found, [*_knowledge(examined), *_sensors(tried)])
     )
     return 0 if all(a.holds for a in found) else 1
 
 
-def _knowledge(estimable: Mapping[str, float | None]) -> list[str]:
-    """What can be known, and from when on."""
+def _knowledge(examined: Examination) -> list[str]:
+    """What can be known, from when on, and how well."""
     rows = [
         [name, "cannot be known" if since is None else f"estimable from t = {since:.4g} s on"]
-        for name, since in estimable.items()
+        for name, since in examined.estimable.items()
     ]
+    for row in rows:
+        if row[0] in examined.deviations:
+            deviation = examined.deviations[row[0]]
+            row[1] += f", deviation {deviation:.3g} per unit of noise of the outputs"
     return [f"  {name:<{max(len(row[0]) for row in rows)}}  {text}" for name, text in rows]
 
 
@@ -117,17 +122,16 @@ def _sensors(tried: Sequence[Sensor]) -> list[str]:
     return columns(rows)
 
 
-def _json(
-    found: Sequence[Assumption], estimable: Mapping[str, float | None], tried: Sequence[Sensor]
-) -> str:
+def _json(examined: Examination, tried: Sequence[Sensor]) -> str:
     from gpebo_cli.results.summary import plain
 
     rows = [
         {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
-        for a in found
+        for a in examined.assumptions
     ]
-    holds = all(a.holds for a in found)
-    content = {"holds": holds, "assumptions": rows, "estimable": estimable}
+    holds = all(a.holds for a in examined.assumptions)
+    content = {"holds": holds, "assumptions": rows, "estimable": examined.estimable,
+               "deviations": examined.deviations}
     if tried:
         content["sensors"] = [vars(sensor) for sensor in tried]
     text = json.dumps(plain(content), indent=2, ensure_ascii=False)

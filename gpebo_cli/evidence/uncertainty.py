@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
@@ -83,6 +84,41 @@ def deviations(
         x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ factors[own, size:]
         of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
     return of_eta, of_x
+
+
+def of_least_squares(
+    observer: ErrorsAt, regression: LinearRegression, known: Knowledge, gain: Array,
+    instants: Array, variances: Array,
+) -> tuple[Array, Array]:
+    """One standard deviation at the end of what least squares make of the data, (p,) and (n,).
+
+    η̂ = G⁺h in units of the parameters' own sizes: what is not determined is left out, and its
+    numbers mean nothing.
+
+    Args:
+        observer: as of :func:`deviations`, with ``instants`` and ``variances``.
+        regression: without resets.
+        known: of G, the end last.
+        gain: of the state at the end, (n, p).
+        instants: see above.
+        variances: see above.
+    """
+    mesh, p, V = regression.mesh, regression.p, known.vectors[-1]
+    seen = known.eigenvalues[-1] >= known.level[-1].max(initial=0.0)
+    inverse = np.where(seen, 1.0 / np.where(seen, known.eigenvalues[-1], 1.0), 0.0)
+    inverse = (V * inverse) @ V.T / known.sizes[-1] / known.sizes[-1][:, None]
+
+    def of_h(t: Array, inside: Array) -> ErrorSystem:
+        into = transpose(regression.psi(t, inside))
+        return ErrorSystem(
+            np.zeros((1, p, p)), into, inverse[None], np.zeros((1, *into.shape[1:]))
+        )
+
+    end = mesh.edges[-1:]
+    of_eta, of_x = deviations(
+        observer, of_h, gain[None], mesh.edges, instants, variances, end
+    )
+    return of_eta[-1], of_x[-1]
 
 
 def noise_level(

@@ -15,6 +15,7 @@ import numpy as np
 from gpebo_cli.errors import GpeboError, ModelError
 from gpebo_cli.evidence.excitation import Excitation, assess, estimable
 from gpebo_cli.evidence.knowledge import Knowledge
+from gpebo_cli.evidence.uncertainty import of_least_squares
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
@@ -36,6 +37,8 @@ class Examination:
     assumptions: tuple[Assumption, ...]
     estimable: Mapping[str, float | None] = field(default_factory=dict)  # since when; None: never
     excitation: Excitation | None = None
+    # At the end, of what is estimable, for noise of one unit at every output.
+    deviations: Mapping[str, float] = field(default_factory=dict)
 
 
 def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...]:
@@ -99,7 +102,33 @@ def _of_observer(
         visible(observation, excitation.known, t, system.n),
     )
     found += of_observation(observation, excitation, system)
-    return Examination(tuple(found), times, excitation)
+    return Examination(
+        tuple(found), times, excitation,
+        _per_unit(observation, excitation.known, settings, system, seen, times),
+    )
+
+
+def _per_unit(
+    observation: Observation, known: Knowledge, settings: Settings, system: DescriptorSystem,
+    seen: Measurements, estimable: Mapping[str, float | None],
+) -> dict[str, float]:
+    """Deviations of what is estimable, by name; none where the observer cannot tell."""
+    state_map, regression = observation.state_map, observation.regression
+    plain = not regression.resets and regression.dynamics is None and observation.names is None
+    if observation.errors is None or not plain or not isinstance(state_map, AffineStateMap):
+        return {}
+    start, stop = seen.span
+    instants = (
+        seen.mesh.edges[:-1] if settings.data.name == "csv"
+        else np.arange(start, stop, settings.noise.sample_time)
+    )
+    of_eta, of_x = of_least_squares(
+        observation.errors, regression, known, state_map.gain(np.array([stop]))[0], instants,
+        np.concatenate([np.zeros(system.m), np.ones(system.r)]),
+    )
+    found = dict(zip(system.states, of_x.tolist(), strict=True))
+    found |= dict(zip(regression.parameters, of_eta.tolist(), strict=True))
+    return {name: found[name] for name, since in estimable.items() if since is not None}
 
 
 def visible(observation: Observation, known: Knowledge, t: Array, n: int) -> BoolArray:
