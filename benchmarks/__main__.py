@@ -111,9 +111,9 @@ def write(data: dict[str, Any]) -> None:
 def main(words: list[str]) -> int:
     """Measure the parts named by ``words`` and write after each, so that nothing is lost."""
     if words == ["kernels"]:
-        found = ablation.table()
-        ablation.write(found)
-        sys.stdout.write(found + "\n")
+        for found in ablation.table():
+            ablation.write(found)
+        sys.stdout.write(f"{found}\n")
         return 0
     unknown = [word for word in words if word not in PARTS]
     if unknown:

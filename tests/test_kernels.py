@@ -100,25 +100,6 @@ def _signal(rng, k=8, s=6, c=5, least=False):
     return values, radau_rule(s).to_legendre, min(4, s - 1), 1e-8, 1e-3, 1e-5, sizes
 
 
-def _solution(rng, k=7, s=6, n=3, c=2, one=False):
-    values = 10.0 * np.ones((k, s + 1, n, c)) + 0.01 * rng.normal(size=(k, s + 1, n, c))
-    values *= 10.0 ** rng.integers(-6, 3, size=(n, 1))
-    of_time = 1 if one else k
-    return (
-        values, rng.normal(size=(of_time, n, n)), rng.normal(size=(k, n, c)),
-        rng.exponential(size=(of_time, n, n + c)), np.full(k, 0.1), radau_rule(s).to_legendre,
-        rng.choice([-1.0, 1.0], size=(k + 1, n, 6)), min(4, s - 1), EPS, 8.0, 4.0, 1e-9, 0.3,
-    )
-
-
-def _times(rng, k=6, s=4, count=50):
-    rule = radau_rule(s)
-    edges = np.cumsum(rng.uniform(0.1, 1.0, size=k + 1))
-    t = rng.uniform(edges[0] - 0.1, edges[-1] + 0.1, size=count)
-    t[:2], t[3] = edges[:2], edges[0] + rule.nodes[1] * (edges[1] - edges[0])
-    return edges, rule.points, rule.barycentric, t, t + 1e-15 * np.abs(t), 4 * EPS
-
-
 def _samples(rng, k=6, points=5, c=4, count=50):
     weights, values = rng.normal(size=(count, points)), rng.normal(size=(k, points, c))
     return rng.integers(0, k, count), weights, values
@@ -223,9 +204,6 @@ CASES: list[tuple[str, str, Case]] = [
     ("elements", "chain", _maps),
     ("elements", "chain", partial(_maps, one=True)),
     ("elements", "chain", partial(_maps, k=1, n=16, c=9)),
-    ("elements", "carried_errors", _solution),
-    ("elements", "carried_errors", partial(_solution, one=True)),
-    ("elements", "carried_errors", partial(_solution, k=1, s=3, n=2, c=5)),
     *(("elements", "sweeps", partial(_swept, **options)) for options in (
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
         {"k": 1, "d": 1, "c": 3, "forced": 3},
@@ -233,8 +211,6 @@ CASES: list[tuple[str, str, Case]] = [
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
     ("signals", "tails", partial(_signal, least=True)),
-    ("signals", "interpolation", _times),
-    ("signals", "interpolation", partial(_times, k=1)),
     ("signals", "sample", _samples),
     ("signals", "sample", partial(_samples, c=33)),
     ("signals", "low_pass", _filtered),
@@ -324,13 +300,8 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("chain", _maps, 0, np.s_[:-1]),
     ("chain", _maps, 1, np.s_[:, :-1]),
     ("chain", _maps, 2, np.s_[:-1]),
-    *(("carried_errors", _solution, place, np.s_[:-1]) for place in (2, 4, 5, 6)),
-    *(("carried_errors", _solution, place, np.s_[..., :-1]) for place in (1, 2, 3, 5)),
     ("tails", _signal, 1, np.s_[:-1]),
     ("tails", partial(_signal, least=True), 6, np.s_[:-1]),
-    ("interpolation", _times, 0, np.s_[:1]),
-    ("interpolation", _times, 1, np.s_[:-1]),
-    ("interpolation", _times, 4, np.s_[:-1]),
     ("sample", _samples, 1, np.s_[:-1]),
     ("sample", _samples, 2, np.s_[:2]),
     ("low_pass", _filtered, 1, np.s_[:-1]),

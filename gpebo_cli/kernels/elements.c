@@ -257,143 +257,21 @@ static Outcome chain(Call *call)
     return DONE;
 }
 
-/* A solution whose errors are estimated, and their limits; see elements_numpy.py. */
-typedef struct {
-    npy_intp t, n, c, used, shown;
-    const double *to_legendre;                /* of the coefficients that are `shown` */
-    double *tail, *own, *noise, *made_of;     /* (n, c): the largest of all elements */
-    double *size, *left_out, *rounded, *last; /* memory, (n, c), the last one (4, n, c) */
-} Errors;
-
-/* What an element with these values leaves out at its end, and all of its own. */
-EVERY_WIDTH static void leave_out(const Errors *q, const double *values, double level)
-{
-    const npy_intp m = q->n * q->c, s = q->t - 1;
-    memset(q->size, 0, m * sizeof(double));
-    enlarge(q->size, values, q->t, m);
-    last_coefficients(q->last, q->to_legendre, values, q->shown, q->t, m);
-    for (npy_intp b = 0; b < m; b++) {
-        const double size = larger(q->size[b], DBL_MIN), *last = q->last + b;
-        double exponent = -HUGE_VAL;
-        for (npy_intp j = q->shown - q->used; j < q->shown; j++) {
-            const double share = last[j * m] / size, power = q->t / (double)(q->t - q->shown + j);
-            exponent = larger(power * log(share < 1.0 ? share : 1.0), exponent);
-        }
-        const double tail = size * exp(exponent);
-        /* Ends are superconvergent: half the exponent of that is used. */
-        q->left_out[b] = tail * exp(exponent * (0.5 - 0.5 / s));
-        q->tail[b] = larger(q->tail[b], tail);
-        q->own[b] = larger(q->own[b], q->size[b]);
-        if (q->shown == 4) {
-            const double after = larger(last[2 * m], last[3 * m]);
-            if (!(after < level * larger(last[0], last[m])))
-                q->noise[b] = larger(q->noise[b], after);
-        }
-    }
-}
-
-/* Rounding of what the end of an element is made of, in units in the last place. */
-static void round_off(const Errors *q, const double *values, const double *last,
-                      const double *particular, const double *terms, double end)
-{
-    const npy_intp n = q->n, c = q->c, width = n + c;
-    for (npy_intp i = 0; i < n; i++)
-        for (npy_intp b = 0; b < c; b++) {
-            double made_of = fabs(particular[i * c + b]), rounded = terms[i * width + n + b];
-            for (npy_intp j = 0; j < n; j++) {
-                made_of += fabs(last[i * n + j]) * fabs(values[j * c + b]);
-                rounded += terms[i * width + j] * q->size[j * c + b];
-            }
-            q->made_of[i * c + b] = larger(q->made_of[i * c + b], made_of);
-            q->rounded[i * c + b] = rounded + end * made_of;
-        }
-}
-
-/* Errors (n, 2, S, c) at the right end of an element from those at its left end, and bounds of
-   their sums (n, c). */
-EVERY_WIDTH static void carry(const Errors *q, const double *last, const double *before,
-                              const double *signs, npy_intp S, double eps, double systematic,
-                              double chance, double *after, double *bounds)
-{
-    const npy_intp n = q->n, c = q->c, width = 2 * S * c;
-    for (npy_intp i = 0; i < n; i++) {
-        double *row = after + i * width;
-        combine(row, NULL, last + i * n, n, before, width, width);
-        for (npy_intp b = 0; b < c; b++) {
-            double sums[2] = {0.0, 0.0};
-            for (npy_intp k = 0; k < 2 * S; k++) {
-                const double of = k < S ? q->left_out[i * c + b] : eps * q->rounded[i * c + b];
-                double *error = row + k * c + b;
-                *error += signs[i * 2 * S + k] * of;
-                sums[k >= S] += *error * *error;
-            }
-            bounds[i * c + b] = systematic * sqrt(sums[0] / S) + chance * sqrt(sums[1] / S);
-        }
-    }
-}
-
-/* Values, maps to right ends, particular solutions there, terms, lengths, to_legendre, signs, how
-   many of the last coefficients are used, units in the last place, those of an end, by how much
-   chance may exceed its root mean square, what is the same, what is noise -> bounds of carried
-   errors; and the largest tails, sizes, noise and what ends are made of. */
-static Outcome carried_errors(Call *call)
-{
-    const npy_intp K = SIZE(K), n = SIZE(n), c = SIZE(c), t = SIZE(t), m = n * c, S = SIZE(S) / 2;
-    const npy_intp width = 2 * S * c, *step = call->step;
-    const double *values = call->in[0], *terms = call->in[3], *signs = call->in[6];
-    Errors q = {.t = t, .n = n, .c = c, .used = SIZE(u), .shown = t > 4 ? 4 : t};
-    if (q.used >= t || q.used > q.shown || S < 1)
-        return refused("Legendre coefficients, or choices of signs", q.used);
-    q.to_legendre = call->in[5] + (t - q.shown) * t;
-    q.size = scratch(call, 7 * m + 2 * n * width);
-    if (q.size == NULL)
-        return ERROR;
-    q.left_out = q.size + m, q.rounded = q.left_out + m, q.last = q.rounded + m;
-    q.tail = call->out[1], q.own = call->out[2], q.noise = call->out[3], q.made_of = call->out[4];
-    for (int i = 1; i < 5; i++)
-        memset(call->out[i], 0, m * sizeof(double));
-    int constant = 1; /* then rounding is wrong in the same direction each time */
-    for (npy_intp k = 1; step[3] && k < K; k++)
-        for (npy_intp i = 0; i < n; i++)
-            for (npy_intp j = i * (n + c); j < i * (n + c) + n; j++) {
-                const double first = terms[j] / call->in[4][0];
-                const double change = terms[k * step[3] + j] / call->in[4][k] - first;
-                constant &= fabs(change) <= call->number[11] * first;
-            }
-    double *before = q.last + 4 * m, *after = before + n * width;
-    for (npy_intp i = 0; i < n * width; i++) {
-        const npy_intp k = i / c % (2 * S), row = i / width;
-        const double rounded = call->number[8] * fabs(values[row * c + i % c]);
-        before[i] = k < S ? 0.0 : signs[row * 2 * S + k] * rounded;
-    }
-    for (npy_intp k = 0; k < K; k++) {
-        const double *x = values + k * t * m, *last = call->in[1] + k * step[1];
-        const double systematic = sqrt((double)k + 2.0), chance = call->number[10];
-        leave_out(&q, x, call->number[12]);
-        round_off(&q, x, last, call->in[2] + k * m, terms + k * step[3], call->number[9]);
-        carry(&q, last, before, signs + (k + 1) * n * 2 * S, S, call->number[8], systematic,
-              constant || systematic < chance ? systematic : chance, after, call->out[0] + k * m);
-        double *spare = before;
-        before = after, after = spare;
-    }
-    return DONE;
-}
-
-#define MOST_STAGES 16 /* of a rule; its nodes lie side by side, so loops over them have this length */
+#define MOST_STAGES 16 /* of a rule; its nodes lie side by side: loops have this length */
 #define TOGETHER 4
-#define AT_ONCE 8      /* columns, so that what is swept over fits the cache */
+#define AT_ONCE 8 /* columns, so that what is swept over fits the cache */
 typedef double Nodes[MOST_STAGES];
 #define EACH_NODE for (int j = 0; j < MOST_STAGES; j++)
 
 /* Everything about one element and some of the columns while sweeping. */
 typedef struct {
     npy_intp s, d, columns;
-    const npy_intp *row, *column;      /* of the entries of A */
-    const Nodes *R;                    /* h Rᵀ */
-    const Nodes *A, *f;                /* entries; (d, columns) forcing */
-    Nodes *X;                          /* (d, columns) */
-    const double *left, *weight;       /* (d, columns) at the left end; (d,) */
-    double *size, *change;             /* (d,) */
+    const npy_intp *row, *column; /* of the entries of A */
+    const Nodes *R;               /* h Rᵀ */
+    const Nodes *A, *f;           /* entries; (d, columns) forcing */
+    Nodes *X;                     /* (d, columns) */
+    const double *left, *weight;  /* (d, columns) at the left end; (d,) */
+    double *size, *change;        /* (d,) */
 } Swept;
 
 /* What is not a number is left out: the caller looks for that. */
@@ -466,7 +344,8 @@ static double largest_change(const Swept *q, double share)
 static Outcome sweeps(Call *call)
 {
     const npy_intp K = SIZE(K), s = SIZE(s), d = SIZE(d), entries = SIZE(e), all = SIZE(c);
-    const npy_intp forced = SIZE(f), most = SIZE(m), *row = call->index[2], *column = call->index[3];
+    const npy_intp forced = SIZE(f), most = SIZE(m), *row = call->index[2],
+                   *column = call->index[3];
     const double *R = call->in[0], *h = call->in[1], *kicks = call->in[6];
     const double tol = call->number[9], share = call->number[10];
     if (s > MOST_STAGES || (SIZE(P) != 1 && SIZE(P) != K * (s + 1)))
@@ -489,8 +368,19 @@ static Outcome sweeps(Call *call)
         call->out[1][k] = 0.0;
     for (npy_intp first = 0; first < all; first += width) {
         const npy_intp b = all - first < width ? all - first : width;
-        Swept q = {s, d, b, row, column, (const Nodes *)hR, (const Nodes *)A, (const Nodes *)f, X,
-                   left, call->in[8], size, change};
+        Swept q = {s,
+                   d,
+                   b,
+                   row,
+                   column,
+                   (const Nodes *)hR,
+                   (const Nodes *)A,
+                   (const Nodes *)f,
+                   X,
+                   left,
+                   call->in[8],
+                   size,
+                   change};
         memset(size, 0, d * sizeof(double));
         for (npy_intp i = 0; i < d; i++)
             for (npy_intp c = 0; c < b; c++)
@@ -542,8 +432,6 @@ static Outcome sweeps(Call *call)
 const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
-    {"carried_errors", "Ktnc K?nn Knc K?nw K tt K+nS %u # # # # # w=n+c", "Knc nc nc nc nc",
-     carried_errors},
     {"sweeps", "ss K @d+ @e P?e Q?df |Kdc dc d # # %m", "Ks+dc K", sweeps},
     {NULL, NULL, NULL, NULL},
 };

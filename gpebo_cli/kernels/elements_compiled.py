@@ -46,20 +46,6 @@ def chain(
     return values, int(whole[0])
 
 
-def carried_errors(
-    values: Array, last: Array, particular: Array, noise: Array, steps: Array, to_legendre: Array,
-    signs: Array, used: int, eps: float, end: float, chance: float, same: float, level: float,
-    renew: Callable[[int, Array], Array] | None = None,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """In C for few components whose errors nothing replaces."""
-    arguments = (values, last, particular, noise, steps, to_legendre, signs, used, eps, end, chance,
-                 same, level)
-    if renew is not None or not _is_small(*values.shape[2:]):
-        return elements_numpy.carried_errors(*arguments, renew)
-    found: tuple[Array, Array, Array, Array, Array] = _compiled.carried_errors(*arguments)
-    return found
-
-
 def sweeps(
     R: Array, h: Array, rows: IntArray, indices: IntArray, entries: Array, f: Array,
     kicks: Array | None, start: Array, weights: Array, tol: float, share: float, most: int,

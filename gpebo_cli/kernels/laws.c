@@ -244,8 +244,7 @@ static Outcome squared_errors(Call *call)
     return DONE;
 }
 
-#define SWEEPS 30
-#define ROUNDING 1e-17 /* beside the largest entry, which is 1 */
+#define SWEEPS 30 /* at most, until what is left beside the largest entry, which is 1, is 1e-17 */
 
 /* Rotates rows and columns i < j of symmetric A (p, p) so that entry (i, j) becomes zero. */
 EVERY_WIDTH static void rotate(Lane *A, npy_intp p, npy_intp i, npy_intp j)
@@ -266,8 +265,7 @@ EVERY_WIDTH static void rotate(Lane *A, npy_intp p, npy_intp i, npy_intp j)
     }
 }
 
-/* Symmetric matrices in front of further columns -> their eigenvalues, by Jacobi's method, from
-   the lower triangles. */
+/* Symmetric matrices, further columns -> eigenvalues of the lower triangles by Jacobi's method. */
 static Outcome eigenvalues(Call *call)
 {
     const npy_intp N = SIZE(N), p = SIZE(p), w = SIZE(w);
@@ -286,7 +284,7 @@ static Outcome eigenvalues(Call *call)
             EACH A[i][l] = given[row * w + column][l] / larger(size[l], DBL_MIN);
         }
         double off = 1.0;
-        for (int sweep = 0; sweep < SWEEPS && off > ROUNDING; sweep++) {
+        for (int sweep = 0; sweep < SWEEPS && off > 1e-17; sweep++) {
             off = 0.0;
             for (npy_intp j = 1; j < p; j++)
                 for (npy_intp i = 0; i < j; i++) {

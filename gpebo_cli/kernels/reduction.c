@@ -254,8 +254,7 @@ static int equations(const Model *m, Elimination *el, Forcing *f, npy_intp first
 {
     const npy_intp n = m->n, r = el->rank, a = el->a, d = el->d;
     Lane grown, *some = el->e, *f2 = el->M22;
-    const npy_intp these = matrices == 1 ? 1 : used;
-    const int fresh = matrices > 1 || first == 0;
+    const npy_intp these = matrices == 1 ? 1 : used, fresh = matrices > 1 || first == 0;
     force(m, f, first, used);
     if (fresh) {
         fill(m, el, first, used);

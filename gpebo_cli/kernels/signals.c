@@ -56,51 +56,6 @@ static Outcome tails(Call *call)
     return DONE;
 }
 
-/* The element in which a time lies, from a guess on: edges[e] ≤ t < edges[e + 1]. */
-static npy_intp element_of(const double *edges, npy_intp K, double t, npy_intp e)
-{
-    if (edges[e] <= t && (e == K - 1 || t < edges[e + 1]))
-        return e;
-    npy_intp above = K; /* the first edge beyond, but one of 1 … K; NaN: the last */
-    for (e = 0; above - e > 1;) {
-        const npy_intp middle = e + (above - e) / 2;
-        if (edges[middle] > t)
-            above = middle;
-        else
-            e = middle;
-    }
-    return e;
-}
-
-/* edges (K + 1,), places and barycentric weights (t,), times, where they are decided, exact ->
-   elements, weights of interpolation; nearer than `exact` a point's own value is taken. */
-static Outcome interpolation(Call *call)
-{
-    const npy_intp K = SIZE(K), width = SIZE(t), N = SIZE(N);
-    const double *edges = call->in[0], *places = call->in[1], *barycentric = call->in[2];
-    if (K < 1)
-        return refused("elements", K);
-    npy_intp e = 0;
-    for (npy_intp i = 0; i < N; i++) {
-        call->index_out[0][i] = e = element_of(edges, K, call->in[4][i], e);
-        const double local = (call->in[3][i] - edges[e]) / (edges[e + 1] - edges[e]);
-        double *restrict row = call->out[1] + i * width, sum = 0.0;
-        int hits = 0;
-        for (npy_intp j = 0; j < width; j++) {
-            const double distance = local - places[j];
-            hits += fabs(distance) < call->number[5];
-            row[j] = barycentric[j] / distance;
-        }
-        for (npy_intp j = 0; hits && j < width; j++)
-            row[j] = fabs(local - places[j]) < call->number[5] ? 1.0 : 0.0;
-        for (npy_intp j = 0; j < width; j++)
-            sum += row[j];
-        for (npy_intp j = 0; j < width; j++)
-            row[j] /= sum;
-    }
-    return DONE;
-}
-
 /* out (N, c): each the weighted sum of the point values (points, c) of its element. */
 EVERY_WIDTH static void weighted_sums(double *out, const npy_intp *element, const double *weights,
                                       const double *values, npy_intp N, npy_intp points, npy_intp c)
@@ -187,7 +142,6 @@ static Outcome low_pass(Call *call)
 
 const Kernel signal_kernels[] = {
     {"tails", "Ktc tt %u # # # |c", "K", tails},
-    {"interpolation", "K+ t t N N #", "@N Nt", interpolation},
     {"sample", "@N Nt Ktc", "Nc", sample},
     {"low_pass", "ss K Ks+c c c", "Ks+c", low_pass},
     {NULL, NULL, NULL, NULL},

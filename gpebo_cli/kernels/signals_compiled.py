@@ -8,7 +8,6 @@ from gpebo_cli.kernels import _compiled
 from gpebo_cli.kernels.arrays import Array
 
 tails = _compiled.tails
-interpolation = _compiled.interpolation
 sample = _compiled.sample
 
 

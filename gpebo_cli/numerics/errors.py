@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpebo_cli.kernels import elements
+from gpebo_cli.kernels.elements_numpy import carried_errors
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import SHARE, Mesh, used_coefficients
 from gpebo_cli.numerics.problem import LinearProblem
@@ -66,7 +66,7 @@ def estimated_errors(
         return np.moveaxis(renewed, 0, 1).reshape(error.shape)
 
     with np.errstate(over="ignore", invalid="ignore"):
-        carried, tail, own, noise, made_of = elements.carried_errors(
+        carried, tail, own, noise, made_of = carried_errors(
             values, last, particular, noise, mesh.steps, rule.to_legendre, signs,
             used_coefficients(rule), EPS, END, _CHANCE, _SAME, LEVEL,
             None if renewal is None else renew,

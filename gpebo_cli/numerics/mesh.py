@@ -12,6 +12,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import signals
+from gpebo_cli.kernels.signals_numpy import interpolation
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.radau import RadauRule
 
@@ -155,7 +156,7 @@ class Mesh:
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
         rule = self.rule
         belongs = t + _SNAP * np.abs(t) if inside is None else inside
-        return Sampler(*signals.interpolation(
+        return Sampler(*interpolation(
             self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
         ))
 
