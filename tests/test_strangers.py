@@ -228,6 +228,7 @@ def test_links_lead_nowhere_but_inside(tmp_path):
     for name in ("file", "lab/x", "round", "zero", "folder", "pipe"):
         done = gpebo("run", "--config-dir", folder, f"plant={name}", *SHORT, cwd=tmp_path)
         assert (done.code, done.err.count("\n")) == (2, 1), done.err
+        assert "did you mean" not in done.err
         with pytest.raises(GpeboError):
             run(folder / "plant" / f"{name}.yaml" if name in ("pipe", "zero") else name,
                 config_dir=folder)

@@ -36,10 +36,10 @@ _SWEEPER_KEYS = ("params", "max_batch_size", "fail_fast")
 
 
 def is_file(folder: str, inside: str) -> bool:
-    """Whether there is ``inside`` (``plant/mine``) in ``folder``, as far as it may bring files."""
+    """Whether ``folder`` has ``inside`` (``plant/mine``), of any kind, and may bring such files."""
     brings = "/" not in inside or is_group(folder, inside.partition("/")[0])
     path = os.path.join(folder, f"{inside}.yaml")
-    return brings and os.path.normpath(path) == path and os.path.isfile(path)
+    return brings and os.path.normpath(path) == path and os.path.lexists(path)
 
 
 def is_group(folder: str, group: str) -> bool:
