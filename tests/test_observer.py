@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from plants import reference, seen, shipped
 
+from gpebo_cli import run as experiment
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
@@ -242,3 +243,18 @@ def test_starting_value_of_the_extension_is_free():
     """Another ξ_a(0) changes e₀ and nothing else."""
     _, _, truth = run(shipped("circuit"), xi_a0=[0.0, 0.0, 0.0])
     np.testing.assert_allclose(truth, [0, -1, -2], atol=1e-12)
+
+
+@pytest.mark.parametrize("speed", [1.0, 7.3])
+def test_an_output_that_sees_nothing_is_not_exciting_though_the_kernel_of_E_turns(speed):
+    """z1' = −z1, 0 = z2 − u, y = z2 for x = R(t)ᵀz: 𝒜w is zero by cancelling, and so is ψ."""
+    c, s = f"cos({speed}*t)", f"sin({speed}*t)"
+    result = experiment({
+        "name": "turning", "states": ["a", "b"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[c, s], [0, 0]], "B": [[0], [-1]], "C": [[f"-{s}", c]],
+        "A": [[f"-{c} + {speed}*{s}", f"-{s} - {speed}*{c}"], [f"-{s}", c]],
+        "initial_state": {"a": 1, "b": 0},
+    }).details
+    assert not result.regression.psi.any()
+    assert not result.excitation.is_ie
+    assert "not determined by the data: a, b, e0_a" in result.verdict

@@ -189,10 +189,10 @@ def run_filter(
     W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0, initial=0.0)
     # A common factor of all covariances changes nothing. It is chosen so that W is of order 1:
     # entries of 1e7 would be taken as pivots, and mix the equations.
-    variance = 1.0 / max(float((W * np.outer(unit, unit)).max()), np.finfo(float).tiny)
+    variance = 1.0 / max(float((W * np.outer(unit, unit)).max(initial=0.0)), np.finfo(float).tiny)
     if not np.isfinite(variance):
         variance = 1.0
-    fall = float((W * np.outer(deviation, deviation)).max()) * horizon
+    fall = float((W * np.outer(deviation, deviation)).max(initial=0.0)) * horizon
     if fall > _FALL:
         raise SolverError(
             f"the covariance of the {name} would fall to {1 / fall:.1e} of where it starts, beyond "
@@ -257,7 +257,9 @@ def _units(A: Array, deviation: Array, horizon: float) -> Array:
     Powers of two, so that nothing is rounded. What is constant has a row of zeros in A (N, n, n);
     it moves the others for as long as these remember. By ``_GROWTH`` X₁ may be out of balance.
     """
-    unit = np.where(deviation > 0, deviation, deviation.max(initial=0.0) or 1.0)
+    largest = deviation.max(initial=0.0)
+    rounding = np.sqrt(np.finfo(float).eps) * largest  # of a variance beside the largest one
+    unit = np.where(deviation > rounding, deviation, largest or 1.0)
     pushes = np.abs(A).max(axis=0, initial=0.0) * unit / unit[:, None]
     moving = pushes.any(axis=1)
     rate = max(float(pushes[np.ix_(moving, moving)].max(initial=0.0)), 1.0 / horizon)

@@ -143,11 +143,11 @@ def _sample(
         unique, where = np.unique(t, return_inverse=True)
         solution = solve_ivp(
             derivative, (left, right), state.ravel(), method="DOP853", t_eval=unique,
-            rtol=tol, atol=tol * 1e-2 * max(1e-3, float(np.abs(state).max())),
+            rtol=tol, atol=tol * 1e-2 * float(np.abs(state).max(initial=1e-3)),
         )
         if not solution.success:
             raise SolverError(f"solver=ivp: the {problem.name} failed: {solution.message}")
-        piece = solution.y.T[where].reshape(last - first, -1, *shape)
+        piece = solution.y.T[where].reshape(last - first, mesh.points.shape[1], *shape)
         values[first:last] = piece
         state = piece[-1, -1]
     return values

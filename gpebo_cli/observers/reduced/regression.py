@@ -83,6 +83,10 @@ def regression_signals(
     Y, psi, offset, gain, sizes = kernels.observer.regression_signals(
         z, q, basis, algebraic, g_y, G, Q1, H
     )
+    if basis.shape[0] == basis.shape[1]:  # the kernel of E turns: products with w cancel, too
+        sizes = np.maximum(sizes, (np.abs(algebraic) @ np.abs(z)).max(axis=(0, 1), initial=0.0))
+        nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= _VANISHING * sizes[1:]
+        psi = np.where(nothing, 0.0, psi)
     return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity)
 
 
