@@ -220,7 +220,8 @@ def run_filter(
         if monitor is not None:
             found += monitor(unit[:, None] * estimate, extras)
         n = P.shape[-1]
-        return _in_front(np.abs(values[..., :n, :n]).max(axis=(1, 2, 3)) > _GROWTH, found)
+        grown = np.abs(values[..., :n, :n]).max(axis=(1, 2, 3), initial=0.0)
+        return _in_front(grown > _GROWTH, found)
 
     problem = LinearProblem(
         coefficients, pair(P0 / variance, start), signals, name, renewal=_Restart()

@@ -58,6 +58,8 @@ class OutputInjection:
             ModelError, SolverError: as there.
             ConfigError: ``injection`` does not fit the plant.
         """
+        if not reduced.basis.shape[1]:  # nothing moves by itself
+            return Plain().observe(reduced)
         if self.injection is None:
             injection, mesh = riccati_injection(reduced)
         else:
