@@ -127,7 +127,7 @@ class Recursion(Protocol):
         ...
 
     def truth(self, extension: Array) -> Truth:
-        """What the parameters are, for those who know the states, from a block's extension."""
+        """What the parameters are, from [ξ_a | ξ_b | Φ] (K, k, 1 + p) at the times to be asked."""
         ...
 
 

@@ -84,7 +84,7 @@ class Given:
         self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,  # noqa: ARG002  protocol
         sample: Array,  # noqa: ARG002
     ) -> GivenAtSamples:
-        """The regression's recursion, whose first sample is at ``start``.
+        """The regression's recursion, whose first sample [u; y] (m + r,) is at ``start``.
 
         Raises:
             ConfigError: the system is a plant, or has a parametrisation S.
@@ -163,7 +163,7 @@ class GivenAtSamples:
         return ()
 
     def truth(self, extension: Array) -> Truth:  # noqa: ARG002  protocol
-        """η is θ."""
+        """η is θ; the extension (K, 0, p) is empty."""
         return _constant_truth
 
 

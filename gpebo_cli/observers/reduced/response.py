@@ -26,7 +26,7 @@ def errors_of(reduced: ReducedSystem, kept: IntArray) -> ErrorsAt:
 
 
 def error_system(o: ObserverMatrices, kept: IntArray | slice, inputs: int) -> ErrorSystem:
-    """The same from the matrices at N times, for a number of inputs."""
+    """The same from the matrices at N times, of the rows ``kept`` (k,), for a number of inputs."""
     R, H, Q1 = o.residual[:, kept], o.elimination, transpose(o.range)
     g = o.of_noise(o.g_signals, inputs)
     return ErrorSystem(
