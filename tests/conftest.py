@@ -5,9 +5,11 @@ from __future__ import annotations
 import hypothesis
 import pytest
 
-hypothesis.settings.register_profile(
-    "any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
-)
+# The same examples everywhere, so that a change is what makes a test fail. New ones are looked for
+# with `pytest --hypothesis-profile=explore`.
+_ANY_MACHINE = {"deadline": None, "suppress_health_check": [hypothesis.HealthCheck.too_slow]}
+hypothesis.settings.register_profile("any machine", derandomize=True, **_ANY_MACHINE)
+hypothesis.settings.register_profile("explore", **_ANY_MACHINE)
 hypothesis.settings.load_profile("any machine")
 
 

@@ -207,6 +207,7 @@ WRONG = [
     (["run", "observer.xi_a0.foo=1"], "observer.xi_a0 is empty; give it as a whole"),
     (["run", "plant.title='a\udcff'"], "is not text in UTF-8"),
     (["run", "+launcher=null"], "cannot be composed: Config group override must be"),
+    (["run", "noise.outputs=0.1"], "noise has name, title; choose noise=gaussian first"),
     (["run", "+launcher=[1,2]"], "cannot be composed: argument of type"),
     (["run", "time=1"], "time: expected a mapping"),
     (["run", "--resolve"], "--resolve is for what --cfg prints; add --cfg job"),

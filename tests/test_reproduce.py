@@ -39,7 +39,7 @@ def test_the_page_is_that_of_the_recipes():
 
 def test_a_number_that_is_off_is_an_exit_code(tmp_path, monkeypatch, capsys):
     found = reproduce.Finding("r", "t", "s", "last.x", 1.0, 1.1, 0.05, "page 3")
-    monkeypatch.setattr(reproduce, "reproduced", lambda name: [found])
+    monkeypatch.setattr(reproduce, "reproduced", lambda name, options: [found])
     assert reproduce.main(["gelda"]) == 1
     out = capsys.readouterr().out
     assert "OFF by 0.1" in out
