@@ -179,7 +179,8 @@ def carried_errors(
     sizes = np.abs(values).max(axis=1)
     size = np.maximum(sizes, _TINY)
     flat = values.reshape(K, points, n * columns)
-    shown = np.abs(np.matmul(to_legendre[-4:], flat)).reshape(K, min(4, len(to_legendre)), n, columns)
+    last_degrees = to_legendre[-4:]
+    shown = np.abs(np.matmul(last_degrees, flat)).reshape(K, len(last_degrees), n, columns)
     to_next = points / np.arange(points - used, points)  # (ρ^j)^this = ρ^(s + 1)
     shares = np.minimum(shown[:, -used:] / size[:, None], 1.0) ** to_next[:, None, None]
     tail = size * shares.max(axis=1)
