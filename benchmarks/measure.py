@@ -47,7 +47,7 @@ class Row:
     peer: str
     peer_seconds: float | None  # None: it fails, and ``note`` says how
     peer_error: float | None
-    target: float | None = None  # an error above it loses, whatever the time
+    target: float | None = None  # an error above it is no solution, whatever the time
     note: str = ""
 
     @property
@@ -57,14 +57,14 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """Who is ahead; a wrong answer loses."""
+        """Which of both is faster, of those whose error meets the target."""
         if _misses(self.ours_error, self.target):
-            return "ours lost: error"
+            return "our error too large"
         if self.peer_seconds is None:
-            return "peer fails"
+            return "no result"
         if _misses(self.peer_error, self.target):
-            return "peer lost: error"
-        return "ours ahead" if self.peer_seconds >= self.ours_seconds else "peer ahead"
+            return "larger error"
+        return "ours faster" if self.peer_seconds >= self.ours_seconds else "peer faster"
 
     def record(self) -> dict[str, Any]:
         """The row as it stands in the JSON."""
@@ -153,7 +153,7 @@ def compare(
 ) -> Row:
     """One row: the peer at its loosest sufficient tolerance, in turns with ours.
 
-    A peer that misses the target has lost already and is timed once, as is a slow one. ``scale``
+    A peer that misses the target is timed once, as is a slow one. ``scale``
     multiplies the peer's time, where it does only a part of the work.
     """
     say(f"{name}: {peer}")

@@ -86,7 +86,7 @@ def _ratio(row: Row) -> str:
 
 
 def _verdict(row: Row) -> str:
-    good = row["verdict"] in ("ours ahead", "peer ahead")
+    good = row["verdict"] in ("ours faster", "peer faster")
     return row["verdict"] if good else f"**{row['verdict']}**"
 
 
@@ -120,14 +120,14 @@ def _reached(data: Data) -> str:
     lines = []
     for part, who, words in (
         ("circuit", "scipy", "the circuit: 300 × the best scipy"),
-        ("circuit", "diffrax", "the circuit: ahead of diffrax"),
+        ("circuit", "diffrax", "the circuit: faster than diffrax"),
         ("gains", "scipy", "1,000 gains: 20,000 × the best scipy"),
-        ("gains", "diffrax", "1,000 gains: ahead of diffrax"),
+        ("gains", "diffrax", "1,000 gains: faster than diffrax"),
     ):
         lines += [(words, _best(by_part[part], who))] if by_part[part] else []
     if by_part["problems"]:
         lines.append((
-            "published problems: all solved, ahead of every peer that solves one",
+            "published problems: all solved, faster than every peer that solves one",
             _problem_score(by_part["problems"]),
         ))
     lines += [
@@ -145,7 +145,7 @@ def _reached(data: Data) -> str:
 def _best(rows: Sequence[Row], who: str) -> str:
     valid = [
         row for row in rows
-        if row["peer"].startswith(who) and row["verdict"] in ("ours ahead", "peer ahead")
+        if row["peer"].startswith(who) and row["verdict"] in ("ours faster", "peer faster")
     ]
     if not valid:
         return f"no {who} solver meets the target"
@@ -160,12 +160,12 @@ def _best(rows: Sequence[Row], who: str) -> str:
 
 def _problem_score(rows: Sequence[Row]) -> str:
     names = list(dict.fromkeys(row["name"] for row in rows))
-    solved = {row["name"] for row in rows if row["verdict"] != "ours lost: error"}
-    valid = [row for row in rows if row["verdict"] in ("ours ahead", "peer ahead")]
-    ahead = sum(row["verdict"] == "ours ahead" for row in valid)
+    solved = {row["name"] for row in rows if row["verdict"] != "our error too large"}
+    valid = [row for row in rows if row["verdict"] in ("ours faster", "peer faster")]
+    ahead = sum(row["verdict"] == "ours faster" for row in valid)
     return (
         f"{len(solved)} of {len(names)} solved; of {len(rows)} runs of peers {len(valid)} solve "
-        f"their problem, ours is ahead of {ahead} of these"
+        f"their problem, ours is faster than {ahead} of these"
     )
 
 

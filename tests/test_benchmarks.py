@@ -45,12 +45,12 @@ class Clock:
 
 
 def test_a_wrong_answer_loses_whatever_its_time():
-    assert row().verdict == "ours ahead"
-    assert row(peer_seconds=1.0).verdict == "peer ahead"
-    assert row(peer_seconds=1.0, peer_error=2e-9).verdict == "peer lost: error"
-    assert row(peer_seconds=1.0, peer_error=math.nan).verdict == "peer lost: error"
-    assert row(ours_error=2e-9).verdict == "ours lost: error"
-    assert row(peer_seconds=None, peer_error=None).verdict == "peer fails"
+    assert row().verdict == "ours faster"
+    assert row(peer_seconds=1.0).verdict == "peer faster"
+    assert row(peer_seconds=1.0, peer_error=2e-9).verdict == "larger error"
+    assert row(peer_seconds=1.0, peer_error=math.nan).verdict == "larger error"
+    assert row(ours_error=2e-9).verdict == "our error too large"
+    assert row(peer_seconds=None, peer_error=None).verdict == "no result"
 
 
 def test_a_row_has_the_keys_that_are_promised():
@@ -102,7 +102,7 @@ def test_failures_are_rows_in_the_solvers_own_words():
         (missing, "cannot be imported: No module named 'peer'"), (singular, "corrector failed")
     ):
         found = compare("n", ours, "p", prepare, [1e-3], float, 1e-9, budget=0.0)
-        assert found.verdict == "peer fails"
+        assert found.verdict == "no result"
         assert (found.peer_seconds, found.ratio, found.note) == (None, None, words)
     with pytest.raises(Failed, match="no finite solution"):
         loosest(lambda tol: lambda: np.array(np.nan), [1e-3], float, 1e-9)
