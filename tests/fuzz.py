@@ -218,11 +218,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=int(time.time()) * 1000, help="of the first")
+    parser.add_argument("--cases", type=int, default=sys.maxsize, help="at most")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     end = time.monotonic() + arguments.seconds
     seed, failures = arguments.seed, []
-    while time.monotonic() < end and len(failures) < 10:
+    last = arguments.seed + arguments.cases
+    while time.monotonic() < end and seed < last and len(failures) < 10:
         faulthandler.dump_traceback_later(10 * _SECONDS, exit=True)  # other work slows us down
         with tempfile.TemporaryDirectory() as folder:
             failures += [problem] if (problem := case(seed, Path(folder))) else []
