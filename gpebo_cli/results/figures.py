@@ -125,7 +125,7 @@ def fit(result: RunResult) -> list[Panel]:
             Curve(s.t, measured, f"{name} measured", style.MEASURED, f"{text} measured"),
             Curve(s.t, fitted, f"{name} fitted", line(0), f"{text} fitted"),
         )
-        left = (Curve(s.t, measured - fitted, "", line(1)),)
+        left = (Curve(s.t, measured - fitted, "", style.RESIDUAL),)
         panels += [
             Panel(name, curves, unit, text, legend=True),
             Panel(f"residual of {name}", left, unit, f"residual of {text}"),
@@ -517,7 +517,12 @@ def _estimate(
     known = bool(np.isfinite(truth.y).any())
     if known:
         curves = (truth, *curves) if behind else (*curves, truth)
-    limits = _estimate_limits(truth.y, values[_shown_cases(estimation)]) if known else None
+    drawn = values[_shown_cases(estimation)]
+    if known:
+        limits = _estimate_limits(truth.y, drawn)
+    else:  # what an estimate comes to stands for the truth
+        bands = [] if deviation is None else [low, high]
+        limits = _estimate_limits(drawn[0, -1:], np.vstack([drawn, *bands]))
     return Panel(name, curves, _unit(result, name), typeset(name, result.system.labels),
                  limits=limits)
 
@@ -534,9 +539,12 @@ def _state_estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
     return _with_legend(panels, _note(estimation))
 
 
-def _estimate_limits(truth: Array, guesses: Array) -> tuple[float, float]:
+def _estimate_limits(truth: Array, guesses: Array) -> tuple[float, float] | None:
     """Show the truth and all estimates, but do not let a wild one flatten the truth to a line."""
-    low, high = float(np.nanmin(truth)), float(np.nanmax(truth))
+    known = truth[np.isfinite(truth)]
+    if not known.size:
+        return None
+    low, high = float(known.min()), float(known.max())
     room = 2.0 * (high - low or abs(high) or 1.0)
     finite = guesses[np.isfinite(guesses)]
     lowest = float(np.min(finite, initial=low))

@@ -171,6 +171,7 @@ LINES = (
 )
 TRUTH = Line("#B4B4B4", (), 2.6)  # wide and pale: an estimate that has converged lies on it
 MEASURED = Line("#9A9A9A", (), 0.5)  # thin and pale: noise fills an area
+RESIDUAL = Line("#D55E00", (), 0.5)  # thin: noise, whose dashes would be its own
 VARYING = Line("#000000", (4, 2), 0.9)  # a truth that varies, over what follows it
 SPREAD = Line("#0072B2", (2.0, 1.5), 0.8)  # what an estimator says of its own error
 LIMIT = Line("#000000", (1.0, 1.5), 0.9)  # a level
@@ -300,7 +301,11 @@ def _arrange(figure: Figure, rows: Sequence[Axes], panels: Sequence[Panel], tall
     """
     dpi, width = figure.dpi, figure.get_figwidth()
     names: list[Any] = [axes.yaxis.get_tightbbox() for axes in rows]
-    left = _PAD + max(a.bbox.x0 - box.x0 for a, box in zip(rows, names, strict=True)) / dpi
+    labels = [axes.yaxis.label.get_window_extent().width for axes in rows]
+    thick = max(labels) / dpi
+    # All names stand in one column, beside the widest ticks: these may be another panel's.
+    ticks = [a.bbox.x0 - box.x0 - own for a, box, own in zip(rows, names, labels, strict=True)]
+    left = _PAD + thick + max(ticks) / dpi
     across: Any = rows[-1].xaxis.get_tightbbox()
     right = _PAD + max(0.0, across.x1 - rows[-1].bbox.x1) / dpi
     inner = width - left - right
@@ -311,7 +316,6 @@ def _arrange(figure: Figure, rows: Sequence[Axes], panels: Sequence[Panel], tall
     bottom = _PAD + (rows[-1].bbox.y0 - across.y0) / dpi
     height = _PAD + sum(heads) + len(rows) * (tall + _GAP) - _GAP + bottom
     figure.set_size_inches(width, height)
-    thick = max(axes.yaxis.label.get_window_extent().width for axes in rows) / dpi
     top = height - _PAD
     for axes, head in zip(rows, heads, strict=True):
         top -= head + tall
