@@ -74,7 +74,7 @@ def test_mistakes_name_the_file(tmp_path):
     write(tmp_path, {**SINE, "psi": [["s", "lp(s)"]]})
     done = gpebo("run", "--config-dir", ".", "regression=sine", cwd=tmp_path)
     assert done.returncode == 2
-    assert "sine" in done.stderr
+    assert "regression sine (regression/sine.yaml): " in done.stderr
     assert "psi[0][1]" in done.stderr
     assert "lp takes two arguments" in done.stderr
     with pytest.raises(ConfigError, match="stands in place of a plant"):

@@ -206,12 +206,12 @@ def run_recipe_job(cfg: DictConfig, arguments: Arguments, options: Options) -> R
         GpeboError: it fails.
     """
     from gpebo_cli.cli import composition
-    from gpebo_cli.cli.job import plant_file
+    from gpebo_cli.cli.job import described_in
     from gpebo_cli.cli.progress import Progress
     from gpebo_cli.experiment.pipeline import run_experiment
     from gpebo_cli.regression.text import system_from_mapping
 
     settings = configuration.settings(composition.plain(cfg), draw=False)
-    source = plant_file(str(cfg.hydra.runtime.choices.get("plant") or ""), arguments)
+    source = described_in(cfg.hydra.runtime.choices, arguments)
     with Progress(quiet=options.quiet, loud=options.loud) as progress:
         return run_experiment(settings, system_from_mapping(settings.plant, source), progress)

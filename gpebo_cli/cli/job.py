@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +50,7 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     from gpebo_cli.regression.text import system_from_mapping
 
     build(settings.estimator)  # used or not: its name becomes part of a folder's
-    source = plant_file(str(HydraConfig.get().runtime.choices.get("plant") or ""), arguments)
+    source = described_in(HydraConfig.get().runtime.choices, arguments)
     system = system_from_mapping(settings.plant, source)
     config["plant"] = located(settings.plant, source)
     return Job(settings, system, configuration.complete(config, settings))
@@ -94,9 +95,10 @@ def remove_if_empty(folder: str) -> None:
         return
 
 
-def plant_file(chosen: str, arguments: Arguments) -> str:
-    """Where the plant of that name, or that of the primary configuration, was written."""
-    inside = os.path.join("plant", chosen) if chosen else arguments.config_name
+def described_in(chosen: Mapping[str, Any], arguments: Arguments) -> str:
+    """Where the plant or regression that was chosen, or the primary configuration, was written."""
+    names = {group: chosen.get(group) for group in ("regression", "plant")}
+    inside = next((f"{g}/{name}" for g, name in names.items() if name), arguments.config_name)
     for folder in arguments.folders:
         path = os.path.join(folder, f"{inside}.yaml")
         if os.path.isfile(path):
