@@ -21,6 +21,7 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.model.entries import Entries, Places
+from gpebo_cli.model.expressions import jets
 from gpebo_cli.reduction.derivative_array import balance
 
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
@@ -93,20 +94,13 @@ class Explicit:
         return x
 
 
-def _product(a: Array, b: Array) -> Array:
-    orders = min(len(a), len(b))
-    if orders == 1:
-        return np.asarray(a[:1] * b[:1])
-    return np.array(
-        [sum(a[i] * b[k - i] for i in range(1, k + 1)) + a[0] * b[k] for k in range(orders)]
-    )
+def product(a: Array, b: Array) -> Array:
+    """Of (orders, N or 1) each, to the order that both are known to."""
+    return np.array(jets.multiply(list(a), list(b), min(len(a), len(b)) - 1))
 
 
 def _reciprocal(a: Array) -> Array:
-    found = [1.0 / a[0]]
-    for k in range(1, len(a)):
-        found.append(-found[0] * sum(a[i] * found[k - i] for i in range(1, k + 1)))
-    return np.array(found)
+    return np.array(jets.divide([1.0], list(a), len(a) - 1))
 
 
 def _sum(a: Array, b: Array) -> Array:
@@ -117,7 +111,7 @@ def _sum(a: Array, b: Array) -> Array:
 def _derivative(a: Array) -> Array:
     if len(a) < 2:
         raise MoreOrdersError
-    return np.asarray(a[1:] * np.arange(1.0, len(a))[:, None])
+    return np.array(jets.derivative(list(a), len(a) - 2))
 
 
 def _one(orders: int) -> Array:
@@ -131,7 +125,7 @@ def _size(a: Array) -> float:
 def _divided(values: Array, which: IntArray, factor: Array) -> Array:
     """Some of the values (e, orders, N or 1) times factors (w, orders, N or 1)."""
     new = np.moveaxis(
-        _product(np.moveaxis(values[which], 0, 2), np.moveaxis(factor, 0, 2)), 2, 0
+        product(np.moveaxis(values[which], 0, 2), np.moveaxis(factor, 0, 2)), 2, 0
     )
     count = max(values.shape[2], new.shape[2])
     out = np.array(np.broadcast_to(values, (*values.shape[:2], count)))
@@ -223,7 +217,7 @@ class _Equations:
         """Add a multiple of a row to row i."""
         into = self.row(i)
         for k, value in row.items():
-            more = _product(factor, value)
+            more = product(factor, value)
             old = into.get(k)
             if old is None:
                 into[k] = more
@@ -243,7 +237,7 @@ class _Equations:
         if len(into) > _FILL + len(self.units) // 4:
             raise UndecidedError
         if known is not None:
-            self.known[i] = _sum(self.known[i], _product(factor, known))
+            self.known[i] = _sum(self.known[i], product(factor, known))
 
     def take_out(self, i: int) -> tuple[Row, Array]:
         """Row i, which is none of them any more."""
@@ -366,9 +360,9 @@ def _leading(E: _Equations, A: _Equations) -> dict[int, int]:
             continue
         k = E.pivot(i, [k for k in E.row(i) if k not in equation_of])
         factor = _reciprocal(E.row(i)[k])
-        E.rows[i] = {j: _product(factor, v) for j, v in E.row(i).items()}
-        A.rows[i] = {j: _product(factor, v) for j, v in A.row(i).items()}
-        A.known[i] = _product(factor, A.known[i])
+        E.rows[i] = {j: product(factor, v) for j, v in E.row(i).items()}
+        A.rows[i] = {j: product(factor, v) for j, v in A.row(i).items()}
+        A.known[i] = product(factor, A.known[i])
         rest = {j: v for j, v in E.rows[i].items() if j != k}
         for other in [o for o in E.where(k) if o != i]:
             times = -E.put(other, k)
@@ -417,8 +411,8 @@ def _without_others(
             c = A.pivot(i, free or A.row(i))
             row, known = A.take_out(i)
             factor = _reciprocal(row.pop(c))
-            row = {k: _product(factor, v) for k, v in row.items()}
-            known = _product(factor, known)
+            row = {k: product(factor, v) for k, v in row.items()}
+            known = product(factor, known)
             for other in list(A.where(c)):
                 A.add(other, -A.put(other, c), row, known)
             others.append((c, row, known))

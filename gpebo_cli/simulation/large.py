@@ -28,6 +28,7 @@ from gpebo_cli.reduction.explicit import (
     MoreOrdersError,
     UndecidedError,
     explicit_form,
+    product,
     row_weights,
 )
 from gpebo_cli.reduction.structure import without_equations
@@ -51,16 +52,11 @@ def forcing(found: Entries, n: int) -> Array:
         for (i, j), value in found.of(matrix).items():
             signal = known.get((j,))
             if signal is not None:
-                product = convolution(value, signal)
-                if product.shape[1] > f.shape[1]:
-                    f = np.repeat(f, product.shape[1], axis=1)
-                f[:, :, i] += product
+                term = product(value, signal)
+                if term.shape[1] > f.shape[1]:
+                    f = np.repeat(f, term.shape[1], axis=1)
+                f[:, :, i] += term
     return np.asarray(f)
-
-
-def convolution(a: Array, b: Array) -> Array:
-    """Taylor coefficients of a product, (orders, N or 1)."""
-    return np.array([sum(a[i] * b[k - i] for i in range(k + 1)) for k in range(len(a))])
 
 
 def _placed(found: Entries, name: str, size: int) -> Array:
