@@ -5,17 +5,12 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-import numpy as np
-
 from gpebo_cli import observers
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import RunResult
-from gpebo_cli.model.descriptor import Array
 from gpebo_cli.observers.gpebo import Gpebo
-from gpebo_cli.observers.reduced.extension import choose_form
-from gpebo_cli.observers.reduced.split import initial_basis
+from gpebo_cli.observers.reduced.invariant import invariant_observer
 from gpebo_cli.observers.remedies.plain import Plain
-from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.results.frames import frame
 
 
@@ -38,12 +33,6 @@ def to_xarray(result: RunResult, table: str) -> Any:
 def to_control(result: RunResult) -> Any:
     """The observer of a time-invariant plant as a ``control.StateSpace`` from [u; y; θ] to x̂.
 
-    Theory 4 with ŵ = ξ_a + ξ_b θ − Φ e₀, in which e₀ is the start of the state alone:
-
-        ŵ' = A_0 ŵ + b_0 + D_0 θ,      x̂ = (I − K𝒜) ŵ − K (g_y + G θ)
-
-    where b_0 and g_y are linear in u and y.
-
     Raises:
         ConfigError: another observer, a plant that varies with time, or python-control is not
             installed.
@@ -58,35 +47,11 @@ def to_control(result: RunResult) -> Any:
             f"observer={settings.observer.get('name')}, sample_time "
             f"{settings.observer.get('sample_time')}, remedy {settings.observer.get('remedy')}"
         )
-    moving = [key for key in "EABFCDH" if key not in system.coefficients.constant]
-    if moving or "phi" not in system.coefficients.zero:
-        raise ConfigError(
-            f"plant {system.name} is not time-invariant: {moving[0] if moving else 'phi'} "
-            + ("depends on time or on signals" if moving else "is not zero")
-            + ", and a state-space model of python-control has constant matrices alone"
-        )
-    t = np.array([float(result.signals.t[0])])
-    derivatives = InputDerivatives.of_plant(system, np.ones(system.m, dtype=bool))
-    form, o, _ = choose_form(
-        system, t, t, None, derivatives, settings.solver, observer.form, observer.weights
+    *matrices, states = invariant_observer(
+        system, settings.solver, observer.form, observer.weights, float(result.signals.t[0])
     )
-    if form.derivatives:
-        raise ConfigError(
-            f"plant {system.name}: its observer needs derivatives of inputs, which no state-space "
-            "model has"
-        )
-    K = o.elimination[0] @ o.range[0].T
-    basis: Array = o.split.basis
-    _, names = initial_basis(o.split.projector[0], o.split.rank, system.states)
-    if basis.shape[1] > o.split.rank:
-        names = system.states
     return control.StateSpace(
-        o.dynamics[0],
-        np.concatenate([o.from_signals[0], o.from_unknowns[0]], axis=1),
-        basis - K @ o.on_basis[0],
-        -K @ np.concatenate([o.g_signals[0], o.G[0]], axis=1),
-        name=system.name,
-        states=[f"w_{name.removeprefix('e0_')}" for name in names],
+        *matrices, name=system.name, states=list(states),
         inputs=[*system.inputs, *system.outputs, *system.unknowns],
         outputs=[f"{state}_hat" for state in system.states],
     )

@@ -164,9 +164,10 @@ class BoundedEstimates:
         levels[moving <= _UNMOVED * most[:, None]] = -np.inf
         working: list[_Row] = []
         active: list[_Row] = []
+        squares, bases = np.linalg.eigh(metric)
+        roots = np.sqrt(np.maximum(squares, np.finfo(float).tiny))
         for k, end in enumerate(np.searchsorted(grid, self.t) + 1):
-            values, vectors = np.linalg.eigh(metric[k])
-            root = np.sqrt(np.maximum(values, np.finfo(float).tiny))
+            root, vectors = roots[k], bases[k]
             free = eta[k].copy()
             for _ in range(_ROUNDS):
                 rows = [*self.unknowns, *working]

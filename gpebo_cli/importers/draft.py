@@ -12,6 +12,7 @@ import yaml
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import ARCHIVE, MATRICES, archive_of
+from gpebo_cli.model.entries import is_sparse
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.schema import nearest, shown
 
@@ -248,7 +249,7 @@ class PlantDraft:
 
 def _nonzero(values: object) -> Iterable[tuple[int, int, Entry]]:
     """Row, column and value of what is not zero in a dense, sparse or nested matrix."""
-    if hasattr(values, "tocoo"):
+    if is_sparse(values):
         sparse = values.tocoo()
         order = np.lexsort((sparse.col, sparse.row))
         for k in order.tolist():

@@ -20,6 +20,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
 from gpebo_cli.model.archive import MAX_BYTES, read_archive
+from gpebo_cli.model.entries import is_sparse
 from gpebo_cli.reading import open_regular, read_text
 from gpebo_cli.schema import shown
 
@@ -270,8 +271,8 @@ def _labels(
 
 def _real(key: str, value: Any, plant: str) -> Any:
     """A matrix of finite real numbers, sparse ones as they are."""
-    matrix = value if hasattr(value, "tocoo") else np.atleast_2d(np.asarray(value))
-    data = matrix.tocoo().data if hasattr(matrix, "tocoo") else matrix
+    matrix = value if is_sparse(value) else np.atleast_2d(np.asarray(value))
+    data = matrix.tocoo().data if is_sparse(matrix) else matrix
     if not np.issubdtype(data.dtype, np.number) or (np.iscomplexobj(data) and data.imag.any()):
         raise ConfigError(f"plant {plant}: {key} is not a matrix of real numbers")
     if not np.isfinite(data).all():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
@@ -31,17 +31,29 @@ class Entries(NamedTuple):
         return dict(zip(zip(*places, strict=True), values, strict=True))
 
 
+@runtime_checkable
+class ByEntries(CoefficientSource, Protocol):
+    """A source that has its entries apart."""
+
+    def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
+        """Those that are not always zero at the times t (N,), as :func:`entries` has them."""
+        ...
+
+
+def is_sparse(value: object) -> TypeGuard[Any]:
+    """Whether a matrix is one of SciPy's sparse ones, which nobody has to import to know that."""
+    return hasattr(value, "tocoo")
+
+
 def entries(
     source: CoefficientSource, t: Array, order: int, inside: Array | None = None
 ) -> Entries:
     """Those of a source at the times t (N,), see ``CoefficientSource.taylor``.
 
-    A source that has its entries apart says so itself.
+    A source that has its entries apart (:class:`ByEntries`) says so itself.
     """
-    own = getattr(source, "entries", None)
-    if own is not None:
-        found: Entries = own(t, order, inside)
-        return found
+    if isinstance(source, ByEntries):
+        return source.entries(t, order, inside)
     return entries_of(source.taylor(t, order, inside), source.constant)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, DescriptorSystem
-from gpebo_cli.model.entries import Entries, Places, entries_of, not_zero
+from gpebo_cli.model.entries import Entries, Places, entries_of, is_sparse, not_zero
 
 # (t), (t, u) or (t, u, y), t (N,), u (N, m) and y (N, r), real or complex -> (N, rows, columns), or
 # (N, m) for u, (N, n) for phi
@@ -313,7 +313,7 @@ def system_from_functions(
         elif listed and all(callable(item) for item in listed):
             functions[key] = tuple(listed)
             probe = listed[0](_PROBES) if _arguments(listed[0]) == 1 else None
-            if isinstance(probe, list | tuple) and all(hasattr(m, "tocsr") for m in probe):
+            if isinstance(probe, list | tuple) and all(map(is_sparse, probe)):
                 stored = np.concatenate([np.ravel_multi_index(m.tocoo().coords, m.shape)
                                          for m in probe])
                 places[key] = np.unravel_index(np.unique(stored), shapes[key])
@@ -329,7 +329,7 @@ def system_from_functions(
         else:
             given: Any = entry
             value = np.asarray(
-                given.toarray() if hasattr(given, "tocsr") else given, dtype=np.float64
+                given.toarray() if is_sparse(given) else given, dtype=np.float64
             )
             if value.shape != shapes[key]:
                 raise ConfigError(
@@ -366,7 +366,7 @@ def _rows(entry: Entry | None, inputs: int = 0) -> int:
     if callable(first):
         signals = [np.zeros((1, inputs))] * (_arguments(first) - 1)
         first = first(np.zeros(1), *signals)[0]
-    if hasattr(first, "tocsr"):
+    if is_sparse(first):
         return int(first.shape[0])
     return 0 if first is None else len(np.asarray(first))
 

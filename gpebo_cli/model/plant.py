@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import ARCHIVE, with_archive
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, DescriptorSystem
-from gpebo_cli.model.entries import Entries
+from gpebo_cli.model.entries import Entries, is_sparse
 from gpebo_cli.model.expressions import (
     RESERVED,
     Assembly,
@@ -595,7 +595,7 @@ def _matrix(
     n_rows, n_columns = len(down.names), len(across.names)
     if _is_empty(value) and not needed:
         return []
-    if isinstance(value, np.ndarray) or hasattr(value, "tocsr"):
+    if isinstance(value, np.ndarray) or is_sparse(value):
         return _numbers(plant, key, value, down, across)
     if isinstance(value, Mapping) and value:
         return _by_place(plant, key, value, down, across)
