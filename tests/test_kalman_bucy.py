@@ -13,6 +13,7 @@ from plants import seen, shipped
 from test_cli import FAST, folders, gpebo
 from test_observer import ROTATING
 
+from gpebo_cli import run as api_run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.assumptions import check
 from gpebo_cli.experiment.pipeline import run_experiment
@@ -274,3 +275,13 @@ def test_command_line(tmp_path):
     assert checked.returncode == 0, checked.stdout
     assert "holds  uniform observability" in checked.stdout
     assert "kalman_bucy" in gpebo("list", "observers", cwd=tmp_path).stdout
+
+
+def test_nothing_to_filter_is_one_line():
+    plant = {
+        "name": "algebraic", "states": ["x"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[0]], "A": [[-1]], "B": [[1]], "C": [[1]], "initial_state": [0],
+    }
+    with pytest.raises(ConfigError, match="nothing for observer=kalman_bucy to filter"):
+        api_run(plant, observer="kalman_bucy", time={"horizon": 1})
+    assert api_run(plant, observer="gpebo", time={"horizon": 1}).details.metrics is not None

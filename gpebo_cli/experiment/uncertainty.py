@@ -72,14 +72,15 @@ def standard_deviations(
     """Of parameters (G, M, p) and ``states`` (G, M, n) at the times t (M,).
 
     None where they are not known: an observer that cannot tell how it responds to noise, an
-    estimator that is not ``Affine``, more than 32 cases, a simulation without noise. Rounding to
+    estimator that is not ``Affine``, more than 32 cases, a simulation without noise, and where
+    there is nothing to estimate. Rounding to
     steps q counts as noise of variance q²/12. Of a recording without levels, the one level that
     all outputs share is that of the residual.
     """
     state_map, errors = observation.state_map, observation.errors
     if levels.silent and not source.recording:
         return None
-    if errors is None or not isinstance(state_map, Differentiable):
+    if errors is None or not isinstance(state_map, Differentiable) or not observation.regression.p:
         return None
     if not isinstance(estimator, Affine) or len(estimator.cases) > MOST_CASES:
         return None

@@ -29,6 +29,7 @@ from typing import Literal
 
 import numpy as np
 
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
@@ -223,6 +224,11 @@ class KalmanBucy:
             return filter_model(o, *known.driving(t, inside), known.form)
 
         names = (*system.unknowns, *(f"w_{label}" for label in known.labels))
+        if not names:
+            raise ConfigError(
+                f"plant {system.name} has neither unknowns nor differential states: there is "
+                "nothing for observer=kalman_bucy to filter; observer=gpebo takes it"
+            )
         w0 = basis.T @ known.xi_a
         start = np.concatenate([np.zeros(q), w0])
         P0 = _initial_covariance(self.P0, names, known)

@@ -26,8 +26,9 @@ def consistent_state(form: StrangenessFree, x0: Array, weights: Array) -> Array:
     """The consistent x nearest to x0 in its differential part, shape (n,).
 
     Minimises ‖W E (x − x0)‖ subject to A2 x + f2 = 0, where W makes the rows of E comparable.
-    Unique, because E has full column rank on the kernel of A2. A state that satisfies the
-    constraints to rounding is returned as it is.
+    Unique, because E has full column rank on the kernel of A2; NaN where numbers are so large or
+    so small that it has not. A state that satisfies the constraints to rounding is returned as it
+    is.
 
     Args:
         form: the strangeness-free equations at times of which the start is the first.
@@ -46,6 +47,8 @@ def consistent_state(form: StrangenessFree, x0: Array, weights: Array) -> Array:
     if (np.abs(E @ moved) > _ROUNDING * _EPS * (np.abs(E) @ (through + terms))).any():
         image = weights[:, None] * (E @ T)
         norms = np.linalg.norm(image, axis=0)
+        if not (np.isfinite(norms) & (norms > 0.0)).all():
+            return np.full(len(x0), np.nan)
         moved -= T @ (np.linalg.lstsq(image / norms, weights * (E @ moved), rcond=None)[0] / norms)
     x = x0 + moved
     # What did not move keeps the digits it was given.
