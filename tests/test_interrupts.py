@@ -31,11 +31,13 @@ def test_what_a_finaliser_drops_is_raised_at_the_next_stage(capsys):
         run()
     assert reached == ["after the signal"]
     assert capsys.readouterr().err == ""
+    interrupts.check()  # what has been raised is over
 
 
 def test_what_is_dropped_in_the_last_stage_is_raised_at_the_end():
     with pytest.raises(KeyboardInterrupt), interrupts.Remembered():
         Finaliser()
+    interrupts.check()
 
 
 def test_without_a_signal_nothing_happens_and_all_is_as_before():

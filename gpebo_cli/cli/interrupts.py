@@ -33,8 +33,9 @@ class Remembered:
         sys.unraisablehook = self._hook
         if hasattr(self, "_handler"):
             signal.signal(signal.SIGINT, self._handler)
-            if kind is None:
-                check()
+        lost, Remembered.received = Remembered.received, False  # whoever comes next is not meant
+        if lost and kind is None:
+            raise KeyboardInterrupt
 
 
 def check() -> None:
