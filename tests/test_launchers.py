@@ -6,6 +6,7 @@ import importlib.util
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -132,6 +133,35 @@ def test_a_dead_child_that_nobody_collects_is_noticed(monkeypatch):
         apart(launch, patience=0.2)
     ended.set()
     started[0].wait()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_a_launcher_that_waits_for_ever_does_not_keep_the_process():
+    """Its threads do not end, and Python would wait for them."""
+    script = """
+import subprocess, threading
+from gpebo_cli.cli import app, workers
+
+def launch():
+    subprocess.Popen(["true"])
+    threading.Thread(target=threading.Event().wait, daemon=False).start()  # Python waits for it
+    threading.Event().wait()
+
+def main():
+    workers._FAREWELL = 0.1
+    try:
+        workers.apart(launch, patience=0.2)
+    except ChildProcessError:
+        print("given up")
+        return 1
+
+app.main = main
+app.entry()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout) == (1, "given up\n")
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")

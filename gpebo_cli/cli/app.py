@@ -12,6 +12,10 @@ import sys
 
 from gpebo_cli.errors import ConfigError, GpeboError
 
+TYPE_CHECKING = False  # typing's, which nobody has loaded yet
+if TYPE_CHECKING:
+    from typing import NoReturn
+
 COMMANDS = {
     "run": "run",
     "check": "check",
@@ -40,6 +44,9 @@ def entry() -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     except KeyboardInterrupt:
         code = _interrupted()
+    workers = sys.modules.get("gpebo_cli.cli.workers")  # of a sweep
+    if workers is not None and workers.stranded():
+        _leave(code)
     sys.exit(code)
 
 
@@ -154,12 +161,17 @@ def _interrupted() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # once is enough
     _report("interrupted", 130)
     atexit._run_exitfuncs()  # noqa: SLF001  there is no public way to run them early
+    _leave(130)
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process now, whatever else there is in it."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
         except OSError:  # nobody reads any more
             continue
-    os._exit(130)
+    os._exit(code)
 
 
 def _drop_stdout() -> None:

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from threading import Thread
+from threading import enumerate as threads
 from time import monotonic, sleep
 from typing import TypeVar
 
@@ -22,6 +23,7 @@ T = TypeVar("T")
 _PATIENCE = 8.0  # seconds; a launcher that is alive collects dead children at once
 _INTERVAL = 0.5
 _FAREWELL = 5.0  # seconds that a launcher has to notice that its workers are gone
+_LAUNCHER = "gpebo launcher"  # name of the thread
 
 
 def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
@@ -41,7 +43,7 @@ def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
         except BaseException as error:  # noqa: BLE001  raised again below
             raised.append(error)
 
-    thread = Thread(target=run, daemon=True)
+    thread = Thread(target=run, name=_LAUNCHER, daemon=True)
     thread.start()
     try:
         _wait(thread, patience)
@@ -54,6 +56,14 @@ def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
     if raised:
         raise raised[0]
     return returned[0]
+
+
+def stranded() -> bool:
+    """Whether a launcher still waits for a worker that is gone.
+
+    Its own threads do, too, and Python would wait for these before it ends.
+    """
+    return any(thread.name == _LAUNCHER for thread in threads())
 
 
 def _wait(thread: Thread, patience: float) -> None:
