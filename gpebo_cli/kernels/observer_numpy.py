@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpebo_cli.kernels.arrays import Array, IntArray
+from gpebo_cli.kernels.arrays import Array, IntArray, inverses, joined
 
 _TINY = float(np.finfo(float).tiny)
 
@@ -43,7 +43,7 @@ def in_frame(
     inner = _across(_down(range_.T, E), domain)
     diagonal = np.einsum("nii->ni", inner)
     alone = np.count_nonzero(inner) == np.count_nonzero(diagonal)
-    inverse = (1.0 / diagonal)[:, :, None] * np.eye(d) if alone else _inverse(inner)
+    inverse = (1.0 / diagonal)[:, :, None] * np.eye(d) if alone else inverses(inner)
     sizes = np.array([
         max(float(np.abs(part).max(initial=0.0))
             for part in (_across(E, kernel), _down(equations, E))),
@@ -65,7 +65,7 @@ def in_frame(
     )
     g_signals, G = joined(of_u_theta[:, :, :m], of_y, axis=2), of_u_theta[:, :, m:]
     Q1, R1 = np.linalg.qr(_across(algebraic, kernel))
-    X1 = _inverse(R1)
+    X1 = inverses(R1)
     size = np.maximum(np.sqrt((algebraic**2).sum(axis=(1, 2))), _TINY)
     with np.errstate(divide="ignore"):
         injectivity = 1.0 / (np.sqrt((X1**2).sum(axis=(1, 2))) * size)
@@ -105,23 +105,6 @@ def _down(rows: Array, matrix: Array) -> Array:
     """The product of rows (d, n) with a matrix, likewise."""
     axes = _axes(rows.T)
     return rows @ matrix if axes is None else matrix[:, axes]
-
-
-def joined(*parts: Array, axis: int) -> Array:
-    """Blocks (N or 1, a, b) side by side (axis 2) or stacked (axis 1); those of one time repeat."""
-    count = max(map(len, parts))
-    return np.concatenate(
-        [p if len(p) == count else np.broadcast_to(p, (count, *p.shape[1:])) for p in parts],
-        axis=axis,
-    )
-
-
-def _inverse(matrices: Array) -> Array:
-    """Inverses (N, n, n); infinite everywhere if one is singular."""
-    try:
-        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return np.full_like(matrices, np.inf)
 
 
 def regression_signals(

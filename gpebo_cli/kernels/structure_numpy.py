@@ -12,11 +12,9 @@ and the number μ + 1 of orders that are used.
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 import numpy as np
 
-from gpebo_cli.kernels.arrays import Array, BoolArray, IntArray
+from gpebo_cli.kernels.arrays import Array, BoolArray, IntArray, inverses
 
 _TINY = float(np.finfo(float).tiny)
 
@@ -199,12 +197,12 @@ def bounds(
     M, N = M[:, pivot_rows[:, None], pivot_columns], N[:, pivot_rows]
     found = np.full((len(M), 3), np.inf)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        inverse = _inverses(M[:, :r, :r])
+        inverse = inverses(M[:, :r, :r])
         X = M[:, r:, :r] @ inverse
         whole = np.concatenate(
             [np.broadcast_to(Z1.T @ e[0], (len(M), d, n)), N[:, r:] - X @ N[:, :r]], axis=1
         )
-        states = _inverses(whole)
+        states = inverses(whole)
         determined, size = frobenius_norm(states), array_size(frobenius_norm(M), a)
         if r:
             found[:, 0] = 1.0 / (frobenius_norm(inverse) * size)
@@ -215,18 +213,6 @@ def bounds(
             found[:, 2] = 1.0 / (determined * frobenius_norm(e[0]))
         left = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:]) / size
         return found, left, Z1.T @ a[0] @ states[:, :, :d]
-
-
-def _inverses(matrices: Array) -> Array:
-    """Inverses (N, n, n), infinite where there is none."""
-    try:
-        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        out = np.full_like(matrices, np.inf)
-        for k, one in enumerate(matrices):
-            with suppress(np.linalg.LinAlgError):
-                out[k] = np.linalg.inv(one)
-        return out
 
 
 def forcing(B: Array, F: Array, u: Array, theta: Array, orders: int) -> Array:
@@ -253,7 +239,7 @@ def by_elimination(
     right = np.concatenate([np.broadcast_to(N, (len(g), *N.shape[1:])), g], axis=2)[:, pivot_rows]
     M = M[:, pivot_rows[:, None], pivot_columns]
     with np.errstate(invalid="ignore", over="ignore"):
-        inverse = _inverses(M[:, :r, :r])
+        inverse = inverses(M[:, :r, :r])
         X = M[:, r:, :r] @ inverse
         left = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:])
         poor = ~((left <= residual * frobenius_norm(M)) & (frobenius_norm(X) <= growth))
@@ -268,7 +254,7 @@ def by_elimination(
         A2 = constraints[:count, :, :n].copy()
         whole = np.concatenate([np.broadcast_to(Z1.T @ E, (count, Z1.shape[1], n)), A2], axis=1)
         scale = np.maximum(np.abs(whole).max(axis=2, initial=0.0), _TINY)
-        inverse = _inverses(whole / scale[:, :, None])
+        inverse = inverses(whole / scale[:, :, None])
         poor |= ~(frobenius_norm(inverse) <= growth)
     return A2, constraints[:, :, n:].copy(), size, inverse / scale[:, None, :], poor
 

@@ -26,10 +26,11 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements
+from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import estimated_errors, least_sizes
-from gpebo_cli.numerics.linalg import inverse_or_none, joined
+from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, unresolved_kinds
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import RadauRule, differentiation_schur

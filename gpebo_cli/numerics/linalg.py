@@ -6,10 +6,9 @@ singular value: a one-column product of size 1e-17 has rank 0, not 1.
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 import numpy as np
 
+from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray
 
 _CANCELLED = 1e-13  # of the terms of an entry: what is left is rounding
@@ -36,15 +35,6 @@ def transpose(a: Array) -> Array:
     return np.swapaxes(a, -1, -2)
 
 
-def joined(*parts: Array, axis: int) -> Array:
-    """Blocks (N or 1, a, b) side by side (axis 2) or stacked (axis 1); those of one time repeat."""
-    count = max(map(len, parts))
-    return np.concatenate(
-        [p if len(p) == count else np.broadcast_to(p, (count, *p.shape[1:])) for p in parts],
-        axis=axis,
-    )
-
-
 def exact_product(left: Array, right: Array) -> Array:
     """left @ right (N, i, k), for matrices (N or 1, i, j) and (N or 1, j, k), without rounding.
 
@@ -61,13 +51,7 @@ def frobenius_norm(matrix: Array) -> Array:
 
 def inverse_or_none(whole: Array) -> tuple[Array, BoolArray]:
     """Inverses (N, n, n), and at which of the N there is none."""
-    try:
-        inverse = np.asarray(np.linalg.inv(whole), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        inverse = np.full_like(whole, np.inf)
-        for k, one in enumerate(whole):
-            with suppress(np.linalg.LinAlgError):
-                inverse[k] = np.linalg.inv(one)
+    inverse = inverses(whole)
     finite = np.isfinite(inverse)
     if finite.all():
         return inverse, np.zeros(len(inverse), dtype=bool)

@@ -8,6 +8,7 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
+from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.kernels.structure_numpy import (
     by_elimination,
     derivative_array,
@@ -15,7 +16,7 @@ from gpebo_cli.kernels.structure_numpy import (
     scaled,
 )
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, distinct
-from gpebo_cli.numerics.linalg import inverse_or_none, joined, transpose
+from gpebo_cli.numerics.linalg import inverse_or_none, transpose
 from gpebo_cli.reduction.derivative_array import forcing, who
 from gpebo_cli.reduction.structure import RESIDUAL, Structure
 

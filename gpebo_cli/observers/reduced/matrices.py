@@ -10,10 +10,10 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
+from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import (
     exact_product,
-    joined,
     orthonormal_complement,
     transpose,
     without_rounding,
