@@ -1,0 +1,179 @@
+"""A matrix as a plant file has it: rows, entries by place, or an array; its size is checked.
+
+Every message names the plant, the key and the entry, and where two sizes disagree, both.
+"""
+
+from __future__ import annotations
+
+import itertools
+import reprlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.entries import is_sparse
+from gpebo_cli.model.expressions import shorten
+from gpebo_cli.schema import nearest
+
+
+@dataclass(frozen=True)
+class Side:
+    """What the rows or the columns of a matrix stand for."""
+
+    noun: str
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """``there are 2 inputs (V, I)``, for messages."""
+        verb = "is" if len(self.names) == 1 else "are"
+        named = f" ({listed(self.names)})" if self.names else ""
+        return f"there {verb} {counted(len(self.names), self.noun)}{named}"
+
+
+def listed(names: Sequence[str], limit: int = 8) -> str:
+    """The names with commas, the first ``limit`` of them."""
+    rest = [] if len(names) <= limit else ["..."]
+    return ", ".join([*names[:limit], *rest])
+
+
+def counted(number: int, noun: str) -> str:
+    """``1 row``, ``2 rows``, ``3 entries``."""
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{number} {noun if number == 1 else plural}"
+
+
+def items_of(value: object) -> list[object] | None:
+    """The items of a list, None for anything else (text is not a list of letters)."""
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return list(value)
+    return None
+
+
+def brief(value: object) -> str:
+    """Any value, short: aliases can make a small YAML file a gigantic nested list."""
+    return shorten(value if isinstance(value, str) else reprlib.repr(value))
+
+
+def matrix(
+    plant: str, key: str, value: object, down: Side, across: Side, *, needed: bool
+) -> list[list[tuple[int, object]]]:
+    """The entries of a matrix by row, each with its column; of a sparse one those that it has.
+
+    Args:
+        plant: what the file is, for messages.
+        key: of the matrix.
+        value: rows, a mapping of places, an array (rows, columns) or one of SciPy's sparse ones.
+        down: what its rows stand for.
+        across: what its columns stand for.
+        needed: whether it has to be there; if not, there may be no entries.
+
+    Raises:
+        ConfigError: anything else, or a size that is not that of ``down`` and ``across``.
+    """
+    n_rows, n_columns = len(down.names), len(across.names)
+    if is_empty(value) and not needed:
+        return []
+    if isinstance(value, np.ndarray) or is_sparse(value):
+        return _numbers(plant, key, value, down, across)
+    if isinstance(value, Mapping) and value:
+        return _by_place(plant, key, value, down, across)
+    if is_empty(value):
+        if n_rows and n_columns:
+            why = across if down.noun == "state" else down
+            raise ConfigError(
+                f"{plant}: {key} is missing; {why}, so it needs {counted(n_rows, 'row')} "
+                f"of {n_columns}"
+            )
+        return []
+    rows = items_of(value)
+    if rows is None:
+        raise ConfigError(
+            f"{plant}: {key} must be a list of {counted(n_rows, 'row')}, not {brief(value)}"
+        )
+    if len(rows) != n_rows:
+        raise ConfigError(f"{plant}: {key} has {counted(len(rows), 'row')} but {down}")
+    grid: list[list[tuple[int, object]]] = []
+    for i, row in enumerate(rows):
+        entries = items_of(row)
+        if entries is None:
+            raise ConfigError(
+                f"{plant}: {key}[{i}] must be a list, one entry per {across.noun}, not {brief(row)}"
+            )
+        grid.append(list(enumerate(entries)))
+    widths = [len(row) for row in grid]
+    for i, width in enumerate(widths):
+        if width != widths[0]:
+            raise ConfigError(
+                f"{plant}: the rows of {key} differ: {key}[0] has length {widths[0]}, "
+                f"{key}[{i}] has length {width}"
+            )
+    if widths[0] != n_columns:
+        raise ConfigError(f"{plant}: {key} has {counted(widths[0], 'column')} but {across}")
+    return grid
+
+
+def _by_place(
+    plant: str, key: str, value: Mapping[Any, object], down: Side, across: Side
+) -> list[list[tuple[int, object]]]:
+    """The entries of a mapping, by row and column: ``e1,il: -1`` or ``e1: {il: -1}``."""
+    grid: list[dict[int, object]] = [{} for _ in down.names]
+    places = [{name: i for i, name in enumerate(side.names)} for side in (down, across)]
+    for label, given in value.items():
+        row, comma, column = str(label).partition(",")
+        if comma:
+            given = {column: given}  # noqa: PLW2901  the same, written otherwise
+        if not isinstance(given, Mapping):
+            raise ConfigError(
+                f"{plant}: {key} has {brief(label)}: {brief(given)}; write entries as "
+                f"'row,column': value (in braces with quotation marks) or row: {{column: value}}"
+            )
+        i = _place(plant, f"{key}: row", row, down, places[0])
+        for name, entry in given.items():
+            j = _place(plant, f"{key}: column", str(name), across, places[1])
+            if j in grid[i]:
+                raise ConfigError(f"{plant}: {key} has the entry {row.strip()},{name} twice")
+            grid[i][j] = entry
+    return [sorted(row.items()) for row in grid]
+
+
+def _place(
+    plant: str, where: str, label: str, side: Side, places: Mapping[str, int]
+) -> int:
+    """Of a row or column by its name, or by its number from 0 on."""
+    label = label.strip()
+    if label in places:
+        return places[label]
+    if label.isdecimal() and int(label) < len(side.names):
+        return int(label)
+    raise ConfigError(
+        f"{plant}: {where} {brief(label)} is no {side.noun}{nearest(label, side.names)}, and no "
+        f"number from 0 to {len(side.names) - 1}; {side}"
+    )
+
+
+def _numbers(
+    plant: str, key: str, value: Any, down: Side, across: Side
+) -> list[list[tuple[int, object]]]:
+    """The same of an array, or of one of SciPy's sparse matrices."""
+    shape = (len(down.names), len(across.names))
+    if value.shape != shape:
+        size = " × ".join(map(str, value.shape))
+        raise ConfigError(
+            f"{plant}: {key} is {size}, and {down} and {across}: expected {shape[0]} × {shape[1]}"
+        )
+    if isinstance(value, np.ndarray):
+        return [list(enumerate(row)) for row in value.tolist()]
+    csr = value.tocsr(copy=True)
+    csr.sum_duplicates()
+    columns, values, starts = csr.indices.tolist(), csr.data.tolist(), csr.indptr.tolist()
+    return [
+        list(zip(columns[a:b], values[a:b], strict=True)) for a, b in itertools.pairwise(starts)
+    ]
+
+
+def is_empty(value: object) -> bool:
+    """Whether a key has nothing behind it, or an empty list."""
+    return value is None or (isinstance(value, list) and not value)

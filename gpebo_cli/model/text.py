@@ -1,0 +1,245 @@
+"""The matrices of a plant given as text: constants, and expressions on one tape."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import prod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients
+from gpebo_cli.model.entries import Entries
+from gpebo_cli.model.expressions import (
+    Assembly,
+    Bounds,
+    Expression,
+    Tape,
+    breakpoints_of_tape,
+    divisors_of,
+    record,
+    resolved,
+    shorten,
+)
+
+# Shape of a matrix, and its entries by position, row after row; what is not there is 0.
+MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """How one matrix is put together from constants and columns of the tape's values."""
+
+    shape: tuple[int, ...]
+    fixed: Array  # (size,), constants; zero where an entry depends on time
+    positions: NDArray[np.intp]  # of the entries that depend on time
+    columns: NDArray[np.intp]  # where their values stand among the tape's outputs
+
+    def assemble(self, values: Array) -> Array:
+        """Coefficients (K + 1, N, *shape) from the tape's values (K + 1, N, M)."""
+        orders, times = values.shape[:2]
+        if not len(self.positions):
+            once = np.zeros((orders, 1, *self.shape))
+            once[0] = self.fixed.reshape(self.shape)
+            # What np.broadcast_to does, at a fifth of its price: it is called for every matrix.
+            strides = (once.strides[0], 0, *once.strides[2:])
+            repeated: Array = np.ndarray((orders, times, *self.shape), float, once, 0, strides)
+            repeated.flags.writeable = False
+            return repeated
+        flat = np.zeros((orders, times, len(self.fixed)))
+        flat[0] = self.fixed
+        flat[:, :, self.positions] = values[:, :, self.columns]
+        return flat.reshape(orders, times, *self.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class TextCoefficients:
+    """The matrices of a plant given as text; a ``CoefficientSource``.
+
+    All entries that depend on time are evaluated together, equal ones once. Matrices that do not
+    depend on time come as read-only broadcast arrays.
+    """
+
+    tape: Tape
+    layouts: Mapping[str, _Layout]  # by the names in MATRIX_NAMES
+    unknowns: Tape  # theta on its own
+    signals: Mapping[str, frozenset[str]]  # what a matrix depends on, by the same names
+    outputs: frozenset[str]
+    name: str
+    restricted: TextCoefficients | None = None  # ``of_time``, where that is something else
+    divisors: tuple[Expression, ...] = ()  # continuous ones of outputs, with the text they stand in
+
+    @cached_property
+    def constant(self) -> frozenset[str]:
+        """Those of ``MATRIX_NAMES`` that do not depend on time."""
+        return frozenset(k for k, layout in self.layouts.items() if not len(layout.positions))
+
+    @cached_property
+    def zero(self) -> frozenset[str]:
+        """Those of ``constant`` that vanish."""
+        return frozenset(k for k in self.constant if not self.layouts[k].fixed.any())
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
+    ) -> Coefficients:
+        """All matrices at the times ``t`` (N,) in seconds, to ``order``; see the protocol.
+
+        Raises:
+            ConfigError: an entry without a finite value or derivative; names it and the time. Or
+                a matrix depends on an output, and there are no signals.
+        """
+        if signals is None:
+            for matrix, names in self.signals.items():
+                if not names.isdisjoint(self.outputs):
+                    raise ConfigError(
+                        f"plant {self.name}: {matrix} depends on the output "
+                        f"{min(names & self.outputs)}, which is not known here"
+                    )
+        t = np.asarray(t, dtype=np.float64)
+        filled = self._assembly.taylor(t, order, inside, signals)
+        if filled is None:
+            values = self.tape.taylor(t, order, inside, signals)
+            filled = tuple(self.layouts[k].assemble(values) for k in MATRIX_NAMES)
+        found = Coefficients._make(filled)
+        if signals is None:
+            return found
+        if self.divisors:
+            self._refuse_crossings(t, inside, signals)
+        return found.along(signals)
+
+    @cached_property
+    def _divisors(self) -> Tape:
+        return record(self.divisors)
+
+    def _refuse_crossings(self, t: Array, inside: Array | None, signals: Array) -> None:
+        """Refuse a divisor whose sign differs at two times that follow each other."""
+        ascending = np.argsort(t, kind="stable")
+        values = self._divisors.taylor(t, 0, inside, signals[:1])[0][ascending]
+        crossed = np.argwhere(values[1:] * values[:-1] < 0.0)
+        if len(crossed):
+            k, j = crossed[0]
+            where, (before, after) = self.divisors[j], values[k : k + 2, j]
+            first, then = t[ascending][k : k + 2]
+            at = first + (then - first) * before / (before - after)
+            raise ConfigError(
+                f"{where.where} = {shorten(where.text)} divides by something that passes through "
+                f"zero near t = {at:.6g}"
+            )
+
+    def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
+        """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
+        moving = self.tape.taylor(np.asarray(t, dtype=np.float64), order, inside)
+        values: dict[str, Array] = {}
+        places: dict[str, tuple[NDArray[np.intp], ...]] = {}
+        for name, layout in self.layouts.items():
+            fixed = np.flatnonzero(layout.fixed)
+            there = np.concatenate([fixed, layout.positions])
+            found = np.zeros((order + 1, len(t) if len(layout.positions) else 1, len(there)))
+            found[0, :, : len(fixed)] = layout.fixed[fixed]
+            if len(layout.positions):
+                found[:, :, len(fixed) :] = moving[:, :, layout.columns]
+            values[name] = found
+            places[name] = np.unravel_index(there, layout.shape)
+        return Entries(Coefficients(**values), places)
+
+    @property
+    def of_time(self) -> TextCoefficients:
+        """The same with zero for entries that depend on outputs."""
+        return self.restricted or self
+
+    def truth(self, t: Array) -> Array:
+        """True values of the unknowns at the times ``t`` (N,), shape (N, q)."""
+        values: Array = self.unknowns.taylor(t, 0)[0]
+        return values
+
+    @cached_property
+    def _assembly(self) -> Assembly:
+        layouts = [self.layouts[name] for name in MATRIX_NAMES]
+        targets = np.empty((len(self.tape.outputs), 2), dtype=np.intp)
+        for matrix, layout in enumerate(layouts):
+            targets[layout.columns, 0] = matrix
+            targets[layout.columns, 1] = layout.positions
+        fixed = tuple(layout.fixed.reshape(layout.shape) for layout in layouts)
+        return Assembly(self.tape, targets, fixed)
+
+    def breakpoints(self, start: float, stop: float) -> Array:
+        """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks."""
+        if (start, stop) not in self._breakpoints:
+            self._breakpoints[start, stop] = breakpoints_of_tape(self.tape, start, stop)
+        return self._breakpoints[start, stop].copy()
+
+    @cached_property
+    def _breakpoints(self) -> dict[tuple[float, float], Array]:
+        return {}
+
+    def resolved(self, edges: Array) -> Array:
+        """Edges of cells in which nothing narrow hides, from edges (K + 1,); see the protocol."""
+        key = edges.tobytes()
+        if key not in self._resolved:
+            self._resolved[key] = resolved(self._bounds, edges)
+        return self._resolved[key]
+
+    @cached_property
+    def _resolved(self) -> dict[bytes, Array]:
+        return {}
+
+    @cached_property
+    def _bounds(self) -> Bounds:
+        return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
+
+
+def coefficients_of(
+    entries: Mapping[str, MatrixEntries],
+    inputs: Sequence[Expression],
+    outputs: frozenset[str],
+    name: str,
+    restricted: TextCoefficients | None = None,
+) -> TextCoefficients:
+    """Coefficients from entries by the names in ``MATRIX_NAMES``, and those of theta.
+
+    Args:
+        entries: shape of each, and what stands in it.
+        inputs: expressions of the inputs, which stand for their names in ``entries``.
+        outputs: names that have values only along signals.
+        name: of the plant, for messages.
+        restricted: the same without what depends on outputs; None: it is made here.
+    """
+    if restricted is None and any(
+        not e.node.signals.isdisjoint(outputs)
+        for _, given in entries.values() for e in given.values()
+    ):
+        kept = {
+            key: (shape, {k: e for k, e in given.items() if e.node.signals.isdisjoint(outputs)})
+            for key, (shape, given) in entries.items()
+        }
+        restricted = coefficients_of(kept, inputs, outputs, name)
+    varying: list[Expression] = []
+    layouts: dict[str, _Layout] = {}
+    for key, (shape, given) in entries.items():
+        fixed = np.zeros(prod(shape))
+        constant = {k: e.value for k, e in given.items() if e.is_constant}
+        fixed[list(constant)] = list(constant.values())
+        moving = {k: e for k, e in given.items() if k not in constant}
+        layouts[key] = _Layout(
+            shape,
+            fixed,
+            np.array(list(moving), dtype=np.intp),
+            np.arange(len(varying), len(varying) + len(moving), dtype=np.intp),
+        )
+        varying += moving.values()
+    signals = {
+        key: frozenset[str]().union(*(e.node.signals for e in given.values()))
+        for key, (_, given) in entries.items()
+    }
+    depending = {key: signals[key] for key in MATRIX_NAMES if signals[key]}
+    truth = record(list(entries["theta"][1].values()))
+    divisors = tuple(
+        Expression(node, e.text, e.where) for e in varying for node in divisors_of(e.node)
+        if not node.signals.isdisjoint(outputs)
+    )
+    return TextCoefficients(
+        record(varying, inputs), layouts, truth, depending, outputs, name, restricted, divisors
+    )
