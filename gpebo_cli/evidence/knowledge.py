@@ -20,6 +20,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 _UNRESOLVED = 10.0  # tolerances of the terms of a column of ψ: what is smaller says nothing
 _SINGULAR = 1e-12  # eigenvalues of N below this are rounding of products of float64 numbers
 _SEEN = 1e-6  # part in the kernel of N beyond which a direction is not known
+_NOISE = 1e-12  # of a column of a gain in the states' own units: beyond what extensions are good to
 _MIXED = 1e-14  # over an eigenvalue of N: how far its vector may turn into the kernel's
 _TINY = 1e-100  # squares of its reciprocal are numbers
 
@@ -92,11 +93,20 @@ class Knowledge:
                 chosen = more
         return np.sort(np.array(chosen, dtype=np.intp))
 
-    def states(self, gain: Array) -> BoolArray:
-        """Which states x = offset + gain η are, for gain (M, n, p): shape (M, n)."""
+    def states(self, gain: Array, units: Array | None = None) -> BoolArray:
+        """Which states x = offset + gain η are, for gain (M, n, p): shape (M, n).
+
+        Args:
+            gain: at ascending times; NaN for a state that nothing is known of.
+            units: of the states (n,), in which errors of a gain are of one size; None: not known.
+        """
         kernel, slack = self._kernel
         if not kernel.any() and np.isfinite(gain).all():
             return np.ones(gain.shape[:2], dtype=bool)
+        if units is not None:  # the row of a state that no parameter has part in is rounding
+            own = np.abs(gain) / units[:, None]
+            whole = own.max(axis=1, keepdims=True, initial=0.0, where=np.isfinite(own))
+            gain = np.where(own <= _NOISE * np.maximum.accumulate(whole), 0.0, gain)
         scaled = gain / self.sizes[:, None, :]
         size = _row_norms(scaled)
         return np.asarray(_row_norms(scaled @ kernel) <= slack[:, None] * size)

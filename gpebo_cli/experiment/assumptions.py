@@ -135,7 +135,7 @@ def visible(observation: Observation, known: Knowledge, t: Array, n: int) -> Boo
     """Which of the n states are determined at the times t (N,), shape (N, n)."""
     state_map = observation.state_map
     if isinstance(state_map, AffineStateMap) and observation.names is None:
-        return known.states(state_map.gain(t))
+        return known.states(state_map.gain(t), state_map.units)
     # What it needs of the parameters is not known: all of them.
     return np.repeat(known.parameters.all(axis=1, keepdims=True), n, axis=1)
 

@@ -154,7 +154,7 @@ class Online:
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
             block.regression, made.parameters, block.offset + gain, made.delta,
-            eigenvalues, known, known.states(block.gain), block.extension, std, level,
+            eigenvalues, known, known.states(block.gain, block.units), block.extension, std, level,
         )
 
     def truth(self, extension: Array) -> observers.Truth:

@@ -148,6 +148,7 @@ def joined_observation(
                 Trajectory(each.gain.mesh, wide(each.gain.values, k))
                 for k, each in enumerate(affine)
             ], shifts),
+            affine[0].units,
         ),
         truth=truth, error_estimate=max(each.error_estimate for each in observations),
         growth=max(growth, default=None), growth_rate=max(rates, default=None), respond=None,

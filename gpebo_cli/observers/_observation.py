@@ -58,6 +58,7 @@ class AffineStateMap:
 
     offset: Trajectory  # (n,)
     gain: Trajectory  # (n, p)
+    units: Array | None = None  # (n,) of the states, in which rounding is of one size, if known
 
     @property
     def times(self) -> Array:
@@ -186,3 +187,4 @@ class SampledBlock:
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
     scale: Array  # (K, p) of the terms of each column of ψ so far
     errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset
+    units: Array | None = None  # as of ``AffineStateMap``

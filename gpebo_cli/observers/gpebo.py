@@ -9,16 +9,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from gpebo_cli.errors import ConfigError
+import numpy as np
+
+from gpebo_cli.errors import ConfigError, GpeboError, SolverError
+from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import Measurements, Sampling
-from gpebo_cli.observers._observation import Observation
+from gpebo_cli.observers._observation import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.extension import reduced_system
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
 from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.settings import SolverSettings
+
+_NOTE = "; observer on the strangeness-free form, {}"
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,8 @@ class Gpebo:
 
     Attributes:
         form: the equations as given, or with all hidden constraints beside them, which takes any
-            index and needs no output to see the algebraic states; auto: as given where that does.
+            index and needs no output to see the algebraic states; auto: as given where that does,
+            unless the data determine more on the other form.
         regression: the whole residual, or its last r rows as the paper has it.
         xi_a0: where the dynamic extension starts: by state name, or a list of n_a numbers; None:
             what the plant proposes, else zero.
@@ -78,11 +84,42 @@ class Gpebo:
             ConfigError: no outputs, or a setting that does not fit the plant.
             SolverError: the tolerance cannot be reached.
         """
-        return replace(self.remedy.observe(reduced_system(
+        arguments = system, signals, solver
+        if self.form != "auto" or self.regression == "paper" or not isinstance(self.remedy, Plain):
+            return self._on(self.form, *arguments)
+        found: Observation | SolverError
+        known, everything = -1, system.q + system.n
+        try:
+            found = self._on("auto", *arguments)
+            known = everything if found.note else _determined(found, system, solver)
+            why = "which determines more than the equations as given"
+        except SolverError as error:
+            found, why = error, "for as given its signals are not resolved"
+        if known < everything:
+            # On both forms the same can be known, but an unstable A_0 hides it.
+            try:
+                other = self._on("strangeness_free", *arguments, _NOTE.format(why))
+                if _determined(other, system, solver) > known:
+                    return other
+            except GpeboError:  # the form does not exist, or not for these signals
+                pass
+        if isinstance(found, SolverError):
+            raise found
+        return found
+
+    def _on(
+        self, form: str, system: DescriptorSystem, signals: Measurements, solver: SolverSettings,
+        note: str = "",
+    ) -> Observation:
+        """:meth:`observe` on a form of the equations."""
+        reduced = reduced_system(
             system, signals, solver,
-            xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=self.form,
+            xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=form,
             unknown=self.unknown_initial,
-        )), bounds=self.bounds)
+        )
+        return replace(
+            self.remedy.observe(replace(reduced, note=note or reduced.note)), bounds=self.bounds
+        )
 
     def sampling(self) -> Sampling | None:
         """The samples that ``sample_time`` asks for."""
@@ -121,6 +158,20 @@ class Gpebo:
                 f"observer.remedy={name} works in continuous time only; at samples "
                 "(observer.sample_time, streams) there is none"
             )
+
+
+def _determined(found: Observation, system: DescriptorSystem, solver: SolverSettings) -> int:
+    """How many of the unknowns and states the data determine at the end."""
+    regression, state_map = found.regression, found.state_map
+    if not isinstance(state_map, AffineStateMap):
+        return 0
+    start, stop = regression.mesh.edges[[0, -1]]
+    scale = np.broadcast_to(regression.scale, (regression.mesh.size, regression.p))
+    known = knowledge(
+        regression.gram.final[None], scale[-1:], np.array([stop - start]), solver.tol
+    )
+    seen = known.states(state_map.gain(np.linspace(start, stop, 11)), state_map.units)[-1]
+    return int(known.parameters[0, : system.q].sum() + seen.sum())
 
 
 OBSERVER = Gpebo

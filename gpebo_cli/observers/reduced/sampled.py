@@ -214,7 +214,9 @@ class SampledObserver:
                 np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
             ))
         offset, gain = resolved(assembled, z, system, self.basis, equations, self.form.scales)
-        return state, SampledBlock(regression, offset, gain, z, scale, errors)
+        return state, SampledBlock(
+            regression, offset, gain, z, scale, errors, self.form.scales
+        )
 
 
 def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
@@ -234,6 +236,7 @@ def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
         None if first.errors is None or rest.errors is None else ErrorSteps(
             *map(np.concatenate, zip(first.errors, rest.errors, strict=True))
         ),
+        first.units,
     )
 
 

@@ -96,7 +96,9 @@ class CurrentCoordinates:
                 scale=final.column_scale,
                 dynamics=Dynamics(on_mesh(mesh, A), on_mesh(mesh, b), -2.0 * fastest),
             ),
-            state_map=AffineStateMap(on_mesh(mesh, final.offset), on_mesh(mesh, final.gain)),
+            state_map=AffineStateMap(
+                on_mesh(mesh, final.offset), on_mesh(mesh, final.gain), reduced.form.scales
+            ),
             truth=CurrentState(reduced),
             error_estimate=error,
             assumptions=assumptions(reduced, mesh, final),

@@ -39,7 +39,9 @@ class Plain:
                 parameters=(*system.unknowns, *reduced.names),
                 scale=extension.scale(q),
             ),
-            state_map=AffineStateMap(on_mesh(mesh, final.offset), on_mesh(mesh, final.gain)),
+            state_map=AffineStateMap(
+                on_mesh(mesh, final.offset), on_mesh(mesh, final.gain), reduced.form.scales
+            ),
             truth=InitialError(
                 reduced.initial_basis, reduced.xi_a0, reduced.basis, extension.solution.trajectory
             ),

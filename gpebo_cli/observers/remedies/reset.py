@@ -197,7 +197,9 @@ def _joined(
             scale=np.concatenate([e.scale(q) for e in extensions]),
             resets=tuple(resets),
         ),
-        state_map=AffineStateMap(on_mesh(mesh, whole.offset), on_mesh(mesh, whole.gain)),
+        state_map=AffineStateMap(
+            on_mesh(mesh, whole.offset), on_mesh(mesh, whole.gain), reduced.form.scales
+        ),
         truth=SegmentErrors(
             tuple(starts), reduced.basis,
             Trajectory(mesh, np.concatenate([e.solution.trajectory.values for e in extensions])),
