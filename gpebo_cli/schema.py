@@ -293,7 +293,7 @@ def _describe(kind: Any) -> str:
     if origin is Union or origin is types.UnionType:
         return " or ".join(_describe(a) for a in arguments)
     if origin is Literal:
-        return " or ".join(str(a) for a in arguments)
+        return " or ".join(str(a) if str(a)[:1].isalnum() else shown(a) for a in arguments)
     if origin is list:
         return f"a list (each {_describe(arguments[0])})"
     if origin is not None and issubclass(origin, Mapping):

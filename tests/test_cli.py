@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests import inprocess
+
 ROOT = Path(__file__).parents[1]
 FAST = ["figures=none", "time.samples=51"]
 
@@ -173,6 +175,8 @@ WRONG = [
     (["run", "estimator.gama=1"], "did you mean gamma?"),
     (["run", "+estimator.foo=1"], "estimator.foo: no such key"),
     (["run", "+plant.foo=1"], "unknown key 'foo'"),
+    (["run", "plant.inputs={W: 0}"], "plant.inputs.W: no such key"),
+    (["run", "data.decimal=x", "data.file=a.csv"], "data.decimal: expected '.' or ',', got 'x'"),
     (["run", "+foo=1"], "foo: no such key"),
     (["run", "+plant=circuit"], "plant is chosen twice"),
     (["run", "~plant"], "plant.name is missing"),
@@ -434,6 +438,26 @@ def test_cfg_prints_the_configuration_and_runs_nothing(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     assert yaml.safe_load(done.stdout)["plant"]["name"] == "descriptor"
     assert folders(tmp_path) == []
+
+
+@pytest.mark.parametrize(("word", "value"), [
+    ("plant.inputs.V=2*sin(t)/(1 + t)", "2*sin(t)/(1 + t)"),
+    ("plant.inputs.V=sin(t)", "sin(t)"),
+    ("data.separator=;", ";"),
+    ("data.decimal=,", ","),
+    ("data.columns={u: U in (V), t: Time}", {"u": "U in (V)", "t": "Time"}),
+    ('data.columns={"u": "U, in (V)"}', {"u": "U, in (V)"}),
+    ("plant.C=[[1, -1-cos(t)], [true, null]]", [[1, "-1-cos(t)"], [True, None]]),
+    ("plant.title=it's (new)", "it's (new)"),
+])
+def test_what_hydra_cannot_read_is_text(word, value, tmp_path):
+    key = word.partition("=")[0]
+    done = inprocess.gpebo("run", "--cfg", "job", "data=csv", word, cwd=tmp_path)
+    assert not done.err
+    found = yaml.safe_load(done.out)
+    for part in key.split("."):
+        found = found[part]
+    assert found == value
 
 
 # Sweeps ---------------------------------------------------------------------------------------

@@ -576,6 +576,7 @@ def test_a_recording_from_python(tmp_path):
     cubic = run("circuit", estimator="ls_drem", data={"file": path, "hold": "cubic"})
     assert from_path.t[-1] == 20.0
     assert np.isnan(cubic["il"]).all()
+    assert cubic.parameters == {k: cubic.estimates[k][0, -1] for k in cubic.parameters}
     fits = [result.details.fit.residual[0] for result in (from_path, cubic)]
     assert fits[1] < 1e-2 * fits[0]
     found = check("circuit", data=path)

@@ -100,7 +100,7 @@ GOOD = {"name": "r", "unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": ["
     ({"Y": ["a*u"]}, "a is an unknown and cannot be used here"),
     ({"Y": ["lpp(u, 1)"]}, "there is no function 'lpp'; did you mean lp?"),
     ({"Phi": 1}, "unknown key 'Phi'; did you mean"),
-    ({"signals": {"u": "sin("}}, "regression r: inputs.u"),
+    ({"signals": {"u": "sin("}}, "regression r: signals.u"),
 ])
 def test_mistakes(change, message):
     with pytest.raises(ConfigError) as error:
@@ -111,3 +111,13 @@ def test_mistakes(change, message):
 def test_an_expression_without_a_value_is_named_with_its_time():
     with pytest.raises(ConfigError, match="1/u"):
         on_mesh({**GOOD, "psi": [["1/u"]]})
+
+
+def test_signals_are_made_of_parameters():
+    given = {**GOOD, "parameters": {"w": 3, "twice": "2*u"}, "psi": [["u + 0*twice"]]}
+    t = np.linspace(0.0, 2.0, 9)
+    with_name, with_number = (
+        regression_from_mapping({**given, "signals": {"u": text}}).system.coefficients.taylor(t, 0)
+        for text in ("sin(w*t)", "sin(3*t)")
+    )
+    np.testing.assert_array_equal(with_name.u, with_number.u)

@@ -364,3 +364,21 @@ def test_what_stands_between_the_nodes_is_seen(when, width):
     x1, x2 = result.signals.states(np.array([20.0]))[0]
     assert x1 == pytest.approx(area + 1e-3 * (1 - np.cos(20.0)), rel=1e-10)
     assert x2 == pytest.approx(np.exp(-100 * area), rel=1e-10)
+
+
+def test_states_that_nothing_drives_are_no_signals():
+    # Constraints leave e1 = −V = 0 and ir2 = e1/R2; rounding of the others must not be resolved.
+    found = simulate(shipped("circuit", inputs={"V": 0}), TimeSettings(), SolverSettings())
+    states = found.signals.states
+    assert np.abs(states.values[..., [0, 4]]).max() < 1e-14
+    assert states.mesh.size < 200
+    x0 = found.initial_state
+
+    def reduced(t, z):  # z = (C2 e2, L il), ir1 = e2/(4 + 2 sin t)
+        e2, il = z[0] / (2 - np.cos(2 * t)), z[1] / (2 - np.exp(-t))
+        return [-il - e2 / (4 + 2 * np.sin(t)), e2]
+
+    start = [x0[1] * 1.0, x0[2] * 1.0]  # C2(0) = L(0) = 1
+    end = solve_ivp(reduced, (0, 20), start, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    expected = [end[0] / (2 - np.cos(40.0)), end[1] / (2 - np.exp(-20.0))]
+    np.testing.assert_allclose(states.values[-1, -1, [1, 2]], expected, atol=1e-9)

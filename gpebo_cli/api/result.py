@@ -154,11 +154,16 @@ class Result:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """True values of θ and e₀ by name, at the end; none without an observer."""
-        estimation = self.details.estimation
+        """θ and e₀ by name, at the end: true values, or the estimates where nobody knows them.
+
+        Of a recording those of the case that explains it best; without an observer there are none.
+        """
+        estimation, fit = self.details.estimation, self.details.fit
         if estimation is None:
             return {}
-        pairs = zip(estimation.names, estimation.true_parameters[-1], strict=True)
+        found = estimation.parameters[0 if fit is None else fit.best, -1]
+        truth = estimation.true_parameters[-1]
+        pairs = zip(estimation.names, np.where(np.isnan(truth), found, truth), strict=True)
         return {name: float(value) for name, value in pairs}
 
     @property

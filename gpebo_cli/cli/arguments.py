@@ -45,7 +45,6 @@ VALUES = {
 }
 """What an option that has few values accepts."""
 
-# Hydra takes name(…) for one of its own functions, unless it is quoted.
 _LOGSPACE = re.compile(r"^([^=]+)=(logspace\([^()'\"]*\))$")
 # What Hydra's grammar reads as a number, a truth value or nothing.
 _NOT_TEXT = re.compile(
@@ -239,20 +238,17 @@ def logspace(text: str, where: str) -> str | None:
 
 def _override(word: str, *, multirun: bool) -> str:
     """One override as Hydra takes it: ``logspace`` is a sweep with -m, else an axis of one run."""
-    match = _LOGSPACE.match(word)
-    if match is None:
-        key, equals, value = word.partition("=")
-        if key.lstrip("+") == "hydra/sweeper" and equals:
-            raise ConfigError(f"{word}: gpebo has a sweeper of its own; leave this away")
-        if key.lstrip("+") in GROUPS and value.startswith("["):
-            names = ",".join(name.strip() for name in value.strip("[]").split(","))
-            raise ConfigError(f"{word}: one {key} for a run; for a run for each: -m {key}={names}")
-        if key.lstrip("+") in GROUPS and equals and (multirun or "," not in value):
-            return f"{key}={_names(value)}"
-        return word
-    if multirun:
+    if multirun and (match := _LOGSPACE.match(word)):
         return f"{match[1]}={logspace(match[2], match[1])}"
-    return f"{match[1]}='{match[2]}'"
+    key, equals, value = word.partition("=")
+    if key.lstrip("+") == "hydra/sweeper" and equals:
+        raise ConfigError(f"{word}: gpebo has a sweeper of its own; leave this away")
+    if key.lstrip("+") in GROUPS and value.startswith("["):
+        names = ",".join(name.strip() for name in value.strip("[]").split(","))
+        raise ConfigError(f"{word}: one {key} for a run; for a run for each: -m {key}={names}")
+    if key.lstrip("+") in GROUPS and equals and (multirun or "," not in value):
+        return f"{key}={_names(value)}"
+    return word
 
 
 def _names(chosen: str) -> str:

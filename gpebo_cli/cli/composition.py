@@ -7,11 +7,13 @@ anything in it is used.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, cast
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -24,19 +26,22 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.types import RunMode
 from hydra.version import setbase
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gpebo_cli.cli.arguments import Arguments
+from gpebo_cli.cli.arguments import Arguments, quoted
 from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS, explain
 from gpebo_cli.configs import files
-from gpebo_cli.configs.locations import choices, conf_folder
+from gpebo_cli.configs.locations import GROUPS, choices, conf_folder
+from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 
 _INSTANTIATED = ("hydra.launcher._target_", "hydra.sweeper._target_")
+_BETWEEN = re.compile(r",(?![^(]*\))")  # commas that are not within an expression's brackets
 _PLUGINS = ("hydra_plugins.", "hydra._internal.core_plugins.")
 
 
@@ -155,13 +160,46 @@ def session(arguments: Arguments) -> Iterator[Hydra]:
         GlobalHydra.instance().clear()
 
 
+def _words(arguments: Arguments) -> list[str]:
+    """The overrides, quoted where Hydra's grammar would not read them.
+
+    A value that it cannot read is text, such as a formula (``plant.inputs.V=2*sin(t)``) or a single
+    comma; in brackets it is YAML.
+    """
+    parser = OverridesParser.create()
+    swept = "--multirun" in arguments.switches
+    return [_readable(parser, word, swept=swept) for word in arguments.for_hydra]
+
+
+def _readable(parser: OverridesParser, word: str, *, swept: bool) -> str:
+    try:
+        parser.parse_override(word)
+    except HydraException:
+        key, _, value = word.partition("=")
+        if value.startswith(("[", "{")):
+            with suppress(ConfigError):
+                return f"{key}={_quoted_within(parse(value, key))}"
+        elif key and key not in GROUPS and value and value[0] not in "'\"":
+            texts = _BETWEEN.split(value) if swept else [value]
+            return f"{key}={','.join(map(quoted, texts))}"
+    return word
+
+
+def _quoted_within(value: object) -> str:
+    if isinstance(value, dict):
+        return f"{{{','.join(f'{key}:{_quoted_within(inner)}' for key, inner in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{','.join(map(_quoted_within, value))}]"
+    return quoted(value) if isinstance(value, str) else json.dumps(value)
+
+
 def compose(hydra: Hydra, arguments: Arguments) -> tuple[DictConfig, bool]:
     """The configuration, and whether it is of a sweep: a recipe may say so, too.
 
     Raises:
         ConfigError: it would run code.
     """
-    words = arguments.for_hydra
+    words = _words(arguments)
     config = hydra.config_loader.load_configuration(
         arguments.config_name, words, RunMode.MULTIRUN, validate_sweep_overrides=False
     )
@@ -179,7 +217,7 @@ def compose(hydra: Hydra, arguments: Arguments) -> tuple[DictConfig, bool]:
 
 def show(hydra: Hydra, arguments: Arguments) -> bool:
     """Answer ``--cfg``, ``--info`` and the like; whether there was such a question."""
-    name, words = arguments.config_name, list(arguments.for_hydra)
+    name, words = arguments.config_name, _words(arguments)
     options = arguments.options
     if "--hydra-help" in arguments.switches:
         program = [f"{os.path.basename(sys.argv[0])} run", *words]

@@ -126,6 +126,7 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
     if not path:
         known += [group for group in GROUPS if group not in known]
     missing = key.removeprefix(path).lstrip(".").partition(".")[0]
+    missing = missing or str(getattr(cause, "key", ""))  # of a mapping that was given as a whole
     full = f"{path}.{missing}" if path else missing
     if not known:
         return f"{full}: {path} is empty; give it as a whole, as in '{path}={{{missing}: VALUE}}'"

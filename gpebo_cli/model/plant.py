@@ -118,7 +118,8 @@ def plant_from_mapping(
         _check_signals(expression, elsewhere, allowed or {}, where.partition("[")[0])
         return expression
 
-    u = [read(value, f"inputs.{label}", None) for label, value in inputs.items()]
+    where = "inputs" if kind == "plant" else "signals"
+    u = [read(value, f"{where}.{label}", None) for label, value in inputs.items()]
     entries = _entries(plant, mapping, read, states, tuple(inputs), tuple(unknowns), outputs)
     entries["u"] = (len(inputs),), dict(enumerate(u))
     theta = [read(value, f"unknowns.{label}", None) for label, value in unknowns.items()]

@@ -32,7 +32,7 @@ _ROUNDING = 8.0  # units in the last place that cannot be resolved
 LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _SAME = 1e-9  # relative difference of rates that are constant
 _FAINT = 1e-6  # of the largest state: errors below that do not end a solution
-_NOTHING = 8.0 * EPS  # of what it is made of: a component that is smaller is rounding itself
+NOTHING = 8.0 * EPS  # of what it is made of: a component that is smaller is rounding itself
 
 
 class Errors(NamedTuple):
@@ -84,7 +84,7 @@ def judged_errors(
         total = carried.max(axis=0) + tail + noise + EPS * (_VALUE * own + through)
         coupled = np.maximum(np.maximum(made_of, through), problem.floor)
         if problem.apart:
-            scale = np.where(own > _NOTHING * coupled, own, coupled)
+            scale = np.where(own > NOTHING * coupled, own, coupled)
         else:
             scale = np.maximum(np.maximum(own, problem.floor), SHARE * own.max(initial=0.0))
         scale = np.maximum(scale, _TINY)

@@ -243,7 +243,7 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         {
             "states": [], "E": [], "A": [], "initial_state": [],
             **{k: v for k, v in mapping.items()
-               if k not in ("signals", "Y", "psi", "parameters", "S", "box")},
+               if k not in ("signals", "Y", "psi", "S", "box")},
             "inputs": signals,
             "outputs": [] if right is not None else [f"Y_{i + 1}" for i in range(count)],
             **own,

@@ -16,7 +16,7 @@ from gpebo_cli.model.descriptor import (
     distinct,
 )
 from gpebo_cli.numerics.collocation import LinearSolution, solve
-from gpebo_cli.numerics.errors import least_sizes
+from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes
 from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.numerics.mesh import (
     FIRST_ELEMENTS,
@@ -135,7 +135,7 @@ def _simulate_linear(
         floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
-        _amplification(first, float(mesh.steps.max())), apart=True,
+        _amplification(first, structure.scaling.columns, float(mesh.steps.max())), apart=True,
     )
     if solver.name == "ivp":
         solution = _integrate(system, structure, problem, mesh, solver, restarts)
@@ -223,12 +223,13 @@ def _growth_resolved(
     return mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
 
 
-def _amplification(form: StrangenessFree, step: float) -> Array:
+def _amplification(form: StrangenessFree, units: Array, step: float) -> Array:
     """By how much relative rounding of each state, and of 1, reaches each state, (n, n + 1).
 
     Through the constraints; through x = T z of z = E1 x, where a state that is the small difference
-    of large components of z is rounding of those; and through the equations within a ``step``
-    (seconds), because what integrates rounding is no signal either.
+    of large components of z is rounding of those, and an entry of T that is nothing beside the
+    others (in ``units`` of the states (n,)) is rounding as a whole; and through the equations
+    within a ``step`` (seconds), because what integrates rounding is no signal either.
     """
     some = slice(None, None, max(1, len(form.E1) // _LOOKED_AT))
     E1, A1 = form.E1[some], form.A1[some if len(form.A1) > 1 else slice(None)]
@@ -238,7 +239,9 @@ def _amplification(form: StrangenessFree, step: float) -> Array:
     else:
         T = form.basis[some]
     found = form.amplification.copy()
-    found[:, :-1] += (np.abs(T) @ np.abs(E1)).max(axis=0)
+    sizes = np.abs(T) / units[:, None] * (np.abs(E1) @ units)[:, None]
+    rounding = np.where(sizes > NOTHING * sizes.max(initial=0.0), 1.0, 1.0 / EPS)
+    found[:, :-1] += ((np.abs(T) * rounding) @ np.abs(E1)).max(axis=0)
     within = np.minimum(step * (np.abs(T) @ np.abs(A1)).max(axis=0), 1.0)
     once = within @ found
     return np.asarray(found + once + within @ once)
