@@ -60,14 +60,14 @@ def interpolation(
         belongs: times that decide about the element.
         exact: nearer than this, in elements, a point's own value is taken.
     """
-    element = np.clip(np.searchsorted(edges, belongs, side="right") - 1, 0, len(edges) - 2)
-    local = (t - edges[element]) / (edges[element + 1] - edges[element])
-    distance = local[:, None] - places
-    near = np.abs(distance) < exact
-    hit = near.any(axis=1)
-    with np.errstate(divide="ignore"):
-        weights = barycentric / np.where(near, 1.0, distance)
-    weights[hit] = near[hit]
+    element = edges[1:-1].searchsorted(belongs, side="right")
+    left = edges[element]
+    distance = ((t - left) / (edges[element + 1] - left))[:, None] - places
+    row, point = (np.abs(distance) < exact).nonzero()
+    distance[row, point] = 1.0
+    weights = barycentric / distance
+    weights[row] = 0.0
+    weights[row, point] = 1.0
     weights /= weights.sum(axis=1, keepdims=True)
     return element, weights
 

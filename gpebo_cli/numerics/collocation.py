@@ -140,21 +140,22 @@ def _tail_of_numbers(
     tail = np.zeros(mesh.size)
     if count:
         part = slice(count)
-        made_of = np.abs(values[part])
         if problem.apart:
             last = np.abs(maps.homogeneous[part, -1])
-            made_of = last @ made_of[:, 0] + np.abs(maps.particular[part, -1])
+            made_of = last @ np.abs(values[part, 0]) + np.abs(maps.particular[part, -1])
+        else:
+            made_of = np.abs(values[part]).max(axis=0)
         tail[part] = unresolved_signals(
-            problem, Mesh(mesh.edges[: count + 1], mesh.rule), values[part],
+            problem, mesh.rule, values[part],
             tuple(e if e.shape[:2] == (1, 1) else e[part] for e in maps.extras),
-            made_of.max(axis=tuple(range(made_of.ndim - 2))), tol,
+            made_of.max(axis=0), tol,
         )
     return tail
 
 
 def unresolved_signals(
-    problem: LinearProblem, mesh: Mesh, values: Array, extras: tuple[Array, ...], made_of: Array,
-    tol: float,
+    problem: LinearProblem, rule: RadauRule, values: Array, extras: tuple[Array, ...],
+    made_of: Array, tol: float,
 ) -> Array:
     """:func:`unresolved_kinds` over the solution and everything computed from it, shape (K,).
 
@@ -166,7 +167,7 @@ def unresolved_signals(
     kinds: list[Kind] = [(values.reshape(size, points, n * columns), least)]
     if problem.monitor is not None:
         kinds += problem.monitor(values, extras)
-    return unresolved_kinds(kinds, mesh.rule)
+    return unresolved_kinds(kinds, rule)
 
 
 def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArray) -> _ElementMaps:
@@ -306,6 +307,8 @@ def _equal_lengths(h: Array) -> IntArray:
 
     Groups are numbered as they first appear.
     """
+    if h.max(initial=0.0) - h.min(initial=np.inf) <= _EQUAL * h.max(initial=0.0):
+        return np.zeros(len(h), dtype=np.intp)
     order = np.argsort(h, kind="stable")
     new = np.diff(h[order]) > _EQUAL * h.max()
     by_length = np.empty(len(h), dtype=np.intp)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpebo_cli.kernels.elements_numpy import carried_errors
+from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import SHARE, Mesh, used_coefficients
 from gpebo_cli.numerics.problem import LinearProblem
@@ -56,28 +56,61 @@ def estimated_errors(
             element (K or 1, n, n + columns); relative rounding of them is an error.
         values: the solution.
     """
-    K, _, n, columns = values.shape
-    rule, renewal = mesh.rule, problem.renewal
-    signs = _signs(K, n)
-
-    def renew(k: int, error: Array) -> Array:
-        apart = np.moveaxis(error.reshape(n, 2 * _SIGNS, columns), 1, 0)
-        renewed = renewal.error(values[k - 1, -1], apart)  # type: ignore[union-attr]
-        return np.moveaxis(renewed, 0, 1).reshape(error.shape)
-
+    K, points, n, columns = values.shape
+    rule, used, width = mesh.rule, used_coefficients(mesh.rule), 2 * _SIGNS * columns
     with np.errstate(over="ignore", invalid="ignore"):
-        carried, tail, own, noise, made_of = carried_errors(
-            values, last, particular, noise, mesh.steps, rule.to_legendre, signs,
-            used_coefficients(rule), EPS, END, _CHANCE, _SAME, LEVEL,
-            None if renewal is None else renew,
+        sizes = np.abs(values).max(axis=1)
+        size = np.maximum(sizes, _TINY)
+        shown = np.abs(rule.to_legendre[-4:] @ values.reshape(K, points, n * columns))
+        shown = shown.reshape(K, -1, n, columns)
+        to_next = points / np.arange(points - used, points)  # (ρ^j)^this = ρ^(s + 1)
+        shares = np.minimum(shown[:, -used:] / size[:, None], 1.0) ** to_next[:, None, None]
+        share = shares.max(axis=1)
+        visible = np.zeros((n, columns))
+        if shown.shape[1] == 4:
+            before, after = shown[:, :2].max(axis=1), shown[:, 2:].max(axis=1)
+            visible = np.where(after >= LEVEL * before, after, 0.0).max(axis=0)
+        made_of = np.abs(last) @ np.abs(values[:, 0]) + np.abs(particular)
+        # End points are superconvergent, of order 2s − 1 against s + 1 inside: with ρ the decay per
+        # coefficient their error is about ρ^(s−1) times the tail. Half that exponent is used.
+        tail = size * share
+        kinds = np.empty((K, n, 2, 1, columns))
+        kinds[:, :, 0, 0] = tail * share ** (0.5 - 0.5 / rule.stages)
+        kinds[:, :, 1, 0] = EPS * (END * made_of + noise[..., :n] @ sizes + noise[..., n:])
+        signs = _signs(K, n).reshape(K + 1, n, 2, _SIGNS, 1)
+        added = (signs[1:] * kinds).reshape(K, n, width)
+        start = signs[0] * (EPS * np.abs(values[0, 0]))[:, None, None]
+        start[:, 0] = 0.0
+        error, renewal = start.reshape(n, width), problem.renewal
+        if renewal is None:  # X' = last X + added is what a chain of elements is
+            ends = elements.chain(last[:, None], added[:, None], error)[0][:, 1]
+        else:
+            ends = np.empty_like(added)
+            for k in range(K):
+                if k:
+                    apart = np.moveaxis(error.reshape(n, 2 * _SIGNS, columns), 1, 0)
+                    error = renewal.error(values[k - 1, -1], apart)
+                    error = np.moveaxis(error, 0, 1).reshape(n, width)
+                ends[k] = error = last[k if len(last) > 1 else 0] @ error + added[k]
+        squares = np.square(ends).reshape(K, n, 2, _SIGNS, columns).sum(axis=3)
+        rms = np.sqrt(squares / _SIGNS)
+        rates = noise[..., :n] / mesh.steps[: len(noise), None, None]
+        constant = bool((np.abs(rates - rates[0]) <= _SAME * rates[0]).all())
+        systematic = np.sqrt(np.arange(2, K + 2))[:, None, None]
+        by_chance = systematic if constant else np.minimum(systematic, _CHANCE)
+        carried = systematic * rms[:, :, 0] + by_chance * rms[:, :, 1]
+        return judged_errors(
+            problem, carried, tail.max(axis=0), sizes.max(axis=0), visible, made_of.max(axis=0)
         )
-    return judged_errors(problem, carried, tail, own, noise, made_of)
 
 
 def judged_errors(
     problem: LinearProblem, carried: Array, tail: Array, own: Array, noise: Array, made_of: Array
 ) -> Errors:
-    """Errors from what ``kernels.elements.carried_errors`` returns: (K, n, c), and (n, c) each."""
+    """Errors from bounds of them at right ends (K, n, c), and the largest over time (n, c) each of
+
+    tails, values, noise that shows, and what right ends are made of.
+    """
     K = len(carried)
     with np.errstate(over="ignore", invalid="ignore"):
         through = _through_constraints(problem, own)
@@ -96,10 +129,14 @@ def judged_errors(
                   int(np.argmax(lost)) if lost.any() else K)
 
 
-@lru_cache(maxsize=8)
 def _signs(K: int, n: int) -> Array:
     """For each kind of error at the start and the ends of K elements, (K + 1, n, 2 _SIGNS)."""
-    bits = np.random.default_rng(0).integers(0, 2, (K + 1, n, 2 * _SIGNS), dtype=np.int8)
+    return _first_signs(1 << K.bit_length(), n)[: K + 1]
+
+
+@lru_cache(maxsize=16)
+def _first_signs(count: int, n: int) -> Array:
+    bits = np.random.default_rng(0).integers(0, 2, (count, n, 2 * _SIGNS), dtype=np.int8)
     signs: Array = np.where(bits == 1, 1.0, -1.0)
     signs.flags.writeable = False
     return signs

@@ -11,6 +11,7 @@ import numpy as np
 from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray
 
+_TINY = float(np.finfo(float).tiny)
 _CANCELLED = 1e-13  # of the terms of an entry: what is left is rounding
 
 
@@ -46,7 +47,7 @@ def exact_product(left: Array, right: Array) -> Array:
 
 def frobenius_norm(matrix: Array) -> Array:
     """Frobenius norms (N,) of matrices (N, i, j), at least the smallest positive number."""
-    return np.asarray(np.sqrt(np.einsum("nij,nij->n", matrix, matrix)) + np.finfo(float).tiny)
+    return np.asarray(np.sqrt(np.einsum("nij,nij->n", matrix, matrix)) + _TINY)
 
 
 def inverse_or_none(whole: Array) -> tuple[Array, BoolArray]:

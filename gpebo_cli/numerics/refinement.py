@@ -47,7 +47,9 @@ def refine(
     while True:
         found, tail = evaluate(mesh, found, kept)
         # An element that was cut and is no better than the one it comes from shows rounding.
-        poor = (tail > tol) & ~((tail > 0.25 * floor) & (tail < _ROUNDING))
+        poor = tail > tol
+        if poor.any():
+            poor &= (tail <= 0.25 * floor) | (tail >= _ROUNDING)
         if not poor.any():
             return mesh, found, tail, rounds
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)

@@ -231,7 +231,7 @@ def _errors(problem: LinearProblem, mesh: Mesh, units: Array, found: _Found) -> 
     sizes = np.abs(values).max(axis=1)
     size, flat = np.maximum(sizes, _TINY), values.reshape(K, points, n * columns)
     tail = legendre_tail(flat, rule, size.reshape(K, -1)).reshape(sizes.shape)
-    # As in kernels.elements.carried_errors; and what sweeps have not finished.
+    # As in numerics.errors; and what sweeps have not finished.
     added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * sizes
     added += EPS * (END * found.made_of + found.moved)
     start = EPS * np.abs(values[0, 0])

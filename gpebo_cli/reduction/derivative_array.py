@@ -12,12 +12,14 @@ or M (x_1, …, x_{μ+1}) = N x_0 + g with M_ij = (j + 1) e_{i−j} − a_{i−j
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from gpebo_cli.kernels.structure_numpy import forcing as kernel_forcing
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, distinct
 
+_KEPT = 40  # states, up to which what the pattern of E and A alone decides is kept
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 
 
@@ -53,12 +55,10 @@ def balance(c: Coefficients) -> Scaling:
     sizes = np.array([np.abs(distinct(matrix)[0]).max(axis=0) for matrix in (c.E, c.A)])
     there = sizes > 0.0
     while True:
-        kind, i, j = there.nonzero()
-        logs, every = np.log(sizes[there]), np.arange(len(i))
-        terms = np.zeros((len(i), 2 * n + 1))  # of r, c and τ in the logarithm of each entry
-        terms[every, i] = terms[every, n + j] = 1.0
-        terms[:, -1] = kind - 1.0
-        factors = -np.linalg.lstsq(terms.T @ terms, logs @ terms, rcond=1e-12)[0]
+        balancing = _balancing if n <= _KEPT else _balancing.__wrapped__
+        terms, least_squares = balancing(there.tobytes(), n)
+        logs = np.log(sizes[there])
+        factors = -(least_squares @ (logs @ terms))
         entries = np.exp(terms @ factors + logs)
         if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
             break
@@ -75,6 +75,16 @@ def balance(c: Coefficients) -> Scaling:
     weights = 10.0 ** np.rint((r - r[0]) / np.log(10.0)) if n else np.zeros(0)
     powers = np.exp2(np.rint(factors / np.log(2.0)))
     return Scaling(powers[:n], powers[n:-1], float(powers[-1]), np.asarray(weights))
+
+
+@lru_cache(maxsize=64)
+def _balancing(there: bytes, n: int) -> tuple[Array, Array]:
+    """What r, c and τ contribute to the logarithm of each entry that is there; (terms⊤terms)⁺."""
+    kind, i, j = np.frombuffer(there, dtype=np.bool_).reshape(2, n, n).nonzero()
+    every, terms = np.arange(len(i)), np.zeros((len(i), 2 * n + 1))
+    terms[every, i] = terms[every, n + j] = 1.0
+    terms[:, -1] = kind - 1.0
+    return terms, np.linalg.pinv(terms.T @ terms, rcond=1e-12, hermitian=True)
 
 
 def who(system: DescriptorSystem) -> str:

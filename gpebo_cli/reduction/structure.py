@@ -164,7 +164,10 @@ def _refuse_overflow(
     """
     with np.errstate(all="ignore"):
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
-        finite = all(np.isfinite(distinct(matrix) * weight).all() for matrix in (c.E, c.A))
+        largest = max(np.abs(distinct(matrix)).max(initial=0.0) for matrix in (c.E, c.A))
+        finite = np.isfinite(largest * weight.max(initial=0.0)) or all(
+            np.isfinite(distinct(matrix) * weight).all() for matrix in (c.E, c.A)
+        )
     if not finite:
         raise ModelError(
             f"{who(system)}: E and A change by more powers of ten than numbers hold; shorten "
@@ -186,12 +189,12 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
     if not {"E", "A"} <= system.coefficients.constant:
         edges = system.coefficients.resolved(initial_edges(start, stop, jumps))
     if edges is not None:  # where something is narrow
-        steps = np.diff(edges)
-        narrow = np.flatnonzero(steps < 0.4 * (stop - start) / FIRST_ELEMENTS)
+        steps = edges[1:] - edges[:-1]
+        narrow = (steps < 0.4 * (stop - start) / FIRST_ELEMENTS).nonzero()[0]
         narrow = narrow[:: 1 + len(narrow) * _NARROW // _MOST_PROBES]
         places = (np.arange(_NARROW) + 0.5) / _NARROW
         looks = edges[narrow, None] + steps[narrow, None] * places
-        t = np.unique(np.concatenate([t, looks.ravel()]))
+        t = np.unique(np.concatenate([t, looks.ravel()])) if len(narrow) else t
     if not len(jumps):
         return t
     cuts = np.concatenate([[start], jumps, [stop]])
@@ -259,13 +262,14 @@ class _Levels:
 
 def _why_not(t: Array, smallest: Array, rank_tol: float) -> str:
     """What the singular values of Â2 or E T2 (N, 3) say against this μ, or nothing."""
-    for column, what in ((1, "constraints are linearly dependent"),
-                         (2, "some states are in no equation's derivative and in no constraint")):
-        bad = smallest[:, column] <= rank_tol
-        if bad.any():
-            k = int(np.argmax(bad))
-            return f"{what} at t = {t[k]:.6g} (singular value {smallest[k, column]:.1e})"
-    return ""
+    bad = smallest[:, 1:] <= rank_tol
+    if not bad.any():
+        return ""
+    column = int(np.argmax(bad.any(axis=0)))
+    k = int(np.argmax(bad[:, column]))
+    what = ("constraints are linearly dependent",
+            "some states are in no equation's derivative and in no constraint")[column]
+    return f"{what} at t = {t[k]:.6g} (singular value {smallest[k, column + 1]:.1e})"
 
 
 _PLAIN = 1e-5  # bounds of singular values above this need no closer look
@@ -336,6 +340,8 @@ def _follow_dips(
     and not at the flat bottom of a harmless dip. Comparing with the round before would not do: a
     probe may by luck be nearer to the zero than the times of the first round.
     """
+    if not dips:
+        return
     names = ("derivative array", "constraints", "differential part")
     column, k = np.array(dips, dtype=np.intp).reshape(-1, 2).T
     left, right = t[np.maximum(k - 1, 0)], t[np.minimum(k + 1, len(t) - 1)]
