@@ -181,7 +181,8 @@ def _first_time(
         near = slice(max(j - 2, 0), j + 2)
         cubic = _where_zero(level[near].tolist(), points[near].tolist())
         guess = cubic if low < cubic < high else guess
-        points = np.unique(np.clip(guess + (high - low) * _AROUND, low, high))
+        points = np.minimum(np.maximum(guess + (high - low) * _AROUND, low), high)
+        points = points[np.append(True, points[1:] > points[:-1])]
         level = reached(points, piece(points))
         level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
     return high

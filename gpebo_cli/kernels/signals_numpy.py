@@ -68,7 +68,7 @@ def interpolation(
     weights = barycentric / distance
     weights[row] = 0.0
     weights[row, point] = 1.0
-    weights /= weights.sum(axis=1, keepdims=True)
+    weights /= (weights @ np.ones(len(places)))[:, None]
     return element, weights
 
 

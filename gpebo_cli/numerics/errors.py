@@ -19,6 +19,7 @@ import numpy as np
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import largest_within
 from gpebo_cli.numerics.mesh import SHARE, Mesh, used_coefficients
 from gpebo_cli.numerics.problem import LinearProblem
 
@@ -59,16 +60,15 @@ def estimated_errors(
     K, points, n, columns = values.shape
     rule, used, width = mesh.rule, used_coefficients(mesh.rule), 2 * _SIGNS * columns
     with np.errstate(over="ignore", invalid="ignore"):
-        sizes = np.abs(values).max(axis=1)
+        sizes = largest_within(values)
         size = np.maximum(sizes, _TINY)
-        shown = np.abs(rule.to_legendre[-4:] @ values.reshape(K, points, n * columns))
-        shown = shown.reshape(K, -1, n, columns)
+        shown = np.abs(np.tensordot(rule.to_legendre[-4:], values, axes=(1, 1)))
         to_next = points / np.arange(points - used, points)  # (ρ^j)^this = ρ^(s + 1)
-        shares = np.minimum(shown[:, -used:] / size[:, None], 1.0) ** to_next[:, None, None]
-        share = shares.max(axis=1)
+        shares = np.minimum(shown[-used:] / size, 1.0) ** to_next[:, None, None, None]
+        share = shares.max(axis=0)
         visible = np.zeros((n, columns))
-        if shown.shape[1] == 4:
-            before, after = shown[:, :2].max(axis=1), shown[:, 2:].max(axis=1)
+        if len(shown) == 4:
+            before, after = np.maximum(shown[::2], shown[1::2])
             visible = np.where(after >= LEVEL * before, after, 0.0).max(axis=0)
         made_of = np.abs(last) @ np.abs(values[:, 0]) + np.abs(particular)
         # End points are superconvergent, of order 2s − 1 against s + 1 inside: with ρ the decay per

@@ -186,7 +186,7 @@ class Sampler:
     def __call__(self, values: Array) -> Array:
         """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
         flat = _flat(values)
-        if self._grouped is None or flat.shape[2] <= _WIDE:
+        if flat.shape[2] <= _WIDE or self._grouped is None:
             sampled = signals.sample(self.element, self.weights, flat)
             return sampled.reshape(len(sampled), *values.shape[2:])
         out = np.empty((len(self.element), flat.shape[2]))

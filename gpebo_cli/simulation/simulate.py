@@ -125,8 +125,8 @@ def _simulate_linear(
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
         y = _outputs(C, values[..., 0], *direct)
-        size = np.abs(values[..., 0]).max(axis=(0, 1))
-        least = np.abs(C).max(axis=(0, 1)) @ least_sizes(problem, size[:, None], solver.tol)[:, 0]
+        size = np.abs(values[..., 0]).max(axis=0).max(axis=0)
+        least = np.abs(C).max(axis=0).max(axis=0) @ least_sizes(problem, size[:, None], solver.tol)[:, 0]
         return [(u, SHARE * terms(size)), (y, least)]
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.

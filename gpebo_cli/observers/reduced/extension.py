@@ -260,7 +260,7 @@ def reduced_system(
     )
     whole = ReducedSystem(
         used, signals, solver, mesh, first,
-        start_at(used, *_beginning(used, first, signals, solver)), np.zeros(0), regression, note,
+        start_at(used, *_beginning(used, first, signals)), np.zeros(0), regression, note,
     )
     begin, start = whole.begin, begin_at(xi_a0, system, first, whole.begin)
     if unknown is not None:
@@ -269,15 +269,12 @@ def reduced_system(
 
 
 def _beginning(
-    form: EquationForm, first: ObserverMatrices, signals: Measurements, solver: SolverSettings
+    form: EquationForm, first: ObserverMatrices, signals: Measurements
 ) -> tuple[ObserverMatrices, Array, Array]:
     """The matrices at the first time, and v and y there."""
     t, inside = signals.mesh.points.ravel()[:1], signals.mesh.inside.ravel()[:1]
-    at = signals.at(t, inside)
-    o = observer_matrices(
-        form, t, inside, solver.rank_tol, first, signals=at if form.follows_signals else None
-    )
-    return o, form.driving(t, inside, at[:, : form.system.m]), at[:, form.system.m :]
+    u, y = signals.inputs.values[0, :1], signals.outputs.values[0, :1]
+    return first.at_first, form.driving(t, inside, u), y
 
 
 def choose_form(

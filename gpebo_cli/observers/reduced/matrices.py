@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -77,6 +77,13 @@ class ObserverMatrices:
     def outputs(self) -> int:
         """Number of outputs r; theirs are the last rows."""
         return len(self.output_scale)
+
+    @property
+    def at_first(self) -> ObserverMatrices:
+        """Those at the first time alone, split aside."""
+        constant = {"split", "rows", "output_scale"}
+        own = (f.name for f in fields(self) if f.name not in constant)
+        return replace(self, **{name: getattr(self, name)[:1] for name in own})
 
     def of_noise(self, matrix: Array, inputs: int) -> Array:
         """The columns (N, k, m + r) of a matrix of [v; y] that belong to [u; y], m inputs."""

@@ -34,8 +34,8 @@ class Assembled:
     def kinds(self) -> list[tuple[Array, float]]:
         """Everything the mesh has to resolve, with the size below which it is rounding."""
         columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
-        psi, gain = self.psi / columns, self.gain / columns
-        states = np.abs(gain).max(axis=(0, 2), initial=0.0)
+        psi = self.psi / np.tile(columns, (self.psi.shape[1], 1))
+        states = (np.abs(self.gain).max(axis=0) / columns).max(axis=1, initial=0.0)
         if self.Y_scale > 0.0:  # a state that no parameter has part in is no signal to resolve
             own = np.abs(self.offset).max(axis=0, initial=0.0) / self.Y_scale
             states = np.maximum(states, 1e-3 * own)
@@ -44,7 +44,7 @@ class Assembled:
             (self.Y, 1e-3 * self.Y_scale),
             (psi, 1e-3),
             (self.offset, 0.0),
-            (gain / np.where(states > 0.0, states, 1.0)[:, None], 0.0),
+            (self.gain / (np.where(states > 0.0, states, 1.0)[:, None] * columns), 0.0),
             (squares, 1e-3),
             (right, 1e-3 * self.Y_scale),
         ]
