@@ -37,8 +37,7 @@ def transpose(a: Array) -> Array:
 
 
 def largest_within(values: Array) -> Array:
-    """Largest sizes (K, …) of values (K, points, …), whose points are laid out first: that is fast.
-    """
+    """Largest sizes (K, …) of values (K, points, …). With points first in memory that is fast."""
     return np.asarray(np.abs(np.swapaxes(values, 0, 1), order="C").max(axis=0))
 
 

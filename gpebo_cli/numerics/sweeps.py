@@ -110,7 +110,7 @@ def solve(
         made_of, moved = _terms(A, f, mesh, values)
         found = _Found(A, values, change, made_of, moved, extras)
         return found, unresolved_signals(
-            problem, mesh, values, extras, made_of.max(axis=0), tol
+            problem, mesh.rule, values, extras, made_of.max(axis=0), tol
         )
 
     try:

@@ -84,7 +84,7 @@ def _balancing(there: bytes, n: int) -> tuple[Array, Array]:
     every, terms = np.arange(len(i)), np.zeros((len(i), 2 * n + 1))
     terms[every, i] = terms[every, n + j] = 1.0
     terms[:, -1] = kind - 1.0
-    return terms, np.linalg.pinv(terms.T @ terms, rcond=1e-12, hermitian=True)
+    return terms, np.asarray(np.linalg.pinv(terms.T @ terms, rcond=1e-12, hermitian=True))
 
 
 def who(system: DescriptorSystem) -> str:

@@ -99,7 +99,8 @@ def solve(
         extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
         extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in extras)
         sizes = np.abs(values).max(axis=(0, 1))
-        tail = unresolved_signals(replace(problem, apart=False), mesh, values, extras, sizes, tol)
+        plain = replace(problem, apart=False)
+        tail = unresolved_signals(plain, mesh.rule, values, extras, sizes, tol)
         poor = tail > 1e3 * tol  # its dense output is of lower order than its steps
         if not poor.any():
             estimate = float(max(tail.max(initial=0.0), 1e2 * tol))

@@ -126,7 +126,8 @@ def _simulate_linear(
         # to the states.
         y = _outputs(C, values[..., 0], *direct)
         size = np.abs(values[..., 0]).max(axis=0).max(axis=0)
-        least = np.abs(C).max(axis=0).max(axis=0) @ least_sizes(problem, size[:, None], solver.tol)[:, 0]
+        least = least_sizes(problem, size[:, None], solver.tol)[:, 0]
+        least = np.abs(C).max(axis=0).max(axis=0) @ least
         return [(u, SHARE * terms(size)), (y, least)]
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
