@@ -35,7 +35,8 @@ EXPRESSIONS = [
 STRANGE = [None, "x", [], {}, [[]], [["t"], ["t", "t"]], {"a": {"b": 1}}, "\x00", "é\u2028",
            10**400]
 CHOICES = {
-    "estimator": ["drem", "gradient", "least_squares", "ls_drem", "lion", "fct", "mre", "no"],
+    "estimator": ["drem", "gradient", "least_squares", "ls_drem", "lion", "fct", "mre", "power",
+                  "exciting", "instrumental", "annihilator", "no"],
     "observer": ["gpebo", "canonical", "kalman_bucy", "none", "no"],
     "solver": ["collocation", "ivp", "no"],
     "noise": ["none", "gaussian", "no"],

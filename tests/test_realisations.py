@@ -39,6 +39,10 @@ ESTIMATORS = (
     {"name": "lion", "gamma": 1e4},
     {"name": "ls_drem", "gamma": [1.0, 10.0]},
     {"name": "fct", "gamma": 1e2},
+    {"name": "power", "gamma": [1e2, 1e3]},
+    {"name": "exciting"},
+    {"name": "instrumental", "gamma": 1e2},
+    {"name": "annihilator", "gamma": 1e2},
 )
 
 

@@ -287,7 +287,7 @@ def test_windows_of_excitation_run_through_resets():
 
 
 @pytest.mark.parametrize(
-    "name", ["drem", "mre", "lion", "gradient", "least_squares", "ls_drem", "fct"]
+    "name", ["drem", "mre", "lion", "gradient", "least_squares", "ls_drem", "fct", "power"]
 )
 def test_a_reset_to_the_same_parameters_changes_nothing(name):
     """T = I, τ = 0: every estimator goes on where it was, but for its prior."""

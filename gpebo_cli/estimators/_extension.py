@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.mesh import Trajectory, unresolved
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
 
 _TOLERANCE = 1e-11
@@ -64,3 +64,38 @@ def lion(regression: LinearRegression, rates: Array, start: Array | None = None)
     rows = np.arange(regression.p) % both.shape[2]
     signal = Trajectory(regression.mesh, both[:, :, rows])
     return low_pass(signal, rates[:, None], start)
+
+
+def lagged(regression: LinearRegression, delay: float, t: Array, inside: Array) -> Array:
+    """[ψ(t) ; ψ(t − d)]ᵀ (N, 2p, rows) at times t (N,), d in seconds, zero before the start."""
+    start = regression.mesh.edges[0]
+    before = regression.psi(np.maximum(t - delay, start), inside - delay)
+    before[inside - delay < start] = 0.0
+    return np.swapaxes(np.concatenate([regression.psi(t, inside), before], axis=-1), -1, -2)
+
+
+def averaged(regression: LinearRegression, delay: float, settle: float) -> Trajectory:
+    """Means of [ψ(t) ; ψ(t − d)]ᵀ [ψ | Y], shape (2p, p + c): Z' = (product − Z)/(T₀ + t), Z = 0.
+
+    What a disturbance of Y has in common with a factor stays in the mean of that row; what it has
+    not goes away as the mean is taken over longer and longer. The mesh has edges where the delayed
+    ψ has.
+
+    Args:
+        regression: Y = ψη.
+        delay: d in seconds.
+        settle: T₀ in seconds.
+    """
+    edges = regression.mesh.edges
+    later = edges[edges + delay < edges[-1]] + delay
+    after = np.searchsorted(edges, later)
+    apart = np.minimum(edges[after] - later, later - edges[after - 1])
+    cuts = np.union1d(edges, later[apart > 1e-12 * (edges[-1] - edges[0])])
+    mesh = Mesh(cuts, regression.mesh.rule)
+    t, inside = mesh.points.ravel(), mesh.inside.ravel()
+    psi, Y = regression.psi(t, inside), regression.Y(t, inside)
+    both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
+    product = lagged(regression, delay, t, inside) @ both
+    whole = Trajectory(mesh, product.reshape(*mesh.points.shape, *product.shape[1:])).integral()
+    span = (settle + mesh.points - edges[0])[..., None, None]
+    return Trajectory(mesh, whole.values / span)

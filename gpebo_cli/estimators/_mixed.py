@@ -121,7 +121,7 @@ def reached(
 
 def energy_requirement(
     condition: str, gain: float, energy: float, needed: float = DECAY,
-    needed_for: str = "1 % of the initial error",
+    needed_for: str = "1 % of the initial error", of: str = "∫Δ²",
 ) -> Requirement:
     """Whether ∫Δ² is enough at the smallest gain: the error shrinks by e^{−γ∫Δ²}."""
     reached, least = gain * energy, needed / energy if energy > 0.0 else float("inf")
@@ -134,7 +134,7 @@ def energy_requirement(
             "needed": needed,
         },
         text=(
-            f"γ∫Δ² = {reached:.3g} at the smallest gain {gain:.3g}; "
+            f"γ{of} = {reached:.3g} at the smallest gain {gain:.3g}; "
             f"{needed_for} needs {needed:.3g}{would_do(gain, least)}"
         ),
         gain=least,
@@ -177,6 +177,10 @@ class MixedEstimates:
             self.condition, float(self.gains.min()), min(energies), self.needed, self.needed_for
         )
 
+    def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
+        """η̂ (g, M, P) from ``start`` (P,) or (g, P) with ``gains`` (g, P or 1)."""
+        return scalar_law(path, start, gains)
+
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
         g, c = len(self.gains), self.groups[0].quotient.shape[-1] // len(self.start)
@@ -193,7 +197,7 @@ class MixedEstimates:
             if start is not None:
                 own = np.repeat(start[done : done + len(gains)], c, axis=1)
             done += len(gains)
-            eta = scalar_law(path, own, gains)
+            eta = self.law(path, own, gains)
             if self.transform is not None:
                 energy = gains[:, None, :] * path.energy_at_t[:, None]
                 eta = self.transform(eta, energy, np.atleast_2d(own)[:, None])

@@ -1,0 +1,108 @@
+"""The scalar law η̂' = Δ (γ ⌈r⌋^α + γ₂ ⌈r⌋^β), r = 𝐘 − Δη̂, where neither power is smooth at 0."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.errors import SolverError
+from gpebo_cli.estimators._mixing import SINGULAR
+from gpebo_cli.estimators._scalar import ScalarPath
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.numerics.mesh import Mesh, legendre_tail
+
+_TOLERANCE, _ROUNDING = 1e-11, 1e-15
+_ITERATIONS = 12  # of Newton's method
+_SHORTEST = 1e-11  # steps, relative to the element
+
+
+@dataclass(frozen=True, eq=False)
+class PowerLaw:
+    """The law along a mixed regression."""
+
+    path: ScalarPath
+    alpha: float
+    gamma2: float
+    beta: float
+
+    def solve(self, start: Array, gains: Array) -> Array:
+        """η̂ (g, M, P) at the path's times, from ``start`` (P,) or (g, P), for gains (g, P or 1).
+
+        Every gain and parameter has steps of its own: errors come to zero at times of their own.
+
+        Raises:
+            SolverError: steps become too short.
+        """
+        path = self.path
+        P = path.quotient.shape[-1]
+        shape = (len(gains), P)
+        eta, gamma = (np.broadcast_to(x, shape).ravel().copy() for x in (start, gains))
+        column = np.tile(np.arange(P), len(gains))
+        out = np.empty((len(eta), len(path.t)))
+        out[:, : np.searchsorted(path.t, path.mesh.edges[0], side="right")] = eta[:, None]
+        step = np.ones(len(eta))  # of the element, as it turned out to be good
+        for left, right in zip(path.mesh.edges[:-1], path.mesh.edges[1:], strict=True):
+            at = np.zeros(len(eta))  # share of the element that is done
+            wanted = np.flatnonzero((path.t > left) & (path.t <= right))
+            places = (path.t[wanted] - left) / (right - left)
+            while (lanes := np.flatnonzero(at < 1.0)).size:
+                end = at[lanes] + step[lanes]
+                end = np.where(end > 1.0 - 1e-9, 1.0, end)
+                values, good = self._step(
+                    left + (right - left) * at[lanes], left + (right - left) * end,
+                    eta[lanes], gamma[lanes], column[lanes],
+                )
+                step[lanes] *= np.where(good, np.where(step[lanes] < 1.0, 2.0, 1.0), 0.25)
+                if step.min() < _SHORTEST:
+                    raise SolverError(f"the power law is not resolved near t = {left:.6g}")
+                lane, k = np.nonzero(
+                    good[:, None] & (places > at[lanes, None]) & (places <= end[:, None])
+                )
+                share = (places[k] - at[lanes][lane]) / (end - at[lanes])[lane]
+                weights = path.mesh.rule.interpolation(share)
+                out[lanes[lane], wanted[k]] = np.einsum("ni,ni->n", weights, values[lane])
+                eta[lanes] = np.where(good, values[:, -1], eta[lanes])
+                at[lanes] = np.where(good, end, at[lanes])
+        return np.moveaxis(out.reshape(*shape, -1), 1, 2)
+
+    def _step(
+        self, left: Array, right: Array, eta: Array, gamma: Array, column: IntArray
+    ) -> tuple[Array, BoolArray]:
+        """Collocation of n laws over steps (n,) of their own: η̂ (n, s + 1), and which are resolved.
+
+        Unknown are w = ⌈r⌋^α at the nodes: ⌈w_i⌋^{1/α} = 𝐘_i − Δ_i η̂_i is smooth in them where a
+        power of r is not, and η̂ follows by integration.
+        """
+        path, rule = self.path, self.path.mesh.rule
+        pairs, lane = np.unique(np.stack([left, right]), axis=1, return_inverse=True)
+        places = np.concatenate([Mesh(pair, rule).points for pair in pairs.T])
+        inside = np.concatenate([Mesh(pair, rule).inside for pair in pairs.T])
+        found = path.signals(places.ravel(), inside.ravel())
+        delta, digits = (found[i].reshape(places.shape)[lane, 1:] for i in (0, 2))
+        Y = found[1].reshape(*places.shape, -1)[lane, 1:, column]
+        # Where 𝐘/Δ is rounding nothing is known, and nothing moves.
+        known = (digits > SINGULAR) & (delta != 0.0)
+        rest = np.where(known, Y - delta * eta[:, None], 0.0)
+        integral = (right - left)[:, None, None] * rule.integration * delta[:, None]
+        coupling, diagonal = delta[:, :, None] * integral, np.arange(rule.stages)
+        w, before = np.sign(rest) * np.abs(rest) ** self.alpha, np.full_like(rest, np.inf)
+        ratio, root = self.beta / self.alpha, 1.0 / self.alpha
+        scale = np.maximum(np.abs(eta), max(np.abs(path.quotient[-1]).max(), path.floor, 1e-300))
+        for _ in range(_ITERATIONS):
+            size = np.abs(w)
+            speed = gamma[:, None] * w + self.gamma2 * np.sign(w) * size**ratio
+            moved = (integral @ speed[..., None])[..., 0]
+            change = np.abs(moved - before).max(axis=1) / scale
+            if (change < 1e-3 * _TOLERANCE).all():
+                break
+            slope = gamma[:, None] + self.gamma2 * ratio * size ** (ratio - 1.0)
+            J = coupling * slope[:, None]
+            J[:, diagonal, diagonal] += np.where(delta, root * size ** (root - 1.0), 1.0)
+            F = np.sign(w) * size**root + delta * moved - rest
+            w, before = w - np.linalg.solve(J, F[..., None])[..., 0], moved
+        values = np.concatenate([eta[:, None], eta[:, None] + moved], axis=1)
+        tail = legendre_tail(values[..., None], rule, scale[:, None])[:, 0] / scale
+        worst = np.where(known, digits, 1.0).min(axis=1)
+        allowed = np.maximum(_TOLERANCE, 30.0 * _ROUNDING / worst)
+        return values, (tail < allowed) & (change < allowed)

@@ -1,0 +1,54 @@
+"""DREM with an annihilator: some regressors share a disturbance with Y, and their rows go.
+
+After Glushchenko and Lastochkin, Unbiased parameter estimation via DREM with annihilators,
+arXiv:2403.11076, which is bias-eliminated least squares. Y = ψη + w, where w has something in
+common with the perturbed columns of ψ only. Of the means of [ψ(t) ; ψ(t − d)]ᵀ Y those 2p rows are
+
+    𝒴 = Ω η + B b,   b the unknown bias, B the unit vectors of the perturbed rows of ψ(t),
+
+and N with N B = 0 annihilates it: (NΩ)ᵀNΩ η = (NΩ)ᵀN𝒴, then mixing. The rows of ψ(t − d) stay, w
+being forgotten within d; without perturbed columns this is least squares on twice the rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators.instrumental import Instrumental
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.schema import nearest, shown
+
+
+@dataclass(frozen=True, kw_only=True)
+class Annihilator(Instrumental):
+    """The same means as of ``instrumental``; rows without bias, squared up.
+
+    Attributes:
+        perturbed: the parameters whose columns of ψ share the disturbance of Y.
+        gamma, delay, settle, initial: as of ``instrumental``.
+    """
+
+    perturbed: list[str] = field(default_factory=list)
+
+    def left(self, means: Array, names: Sequence[str]) -> Array:
+        """(NΩ)ᵀN (N, p, 2p) of [Ω | 𝒴] (N, 2p, p + c).
+
+        Raises:
+            ConfigError: a perturbed parameter that there is not.
+        """
+        for name in self.perturbed:
+            if name not in names:
+                raise ConfigError(
+                    f"estimator.perturbed: there is no parameter {shown(name)}; the parameters "
+                    f"are {', '.join(names)}{nearest(str(name), names)}"
+                )
+        kept = [name not in self.perturbed for name in names] + [True] * len(names)
+        return np.asarray(transpose(means[..., : len(names)]) * np.array(kept))
+
+
+ESTIMATOR = Annihilator

@@ -1,0 +1,100 @@
+"""DREM with an instrumental variable and averaging: unbiased behind coloured disturbances.
+
+After Glushchenko and Lastochkin, Instrumental variables based DREM for online asymptotic
+identification of perturbed linear systems, arXiv:2312.15631. Y = ψη + w, and an instrument ζ that
+has nothing in common with w: the mean of ζY goes to the mean of ζψ times η. Here ζ is ψ itself as
+it was d seconds ago, which needs w to forget within d:
+
+    Ω' = (ζψ − Ω)/(T₀ + t),   𝒴' = (ζY − 𝒴)/(T₀ + t),   ζ(t) = ψ(t − d)ᵀ,   then mixing, as in drem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpebo_cli.estimators._base import GainEstimator, gain
+from gpebo_cli.estimators._extension import averaged, lagged
+from gpebo_cli.estimators._mixed import MixedEstimates
+from gpebo_cli.estimators._mixing import mix
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.schema import number
+
+
+@dataclass(frozen=True, kw_only=True)
+class Instrumental(GainEstimator):
+    """Means of products with a delayed ψ, mixing, and η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i).
+
+    Attributes:
+        gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
+            parameter (one gain each).
+        delay: d of the instrument in seconds.
+        settle: T₀ of the means in seconds.
+        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
+    """
+
+    gamma: object = gain(1e10, by_parameter=True, auto=True)
+    delay: float = 0.5
+    settle: float = 1.0
+
+    def means(self, regression: LinearRegression) -> Trajectory:
+        """Of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c).
+
+        Raises:
+            ConfigError: the delay or T₀ is not positive.
+        """
+        delay, settle = (number(getattr(self, k), f"estimator.{k}") for k in ("delay", "settle"))
+        return averaged(regression, delay, settle)
+
+    def left(self, means: Array, names: Sequence[str]) -> Array:  # noqa: ARG002
+        """What makes p equations of the 2p means (N, 2p, p + c), (N or 1, p, 2p)."""
+        return np.eye(2 * len(names))[None, len(names) :]
+
+    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
+        """Extend, mix, and keep what the closed form needs at the times t (M,)."""
+        names, means = regression.parameters, self.means(regression)
+        rows = means.values.reshape(-1, *means.values.shape[2:])
+        square = (self.left(rows, names) @ rows).reshape(*means.values.shape[:2], len(names), -1)
+        return MixedEstimates(
+            groups=(mix(Trajectory(means.mesh, square), np.asarray(t), regression.floor),),
+            at_end=lambda: (),
+            start=self.start(names),
+            gains=self.gains("gamma", names),
+            condition="Δ not in L2",
+            realisations=regression.realisations,
+        )
+
+    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+        """δ𝒴' = (ζδY − δ𝒴)/(T₀ + t) of all means, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂), of every case."""
+        names, p = regression.parameters, regression.p
+        means, began = self.means(regression), regression.mesh.edges[0]
+
+        def of_case(gain: Array) -> ErrorsAt:
+            def at(t: Array, inside: Array) -> ErrorSystem:
+                rows = means(t, inside)
+                left = self.left(rows, names)
+                delta, adjugate, _ = determinant_and_adjugate_action(
+                    left @ rows[..., :p], np.broadcast_to(np.eye(p), (len(t), p, p))
+                )
+                rate = (1.0 / (self.settle + t - began))[:, None, None]
+                weighted = delta[:, None, None] * gain[:, None]
+                A = np.zeros((len(t), 3 * p, 3 * p))
+                A[:, : 2 * p, : 2 * p] = -rate * np.eye(2 * p)
+                A[:, 2 * p :, : 2 * p] = weighted * (adjugate @ left)
+                A[:, 2 * p :, 2 * p :] = -weighted * delta[:, None, None] * np.eye(p)
+                into = rate * lagged(regression, self.delay, t, inside)
+                B = np.concatenate([into, np.zeros_like(into[:, :p])], axis=1)
+                return ErrorSystem(A, B, np.eye(3 * p)[None, 2 * p :], np.zeros_like(B[:1, :p]))
+
+            return at
+
+        return tuple(map(of_case, self.gains("gamma", names)))
+
+
+ESTIMATOR = Instrumental

@@ -1,0 +1,101 @@
+"""DREM with power laws: finite time with one power below 1, fixed time with one above 1 beside it.
+
+    η̂_i' = Δ (γ ⌈r_i⌋^α + γ₂ ⌈r_i⌋^β),   r = 𝐘 − Δ η̂,   ⌈r⌋^α = sign(r) |r|^α,   0 < α < 1 < β
+
+after Wang, Efimov and Bobtsov, On robust parameter estimation in finite-time without persistence
+of excitation, IEEE TAC 65(4), 2020; this form is that of drem.hpp in SDU-Robotics/sdu_estimators.
+Without noise and with γ₂ = 0 an error e is zero from γ(1 − α)∫|Δ|^{1+α} = |e(0)|^{1−α} on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.estimators._base import ResumableEstimator, gain
+from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement
+from gpebo_cli.estimators._power import PowerLaw
+from gpebo_cli.estimators._scalar import ScalarPath
+from gpebo_cli.estimators.drem import Drem
+from gpebo_cli.findings import Requirement
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
+
+
+@dataclass(frozen=True, kw_only=True)
+class Power(ResumableEstimator):
+    """Kreisselmeier filters, mixing, and a power of each scalar residual.
+
+    Attributes:
+        gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
+            parameter (one gain each).
+        alpha: α, between 0 and 1.
+        gamma2: γ₂; 0 is the finite-time law, more than 0 the fixed-time one.
+        beta: β, above 1.
+        rates: λ of the filters, as of ``drem``.
+        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
+    """
+
+    gamma: object = gain(1e10, by_parameter=True, auto=True)
+    alpha: float = 0.5
+    gamma2: float = 0.0
+    beta: float = 1.5
+    rates: object = field(default=None, metadata={"key": "lambda"})
+
+    def axes(self) -> dict[str, Sequence[float]]:
+        """The gain γ.
+
+        Raises:
+            ConfigError: a power or γ₂ is out of its range.
+        """
+        if not (0.0 < self.alpha < 1.0 < self.beta < np.inf and 0.0 <= self.gamma2 < np.inf):
+            raise ConfigError(
+                "estimator: it takes 0 < alpha < 1 < beta and gamma2 of 0 or more, got "
+                f"alpha={self.alpha:g}, beta={self.beta:g}, gamma2={self.gamma2:g}"
+            )
+        return super().axes()
+
+    def resume(
+        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
+    ) -> PowerEstimates:
+        """Extend and mix as ``drem``, for the times t (M,)."""
+        linear = Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
+        inner = linear.resume(regression, t, known)
+        return PowerEstimates(**{**vars(inner), "condition": "IE with enough ∫|Δ|^(1+α)",
+                                 "alpha": self.alpha, "beta": self.beta, "gamma2": self.gamma2})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PowerEstimates(MixedEstimates):
+    """As of ``drem``, with the power law."""
+
+    alpha: float
+    beta: float
+    gamma2: float
+
+    @property
+    def requirement(self) -> Requirement:
+        """γ∫|Δ|^{1+α} at the end, against what the errors of the start need to be zero."""
+        (path,) = self.groups
+        delta = np.abs(path.signals(path.mesh.points.ravel(), path.mesh.inside.ravel())[0])
+        powers = delta.reshape(path.mesh.points.shape) ** (1.0 + self.alpha)
+        energy = float(Trajectory(path.mesh, powers).integral().final)
+        start = np.repeat(self.start, path.quotient.shape[-1] // len(self.start))
+        error = float(np.abs(path.quotient[-1, -1] - start).max(initial=0.0))
+        needed = error ** (1.0 - self.alpha) / (1.0 - self.alpha)
+        return energy_requirement(
+            self.condition, float(self.gains.min()), energy, max(needed, 1e-300),
+            "finite-time convergence", "∫|Δ|^(1+α)",
+        )
+
+    def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
+        """η̂ (g, M, P) from ``start`` (P,) or (g, P) with the gains (g, P or 1)."""
+        return PowerLaw(path, self.alpha, self.gamma2, self.beta).solve(start, gains)
+
+
+ESTIMATOR = Power
