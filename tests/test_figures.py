@@ -201,6 +201,23 @@ def test_axes_carry_the_units_of_their_signals() -> None:
     assert labels["state_error_a"][2] == r"$|\hat{i}_L - i_L|$ (A)"
 
 
+def test_mathematics_is_broken_at_a_minus_sign_or_not_at_all() -> None:
+    result = make_result(samples=51)
+    names = tuple(f"substrates_{i}" for i in range(6))
+    parameters = tuple(f"e0_{name}" for name in names[:3])
+    long = replace(
+        result, system=replace(result.system, states=names, units=dict.fromkeys(names, "g/l")),
+        estimation=replace(estimation_of(result), names=parameters),
+    )
+    for name, figure in draw(long):
+        rendered(figure)  # raises for mathematics that is none
+        for axes in figure.axes:
+            lines = axes.get_ylabel().split("\n")
+            assert all(line.count("$") % 2 == 0 for line in lines), name
+    assert any("$\n$- " in axes.get_ylabel() for _, figure in draw(long)
+               for axes in figure.axes)
+
+
 def test_time_axis_of_other_scales() -> None:
     for result, label in ((make_result(samples=9), "s"), (at_times(0.0, 2e-6), "10⁻⁶ s")):
         [(_, figure)] = draw(result, ["states"])

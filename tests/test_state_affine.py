@@ -12,7 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import shipped
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
+from gpebo_cli import run
 from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
 from gpebo_cli.model.functions import Names, system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
@@ -78,6 +80,12 @@ def test_a_mildly_nonlinear_plant_costs_few_linear_solves():
     effort = simulate(boost(), TimeSettings(horizon=3.0), SOLVER).effort
     assert effort.windows == 1
     assert effort.linear_solves <= 4
+
+
+def test_a_run_says_what_newtons_method_cost():
+    verdict = run(boost(), time={"horizon": 3}).verdict
+    assert verdict.endswith("Newton's method cost 2 linear solves")
+    assert "Newton" not in run("circuit", time={"horizon": 1}).verdict
 
 
 def test_a_chaotic_plant_says_how_accurate_it_is():
@@ -231,6 +239,19 @@ def test_division_by_an_output_that_reaches_zero_is_named_with_its_time():
         simulate(system, TimeSettings(horizon=3.0), SOLVER)
     said = float(str(caught.value).split("beyond t = ")[1].split()[0])
     assert abs(said - 1.0) < 1e-6
+
+
+def test_division_by_an_output_that_crosses_zero_names_the_entry():
+    """x = (cos t + sin t + e^−t)/2 crosses zero; another state divides by it."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x", "z"], "outputs": ["y"], "inputs": {"u": "cos(t)"},
+        "E": [[1, 0], [0, 1]], "A": [[-1, 0], [0, -1]], "B": [[1], [0]], "C": [[1, 0]],
+        "phi": [0, "1/y"], "initial_state": [1, 0],
+    })  # fmt: skip
+    at = brentq(lambda t: np.cos(t) + np.sin(t) + np.exp(-t), 2.0, 3.0)
+    with pytest.raises(ConfigError, match=r"phi\[1\] = '1/y' divides by something that") as caught:
+        simulate(system, TimeSettings(horizon=6.0), SOLVER)
+    assert float(str(caught.value).rpartition("t = ")[2]) == pytest.approx(at, rel=1e-5)
 
 
 def test_zero_output_at_the_start_of_a_division_is_refused():

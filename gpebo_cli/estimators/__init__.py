@@ -19,7 +19,7 @@ from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reach
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._recursive import InformationRoot, KreisselmeierFilter, ScalarLaw
 from gpebo_cli.estimators._registry import GROUP, able, build, names, settings_of
-from gpebo_cli.estimators._segments import estimate, raised, tuned
+from gpebo_cli.estimators._segments import estimate, raised, tuned, tuned_for
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.findings import Requirement
@@ -91,4 +91,5 @@ __all__ = [
     "reached",
     "settings_of",
     "tuned",
+    "tuned_for",
 ]

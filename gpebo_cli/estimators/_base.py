@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import product
@@ -100,18 +100,17 @@ class GainEstimator(ABC):
         """Every combination of the gains; the last one that is declared varies fastest."""
         return combinations(self.axes())
 
-    def tuned(self, regression: LinearRegression) -> Self:
+    def tuned(self, requirement: Callable[[Self], Requirement]) -> Self:
         """The same with a number for a gain that is ``auto``: ten times the least that would do.
 
-        The least is that of the requirement for γ = 1 over the whole regression; where no gain
+        The least is that of the ``requirement`` for γ = 1 over all of the data; where no gain
         would do, it is the default one.
         """
         chosen = {}
         for own in fields(self):
             if "gain" in own.metadata and is_auto(getattr(self, own.name)):
                 once: dict[str, Any] = {own.name: 1.0}
-                found = replace(self, **once).estimate(regression, regression.mesh.edges[-1:])
-                least = found.requirement.gain
+                least = requirement(replace(self, **once)).gain
                 default = own.metadata["gain"].default
                 chosen[own.name] = _AMPLE * least if 0.0 < least < np.inf else default
         return replace(self, **chosen)
@@ -143,8 +142,8 @@ class GainEstimator(ABC):
             value = type(self).__dataclass_fields__[name].metadata["gain"].default
         if is_auto(value):
             raise ConfigError(
-                f"{where}: auto needs to know the signals to their end; give a number at samples, "
-                "with resets and in streams"
+                f"{where}: auto needs to know the signals to their end; give a number with resets "
+                "and in streams"
             )
         if isinstance(value, Mapping):
             return per_name(value, parameters, "parameter", where, "positive")[None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,9 +28,19 @@ _GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
 
 def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
     """The estimator with numbers for gains that are ``auto``; one of another kind as it is."""
-    plain = not regression.resets and regression.dynamics is None
-    if plain and isinstance(estimator, GainEstimator | Several):
-        return estimator.tuned(regression)
+    if regression.resets or regression.dynamics is not None:
+        return estimator
+    return tuned_for(
+        estimator, lambda one: one.estimate(regression, regression.mesh.edges[-1:]).requirement
+    )
+
+
+def tuned_for(
+    estimator: Estimator, requirement: Callable[[Estimator], Requirement]
+) -> Estimator:
+    """:func:`tuned`, by what data make an estimator require."""
+    if isinstance(estimator, GainEstimator | Several):
+        return estimator.tuned(requirement)
     return estimator
 
 

@@ -29,10 +29,10 @@ class Several:
         pairs = zip(self.chosen, self.members, strict=True)
         return tuple({**own, **case} for own, member in pairs for case in member.cases)
 
-    def tuned(self, regression: LinearRegression) -> Several:
-        """Each with numbers for gains that are ``auto``."""
+    def tuned(self, requirement: Callable[[Estimator], Requirement]) -> Several:
+        """Each with numbers for gains that are ``auto``, by the ``requirement`` for γ = 1."""
         return Several(self.chosen, tuple(
-            m.tuned(regression) if isinstance(m, GainEstimator) else m for m in self.members
+            m.tuned(requirement) if isinstance(m, GainEstimator) else m for m in self.members
         ))
 
     def estimate(self, regression: LinearRegression, t: Array) -> Estimates:

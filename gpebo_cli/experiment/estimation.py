@@ -30,7 +30,7 @@ from gpebo_cli.evidence.metrics import (
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
-from gpebo_cli.experiment.online import Online, joined
+from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
@@ -182,16 +182,29 @@ def at_samples(
         u, y = source.inputs(t), source.outputs(t)
         first = np.append(u[0], y[0])
         levels = noise_levels(settings.noise, system)
-        wanted = (
-            sampled_deviations(settings.noise, levels, source) if settings.uncertainty else None
+
+        def fed(by: estimators.Estimator, *, last: bool) -> tuple[Online, list[OnlineEstimates]]:
+            wanted = (
+                sampled_deviations(settings.noise, levels, source)
+                if settings.uncertainty and last else None
+            )
+            online = Online(settings, system, samples.hold, start, first, by, wanted)
+            made = []
+            for i in range(0, len(t), _SAMPLES_AT_ONCE):
+                part = slice(i, i + _SAMPLES_AT_ONCE)
+                found = online.feed(t[part], u[part], y[part])
+                made += [found] if last else []
+                share(min(part.stop / len(t), 1.0))
+            return online, made
+
+        estimator = estimators.tuned_for(
+            estimator, lambda one: fed(one, last=False)[0].requirement
         )
-        online = Online(settings, system, samples.hold, start, first, estimator, wanted)
-        parts = [slice(i, i + _SAMPLES_AT_ONCE) for i in range(0, len(t), _SAMPLES_AT_ONCE)]
-        fed = []
-        for part in parts:
-            fed.append(online.feed(t[part], u[part], y[part]))
-            share(part.stop / len(t))
-        made = joined(fed)
+        online, made_of = fed(estimator, last=True)
+        raised = estimators.raised(estimator, online.requirement)
+        if raised is not estimator:
+            online, made_of = fed(raised, last=True)
+        made = joined(made_of)
         truth = online.truth(made.extension)(t, source.theta(t), source.states)
         x = source.states(t)
         parameters = made.parameters * _told(made.known.parameters[-1])

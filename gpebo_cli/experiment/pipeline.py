@@ -23,7 +23,7 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.uncertainty import sampled_deviations
-from gpebo_cli.experiment.verdict import amplified, verdict
+from gpebo_cli.experiment.verdict import simulation_note, verdict
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
@@ -126,7 +126,7 @@ def run_experiment(
             *source.assumptions, *of_observation(found.observed, found.excitation, system)
         ),
         verdict="; ".join([
-            told + found.note + amplified(source.simulation, settings.solver.tol), *warned
+            told + found.note + simulation_note(source.simulation, settings.solver.tol), *warned
         ]),
         warnings=warned,
         # What the result is labelled with is what estimated.

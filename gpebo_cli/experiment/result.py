@@ -124,6 +124,7 @@ class SimulationResult:
     measured_inputs: Array | None = None  # (N, m) what the observer saw; None: the same
     measured_outputs: Array | None = None  # (N, r)
     state_errors: Array | None = None  # (n,) the estimate for each state, relative to its own size
+    linear_solves: float | None = None  # what Newton's method cost; None: the plant is linear
 
 
 @dataclass(frozen=True)

@@ -234,6 +234,7 @@ def _sample_simulation(
         impulses=tuple(impulses),
         error_estimate=simulation.error_estimate,
         state_errors=simulation.state_errors,
+        linear_solves=None if simulation.effort is None else simulation.effort.linear_solves,
         elements=signals.mesh.size,
     )
 

@@ -95,18 +95,27 @@ def simulation_verdict(simulated: SimulationResult) -> str:
     return (
         f"simulated: index {simulated.index}, {simulated.differential} differential and "
         f"{simulated.algebraic} algebraic equations, error estimate "
-        f"{simulated.error_estimate:.1e} of each state's size"
+        f"{simulated.error_estimate:.1e} of each state's size{newton_note(simulated)}"
     )
 
 
-def amplified(simulated: SimulationResult | None, tol: float) -> str:
-    """What the last line of a run has to say of a plant that amplifies errors, from "; " on."""
-    if simulated is None or simulated.error_estimate <= _AMPLIFIED * tol:
+def simulation_note(simulated: SimulationResult | None, tol: float) -> str:
+    """What the last line of a run has to say of the simulation, from "; " on."""
+    if simulated is None:
         return ""
-    return (
-        "; the plant amplifies errors: its simulation is good to "
-        f"{simulated.error_estimate:.1e} of each state's size"
-    )
+    told = newton_note(simulated)
+    if simulated.error_estimate > _AMPLIFIED * tol:
+        told += (
+            "; the plant amplifies errors: its simulation is good to "
+            f"{simulated.error_estimate:.1e} of each state's size"
+        )
+    return told
+
+
+def newton_note(simulated: SimulationResult) -> str:
+    """What the simulation of a nonlinear plant cost, from "; " on."""
+    solves = simulated.linear_solves
+    return "" if solves is None else f"; Newton's method cost {solves:.2g} linear solves"
 
 
 def _best_case(metrics: Metrics) -> int | None:

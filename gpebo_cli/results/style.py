@@ -487,7 +487,11 @@ def _only_mark_ticks(axes: Axes) -> None:
 
 def _set_name(axes: Axes, name: str, unit: str, height: float) -> None:
     """Name the vertical axis, on several lines or in smaller letters if it is a long one."""
-    broken = "\n".join(textwrap.wrap(name.replace("_", "_ "), 22)).replace("_ ", "_")
+    if "$" in name:  # mathematics is broken at a minus sign, or not at all
+        head, _, tail = name.partition(" - ")
+        broken = f"{head}$\n$- {tail}" if tail and head.count("{") == head.count("}") else name
+    else:
+        broken = "\n".join(textwrap.wrap(name.replace("_", "_ "), 22)).replace("_ ", "_")
     for text in (with_unit(name, unit), f"{name}\n({unit})", f"{broken}\n({unit})"):
         axes.set_ylabel(text.removesuffix("\n()"))
         if len(text) < 12:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.errors import GpeboError, SolverError
+from gpebo_cli.errors import ConfigError, GpeboError, SolverError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, signal_scale
 from gpebo_cli.numerics.radau import radau_rule
@@ -29,6 +29,7 @@ _NEAR = 1e-2  # change from which on iterates are worth the full tolerance
 _SHRINKS = 0.5  # changes that do not fall to this share do not converge
 _MOST_GROWTH = 12.0  # of the logarithm of a small error within one window
 _SHORTEST = 1e-8  # of the horizon; where shorter windows are needed the solution ends
+_AROUND = 1e-3  # of the horizon: a refusal so near to where the solution ends is about its end
 _SAFETY = 10.0
 
 
@@ -64,6 +65,8 @@ def follow(
     t, stop = time.start, time.start + time.horizon
     length, x = time.horizon, system.initial_state
     pieces: list[Trajectory] = []
+    refused: ConfigError | None = None
+    refused_until = t
     iterates, work, change = 0, 0.0, 0.0
     at_start = np.array([t])
     Linearised(system, _at_rest(x, t, length, solver)).taylor(at_start, 0)  # refuses by name
@@ -76,9 +79,13 @@ def follow(
         try:
             piece, count, spent, last = _window(start, window, solver, solve)
         except GpeboError as error:
+            if isinstance(error, ConfigError):
+                refused, refused_until = error, t + length
             length *= 0.25
             if length < _SHORTEST * time.horizon:
-                raise _ends(system, t, x, error) from None
+                # What has a name there is the reason: an entry without a value, a zero divisor.
+                near = refused is not None and t <= refused_until <= t + _AROUND * time.horizon
+                raise _ends(system, t, x, refused if near and refused else error) from None
             continue
         pieces.append(piece)
         iterates, work = iterates + count, work + spent * length / time.horizon
