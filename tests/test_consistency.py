@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 
 from benchmarks.honesty import made
 from gpebo_cli.errors import ModelError
+from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state
-from gpebo_cli.reduction.derivative_array import balance
+from gpebo_cli.reduction.derivative_array import balance, forcing
+from gpebo_cli.reduction.stages import in_stages
 from gpebo_cli.reduction.strangeness_free import strangeness_free_form
 from gpebo_cli.reduction.structure import analyse
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -61,6 +63,27 @@ def test_both_paths_start_from_the_same_state(seed, nu, extra, spread):
     alone = consistent_start(system, structure, 0.0, 0.0)
     np.testing.assert_allclose(alone, expected, atol=1e-8 * size)
     assert np.abs(form.A2[0] @ alone + form.f2[0]).max() < 1e-7 * size * np.abs(form.A2[0]).max()
+
+
+@settings(deadline=None, max_examples=30)
+@given(SEEDS, st.integers(1, 4), st.integers(0, 4))
+def test_stages_find_the_constraints_of_the_derivative_array(seed, nu, extra):
+    """One differentiation at a time or all of them at once."""
+    found, structure, form = case(seed, nu, extra)
+    c = found.system.coefficients.taylor(ZERO, structure.mu)
+    s = structure.scaling
+    e, a = scaled(c.E, c.A, s.rows, s.columns, s.time, structure.mu + 1)
+    weights = (s.time ** np.arange(structure.mu + 1))[:, None, None] * s.rows
+    stages = in_stages(e, a, (forcing(c) * weights)[..., None], 1e-10, 1)
+    assert stages.A2.shape[1] == structure.a
+    assert len(stages.ranks) == structure.index
+    x = found.exact(ZERO)[0] / s.columns
+    off = np.abs(stages.A2[0] @ x + stages.f2[0, :, 0])
+    size = stages.size[0] @ np.append(np.abs(x), 1.0)
+    assert (off <= 20 * np.finfo(float).eps * (size + 1.0)).all()
+    if form.basis is not None:  # the directions that the constraints leave
+        assert np.abs(stages.A2[0] @ (form.basis[0] / s.columns[:, None])).max(initial=0.0) < (
+            1e-7 * np.abs(form.basis[0] / s.columns[:, None]).max(initial=1.0))
 
 
 def test_rows_in_other_units_move_no_consistent_start():

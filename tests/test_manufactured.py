@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import sympy as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from benchmarks.honesty import made
+from gpebo_cli.errors import ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -107,3 +111,25 @@ def test_the_estimate_forgets_an_elimination_that_was_not_used():
     truth = np.array([entry(times) for entry in exact]).T
     error = np.abs(result.signals.states(times) - truth).max() / np.abs(truth).max()
     assert error < result.error_estimate < 1e3 * error
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.floats(0.0, 8.0))
+def test_a_stiff_mode_hides_no_constraint(seed, nu, decades):
+    """One rate of up to 1e8 (index 3: 1e5), turned into all equations and states."""
+    rate = 10.0 ** (decades if nu < 3 else decades * 0.6)
+    case = made(np.random.default_rng(seed), nu + 3, nu, dynamics=np.diag([-rate, -1.0]))
+    result = simulate(case.system, TimeSettings(horizon=case.horizon), SolverSettings())
+    assert (result.structure.index, result.structure.d) == (nu, 2)
+    times = np.linspace(0, case.horizon, 201)
+    truth = case.exact(times)
+    error = np.abs(result.signals.states(times) - truth).max(axis=0) / np.abs(truth).max(axis=0)
+    assert error.max() < 1e-6
+    assert (error < 10 * result.state_errors).all()
+
+
+def test_what_rounding_leaves_nothing_of_is_refused_for_that():
+    """Index 4 needs powers of the rate that doubles do not hold."""
+    case = made(np.random.default_rng(5), 6, 4, dynamics=np.diag([-1e7, -1.0]))
+    with pytest.raises(ModelError, match="leaves no digit of its hidden constraints"):
+        simulate(case.system, TimeSettings(horizon=5.0), SolverSettings())

@@ -44,21 +44,21 @@ def forcing(c: Coefficients) -> Array:
     return np.asarray(c.phi + kernel_forcing(c.B, c.F, c.u, c.theta, len(c.E)))
 
 
-def balance(c: Coefficients) -> Scaling:
+def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     """Scalings that bring the entries of E/τ and A to comparable size, in any units.
 
     The logarithms of the factors minimise Σ (ln|E_ij| + r_i + c_j − τ)² + Σ (ln|A_ij| + r_i + c_j)²
     over all entries that are not zero, |·| being the largest over time: multiplying an equation, a
-    state or the time by a number changes its factor alone.
+    state or the time by a number changes its factor alone. Terms of E count ``mass`` times.
     """
     n = c.E.shape[2]
     sizes = np.array([np.abs(distinct(matrix)[0]).max(axis=0) for matrix in (c.E, c.A)])
     there = sizes > 0.0
     while True:
         balancing = _balancing if n <= _KEPT else _balancing.__wrapped__
-        terms, least_squares = balancing(there.tobytes(), n)
+        terms, least_squares, counts = balancing(there.tobytes(), n, mass)
         logs = np.log(sizes[there])
-        factors = -(least_squares @ (logs @ terms))
+        factors = -(least_squares @ ((logs * counts) @ terms))
         entries = np.exp(terms @ factors + logs)
         if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
             break
@@ -78,13 +78,18 @@ def balance(c: Coefficients) -> Scaling:
 
 
 @lru_cache(maxsize=64)
-def _balancing(there: bytes, n: int) -> tuple[Array, Array]:
-    """What r, c and τ contribute to the logarithm of each entry that is there; (terms⊤terms)⁺."""
+def _balancing(there: bytes, n: int, mass: float) -> tuple[Array, Array, Array]:
+    """What r, c and τ contribute to the logarithm of each entry that is there; (terms⊤terms)⁺.
+
+    And how much each entry counts.
+    """
     kind, i, j = np.frombuffer(there, dtype=np.bool_).reshape(2, n, n).nonzero()
     every, terms = np.arange(len(i)), np.zeros((len(i), 2 * n + 1))
     terms[every, i] = terms[every, n + j] = 1.0
     terms[:, -1] = kind - 1.0
-    return terms, np.asarray(np.linalg.pinv(terms.T @ terms, rcond=1e-12, hermitian=True))
+    counts = np.where(kind, 1.0, mass)
+    inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
+    return terms, np.asarray(inverse), counts
 
 
 def who(system: DescriptorSystem) -> str:

@@ -29,7 +29,11 @@ from gpebo_cli.model.descriptor import (
 )
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.reduction.strangeness_free import MAX_GROWTH, by_singular_vectors
+from gpebo_cli.reduction.strangeness_free import (
+    MAX_GROWTH,
+    by_singular_vectors,
+    constraints_in_stages,
+)
 from gpebo_cli.reduction.structure import RESIDUAL, Structure, analyse
 
 _AHEAD = np.linspace(0.0, 1.0, 17)  # seconds
@@ -213,8 +217,7 @@ def hidden_constraints(
     """
     mu, s, n = structure.mu, structure.scaling, system.n
     count = slice(0, 1) if structure.time_invariant else slice(None)
-    e, a = scaled(c.E[:, count], c.A[:, count], s.rows, s.columns, s.time, mu + 1)
-    M, N = derivative_array(e, a, mu)
+    E, A = c.E[:, count], c.A[:, count]
     weights = (s.time ** np.arange(mu + 1))[:, None] * s.rows
     blocks = np.zeros((mu + 1, len(t), n, mu + 1, system.m))
     for i in range(mu + 1):
@@ -223,22 +226,16 @@ def hidden_constraints(
     parts = blocks.reshape(mu + 1, len(t), n, -1), c.phi[: mu + 1, :, :, None], c.F[: mu + 1]
     g = np.concatenate(
         [np.broadcast_to(part, (mu + 1, len(t), n, part.shape[3])) for part in parts], axis=3
-    ) * weights[:, None, :, None]
-    g = np.moveaxis(g, 0, 1).reshape(len(t), (mu + 1) * n, -1)
-    known = structure.reference
-    A2, f2, _, _, poor = by_elimination(
-        e[0], M, N, g, known.rows, known.columns, known.rank, known.Z1, len(t), MAX_GROWTH,
-        RESIDUAL,
     )
-    if poor.any():
-        _, Z2 = by_singular_vectors(
-            system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
-        )
-        everywhere = np.broadcast_to(poor, len(t))
-        A2[poor], f2[everywhere] = transpose(Z2) @ N[poor], transpose(Z2) @ g[everywhere]
+    if structure.stages:
+        stages = constraints_in_stages(system, structure, E, A, g, t, len(t))
+        A2, f2 = stages.A2, stages.f2
+    else:
+        A2, f2 = _by_array(system, structure, E, A, g * weights[:, None, :, None], t)
+    terms = np.abs(g * weights[:, None, :, None]).max(axis=(0, 2))[:, None, :]
     # Rows of equal size first: they are of any size, and the factors below are then of order one.
     size = np.maximum(np.abs(A2).max(axis=2, keepdims=True), np.finfo(float).tiny)
-    f2 = without_rounding(f2 / size, np.abs(g).max(axis=1, keepdims=True))
+    f2 = without_rounding(f2 / size, terms)
     Q, R = np.linalg.qr(transpose(without_rounding(A2 / size)))  # Â2 = RᵀQᵀ
     inward = exact_product(Q @ transpose(np.linalg.inv(R)), f2)  # Â2⁺ [f̂_v | f̂_θ]
     driving = (mu + 1) * system.m + 1
@@ -246,6 +243,27 @@ def hidden_constraints(
         without_rounding(Q @ transpose(Q)) / s.columns,
         inward[:, :, :driving], inward[:, :, driving:],
     )
+
+
+def _by_array(
+    system: DescriptorSystem, structure: Structure, E: Array, A: Array, g: Array, t: Array
+) -> tuple[Array, Array]:
+    """Â2 and its right-hand sides from the derivative array; g is scaled (μ + 1, N, n, c)."""
+    s, known = structure.scaling, structure.reference
+    e, a = scaled(E, A, s.rows, s.columns, s.time, len(g))
+    M, N = derivative_array(e, a, len(g) - 1)
+    stacked = np.moveaxis(g, 0, 1).reshape(len(t), -1, g.shape[3])
+    A2, f2, _, _, poor = by_elimination(
+        e[0], M, N, stacked, known.rows, known.columns, known.rank, known.Z1, len(t), MAX_GROWTH,
+        RESIDUAL,
+    )
+    if poor.any():
+        _, Z2 = by_singular_vectors(
+            system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
+        )
+        everywhere = np.broadcast_to(poor, len(t))
+        A2[poor], f2[everywhere] = transpose(Z2) @ N[poor], transpose(Z2) @ stacked[everywhere]
+    return A2, f2
 
 
 class _Along:

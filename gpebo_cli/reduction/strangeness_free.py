@@ -15,10 +15,11 @@ from gpebo_cli.kernels.structure_numpy import (
     in_own_states,
     scaled,
 )
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, distinct
+from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem, distinct
 from gpebo_cli.numerics.linalg import inverse_or_none, transpose
 from gpebo_cli.reduction.derivative_array import forcing, who
-from gpebo_cli.reduction.structure import RESIDUAL, Structure
+from gpebo_cli.reduction.stages import Stages, UnclearError, in_stages
+from gpebo_cli.reduction.structure import RESIDUAL, Structure, unclear_ranks
 
 MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
 _LOOKS = 32  # times at which the sensitivity to rounding is looked at
@@ -78,9 +79,13 @@ def strangeness_free_form(
     E, A = c.E[:, count], c.A[:, count]
     model = (scaling.rows, scaling.columns, scaling.time, mu + 1)
     every = max(1, len(t) // _LOOKS)
-    found = kernels.structure.eliminated(
-        E, A, *model, c.B, F, c.u, theta, *pivots, every, MAX_GROWTH, RESIDUAL
-    )
+    found = None
+    if structure.stages:
+        found = _with_stages(system, structure, E, A, forcing(c), t, every)
+    else:
+        found = kernels.structure.eliminated(
+            E, A, *model, c.B, F, c.u, theta, *pivots, every, MAX_GROWTH, RESIDUAL
+        )
     if found is None:
         found = _with_singular_vectors(system, structure, E, A, forcing(c), t, every)
     E1, A1, f1, A2, f2, basis, offset, amplification = found
@@ -89,6 +94,54 @@ def strangeness_free_form(
         E1, A1, f1, A2, f2, None if none else basis, None if none else offset, amplification,
         E[0], c.u[0], distinct(c.C)[0], direct,
     )
+
+
+def _with_stages(
+    system: DescriptorSystem, structure: Structure, E: Array, A: Array, f: Array, t: Array,
+    every: int,
+) -> tuple[Array, ...]:
+    """As the kernel ``eliminated``, from :func:`constraints_in_stages`."""
+    s = structure.scaling
+    stages = constraints_in_stages(system, structure, E, A, f[:, :, :, None], t, every)
+    mass = E[0] * (s.rows[:, None] * s.columns / s.time)
+    whole = np.concatenate([transpose(stages.Z1) @ mass, stages.A2], axis=1)
+    inverse, poor = inverse_or_none(whole)
+    _refuse_undetermined(system, poor, t)
+    return in_own_states(
+        E[0], A[0], f[0], stages.Z1, stages.A2, stages.f2, stages.size, inverse, s.rows, s.columns,
+        s.time, every,
+    )
+
+
+def constraints_in_stages(
+    system: DescriptorSystem, structure: Structure, E: Array, A: Array, f: Array, t: Array,
+    every: int,
+) -> Stages:
+    """:func:`gpebo_cli.reduction.stages.in_stages` at times t (N,), in scaled rows and states.
+
+    Arguments are Taylor coefficients to the order μ, those of f (μ + 1, N, n, c).
+
+    Raises:
+        ModelError: a rank differs from that of ``structure``; names the time.
+    """
+    mu, s = structure.mu, structure.scaling
+    e, a = scaled(E, A, s.rows, s.columns, s.time, mu + 1)
+    weights = (s.time ** np.arange(mu + 1))[:, None] * s.rows
+    g = f[: mu + 1] * weights[:, None, :, None]
+    try:
+        return in_stages(e, a, g, structure.rank_tol, every, structure.stages)
+    except UnclearError as unclear:
+        raise unclear_ranks(
+            system, t[unclear.place], rounding=unclear.rounding
+        ) from unclear
+
+
+def _refuse_undetermined(system: DescriptorSystem, poor: BoolArray, t: Array) -> None:
+    if poor.any():
+        raise ModelError(
+            f"{who(system)}: the equations do not determine the state near "
+            f"t = {t[int(np.argmax(poor))]:.9g}"
+        )
 
 
 def _with_singular_vectors(
@@ -122,11 +175,7 @@ def _with_singular_vectors(
     size[everywhere[some]] = np.abs(transpose(Z2))[np.cumsum(poor)[which] - 1] @ terms[again]
     whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
     inverse[poor], poor[poor] = inverse_or_none(whole)
-    if poor.any():
-        raise ModelError(
-            f"{who(system)}: the equations do not determine the state near "
-            f"t = {t[int(np.argmax(poor))]:.9g}"
-        )
+    _refuse_undetermined(system, poor, t)
     return in_own_states(E[0], A[0], f[0], Z1, A2, f2, size, inverse, *model, every)
 
 

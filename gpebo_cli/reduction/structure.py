@@ -6,13 +6,14 @@ Kunkel & Mehrmann, Differential-Algebraic Equations, Hypothesis 3.48: ranks of t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
-from gpebo_cli.kernels.structure_numpy import relative_singular_values
+from gpebo_cli.kernels.structure_numpy import relative_singular_values, scaled
 from gpebo_cli.model.descriptor import (
     Array,
     Coefficients,
@@ -20,9 +21,10 @@ from gpebo_cli.model.descriptor import (
     IntArray,
     distinct,
 )
-from gpebo_cli.numerics.linalg import frobenius_norm
+from gpebo_cli.numerics.linalg import frobenius_norm, inverse_or_none, transpose
 from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, initial_edges
 from gpebo_cli.reduction.derivative_array import Scaling, balance, who
+from gpebo_cli.reduction.stages import Stages, UnclearError, in_stages
 
 RESIDUAL = 1e-13  # rows that should vanish after elimination, relative to the array
 _PROBES = 65  # times at which the structure is established before anything is integrated
@@ -63,6 +65,8 @@ class Structure:
     steady: bool  # no singular value behind the ranks comes near zero between the ends
     # z' = this z + … with z = Z1ᵀE x: Z1ᵀA T, [Z1ᵀE; Â2] T = [I; 0]; None where not determined
     dynamics: Array | None  # (N or 1, d, d) at the probes, 1/s
+    # Ranks of E, see ``stages.py``, where the derivative array does not tell them clearly.
+    stages: tuple[int, ...] = ()
 
     @property
     def index(self) -> int:
@@ -138,8 +142,18 @@ def analyse(
         if reference is None:
             reason = levels.failure
             continue
-        steady, dips = (True, []) if invariant else _dips(levels.smallest)
-        _follow_dips(system, t, levels, dips, mu, scaling, rank_tol, reference)
+        if mu and (levels.least < _UNCLEAR or _differs(t, c, scaling, rank_tol, levels.a)):
+            staged = _in_stages(system, t, max_mu, rank_tol, levels.least)
+            if staged is not None:
+                return staged
+
+        def lines(
+            _: Array, c: Coefficients, column: IntArray, which: IntArray, mu: int = mu,
+            a: int = levels.a, reference: Pivots = reference,
+        ) -> Array:
+            return _lines(c, mu, scaling, rank_tol, a, column, which, reference)
+
+        steady = invariant or _follow_dips(system, t, levels.smallest, mu, rank_tol, lines)
         if not levels.a and "E" not in system.coefficients.constant:
             _refuse_crossing(system, t, c.E[0])
         return Structure(
@@ -148,10 +162,96 @@ def analyse(
             reference=reference, steady=steady,
             dynamics=None if levels.dynamics is None else levels.dynamics / scaling.time,
         )
+    staged = _in_stages(system, t, max_mu, rank_tol)
+    if staged is not None:
+        return staged
     raise ModelError(
         f"{who(system)} is not uniquely solvable, or its index is above {max_mu + 1}: with "
         f"{max_mu} differentiations {reason}; is an equation missing, or there twice?"
     )
+
+
+def _in_stages(
+    system: DescriptorSystem, t: Array, max_mu: int, rank_tol: float, least: float = 0.0
+) -> Structure | None:
+    """What :mod:`.stages` find, if that is clearer than a smallest singular value.
+
+    Raises:
+        ModelError: a rank changes between the times t (N,).
+    """
+    # Nothing of A stands beside E here, and rates in A say nothing about it.
+    s = balance(system.coefficients.taylor(t, 0), _MASS)
+    mu, ranks = 0, None
+
+    def found(t: Array, c: Coefficients) -> Stages:
+        e, a = scaled(c.E, c.A, s.rows, s.columns, s.time, mu + 1)
+        e, a = (x[:, : len(t)] for x in (e, a))
+        return in_stages(e, a, np.zeros((mu + 1, 1, system.n, 0)), rank_tol, 1, ranks)
+
+    def lines(t: Array, c: Coefficients, column: IntArray, which: IntArray) -> Array:
+        try:
+            smallest = found(t, c).smallest
+        except UnclearError as unclear:
+            raise unclear_ranks(
+                system, t[unclear.place], rounding=unclear.rounding
+            ) from unclear
+        return np.asarray(smallest.reshape(-1, _DIP_POINTS, 3)[which, :, column])
+
+    while True:
+        c = system.coefficients.taylor(t, mu)
+        try:
+            stages = found(t, c)
+        except UnclearError as unclear:
+            rounding = unclear.rounding
+        else:
+            rounding = True
+            if stages.smallest.min() > max(_BLURRED, least):
+                break
+        if mu == max_mu:
+            if rounding and not least:
+                raise unclear_ranks(system, t[0], rounding=True)
+            return None
+        mu += 1
+    ranks = stages.ranks
+    steady = len(t) == 1 or _follow_dips(system, t, stages.smallest, mu, rank_tol, lines)
+    none, n, a = np.zeros(0, dtype=np.intp), system.n, stages.A2.shape[1]
+    E, A = (getattr(c, name)[0, : len(t)] * (s.rows[:, None] * s.columns) for name in "EA")
+    W1 = transpose(stages.Z1)
+    inverse, singular = inverse_or_none(np.concatenate([W1 @ E / s.time, stages.A2], axis=1))
+    return Structure(
+        mu=mu, a=a, d=n - a, scaling=s, rank_tol=rank_tol,
+        smallest_singular_value=float(stages.smallest.min()), time_invariant=len(t) == 1,
+        reference=Pivots(0, none, none, np.zeros((n, 0))), steady=steady,
+        dynamics=None if singular.any() else W1 @ A @ inverse[:, :, : n - a] / s.time,
+        stages=ranks,
+    )
+
+
+def _differs(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float, a: int) -> bool:
+    """Whether stages find another number of constraints at one time.
+
+    A rate λ has singular values of λ^−2μ, which may count as zero.
+    """
+    middle, s = len(t) // 2, scaling
+    one = slice(middle, middle + 1)
+    E, A = (x if x.shape[1] == 1 else x[:, one] for x in (c.E, c.A))
+    e, aa = scaled(E, A, s.rows, s.columns, s.time, len(E))
+    try:
+        stages = in_stages(e, aa, np.zeros((len(e), 1, len(s.rows), 0)), rank_tol, 1)
+    except UnclearError:
+        return False
+    return bool(stages.A2.shape[1] != a)
+
+
+def unclear_ranks(system: DescriptorSystem, t: float, *, rounding: bool) -> ModelError:
+    """What :mod:`.stages` could not tell at the time t."""
+    why = f"a rank changes near t = {t:.9g}; choose a horizon that avoids this time"
+    if rounding:
+        why = (
+            "rounding of its largest entries leaves no digit of its hidden constraints: rates or "
+            "units in one equation are too far apart for its index; leave out what is fastest"
+        )
+    return ModelError(f"{who(system)}: {why}")
 
 
 def _refuse_overflow(
@@ -272,6 +372,9 @@ def _why_not(t: Array, smallest: Array, rank_tol: float) -> str:
     return f"{what} at t = {t[k]:.6g} (singular value {smallest[k, column + 1]:.1e})"
 
 
+_MASS = 1e3  # by how much more entries of E than those of A decide about scales in stages
+_BLURRED = 1e-4  # singular values below this are no structure in stages, whose rows are orthonormal
+_UNCLEAR = 1e-3  # with singular values below this, stages may be clearer
 _PLAIN = 1e-5  # bounds of singular values above this need no closer look
 
 
@@ -329,10 +432,12 @@ def _refuse_crossing(system: DescriptorSystem, t: Array, E: Array) -> None:
 
 
 def _follow_dips(
-    system: DescriptorSystem, t: Array, levels: _Levels, dips: list[tuple[int, int]], mu: int,
-    scaling: Scaling, rank_tol: float, reference: Pivots,
-) -> None:
-    """Follow local minima of the decisive singular values between the probes.
+    system: DescriptorSystem, t: Array, smallest: Array, mu: int, rank_tol: float,
+    lines: Callable[[Array, Coefficients, IntArray, IntArray], Array],
+) -> bool:
+    """Follow local minima of the decisive singular values (N, 3) between the probes.
+
+    Returns whether there is none between the ends. ``lines`` are as :func:`_lines` says.
 
     A rank that drops at an isolated time is never hit by a grid: |sin t| is 1e-2 at the nearest
     probe and looks harmless. Each deep local minimum is bracketed and cut by 8 per round, for as
@@ -340,12 +445,13 @@ def _follow_dips(
     and not at the flat bottom of a harmless dip. Comparing with the round before would not do: a
     probe may by luck be nearer to the zero than the times of the first round.
     """
+    steady, dips = _dips(smallest)
     if not dips:
-        return
+        return steady
     names = ("derivative array", "constraints", "differential part")
     column, k = np.array(dips, dtype=np.intp).reshape(-1, 2).T
     left, right = t[np.maximum(k - 1, 0)], t[np.minimum(k + 1, len(t) - 1)]
-    lowest = levels.smallest[k, column]
+    lowest = smallest[k, column]
     for _ in range(_DIP_ROUNDS):
         if not len(column):
             break
@@ -356,10 +462,10 @@ def _follow_dips(
         grid = (left[:, None] + (right - left)[:, None] * _CUTS)[first]
         grid[:, -1] = right[first]
         c = system.coefficients.taylor(grid.ravel(), mu)
-        lines = _lines(c, mu, scaling, rank_tol, levels.a, column, which, reference)
-        dip, best = np.arange(len(lines)), lines.argmin(axis=1)
+        values = lines(grid.ravel(), c, column, which)
+        dip, best = np.arange(len(values)), values.argmin(axis=1)
         before, after = np.maximum(best - 1, 0), np.minimum(best + 1, _DIP_POINTS - 1)
-        value = lines[dip, best]
+        value = values[dip, best]
         lowest = np.minimum(lowest, value)
         lost = lowest <= max(rank_tol, 1e-9)
         if lost.any():
@@ -369,9 +475,10 @@ def _follow_dips(
                 f"{who(system)}: the rank of the {names[column[i]]} changes at t = {where:.9g} "
                 f"(singular value {lowest[i]:.1e}); choose a horizon that avoids this time"
             )
-        falls = value < 0.5 * np.maximum(lines[dip, before], lines[dip, after])
+        falls = value < 0.5 * np.maximum(values[dip, before], values[dip, after])
         left, right = grid[which, before][falls], grid[which, after][falls]
         column, lowest = column[falls], lowest[falls]
+    return steady
 
 
 _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
