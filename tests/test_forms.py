@@ -165,14 +165,54 @@ CONSTRAINED = [CAPACITORS, PENDULUM, TANKS, FOUR_BAR, CRANE, LC_LOOP]
 
 @pytest.mark.parametrize("plant", CONSTRAINED, ids=lambda p: p["name"])
 def test_constrained_plants_from_one_output(plant):
-    with pytest.raises(ModelError, match=r"Assumption 1 .* observer\.form=strangeness_free"):
-        observed(plant, form="given")
+    if plant is not CAPACITORS:  # of which something is left
+        with pytest.raises(ModelError, match=r"Assumption 1 .* observer\.form=strangeness_free"):
+            observed(plant, form="given")
     found, error, of_states = observed(plant)
     assert np.abs(error).max() < 1e-9
     assert of_states < 1e-9
     assert "on the strangeness-free form, for as given Assumption 1" in found.note
     evidence = {a.name: a.evidence for a in found.assumptions}["Assumption 1"]
     assert evidence["form"] == "strangeness_free"
+
+
+# Two masses on a rod, index 3: the force in it acts on both.
+ROD = {
+    "name": "rod", "states": ["p1", "p2", "v1", "v2", "force"],
+    "inputs": {"u": "sin(2*t) + cos(t)/2"}, "unknowns": {"load": 0.7}, "outputs": ["y"],
+    "E": np.diag([1, 1, 1, 2, 0]).tolist(),
+    "A": [[0, 0, 1, 0, 0], [0, 0, 0, 1, 0], ["-2 - sin(t)", 0, -0.1, 0, 1],
+          [0, "-3/2 - 0.3*cos(2*t)", 0, -0.2, 0.6], [1, 0.6, 0, 0, 0]],
+    "B": [[0], [0], [1], [0], [0]], "F": [[0], [0], [1], [0], [0]], "C": [[1, 0, 0, 0, 0]],
+    "initial_state": [0.6, -1, 0, 0, 0],
+}
+
+
+@pytest.mark.parametrize(("plant", "lost"), [
+    (CAPACITORS, {"is"}), (ROD, {"v1", "v2", "force"}),
+], ids=["capacitors", "rod"])
+@pytest.mark.parametrize("unit", [1.0, 1e-7])
+def test_what_a_failure_of_assumption_1_does_not_touch_is_kept(plant, lost, unit):
+    """The unknown v drives some states and not others; units of what is lost do not matter."""
+    last = np.diag([*[1.0] * (len(plant["states"]) - 1), unit])
+    plant = {**plant, "A": [[*row[:-1], f"({row[-1]})*{unit}"] for row in plant["A"]],
+             "initial_state": list(np.linalg.solve(last, plant["initial_state"]))}
+    result = run(plant, estimator="ls_drem", time={"horizon": 10},
+                 observer={"name": "gpebo", "form": "given"})
+    told = result.details.estimable
+    assert {name for name in plant["states"] if told[name] is None} == lost
+    for name in (*plant["unknowns"], *plant["states"]):
+        error = np.abs(result.errors[name][0, -1])
+        assert np.isnan(error) if name in lost else error < 1e-9
+    (warning,) = result.details.warnings
+    assert "fails at t = 0" in warning
+    assert "singular value" in warning
+    noisy = run(plant, estimator="ls_drem", time={"horizon": 10}, noise="gaussian",
+                observer={"name": "gpebo", "form": "given"})
+    stds = dict(zip(plant["states"], noisy.details.estimation.states_std[0, -1], strict=True))
+    assert all(np.isfinite(stds[name]) == (name not in lost) for name in stds)
+    with pytest.raises(ModelError, match="Assumption 1"):
+        run(plant, observer={"name": "gpebo", "form": "given", "remedy": "reset"})
 
 
 def test_the_states_are_those_in_closed_form():

@@ -197,7 +197,12 @@ def test_assumption_1_violated_names_the_time_and_the_singular_value():
     signals = simulate(shipped("circuit"), TimeSettings(), SOLVER).signals
     blind = shipped("circuit", C=[[0, 0, 1, 0, 0, 0]])
     with pytest.raises(ModelError, match=r"Assumption 1 .* t = .* singular value"):
-        observe(blind, seen(signals), SOLVER, form="given")
+        observer_matrices(EquationForm(blind), signals.mesh.edges, signals.mesh.edges, 1e-10)
+    found = observe(blind, seen(signals), SOLVER, form="given")
+    (failed,) = [a for a in found.assumptions if not a.holds]
+    assert failed.name == "Assumption 1"
+    lost = np.isnan(found.state_map.offset.final)
+    assert [blind.states[i] for i in np.flatnonzero(lost)] == ["iv"]
 
 
 def test_rank_of_E_that_changes_is_an_error_of_the_observer():

@@ -29,7 +29,8 @@ _ADVICE = {
     "Rank of E": "choose a horizon in which no entry of E passes through zero; an E with a row of "
     "zeros is fine as long as it stays one",
     "Observer": "change the plant as said above, or use observer=gpebo",
-    "Assumption 1": "add an output (a row of C) that sees the algebraic states",
+    "Assumption 1": "add an output (a row of C) that sees the algebraic states, or take hidden "
+    "constraints (observer.form=strangeness_free)",
     "Assumption 2": "the direction named is not visible in the outputs: measure more "
     "(sensors=all tries every state), lengthen time.horizon, start at another time, "
     "or leave an unknown out; one that no output depends on cannot be estimated. Another input "
@@ -83,7 +84,7 @@ def main(words: list[str]) -> int:
         from gpebo_cli.experiment.assumptions import examine
         from gpebo_cli.experiment.sensors import candidates
 
-        examined = examine(job.settings, job.system)
+        examined = examine(job.settings, job.system, both=True)
         tried = candidates(job.settings, job.system) if sensors else []
     found = examined.assumptions
     title = f"plant {job.system.name}, observer {job.settings.observer['name']}"

@@ -7,7 +7,7 @@ first stage that cannot be carried out and reports that stage as the failed assu
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +21,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.observers import Measurements, Observation, Observer, build
 from gpebo_cli.observers._observation import AffineStateMap
+from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
@@ -46,13 +47,17 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
 
     They are about ψ, which noise does not reach: signals are taken without it.
     """
-    return examine(settings, system).assumptions
+    return examine(settings, system, both=True).assumptions
 
 
 def examine(
-    settings: Settings, system: DescriptorSystem, seen: Measurements | None = None
+    settings: Settings, system: DescriptorSystem, seen: Measurements | None = None, *,
+    both: bool = False,
 ) -> Examination:
-    """:func:`check`, with what can be known; of given signals the observer's part only."""
+    """:func:`check`, with what can be known; of given signals the observer's part only.
+
+    ``both``: where the observer may choose, evidence of the form that it does not take, too.
+    """
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if seen is None and settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
@@ -61,7 +66,7 @@ def examine(
         )
     if seen is not None:
         return Examination(()) if observer is None else _of_observer(
-            observer, settings, system, seen, []
+            observer, settings, system, seen, [], both
         )
     found: list[Assumption] = []
     try:
@@ -82,12 +87,12 @@ def examine(
     noise = signal_noise(settings.noise, levels)
     derivatives = InputDerivatives.of_plant(system, ~levels.noisy_inputs)
     seen = Measurements(signals.inputs, signals.outputs, noise, derivatives)
-    return _of_observer(observer, settings, system, seen, found)
+    return _of_observer(observer, settings, system, seen, found, both)
 
 
 def _of_observer(
     observer: Observer, settings: Settings, system: DescriptorSystem, seen: Measurements,
-    found: list[Assumption],
+    found: list[Assumption], both: bool,
 ) -> Examination:
     """What the observer needs of the plant, and of the signals it gets to see."""
     try:
@@ -102,10 +107,30 @@ def _of_observer(
         visible(observation, excitation.known, t, system.n),
     )
     found += of_observation(observation, excitation, system)
+    if both and isinstance(observer, Gpebo) and observer.form == "auto":
+        found = [_with_other_form(a, observer, system, seen, settings) for a in found]
     return Examination(
         tuple(found), times, excitation,
         _per_unit(observation, excitation.known, settings, system, seen, times),
     )
+
+
+def _with_other_form(
+    found: Assumption, observer: Gpebo, system: DescriptorSystem, seen: Measurements,
+    settings: Settings,
+) -> Assumption:
+    """Assumption 1 as given, with what the strangeness-free form would say; others as they are."""
+    if found.evidence.get("form") != "given":  # of the other one it says why that was not taken
+        return found
+    try:
+        other = replace(observer, form="strangeness_free").observe(system, seen, settings.solver)
+        text = next(
+            f"holds, too, with singular value {a.evidence['smallest_singular_value']:.4g}"
+            for a in other.assumptions if a.name == found.name
+        )
+    except GpeboError as error:
+        text = str(error)
+    return replace(found, evidence={**found.evidence, "strangeness_free": text})
 
 
 def _per_unit(
@@ -276,13 +301,20 @@ def of_observation(
 
 
 def warnings(observation: Observed) -> tuple[str, ...]:
-    """What does not stop a run and spoils its result, one line each: Φ that grows too far."""
+    """What does not stop a run and spoils its result, one line each.
+
+    Assumption 1 that fails on the form chosen, and Φ that grows too far.
+    """
+    found = tuple(
+        str(a.evidence["because"]) for a in observation.assumptions
+        if not a.holds and "because" in a.evidence
+    )
     growth, rate = observation.growth, observation.growth_rate
     if growth is None or rate is None or growth < _GROWTH:
-        return ()
+        return found
     text = (
         f"Φ has grown to {growth:.2g}, at {rate:.3g} 1/s: of its 16 digits the state estimate "
         f"loses {np.log10(growth):.0f}; a remedy is needed, observer.remedy=output_injection, "
         "reset or current_coordinates; observer.form=strangeness_free feeds no output back"
     )
-    return (text,)
+    return (*found, text)

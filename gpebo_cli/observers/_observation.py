@@ -187,4 +187,4 @@ class SampledBlock:
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
     scale: Array  # (K, p) of the terms of each column of ψ so far
     errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset
-    units: Array | None = None  # as of ``AffineStateMap``
+    units: Array | None = None  # (n,) as of ``AffineStateMap``

@@ -115,7 +115,7 @@ class Gpebo:
         reduced = reduced_system(
             system, signals, solver,
             xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=form,
-            unknown=self.unknown_initial,
+            unknown=self.unknown_initial, in_part=isinstance(self.remedy, Plain),
         )
         return replace(
             self.remedy.observe(replace(reduced, note=note or reduced.note)), bounds=self.bounds

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.linalg import exact_product
@@ -31,6 +31,7 @@ from gpebo_cli.observers.reduced.matrices import (
     observer_matrices,
     weakest,
 )
+from gpebo_cli.observers.reduced.partial import untouched
 from gpebo_cli.observers.reduced.regression import (
     Assembled,
     regression_signals,
@@ -100,7 +101,11 @@ def begin_at(
     Raises:
         ConfigError: an unknown state, or the wrong number of values.
     """
-    V1, names = initial_basis(o.split.projector[0], o.split.rank, system.states)
+    P, frame = o.split.projector[0], o.split.frame
+    if frame is not None:  # with what may have been given up
+        P = frame.projector
+    rank = int(np.rint(np.trace(P)))
+    V1, names = initial_basis(P, rank, system.states)
     return np.asarray(begin.basis.T @ V1 @ initial_extension(xi_a0, system, names))
 
 
@@ -155,6 +160,7 @@ class ReducedSystem:
     xi_a0: Array  # (d,) where the extension starts, in the coordinates of its basis
     regression: str  # projected: all rows of the residual, paper: the last r
     note: str = ""  # which form is used, where that was not said, and why
+    lost: BoolArray | None = None  # (n,) states that a failure of Assumption 1 touches
     injection: Injection | None = None
 
     @property
@@ -235,6 +241,7 @@ def reduced_system(
     regression: str = "projected",
     form: str = "auto",
     unknown: Sequence[str] | None = None,
+    in_part: bool = False,
 ) -> ReducedSystem:
     """The reduced system on measured signals.
 
@@ -247,6 +254,7 @@ def reduced_system(
         regression: which rows of the residual to keep.
         form: given, strangeness_free, or auto: as given where Assumption 1 holds.
         unknown: ``observer.unknown_initial``, None for all.
+        in_part: where Assumption 1 fails on the form chosen, without what that touches.
 
     Raises:
         ModelError: rank of E not constant, or Assumption 1 violated.
@@ -255,12 +263,26 @@ def reduced_system(
     mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
     at = signals.at(t, inside) if system.coefficients.signals else None
-    used, first, note = choose_form(
-        system, t, inside, at, signals.derivatives, solver, form, weights
-    )
+    lost = None
+    try:
+        used, first, note = choose_form(
+            system, t, inside, at, signals.derivatives, solver, form, weights
+        )
+    except NotObservableError as error:
+        used = EquationForm(system, inputs=signals.derivatives)
+        left = untouched(used, t, inside, at, solver.rank_tol) if in_part else None
+        if left is None:
+            raise
+        frame, lost = left
+        first = observer_matrices(
+            used, t, inside, solver.rank_tol, normalise=True,
+            output_scale=output_scale(weights, system), signals=at, frame=frame,
+        )
+        note = f"; {_reason(error)}: what it touches is not estimated"
     whole = ReducedSystem(
         used, signals, solver, mesh, first,
         start_at(used, *_beginning(used, first, signals)), np.zeros(0), regression, note,
+        lost,
     )
     begin, start = whole.begin, begin_at(xi_a0, system, first, whole.begin)
     if unknown is not None:
@@ -318,13 +340,17 @@ def choose_form(
         except NotObservableError as error:
             if form == "given":
                 raise
-            reason = str(error).rpartition("; ")[0].partition(": ")[2]
-            note = f"; observer on the strangeness-free form, for as given {reason}"
+            note = f"; observer on the strangeness-free form, for as given {_reason(error)}"
     hidden = strangeness_free(
         system, t, inside, signals, derivatives,
         max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol,
     )
     return hidden, matrices(hidden), note
+
+
+def _reason(error: NotObservableError) -> str:
+    """What fails where, without whose it is and what to do."""
+    return str(error).rpartition("; ")[0].partition(": ")[2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,15 +468,18 @@ def assumptions(
 ) -> tuple[Assumption, ...]:
     """Rank of E and Assumption 1, with their evidence at the points of the mesh."""
     smallest, where = weakest(found.injectivity, found.elimination)
+    frame = reduced.first.split.frame
+    left = None if frame is None else frame.remaining
+    rank = reduced.rank + (0 if left is None else left.given_up.shape[1])
     return (
         Assumption(
             "Rank of E", "rank E(t) is constant", True,
-            {"rank": reduced.rank, "states": reduced.system.n},
+            {"rank": rank, "states": reduced.system.n},
         ),
         Assumption(
             "Assumption 1",
             "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
-            True,
+            reduced.lost is None,
             {"smallest_singular_value": smallest, "at": float(mesh.points.ravel()[where]),
              **form_used(reduced.form, reduced.note)},
         ),

@@ -141,7 +141,7 @@ def row_sizes(entries: Array) -> Array:
 def observer_matrices(
     form: EquationForm, t: Array, inside: Array, rank_tol: float,
     like: ObserverMatrices | None = None, *, normalise: bool = False,
-    output_scale: Array | None = None, signals: Array | None = None,
+    output_scale: Array | None = None, signals: Array | None = None, frame: Frame | None = None,
 ) -> ObserverMatrices:
     """Evaluate the observer's matrices at the times t (N,).
 
@@ -154,6 +154,7 @@ def observer_matrices(
         normalise: divide the equations by their sizes first, see :func:`row_sizes`.
         output_scale: √w (r,) of the outputs' weights; default: that of ``like``, else ones.
         signals: [u; y] at these times (N, m + r), for a plant whose matrices follow them.
+        frame: in place of that of ``like``.
 
     Raises:
         ModelError: the rank of E is not constant, or Assumption 1 fails; names the time and the
@@ -169,14 +170,15 @@ def observer_matrices(
     if output_scale is not None:
         scale = output_scale
     plain = model.hidden is None and {"D", "H"} <= system.coefficients.zero
-    frame = axes_frame(entry_sizes(model.E)) if like is None else like.split.frame
+    known = like.split.frame if frame is None and like is not None else frame
+    frame = axes_frame(entry_sizes(model.E)) if like is None and frame is None else known
     found = None
-    if plain and frame is not None:
+    if plain and frame is not None and frame.remaining is None:
         found = _in_frame(model, rows, scale, frame, rank_tol)
     if found is not None:
         return found
     return _by_steps(
-        system, model, rows, scale, t, rank_tol, like,
+        system, model, rows, scale, t, rank_tol, like, known,
         lambda: form.mass(t, inside, signals, 1)[: len(model.E)],
     )
 
@@ -207,7 +209,7 @@ def _in_frame(
 
 def _by_steps(
     system: DescriptorSystem, model: Equations, rows: Array, scale: Array, t: Array,
-    rank_tol: float, like: ObserverMatrices | None, slope: Callable[[], Array],
+    rank_tol: float, like: ObserverMatrices | None, frame: Frame | None, slope: Callable[[], Array],
 ) -> ObserverMatrices:
     """The observer's matrices from those of the plant at the times t (N,) and Ė (N or 1, n, n)."""
     q, r = system.q, system.r
@@ -215,11 +217,10 @@ def _by_steps(
     if (rows != 1.0).any():
         E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
     C, D, H = (scale[:, None] * matrix for matrix in (C, D, H))
-    if like is None:
-        split = constant_split(E, system.states, rank_tol)
+    if frame is not None:
+        split = split_in_frame(E, frame, rank_tol)
     else:
-        frame = like.split.frame
-        split = None if frame is None else split_in_frame(E, frame, rank_tol)
+        split = constant_split(E, system.states, rank_tol) if like is None else None
     if split is None:
         known = None if like is None else like.split.basis
         split = split_by_svd(system, E, slope() / rows[:, None], t, rank_tol, known)
@@ -238,7 +239,12 @@ def _by_steps(
     of_y = np.zeros((1, algebraic.shape[1], r))
     of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
     g_signals = joined(of_inputs, of_y, axis=2)
-    Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
+    if frame is not None and frame.remaining is not None:
+        Q1, K, injectivity = _eliminate_in_part(
+            system, algebraic, split.kernel, t, rank_tol, frame.remaining.rank
+        )
+    else:
+        Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
     if hidden is not None:
         Q1[:, Q1.shape[1] - r :] = 0.0  # y has no part in it, nor has its rounding
     Lambda = exact_product(pinv, A)  # Λ = E⁺A + Ṗ
@@ -320,6 +326,24 @@ def _eliminate(
                 "observer.form=strangeness_free"
             )
     return Q1, kernel @ inverse, bound
+
+
+def _eliminate_in_part(
+    system: DescriptorSystem, algebraic: Array, kernel: Array, t: Array, rank_tol: float, rank: int
+) -> tuple[Array, Array, Array]:
+    """:func:`_eliminate` by the pseudoinverse of a rank that has to be the same at all times."""
+    size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), TINY)
+    U, sigma, Vt = np.linalg.svd(algebraic @ kernel)
+    ranks = (sigma > rank_tol * size[:, None]).sum(axis=1)
+    if (ranks != rank).any():
+        raise NotObservableError(
+            f"plant {system.name}: Assumption 1 fails, and the rank of [ΠA; C] on the kernel of E "
+            f"changes at t = {t[int(np.argmax(ranks != rank))]:.6g}; use "
+            "observer.form=strangeness_free"
+        )
+    inverse = kernel @ (transpose(Vt[:, :rank]) / sigma[:, None, :rank])
+    smallest = sigma[:, :rank].min(axis=1, initial=np.inf) / size
+    return U[:, :, :rank], inverse, smallest
 
 
 def weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:

@@ -32,6 +32,15 @@ class Split:
 
 
 @dataclass(frozen=True, eq=False)
+class Remaining:
+    """What is left of w where Assumption 1 fails, see :mod:`.partial`."""
+
+    kept: Array  # (n, k) orthonormal
+    given_up: Array  # (n, c) orthonormal, the rest of range P
+    rank: int  # of 𝒜 on the kernel and on what is given up
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """Kernel and range of an E(t) in which neither depends on time."""
 
@@ -39,6 +48,7 @@ class Frame:
     range: Array  # (n, n_a) orthonormal, of range E
     kernel: Array  # (n, n_b)
     equations: Array  # (e, n)
+    remaining: Remaining | None = None
 
     @cached_property
     def projector(self) -> Array:
@@ -129,6 +139,14 @@ def fits(
 
 def within_frame(frame: Frame, pinv: Array) -> Split:
     """The split in a frame, with BᵀE⁺ (N, n_a, n)."""
+    left = frame.remaining
+    if left is not None:
+        return Split(
+            rank=left.kept.shape[1], basis=left.kept, pinv=left.kept.T @ frame.domain @ pinv,
+            turn=None, equations=frame.equations[None],
+            kernel=np.hstack([frame.kernel, left.given_up])[None],
+            projector=(left.kept @ left.kept.T)[None], frame=frame,
+        )
     return Split(
         rank=frame.domain.shape[1], basis=frame.domain, pinv=pinv, turn=None,
         equations=frame.equations[None], kernel=frame.kernel[None],

@@ -27,6 +27,8 @@ class Plain:
         system, q = reduced.system, reduced.system.q
         extension = extend(reduced, reduced.mesh, reduced.start())
         mesh, final = extension.mesh, extension.assembled
+        if reduced.lost is not None:
+            final.offset[:, reduced.lost] = final.gain[:, reduced.lost] = np.nan
         kept = final.kept_rows(system, reduced.regression)
         all_kept = len(kept) == final.Y.shape[1]
         start, stop = reduced.signals.span
@@ -53,7 +55,7 @@ class Plain:
             respond=None if errors is None else (
                 lambda e_u, e_y: respond(mesh, errors, len(kept), e_u, e_y)
             ),
-            note=reduced.note,
+            note=reduced.note if reduced.lost is None else "",  # a warning says it
         )
 
 

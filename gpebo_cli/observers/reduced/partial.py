@@ -1,0 +1,79 @@
+"""What the equations as given still tell where Assumption 1 fails: the states it does not touch.
+
+With 𝒜 V2 of a rank below n_b, v = V2 ζ is known up to V2 N s, where N spans the kernel of 𝒜 V2 and
+s(t) is any function. It drives w through Λ V2 N. What it drives, a subspace S of range P, is given
+up as an unknown: it counts as algebraic, V2 becomes [V2, S], and rows of 𝒜 that see it may give it
+back. This is repeated until nothing more is driven; the w left obey an equation of their own, and
+all that is lost of x lies in the range of [V2, S] N (theory 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gpebo_cli.kernels.arrays import joined
+from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.numerics.linalg import exact_product, transpose
+from gpebo_cli.observers.reduced.matrices import row_sizes
+from gpebo_cli.observers.reduced.split import (
+    TINY,
+    Frame,
+    Remaining,
+    constant_split,
+    initial_basis,
+    within_frame,
+)
+from gpebo_cli.reduction.form import EquationForm
+
+_DRIVEN = 1e-9  # of the largest entry of Λ V2 N: less is rounding
+_DIP = 1e-3  # of the largest of a singular value over time: where less, it may be zero in between
+
+
+def untouched(
+    form: EquationForm, t: Array, inside: Array, signals: Array | None, rank_tol: float
+) -> tuple[Frame, BoolArray] | None:
+    """The frame of E without what is given up, and which states are lost (n,).
+
+    Args:
+        form: as given.
+        t: times (N,).
+        inside: where functions that jump are decided.
+        signals: [u; y] there (N, m + r), for matrices that follow them.
+        rank_tol: singular values below this, relative, are zero.
+
+    Returns:
+        None where no state is left, where the kernel of E turns, or where a rank changes or may.
+    """
+    model, states = form.equations(t, inside, signals), form.system.states
+    rows = row_sizes(np.abs(model.E[0]))[:, None]
+    E, A = model.E / rows, model.A / rows
+    split = constant_split(E, states, rank_tol)
+    if split is None or split.frame is None:
+        return None
+    frame = split.frame
+    algebraic = joined(exact_product(split.equations, A), model.C, axis=1)
+    size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), TINY)
+    given_up = np.zeros((len(states), 0))
+    while given_up.shape[1] < split.rank:
+        kept, _ = initial_basis(
+            frame.projector - given_up @ given_up.T, split.rank - given_up.shape[1], states
+        )
+        kernel = np.hstack([frame.kernel, given_up])
+        _, sigma, Vt = np.linalg.svd(algebraic @ kernel)
+        ranks = (sigma > rank_tol * size[:, None]).sum(axis=1)
+        weakest = sigma[:, max(ranks[0] - 1, 0)]
+        if (ranks != ranks[0]).any() or weakest.min() < _DIP * weakest.max():
+            return None
+        left = replace(frame, remaining=Remaining(kept, given_up, int(ranks[0])))
+        free = kernel @ transpose(Vt[:, ranks[0] :])
+        drive = within_frame(left, split.pinv).pinv @ A
+        into = drive @ free
+        U, sizes, _ = np.linalg.svd(np.moveaxis(into, 1, 0).reshape(len(kept.T), -1), False)
+        driven = sizes > _DRIVEN * max(float(np.linalg.norm(drive @ kernel)), TINY)
+        if not driven.any():
+            lost = (np.linalg.norm(free, axis=2) > _DRIVEN).any(axis=0)
+            return None if lost.all() else (left, lost)
+        given_up = np.hstack([given_up, kept @ U[:, driven]])
+    return None
