@@ -185,14 +185,14 @@ def test_workers_end_with_their_parent(tmp_path, how):
         assert len(workers(process.pid)) > 0
         process.send_signal(how)
         # Workers and trackers hold these pipes: the end of both is the end of all of them.
-        process.communicate(timeout=8)
+        process.communicate(timeout=30)
     assert process.returncode == -how
 
 
 def workers(parent):
     """Processes of joblib's that ``parent`` has started."""
     found = []
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while not found and time.monotonic() < deadline:
         for entry in Path("/proc").glob("[0-9]*"):
             try:
