@@ -195,6 +195,8 @@ WRONG = [
     (["run", "observer.regression=papr"], "did you mean paper?"),
     (["run", "figures=regressor"], "did you mean figures=[regressor]?"),
     (["run", "figures=[nope]"], "nope"),
+    (["run", "figures.width=wide"], "figures.width: expected column or page"),
+    (["run", "figures.dpi=9"], "figures.dpi: expected 30 to 1200"),
     (["run", "plant.title=${oc.env:HOME}"], "plant.title: ${…} is not allowed in a plant"),
     (["run", "--multrun"], "did you mean --multirun?"),
     (["run", "--multirun=3"], "--multirun takes no value"),

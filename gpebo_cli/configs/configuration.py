@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -160,7 +161,10 @@ def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:
             )
         figures = words[figures]
     chosen = convert(figures, bool | list[str], "figures")
-    built = read(OutputSettings, {**section, "figures": chosen}, "output")
+    try:
+        built = read(OutputSettings, {**section, "figures": chosen}, "output")
+    except ConfigError as error:
+        raise ConfigError(_as_written(str(error))) from error
     low, high = _INCHES
     if isinstance(built.width, float) and not low <= built.width <= high:
         raise ConfigError(
@@ -172,12 +176,17 @@ def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:
     return built
 
 
+def _as_written(message: str) -> str:
+    """A message about the look of figures with the key that the help has for it."""
+    return re.sub(r"^output\.(?=(formats|width|dpi|style|error)\b)", "figures.", message)
+
+
 def _check_ranges(built: Settings) -> None:
     for name, (low, high) in _RANGES.items():
         value = _value(built, name)
         if not low <= value <= high:
             upto = f"to {high:g}" if math.isfinite(high) else "or more"
-            raise ConfigError(f"{name}: expected {low:g} {upto}, got {value:g}")
+            raise ConfigError(_as_written(f"{name}: expected {low:g} {upto}, got {value:g}"))
     for name in _POSITIVE:
         value = _value(built, name)
         if value is not None and value <= 0:
