@@ -306,6 +306,14 @@ def test_a_name_too_long_for_its_axis_stands_on_several_lines_with_its_unit() ->
     ]
 
 
+def test_a_formula_is_broken_before_its_sign_and_nowhere_else() -> None:
+    axes = style.new_figure(3.0, 2.0).add_subplot()
+    style._set_name(axes, symbols.error_of("substrate", {}, signed=False), "g/l", 0.5)
+    first, second, unit = axes.get_ylabel().split("\n")
+    assert first == r"$|\widehat{\mathrm{substrate}}$"
+    assert (second, unit) == (r"$- \mathrm{substrate}|$", "(g/l)")
+
+
 def test_one_case_that_diverges_does_not_hide_the_others() -> None:
     [(_, figure)] = draw(wild(), ["state_error_a"])
     low, high = figure.axes[1].get_ylim()
