@@ -207,7 +207,7 @@ WRONG = [
     (["run", "noise=gaussian", "noise.sample_time=1e-4"], "take some 7.68 GB of memory; a run"),
     (["run", "estimator.gamma=logspace(1,9,1e5)", "time.samples=100000", "output.max_rows=1e12"],
      "100000 cases with 100000 samples each (output.max_rows) would take some 2.88e+03 GB"),
-    (["run", "estimator.gamma=logspace(1,9,1000000)"], "whole number of values up to 200000"),
+    (["run", "estimator.gamma=logspace(1,9,1000001)"], "whole number of values up to 1000000"),
     (["run", "-m", "time.horizon=range(1,1000000000)"], "a sweep of 999999999 jobs; at most"),
     (["run", "-m", "time.horizon=range(0,1,1e-6)", "plant=window,circuit"], "of 2000000 jobs"),
     (["run", "observer.xi_a0.foo=1"], "observer.xi_a0 is empty; give it as a whole"),

@@ -28,7 +28,7 @@ from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.schema import Accepted, number, per_name
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
-_MAX_CASES = 200_000  # some ten seconds of writing
+_MAX_CASES = 1_000_000
 _AMPLE = 10.0  # times the least gain that would do: 1 % long before the end
 _MANY = 8  # numbers, from which on looking at them one by one is what takes the time
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -154,6 +156,12 @@ class EstimationResult:
     parameters_std: Array | None = None  # (G, M, p) standard deviations; None: nobody knows
     states_std: Array | None = None  # (G, M, n)
     active: Mapping[int, tuple[ActiveBound, ...]] = field(default_factory=dict)  # bounds, by case
+
+    @cached_property
+    def gains(self) -> dict[str, Array]:
+        """The gains of all cases (G,) by name, in order of first appearance; NaN: it has none."""
+        names = dict.fromkeys(chain.from_iterable(self.cases))
+        return {name: np.array([case.get(name, np.nan) for case in self.cases]) for name in names}
 
 
 @dataclass(frozen=True)

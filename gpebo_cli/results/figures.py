@@ -218,7 +218,7 @@ def gains(result: RunResult) -> list[Panel]:
         return []
     if np.isnan(metrics.final_error_parameters).all() and not _known(result):
         return []
-    values = np.array([case[gain] for case in estimation.cases])
+    values = estimation.gains[gain]
     order = np.argsort(values, kind="stable")
     axis = Axis(gain, f"gain {symbol(gain)}", log=True)
 
@@ -407,13 +407,12 @@ def _seen(result: RunResult, members: Iterable[int]) -> list[int]:
 
 def _varying_gain(estimation: EstimationResult) -> str | None:
     """The gain that alone tells the cases apart, if there are enough of them to draw a curve."""
-    names = dict.fromkeys(name for case in estimation.cases for name in case)
-    values = {name: {case.get(name, np.nan) for case in estimation.cases} for name in names}
-    varying = [name for name, found in values.items() if len(found) > 1]
+    distinct = {name: np.unique(values) for name, values in estimation.gains.items()}
+    varying = [name for name, found in distinct.items() if len(found) > 1]
     if len(varying) != 1:
         return None
-    found = values[varying[0]]
-    usable = len(found) >= MIN_GAINS and all(np.isfinite(v) and v > 0 for v in found)
+    found = distinct[varying[0]]
+    usable = len(found) >= MIN_GAINS and bool(np.isfinite(found).all() and found[0] > 0.0)
     return varying[0] if usable else None
 
 

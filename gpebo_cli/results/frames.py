@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.results import tables
@@ -74,6 +72,5 @@ def _estimates(result: RunResult, estimation: EstimationResult) -> DataFrame:
     names = tables.estimates_header(result.system.states, estimation)
     count = len(estimation.cases)
     index = MultiIndex.from_product([range(count), estimation.t], names=names[:2])
-    truth = tables.varying_truth(estimation)
-    values = np.concatenate([tables.case_values(estimation, k, truth) for k in range(count)])
-    return DataFrame(values[:, 1:], columns=names[2:], index=index)
+    values = tables.case_values(estimation, slice(None))[..., 2:]
+    return DataFrame(values.reshape(len(index), -1), columns=names[2:], index=index)

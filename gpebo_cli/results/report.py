@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,15 +16,17 @@ if TYPE_CHECKING:
 _SHOWN_CASES = 12
 
 
-def case_rows(result: RunResult) -> list[dict[str, float]]:
-    """Gains and metrics of every case, named as in ``cases.csv``; none without an estimator."""
+def case_rows(
+    result: RunResult, chosen: Iterable[int] | None = None
+) -> list[dict[str, float]]:
+    """Gains and metrics of cases (None: all), named as in ``cases.csv``; none if unestimated."""
     estimation, metrics = result.estimation, result.metrics
     if estimation is None or metrics is None:
         return []
-    columns = {name: [float(v) for v in values] for name, values in metrics.columns.items()}
+    columns, cases = metrics.columns, estimation.cases
     return [
-        {**case, **{name: values[i] for name, values in columns.items()}}
-        for i, case in enumerate(estimation.cases)
+        {**cases[i], **{name: float(values[i]) for name, values in columns.items()}}
+        for i in (range(len(cases)) if chosen is None else chosen)
     ]
 
 
@@ -56,9 +58,15 @@ _TIMES = {
 }
 
 
-def case_table(rows: Sequence[Mapping[str, float]], gains: Sequence[str]) -> list[str]:
+def case_table(result: RunResult) -> list[str]:
     """The lines of a table with one row per case; the middle of a long one is left out."""
-    count = len(rows)
+    cases = () if result.estimation is None else result.estimation.cases
+    count, half = len(cases), _SHOWN_CASES // 2
+    few = count <= _SHOWN_CASES
+    rows = case_rows(result, None if few else [*range(half), *range(count - half, count)])
+    if not rows:
+        return []
+    gains = list(cases[0])
     settled = [name for name in rows[0] if name.startswith(STANDING)]
     headings = dict(_HEADINGS)
     if any(math.isfinite(rows[0][name]) for name in settled):  # with noise 1 % is chance
@@ -70,17 +78,10 @@ def case_table(rows: Sequence[Mapping[str, float]], gains: Sequence[str]) -> lis
         {**row, "settled": max((row[n] for n in settled if row[n] == row[n]), default=math.nan)}
         for row in rows
     ]
-    chosen = list(range(count))
-    if count > _SHOWN_CASES:
-        half = _SHOWN_CASES // 2
-        chosen = [*range(half), *range(count - half, count)]
-    body = [
-        [*(f"{rows[i][g]:g}" for g in gains), *(_cell(n, rows[i]) for n in headings)]
-        for i in chosen
-    ]
+    body = [[*(f"{row[g]:g}" for g in gains), *(_cell(n, row) for n in headings)] for row in rows]
     lines = columns([head, *body])
-    if count > _SHOWN_CASES:
-        lines.insert(1 + _SHOWN_CASES // 2, f"… {count - _SHOWN_CASES} more in cases.csv")
+    if not few:
+        lines.insert(1 + half, f"… {count - 2 * half} more in cases.csv")
     return lines
 
 
@@ -149,10 +150,7 @@ def _cell(name: str, row: Mapping[str, float]) -> str:
 
 def run_lines(result: RunResult, folder: str = "") -> list[str]:
     """The lines that tell of a run: table, what moved, ``folder`` if given, and the verdict."""
-    rows = case_rows(result)
-    lines: list[str] = []
-    if rows and result.estimation is not None:
-        lines += case_table(rows, list(result.estimation.cases[0]))
+    lines = case_table(result)
     if result.recording is not None or None in result.estimable.values():
         lines += estimate_table(result)
     if result.noise is not None:

@@ -102,22 +102,20 @@ def estimates_header(states: Sequence[str], estimation: EstimationResult) -> lis
     return [*header, *estimation.checks, *(f"{name}_true" for name, _ in varying_truth(estimation))]
 
 
-def case_values(
-    estimation: EstimationResult, case: int, truth: Sequence[tuple[str, Array]]
-) -> Array:
-    """The rows of one case, (M, columns), under :func:`estimates_header` without ``case``.
-
-    ``truth`` is what :func:`varying_truth` finds; it is the same for all cases.
-    """
-    delta = estimation.delta
-    columns = [estimation.t, estimation.parameters[case], estimation.states[case]]
-    if delta is not None:
-        columns.append(delta[case if len(delta) > 1 else 0])
+def case_values(estimation: EstimationResult, cases: slice) -> Array:
+    """The rows of some cases, (g, M, columns), under :func:`estimates_header`."""
+    numbers = np.arange(len(estimation.parameters))[cases]
+    columns = [estimation.parameters[cases], estimation.states[cases]]
+    if estimation.delta is not None:
+        own = len(estimation.delta) > 1
+        columns.append(estimation.delta[cases if own else slice(None)][..., None])
     if estimation.parameters_std is not None and estimation.states_std is not None:
-        columns += [estimation.parameters_std[case], estimation.states_std[case]]
-    columns += [check[case] for check in estimation.checks.values()]
-    columns += [values for _, values in truth]
-    return np.column_stack(columns)
+        columns += [estimation.parameters_std[cases], estimation.states_std[cases]]
+    columns += [check[cases][..., None] for check in estimation.checks.values()]
+    columns += [values[:, None] for _, values in varying_truth(estimation)]
+    columns = [numbers[:, None, None].astype(float), estimation.t[:, None], *columns]
+    shape = columns[2].shape[:2]
+    return np.concatenate([np.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=2)
 
 
 def write_estimates(
@@ -134,41 +132,28 @@ def write_estimates(
 def write_cases(path: Path, estimation: EstimationResult, metrics: Metrics) -> None:
     """Write one row per case: ``case``, its gains, its metrics; NaN is an empty cell."""
     table = cases_table(estimation, metrics)
-    lines = [_header(["case", *table.header])]
-    for case, numbers in enumerate(table.rows):
-        cells = ["" if np.isnan(number) else f"{number:.17g}" for number in numbers]
-        lines.append(",".join([str(case), *cells]).encode() + b"\n")
-    write_file(path, lines)
+    rows = np.column_stack([np.arange(len(table.rows)), table.rows])
+    write_file(path, [_header(["case", *table.header]), *_rows(rows, "%d")])
 
 
 def cases_table(estimation: EstimationResult, metrics: Metrics) -> Table:
     """One row per case: its gains (NaN: it has no such gain), its metrics."""
-    gains = gain_names(estimation)
-    measured = metrics.columns
-    columns: list[Sequence[float] | Array] = [
-        *([case.get(gain, np.nan) for case in estimation.cases] for gain in gains),
-        *measured.values(),
-    ]
-    return Table([*gains, *measured], np.column_stack(columns))
+    columns = {**estimation.gains, **metrics.columns}
+    return Table([*columns], np.column_stack([*columns.values()]))
 
 
 def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics) -> None:
     """Write one row per case and parameter: its gains, the truth, and errors over the seeds."""
-    gains = gain_names(estimation)
-    lines = [_header(["case", *gains, "parameter", "truth", "bias", "deviation", "rms", "seeds"])]
+    names = list(estimation.gains)
+    lines = [_header(["case", *names, "parameter", "truth", "bias", "deviation", "rms", "seeds"])]
     for case, values in enumerate(estimation.cases):
-        own = ["" if gain not in values else f"{values[gain]:.17g}" for gain in gains]
+        own = ["" if gain not in values else f"{values[gain]:.17g}" for gain in names]
         for i, name in enumerate(noise.names):
             numbers = (noise.truth[i], noise.bias[case, i], noise.deviation[case, i],
                        noise.rms[case, i])
             cells = [str(case), *own, name, *(f"{x:.17g}" for x in numbers), str(noise.seeds)]
             lines.append(",".join(cells).encode() + b"\n")
     write_file(path, lines)
-
-
-def gain_names(estimation: EstimationResult) -> list[str]:
-    """Names of the gains of all cases, in order of first appearance."""
-    return list(dict.fromkeys(name for case in estimation.cases for name in case))
 
 
 def varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
@@ -183,9 +168,10 @@ def varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
 
 def _estimate_chunks(header: Sequence[str], estimation: EstimationResult) -> Iterator[bytes]:
     yield _header(header)
-    truth = varying_truth(estimation)
-    for case in range(len(estimation.cases)):
-        yield from _rows(case_values(estimation, case, truth), prefix=f"{case},")
+    cases, at_once = len(estimation.cases), max(1, _CHUNK_ROWS // max(len(estimation.t), 1))
+    for first in range(0, cases, at_once):
+        values = case_values(estimation, slice(first, first + at_once))
+        yield from _rows(values.reshape(-1, values.shape[2]), "%d")
 
 
 def _lines(table: Table) -> Iterator[bytes]:
@@ -200,9 +186,9 @@ def _header(names: Sequence[str]) -> bytes:
     return stream.getvalue().encode()
 
 
-def _rows(table: Array, prefix: str = "") -> Iterator[bytes]:
-    """Format ``table`` (rows, columns); every line starts with ``prefix`` (free of ``%``)."""
-    line = prefix + ",".join(["%.17g"] * table.shape[1]) + "\n"
+def _rows(table: Array, first: str = "%.17g") -> Iterator[bytes]:
+    """Format ``table`` (rows, columns), its first column by a format of its own."""
+    line = ",".join([first] + ["%.17g"] * (table.shape[1] - 1)) + "\n"
     for start in range(0, len(table), _CHUNK_ROWS):
         chunk = table[start : start + _CHUNK_ROWS]
         text = (line * len(chunk) % tuple(chunk.ravel().tolist())).encode()
