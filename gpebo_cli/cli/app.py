@@ -7,6 +7,7 @@ module imports nothing that the interpreter has not loaded already.
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]  # signal itself takes milliseconds to import
 import os
 import sys
 
@@ -32,6 +33,8 @@ COMMANDS = {
 
 def entry() -> None:
     """The process ``gpebo``: :func:`main`, and a Ctrl-C that comes when all is done is too late."""
+    # Before main() is inside its own handler nothing is there that would have to be cleaned up.
+    _signal.signal(_signal.SIGINT, lambda *_: _interrupted())
     if not sys.warnoptions:  # of libraries, for whoever writes programs; -W shows them
         import warnings
 
@@ -39,9 +42,7 @@ def entry() -> None:
         os.environ["PYTHONWARNINGS"] = "ignore"  # of workers, too
     try:
         code = main()
-        import signal
-
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        _signal.signal(_signal.SIGINT, _signal.SIG_IGN)
     except KeyboardInterrupt:
         code = _interrupted()
     workers = sys.modules.get("gpebo_cli.cli.workers")  # of a sweep
@@ -156,9 +157,8 @@ def _interrupted() -> int:
     process by the signal whatever is returned here.
     """
     import atexit
-    import signal
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # once is enough
+    _signal.signal(_signal.SIGINT, _signal.SIG_IGN)  # once is enough
     _report("interrupted", 130)
     atexit._run_exitfuncs()  # noqa: SLF001  there is no public way to run them early
     _leave(130)

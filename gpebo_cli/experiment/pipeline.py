@@ -88,7 +88,7 @@ def run_experiment(
     observer = build(settings.observer)
     if observer is not None and estimator is None:
         estimator = estimators.build(settings.estimator)
-    check_seeds(settings.noise, levels)
+    check_seeds(settings.noise, levels, settings.time.horizon)
     check_memory(settings, system, levels, 0 if estimator is None else len(estimator.cases))
     stage = _Clock(progress)
     recorded = settings.data.name == "csv"

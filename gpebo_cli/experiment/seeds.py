@@ -35,10 +35,11 @@ from gpebo_cli.settings import NoiseSettings
 from gpebo_cli.simulation.signals import Signals
 
 _NUMBERS = 1 << 20  # in Y of one batch of seeds; estimators hold tens of times that
+_MOST_SAMPLES = 2e6  # of all seeds: some twenty seconds
 
 
-def check_seeds(settings: NoiseSettings, levels: NoiseLevels) -> None:
-    """Refuse many seeds of nothing.
+def check_seeds(settings: NoiseSettings, levels: NoiseLevels, horizon: float) -> None:
+    """Refuse many seeds of nothing, and more samples in all of them than can be computed soon.
 
     Raises:
         ConfigError: says what is needed.
@@ -47,6 +48,12 @@ def check_seeds(settings: NoiseSettings, levels: NoiseLevels) -> None:
         raise ConfigError(f"noise.seeds: expected 1 or more, got {settings.seeds}")
     if settings.seeds > 1 and levels.silent:
         raise ConfigError(f"noise.seeds = {settings.seeds}, but there is no noise; set its levels")
+    samples = settings.seeds * horizon / settings.sample_time
+    if settings.seeds > 1 and samples > _MOST_SAMPLES:
+        raise ConfigError(
+            f"noise.seeds = {settings.seeds}: with noise.sample_time = {settings.sample_time:g} s "
+            f"they have {samples:.3g} samples; at most {_MOST_SAMPLES:.3g} are computed"
+        )
 
 
 def refuse_seeds(settings: NoiseSettings) -> None:
