@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpebo_cli.cli.options import PLAIN, VOLUME, Options, parse
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 FOLDER = "experiment/published"
 _PAGE = {"--page": "a Markdown file"}
+_NOTES = {"theirs": "Their figure", "differs": "What differs", "erratum": "Erratum"}
+_PICTURES = Path("img", "atlas")  # beside the page
 _KINDS = ("case", "final", "last", "first", "max", "min")
 
 
@@ -24,7 +27,7 @@ _KINDS = ("case", "final", "last", "first", "max", "min")
 class Expected:
     """One number of a publication, as a recipe's ``expected`` has it."""
 
-    quantity: str  # case.COLUMN of cases.csv, final.PARAMETER; last., first., max. or min.SIGNAL
+    quantity: str  # case.COLUMN of cases.csv, final.ESTIMATE; last., first., max. or min.SIGNAL
     value: float | list[float]  # a list has one for each case
     tolerance: float  # absolute
     where: str  # it is printed
@@ -42,6 +45,7 @@ class Finding:
     ours: float
     tolerance: float
     where: str
+    notes: Mapping[str, str] = field(default_factory=dict)  # what the recipe says besides
 
     @property
     def holds(self) -> bool:
@@ -62,13 +66,12 @@ def main(words: list[str]) -> int:
 
         sys.stdout.write(REPRODUCE_HELP)
         return 0
-    findings = [finding for name in _names(options) for finding in reproduced(name, options)]
+    page = options.values.get("--page")
+    pictures = None if page is None else Path(page).parent / _PICTURES
+    findings = [f for name in _names(options) for f in reproduced(name, options, pictures)]
     if not options.quiet:
         sys.stdout.writelines(f"{line}\n" for line in table(findings))
-    page = options.values.get("--page")
     if page is not None:
-        from pathlib import Path
-
         from gpebo_cli.results.files import write_text
 
         write_text(Path(page), atlas(findings))
@@ -90,12 +93,15 @@ def _names(options: Options) -> list[str]:
     return list(options.words) or known
 
 
-def reproduced(name: str, options: Options = PLAIN) -> Iterator[Finding]:
-    """Run a recipe of ``experiments/published`` and compare.
+def reproduced(
+    name: str, options: Options = PLAIN, pictures: Path | None = None
+) -> Iterator[Finding]:
+    """Run a recipe of ``experiments/published`` and compare; nothing where its data are not here.
 
     Args:
         name: of the recipe.
         options: how much to say meanwhile.
+        pictures: a folder for a small figure of the run, if any.
 
     Raises:
         ConfigError: its ``expected`` names no quantity of the run.
@@ -110,10 +116,17 @@ def reproduced(name: str, options: Options = PLAIN) -> Iterator[Finding]:
     where = f"experiment published/{name}"
     with session(Arguments()) as hydra:
         ((_, config),) = recipe_jobs(f"published/{name}", hydra.config_loader)
+    file = OmegaConf.select(config, "data.file")
+    if file is not None and not Path(file).exists():
+        sys.stderr.write(f"{name}: not run, there is no {file} here; see {config.reference}\n")
+        return
     try:
         result = run_recipe_job(config, Arguments(), options)
     except GpeboError as error:
         raise type(error)(f"{where}: {error}") from error
+    if pictures is not None:
+        _draw(result, pictures / f"{name}.png")
+    notes = {key: str(config[key]).strip() for key in _NOTES if config.get(key)}
     title, reference = (str(OmegaConf.select(config, key) or "") for key in ("title", "reference"))
     entries = OmegaConf.to_container(config.expected)
     for entry in entries if isinstance(entries, list) else []:
@@ -130,8 +143,19 @@ def reproduced(name: str, options: Options = PLAIN) -> Iterator[Finding]:
         for value, own in zip(values, ours, strict=True):
             yield Finding(
                 name, title, reference, expected.quantity, value, own, expected.tolerance,
-                expected.where,
+                expected.where, notes,
             )
+
+
+def _draw(result: RunResult, path: Path) -> None:
+    """The first panel of the first figure that there is, small."""
+    from gpebo_cli.results.figures import describe
+    from gpebo_cli.results.style import compose, save
+    from gpebo_cli.settings import OutputSettings
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    panels = next(iter(describe(result, ("parameter_error", "parameters", "states")).values()))
+    save(compose(panels[:1], OutputSettings(width=2.0, dpi=72)), path)
 
 
 def quantity(result: RunResult, name: str, where: str) -> list[float]:
@@ -146,9 +170,11 @@ def quantity(result: RunResult, name: str, where: str) -> list[float]:
     signals, system = result.signals, result.system
     columns = {
         "case": {} if result.metrics is None else vars(result.metrics),
-        "final": {} if result.estimation is None else dict(
-            zip(result.estimation.names, result.estimation.parameters[:, -1].T, strict=True)
-        ),
+        "final": {} if result.estimation is None else dict(zip(
+            (*result.system.states, *result.estimation.names),
+            (*result.estimation.states[:, -1].T, *result.estimation.parameters[:, -1].T),
+            strict=True,
+        )),
     }
     every = np.column_stack([signals.inputs, signals.outputs, signals.states])
     named = dict(zip((*system.inputs, *system.outputs, *system.states), every.T, strict=True))
@@ -186,16 +212,25 @@ def atlas(findings: Sequence[Finding]) -> str:
         "# Published results, reproduced", "",
         "Made by `gpebo reproduce --page docs/atlas.md`. Each recipe is a file of",
         "`experiments/published`, and runs alone as `gpebo run experiment=published/NAME`.", "",
-        "| recipe | source | quantity | published | ours | tolerance | where it is from |",
+        "| recipe | ours | quantity | published | ours | tolerance | where it is from |",
         "|---|---|---|---|---|---|---|",
     ]
-    previous = ""
+    notes, previous = [], ""
     for f in findings:
-        first = f.recipe != previous
+        name = picture = ""
+        if f.recipe != previous:
+            marked = " **erratum**" if "erratum" in f.notes else ""
+            name = f"`{f.recipe}`: {f.title}; {f.reference}{marked}"
+            picture = f"![{f.title}]({(_PICTURES / f.recipe).as_posix()}.png)"
+            notes += [
+                f"| `{f.recipe}` | {_NOTES[key]} | {text} |" for key, text in f.notes.items()
+            ]
         previous = f.recipe
         lines.append(
-            f"| {f'`{f.recipe}`: {f.title}' if first else ''} | {f.reference if first else ''} | "
-            f"{f.quantity} | {f.published:.7g} | {f.ours:.7g}{'' if f.holds else ' **off**'} | "
-            f"{f.tolerance:.1g} | {f.where} |"
+            f"| {name} | {picture} | {f.quantity} | {f.published:.7g} | "
+            f"{f.ours:.7g}{'' if f.holds else ' **off**'} | {f.tolerance:.1g} | {f.where} |"
         )
-    return "\n".join([*lines, ""])
+    return "\n".join([
+        *lines, "", "## What stands in the publications", "", "| recipe | | |", "|---|---|---|",
+        *notes, "",
+    ])

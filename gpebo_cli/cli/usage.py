@@ -131,8 +131,10 @@ REPRODUCE_HELP = """\
 usage: gpebo reproduce [NAME …] [--page FILE]
 
 Runs the recipes of experiments/published, by default all of them, and prints every published
-number beside ours. Exit code 1 if one is off by more than its tolerance. --page writes the table
-as a page of Markdown; -q prints nothing but errors, -v how long each stage takes.
+number beside ours. Exit code 1 if one is off by more than its tolerance. A recipe whose data have
+to be downloaded runs where they are in the current folder. --page writes the table as a page of
+Markdown, and small figures beside it in img/atlas; -q prints nothing but errors, -v how long each
+stage takes.
 
 examples:
   gpebo reproduce gear_petzold

@@ -36,6 +36,9 @@ KEYS = (
     "title",
     "reference",
     "expected",
+    "theirs",
+    "differs",
+    "erratum",
 )
 """Keys of a configuration, from which everything about a run follows."""
 
