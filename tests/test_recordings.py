@@ -368,8 +368,8 @@ def test_a_gap_is_refused_unless_it_is_said_what_to_do(tmp_path):
 
 def test_dates_are_seconds_after_the_first(tmp_path):
     path = tmp_path / "r.csv"
-    days = ["2024-02-28T23:59:59", "2024-02-29 00:00:00.25", "2024-03-01T00:00:00.25Z"]
-    path.write_text("t,V,y\n" + "".join(f"{day},1,2\n" for day in days))
+    days = ["2024-02-28T23:59:59", "2024-02-29 00:00:00,25", "2024-03-01T00:00:00.25Z"]
+    path.write_text("t,V,y\n" + "".join(f'"{day}",1,2\n' for day in days))
     data = DataSettings("csv", str(path), time_unit="datetime")
     expected = [0.0, 1.25, 86401.25]
     assert read_table(data, shipped("circuit")).samples.t.tolist() == expected

@@ -292,7 +292,8 @@ def seconds(cells: Sequence[str], origin: Any) -> tuple[Array, Any]:
     """Dates and times as seconds after ``origin``, by default the first one; NaN: it is none."""
     import pandas as pd
 
-    times = pd.to_datetime(list(cells), format="ISO8601", utc=True, errors="coerce")
+    points = [cell.replace(",", ".") for cell in cells]  # ISO 8601 has both, pandas only this
+    times = pd.to_datetime(points, format="ISO8601", utc=True, errors="coerce")
     origin = times[0] if origin is None else origin
     return np.asarray((times - origin).total_seconds(), dtype=np.float64), origin
 
