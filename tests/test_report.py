@@ -101,7 +101,9 @@ def test_the_page_needs_nothing_else(inside):
 def test_a_recording_and_a_sweep_are_told(inside):
     words = " ".join(page_of("recorded")[0].text)
     assert "file r.csv" in words
-    assert "e0_il" in words
+    assert "e0_il (A)" in words
+    assert "truth" not in words  # nobody knows it, nor when the error was small
+    assert "never" not in words
     page, _ = page_of("sweep")
     words = " ".join(page.text)
     assert "3 of 3 jobs are done" in words

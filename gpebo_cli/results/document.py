@@ -17,7 +17,7 @@ from gpebo_cli.results.finished import Case, read_columns, read_summary
 from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.page import case_table
 from gpebo_cli.results.style import file_content
-from gpebo_cli.results.symbols import number_text
+from gpebo_cli.results.symbols import number_text, with_unit
 
 if TYPE_CHECKING:
     from gpebo_cli.results.provenance import Provenance
@@ -169,17 +169,23 @@ def _estimates(folder: Path, summary: Mapping[str, Any]) -> list[list[str]]:
     truth = {name: values[-1] for name, values in signals.items() if name not in ("case", "t")}
     truth |= summary.get("parameters") or {}
     last = np.flatnonzero(np.diff(columns["case"], append=np.inf))[:_MOST_CASES]
+    found = summary.get("estimates") or {}
+    units = {name: entry.get("unit") for name, entry in found.get("0", found).items()}
+    names = [name.removesuffix("_hat") for name in columns if name.endswith("_hat")]
+    known = any(truth.get(name) is not None for name in names)
     rows = []
-    for hat in (name for name in columns if name.endswith("_hat")):
-        name = hat.removesuffix("_hat")
+    for name in names:
         std = columns.get(f"{name}_std")
         cells = [
-            number_text(columns[hat][k]) + (f" ± {number_text(std[k])}" if std is not None else "")
+            number_text(columns[f"{name}_hat"][k])
+            + (f" ± {number_text(std[k])}" if std is not None else "")
             for k in last
         ]
         true = truth.get(name)
-        rows.append([name, *cells, "" if true is None else number_text(float(true))])
-    return [["", *(f"case {int(columns['case'][k])}" for k in last), "truth"], *rows]
+        shown = "" if true is None else number_text(float(true))
+        rows.append([with_unit(name, units.get(name) or ""), *cells, *([shown] if known else [])])
+    head = ["", *(f"case {int(columns['case'][k])}" for k in last), *(["truth"] if known else [])]
+    return [head, *rows]
 
 
 def _cases(folder: Path) -> list[list[str]]:

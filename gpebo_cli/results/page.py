@@ -107,12 +107,17 @@ def case_table(named: Sequence[tuple[str, dict[str, float]]]) -> list[list[str]]
     several = any(name for name, _ in named)
     # Gains that are the same everywhere tell nothing; those of other estimators are not theirs.
     shown = [g for g in gains if len({row.get(g) for _, row in named}) > 1] or gains[:1]
-    head = [*(["estimator"] if several else []), *map(symbol, shown), *_METRICS.values()]
+    # Without the truth nothing is known of errors, nor from when on they are small.
+    known = [
+        key for key in _METRICS
+        if any(math.isfinite(row[f"final_error_{key.split('_')[-1]}"]) for _, row in named)
+    ]
+    head = [*(["estimator"] if several else []), *map(symbol, shown), *(_METRICS[k] for k in known)]
     rows = [
         [
             *([name] if several else []),
             *(number_text(row[gain]) if gain in row else "" for gain in shown),
-            *(_metric(key, row[key]) for key in _METRICS),
+            *(_metric(key, row[key]) for key in known),
         ]
         for name, row in named
     ]
