@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,13 +14,13 @@ import numpy as np
 import pytest
 import sympy as sp
 import yaml
-from examples import gpebo
+from examples import blocks, gpebo, python
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 from scipy.integrate import solve_ivp
-from scipy.io import mmwrite, savemat
-from scipy.linalg import expm
+from scipy.io import loadmat, mmwrite, savemat
+from scipy.linalg import eigh, expm, null_space
 
 from gpebo_cli import ConfigError, load_plant, run
 from gpebo_cli.api.choice import plain
@@ -600,3 +601,47 @@ def test_what_is_measured_and_unknown_of_matrices(tmp_path):
     assert "D" not in plant
     with pytest.raises(ConfigError, match="measure has 'x3', which is no state"):
         from_file(path, "p", measure="x3")
+
+
+BENCHMARKS = os.environ.get("GPEBO_BENCHMARKS", "")  # where g600.mat and drivencavity… are
+
+
+@pytest.mark.skipif(not os.path.isdir(BENCHMARKS), reason="GPEBO_BENCHMARKS names no folder")
+def test_public_benchmarks(tmp_path):
+    masses = from_file(f"{BENCHMARKS}/g600.mat", "g600").mapping()
+    masses["inputs"]["u1"] = "sin(t)"
+    result = simulated(masses, 20.0)
+    file = loadmat(f"{BENCHMARKS}/g600.mat")
+    A, B, M, G = (file[name].toarray() for name in ("A", "B", "M", "G"))
+    size, N = len(M), null_space(G)
+    k = N.shape[1]
+    reduced = np.linalg.solve(N.T @ M @ N, N.T @ np.hstack([
+        A[size : 2 * size, :size] @ N, A[size : 2 * size, size : 2 * size] @ N,
+        B[size : 2 * size],
+    ]))
+    ode = np.block([[np.zeros((k, k)), np.eye(k)], [reduced[:, :-1]]])
+    forced = np.linalg.solve(1j * np.eye(2 * k) - ode, np.r_[np.zeros(k), reduced[:, -1]])
+    t = result["t"]
+    swinging = np.imag(forced * np.exp(1j * t)[:, None])
+    states, step = [np.zeros(2 * k)], expm(ode * (t[1] - t[0]))
+    for k_0, k_1 in pairwise(swinging):
+        states.append(step @ (states[-1] - k_0) + k_1)
+    true = np.array(states)[:, :k] @ N.T
+    found = np.array([result[name] for name in masses["states"][:size]]).T
+    assert np.abs(found - true).max() < 1e-12 * np.abs(true).max()
+
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "import.md").read_text(encoding="utf-8")
+    (source,) = [s for s in blocks(page, "python") if "cavity" in s]
+    said = python(source + f"np.save({str(tmp_path / 'x')!r}, [result[s] for s in plant.states])", BENCHMARKS)
+    assert "index 2, 602 differential and 240 algebraic" in said
+    file = loadmat(f"{BENCHMARKS}/drivencavity__mats_NV722_Re1.mat")
+    M, K, J, B = (file[name].toarray() for name in ("M", "A", "J", "B"))
+    N = null_space(J)
+    rates, V = eigh(N.T @ K @ N, N.T @ M @ N)
+    t = np.linspace(0.0, 1.0, 201)[:, None]
+    modes = V.T @ N.T @ B[:, 0] / (rates**2 + 100.0) * (
+        rates * np.sin(10 * t) - 10 * np.cos(10 * t) + 10 * np.exp(-rates * t)
+    )
+    true = (modes @ (N @ V).T).T
+    found = np.load(tmp_path / "x.npy")
+    assert np.abs(found[: len(true)] - true).max() < 1e-12 * np.abs(true).max()

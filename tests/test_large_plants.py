@@ -4,9 +4,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh, null_space
 from scipy.sparse import csr_matrix
 
-from gpebo_cli import load_plant, run, system_from_functions
+from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.numerics.mesh import SHARE
 from gpebo_cli.observers.reduced import extension
@@ -286,3 +287,86 @@ def test_the_swept_extension_is_that_of_dense_elements(monkeypatch):
         np.testing.assert_allclose(one, other, atol=1e-7)
     psi, other = found.details.regression.psi, dense.details.regression.psi
     np.testing.assert_allclose(psi, other, atol=1e-9)
+
+
+def saddle(velocities, pressures, rng):
+    """Index 2, as finite elements of a flow give it: M v' = −K v + Jᵀp + b u, J v = 0; all full."""
+    orthogonal = np.linalg.qr(rng.standard_normal((velocities, velocities)))[0]
+    M = orthogonal * rng.uniform(0.5, 2.0, velocities) @ orthogonal.T
+    K = orthogonal.T * np.logspace(0, 5, velocities) @ orthogonal
+    J = rng.standard_normal((pressures, velocities))
+    return M, K, J, rng.standard_normal(velocities)
+
+
+def matrices(blocks):
+    """E, A and B (n, 1) of M v' = −K v + Jᵀp + b u, J v = 0."""
+    M, K, J, b = blocks
+    n, count = len(M) + len(J), len(M)
+    E, A, B = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 1))
+    E[:count, :count], A[:count, :count], A[:count, count:], A[count:, :count] = M, -K, J.T, J
+    B[:count, 0] = b
+    return E, A, B
+
+
+def exact_flow(blocks, t):
+    """v (N, ·) and p (N, ·) for u = sin 3t from rest, by the modes of what Jᵀ does not reach."""
+    M, K, J, b = blocks
+    N = null_space(J)
+    rates, V = eigh(N.T @ K @ N, N.T @ M @ N)
+    forced = V.T @ N.T @ b / (rates**2 + 9.0)
+    t = t[:, None]
+    q = forced * (rates * np.sin(3 * t) - 3 * np.cos(3 * t) + 3 * np.exp(-rates * t))
+    v = q @ (N @ V).T
+    inward = J @ np.linalg.inv(M)
+    return v, np.linalg.solve(inward @ J.T, inward @ (K @ v.T - np.outer(b, np.sin(3 * t)))).T
+
+
+def full_plant(E, A, B, C=None, u="sin(3*t)"):
+    C = np.eye(len(E))[:1] if C is None else C
+    return load_plant(from_matrices(
+        {"E": E, "A": A, "B": B, "C": C}, "full", inputs={"u": u}
+    ).mapping())
+
+
+def test_a_full_stiff_plant_of_index_2_agrees_with_its_modes():
+    blocks = saddle(48, 11, np.random.default_rng(4))
+    found = large.large_simulation(full_plant(*matrices(blocks)), TIME, SolverSettings(tol=1e-9))
+    assert (found.structure.mu, found.structure.d) == (1, 37)
+    states = found.signals.states
+    true = np.concatenate(exact_flow(blocks, states.mesh.points.ravel()), axis=1)
+    wrong = np.abs(states.values.reshape(true.shape) - true).max(axis=0) / np.abs(true).max(axis=0)
+    assert wrong.max() < 1e-9
+    assert (wrong <= found.state_errors).all()
+
+
+def test_a_full_plant_of_index_3_is_the_sparse_one_in_other_coordinates():
+    rng = np.random.default_rng(5)
+    E, A, B, C = chain(27)
+    left, right = (np.eye(len(E)) + 0.05 * rng.standard_normal(E.shape) for _ in "lr")
+    u = "sin(t)**3"  # with which rest is a consistent start in all coordinates
+    mixed = full_plant(left @ E @ right, left @ A @ right, left @ B, C @ right, u)
+    plain, other = (large.large_simulation(s, TIME, SolverSettings(tol=1e-10))
+                    for s in (full_plant(E, A, B, C, u), mixed))
+    assert other.structure.mu == plain.structure.mu == 2
+    final = right @ other.signals.states.final
+    np.testing.assert_allclose(final, plain.signals.states.final, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-9])
+def test_singular_values_that_decide_nothing_are_left_to_the_derivative_array(size):
+    E, A, B = matrices(saddle(48, 11, np.random.default_rng(6)))
+    U, sigma, V = np.linalg.svd(E[:48, :48])
+    sigma[-1] = size
+    E[:48, :48] = U * sigma @ V
+    assert large.large_simulation(full_plant(E, A, B), TIME, SolverSettings()) is None
+
+
+def test_a_stiff_sparse_plant_agrees_with_dense_collocation(monkeypatch):
+    system = plant(ladder, cells=26, rate=1e4)
+    settings = TIME, SolverSettings(tol=1e-10)
+    found = large.large_simulation(system, *settings)
+    monkeypatch.setattr("gpebo_cli.simulation.simulate.large_simulation", lambda *_: None)
+    dense = simulate.simulate(system, *settings)
+    np.testing.assert_allclose(
+        found.signals.states.final, dense.signals.states.final, rtol=1e-8, atol=1e-12
+    )

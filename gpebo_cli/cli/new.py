@@ -100,8 +100,8 @@ def _from_file(name: str, options: Options) -> tuple[dict[str, bytes], str]:
     """The files of a plant made from a file, and what there is to say of it."""
     from gpebo_cli.importers import from_file
     from gpebo_cli.model.plant import plant_from_mapping
-    from gpebo_cli.reduction.structure import analyse
     from gpebo_cli.settings import SolverSettings, TimeSettings
+    from gpebo_cli.simulation.large import structure_of
 
     given = options.values
     draft = from_file(given["--from"], name, measure=given.get("--measure"),
@@ -109,11 +109,7 @@ def _from_file(name: str, options: Options) -> tuple[dict[str, bytes], str]:
     system = plant_from_mapping(draft.mapping())
     said = [*draft.comments[1:]]
     try:
-        time, solver = TimeSettings(), SolverSettings()
-        structure = analyse(
-            system, time.start, time.start + time.horizon,
-            max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol,
-        )
+        structure = structure_of(system, TimeSettings(), SolverSettings())
         said.append(f"index {structure.index} as computed")
     except GpeboError as error:
         said.append(f"it is written, but cannot be simulated yet: {error}")

@@ -51,7 +51,7 @@ def _needs(
     """Gigabytes by the setting that asks for them, where E has so large a rank."""
     time, n, signals = settings.time, system.n, system.m + system.r
     p = system.q + rank
-    regression = (p + 1) * (n + p)
+    regression = (p + 1) * (n + p) if cases else n
     kept = len(kept_samples(cases, time.samples, settings.output.max_rows))
     needs: dict[str, tuple[float, ...]] = {
         f"time.samples = {time.samples}": (time.samples, regression + signals),

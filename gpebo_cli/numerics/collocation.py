@@ -266,7 +266,7 @@ def _solve_elements(
     if _is_constant(c):
         # One length for all that are equal would be wrong each time in the same direction, and over
         # many elements that adds up; what their mean is wrong by adds up to nothing.
-        group = _equal_lengths(h)
+        group = equal_lengths(h)
         h = (np.bincount(group, weights=h) / np.bincount(group))[group]
     groups = int(group.max(initial=-1)) + 1
     solve = elements.element_maps
@@ -310,7 +310,7 @@ def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
     return np.asarray(np.abs(inverse) @ found)
 
 
-def _equal_lengths(h: Array) -> IntArray:
+def equal_lengths(h: Array) -> IntArray:
     """Group (K,) of each length; those that differ by rounding only count as equal.
 
     Groups are numbered as they first appear.

@@ -4,11 +4,15 @@ An element needs no factorisation where h‖A‖ is modest: ``X ← x_0 + h R (A
 converges like (h‖A‖)^k/k!, and a sweep costs as much as the entries of A. The equations that are
 solved are those of collocation, so what holds for their solution holds here. Errors are carried on
 by the same sweeps, to two digits.
+
+Where A is constant and h‖A‖ is not modest, the same equations are solved directly, with one
+factorisation for all elements of one length.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,20 +20,29 @@ import numpy as np
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.collocation import LinearSolution, at_points, unresolved_signals
+from gpebo_cli.numerics.collocation import (
+    LinearSolution,
+    at_points,
+    equal_lengths,
+    unresolved_signals,
+)
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, legendre_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.radau import ComplexArray, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
 
 LENGTH = 4.0  # h‖A‖ of an element at most
 _MOST_SWEEPS = 80
-_MOST_ELEMENTS = 800  # with more of them the system counts as stiff
+MOST_ELEMENTS = 800  # with more of them the system counts as stiff
 _DIGITS = 1e-2  # of the tolerance, to which sweeps go on
 _ROUGH = 0.02  # to which errors are carried
+_SPARSE = 0.1  # share of entries, up to which factors are sparse
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
 _TINY = float(np.finfo(float).tiny)
 _FEW_COLUMNS = 4  # whose errors are carried one by one
+
+March = Callable[..., tuple[Array, Array]]  # as elements.sweeps
 
 
 class Sparse(NamedTuple):
@@ -45,8 +58,27 @@ class Sparse(NamedTuple):
             return np.abs(self.entries)
         return np.asarray(np.abs(self.entries).reshape(*mesh.points.shape, -1).max(axis=1))
 
+    def full(self) -> Array:
+        """The first of them (d, d)."""
+        d = len(self.rows) - 1
+        out = np.zeros((d, d))
+        out[np.repeat(np.arange(d), np.diff(self.rows)), self.columns] = self.entries[0]
+        return out
+
+    def growth(self, enough: float) -> float:
+        """How fast x' = A x may grow for the first of them, at most; or what is below ``enough``.
+
+        Gershgorin's discs say so without eigenvalues, if these are needed for nothing else.
+        """
+        A = self.full()
+        own = np.diagonal(A)
+        discs = float((own - np.abs(own) + np.abs(A).sum(axis=1)).max(initial=0.0))
+        return discs if discs <= enough else max(0.0, float(np.linalg.eigvals(A).real.max()))
+
     def product(self, entries: Array, x: Array) -> Array:
         """Products (K, d, c) of matrices with these entries (K or 1, e) and x (K, d, c)."""
+        if len(entries) == 1 and len(self.columns) > _DENSE * x.shape[1] ** 2:
+            return self._replace(entries=entries).full() @ x
         terms = entries[:, :, None] * x[:, self.columns]
         full = np.diff(self.rows) > 0
         out = np.zeros_like(x)
@@ -80,7 +112,7 @@ def sparse(A: Array) -> Sparse | None:
 def solve(
     problem: LinearProblem, equation: Callable[[Mesh], tuple[Sparse, Array, tuple[Array, ...]]],
     mesh: Mesh, *, units: Array, tol: float, max_elements: int,
-    restarts: Mapping[float, Callable[[Array], Array]] | None = None,
+    restarts: Mapping[float, Callable[[Array], Array]] | None = None, stiff: bool = False,
 ) -> LinearSolution | None:
     """As :func:`gpebo_cli.numerics.collocation.solve`, or None where sweeps will not do.
 
@@ -93,20 +125,25 @@ def solve(
         tol: see there.
         max_elements: see there.
         restarts: see there.
+        stiff: elements are solved and not swept over; A is constant.
 
     Raises:
         SolverError: ``max_elements`` do not reach ``tol``; names the time.
     """
     A, _, _ = equation(mesh)
-    parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh), units) / LENGTH)
-    if not np.maximum(parts, 1.0).sum() <= min(_MOST_ELEMENTS, max_elements):
-        return None
-    if parts.max(initial=1.0) > 1.0:
-        mesh = mesh.split(np.maximum(parts, 1.0).astype(np.intp))[0]
+    march: March = elements.sweeps
+    if stiff:
+        march = _Solved(A)
+    else:
+        parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh), units) / LENGTH)
+        if not np.maximum(parts, 1.0).sum() <= min(MOST_ELEMENTS, max_elements):
+            return None
+        if parts.max(initial=1.0) > 1.0:
+            mesh = mesh.split(np.maximum(parts, 1.0).astype(np.intp))[0]
 
     def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
         A, f, extras = equation(mesh)
-        values, change = _swept(A, f, problem, mesh, units, tol, restarts or {})
+        values, change = _swept(march, A, f, problem, mesh, units, tol, restarts or {})
         made_of, moved = _terms(A, f, mesh, values)
         found = _Found(A, values, change, made_of, moved, extras)
         return found, unresolved_signals(
@@ -119,7 +156,7 @@ def solve(
         )
     except _StiffError:
         return None
-    errors, lost = _errors(problem, mesh, units, found)
+    errors, lost = _errors(march, problem, mesh, units, found)
     return LinearSolution(
         Trajectory(mesh, found.values),
         max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), rounds, errors,
@@ -172,8 +209,62 @@ class _Found(NamedTuple):
     extras: tuple[Array, ...]
 
 
+class _Solved:
+    """As ``elements.sweeps`` for one constant A, by solving (D/h ⊗ I − I ⊗ A) X = D𝟙/h x_0 + f.
+
+    With D = U T Uᴴ the stages decouple from the last to the first, see
+    :func:`gpebo_cli.numerics.collocation.solve_constant`.
+    """
+
+    def __init__(self, A: Sparse) -> None:
+        self._A, self._solvers = A.full(), dict[str, list[Callable[[Array], Array]]]()
+        self._sparse = len(A.columns) < _SPARSE * self._A.size
+
+    def __call__(
+        self, R: Array, h: Array, _rows: IntArray, _columns: IntArray, _entries: Array, f: Array,
+        kicks: Array | None, start: Array, *_: object,
+    ) -> tuple[Array, Array]:
+        s, (d, columns) = len(R), start.shape
+        U, T = differentiation_schur(s)
+        inward, from_left = U.conj().T, np.linalg.inv(R).sum(axis=1)[:, None, None]
+        group = equal_lengths(h)
+        h = (np.bincount(group, weights=h) / np.bincount(group))[group]
+        values, state = np.empty((len(h), s + 1, d, columns)), start
+        for k, step in enumerate(h.tolist()):
+            right = np.broadcast_to(from_left / step * state, (s, d, columns)).copy()
+            points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
+            right[:, :, : f.shape[2]] += f if len(f) == 1 else f[points]
+            Y = np.tensordot(inward, right, axes=1)
+            for i, solved in zip(range(s - 1, -1, -1), self._at(step, T), strict=True):
+                Y[i] = solved(Y[i] - np.tensordot(T[i, i + 1 :] / step, Y[i + 1 :], axes=1))
+            values[k, 0], values[k, 1:] = state, np.tensordot(U, Y, axes=1).real
+            state = values[k, -1] if kicks is None else values[k, -1] + kicks[k]
+        return values, np.zeros(len(h))
+
+    def _at(self, step: float, T: ComplexArray) -> list[Callable[[Array], Array]]:
+        """What solves (T_ii/h I − A) y = r, of the last stage first."""
+        known = f"{step:.13e}"
+        if known not in self._solvers:
+            shifts = (np.diagonal(T)[::-1] / step).tolist()
+            self._solvers[known] = [self._factorised(shift) for shift in shifts]
+        return self._solvers[known]
+
+    def _factorised(self, shift: complex) -> Callable[[Array], Array]:
+        matrix = -self._A.astype(np.complex128)
+        matrix[np.diag_indices(len(matrix))] += shift
+        if self._sparse:
+            from scipy.sparse import csc_matrix
+            from scipy.sparse.linalg import splu
+
+            solve: Callable[[Array], Array] = splu(csc_matrix(matrix)).solve
+            return solve
+        from scipy.linalg import lu_factor, lu_solve
+
+        return partial(lu_solve, lu_factor(matrix, overwrite_a=True), check_finite=False)
+
+
 def _swept(
-    A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, units: Array, tol: float,
+    march: March, A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, units: Array, tol: float,
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, Array]:
     """Values (K, s + 1, d, c), and the last change in each element (K,).
@@ -189,7 +280,7 @@ def _swept(
         if first:
             state = restarts[edges[first]](state)
         part = slice(first * len(mesh.rule.points), last * len(mesh.rule.points))
-        values, change = elements.sweeps(
+        values, change = march(
             mesh.rule.integration, mesh.steps[first:last], A.rows, A.columns,
             A.entries if len(A.entries) == 1 else A.entries[part],
             f if len(f) == 1 else f[part], None, state, 1.0 / units, enough, SHARE, _MOST_SWEEPS,
@@ -221,7 +312,9 @@ def _terms(A: Sparse, f: Array, mesh: Mesh, values: Array) -> tuple[Array, Array
     return np.abs(values[:, 0]) + h * within, h * within + late * moved
 
 
-def _errors(problem: LinearProblem, mesh: Mesh, units: Array, found: _Found) -> Errors:
+def _errors(
+    march: March, problem: LinearProblem, mesh: Mesh, units: Array, found: _Found
+) -> Errors:
     """Errors of the solution, see :mod:`gpebo_cli.numerics.errors`.
 
     Of many columns the largest error at each place is carried on, for all of them.
@@ -244,7 +337,7 @@ def _errors(problem: LinearProblem, mesh: Mesh, units: Array, found: _Found) -> 
         added, start = (x.max(axis=-1, keepdims=True) for x in (added, start))
     signs = random_signs(K, n)[..., None]
     kicks = (signs[1:] * added[:, :, None]).reshape(K, n, -1)
-    ends, _ = elements.sweeps(
+    ends, _ = march(
         rule.integration, mesh.steps, A.rows, A.columns, A.entries, np.zeros((1, n, 0)), kicks,
         (signs[0] * start[:, None]).reshape(n, -1), 1.0 / units, _ROUGH, SHARE, _MOST_SWEEPS,
     )

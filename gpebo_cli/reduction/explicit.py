@@ -56,8 +56,33 @@ class Explicit:
     # x_j = x̃_j − Σ W x_k for those that stand together under a derivative, applied last
     shifts: tuple[tuple[int, Row], ...]
     mu: int
-    units: Array  # (n,) of the states
+    state_units: Array  # (n,)
     pivot: float  # the smallest one at any time, relative to its row
+    weights: Array | None = None  # (n,) see :func:`row_weights`
+    known: float = 0.0  # sizes of what is known in the states
+    loss: float = 1.0  # by how much elimination may have made rounding grow
+
+    @property
+    def d(self) -> int:
+        """Number of differential equations."""
+        return len(self.states)
+
+    @property
+    def units(self) -> Array:
+        """Of x_I (d,)."""
+        return self.state_units[self.states]
+
+    @property
+    def matrix(self) -> tuple[IntArray, IntArray, Array]:
+        """M by its rows."""
+        return self.rows, self.columns, self.entries
+
+    def reduced(self, x: Array) -> Array:
+        """x_I (d,) of a state (n,)."""
+        shifted = x.copy()
+        for j, row in self.shifts:
+            shifted[j] += sum(w[0] * x[k] for k, w in row.items())
+        return shifted[self.states]
 
     def at_first(self) -> Explicit:
         """At the first of the times."""
@@ -70,7 +95,7 @@ class Explicit:
 
     def states_from(self, z: Array) -> Array:
         """x (N, n, c) from x_I (N, d, c)."""
-        x = np.zeros((len(self.units), len(z), z.shape[2]))
+        x = np.zeros((len(self.state_units), len(z), z.shape[2]))
         x[self.states] = np.moveaxis(z, 1, 0)
         for i, row, known in self.others:
             x[i] = -known[:, None]
@@ -83,7 +108,7 @@ class Explicit:
 
     def sizes_from(self, size: Array) -> Array:
         """What states (n, c) are made of at most, from sizes of x_I (d, c)."""
-        x = np.zeros((len(self.units), size.shape[1]))
+        x = np.zeros((len(self.state_units), size.shape[1]))
         x[self.states] = size
         for i, row, _ in self.others:
             for k, a in row.items():

@@ -1,7 +1,13 @@
-"""Simulate a large sparse plant that is not stiff: elimination, then sweeps over its entries."""
+"""Simulate a large plant: elimination, then sweeps over its entries, or solves where it is stiff.
+
+A sparse plant is eliminated entry by entry at all times. A constant one that is full, or of which
+pivots do not tell the structure, is reduced once, by singular values. Of stiff plants those with
+constant matrices are simulated here.
+"""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +29,7 @@ from gpebo_cli.numerics.mesh import (
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.consistency import Jump
+from gpebo_cli.reduction.constant import ConstantForm, constant_form
 from gpebo_cli.reduction.explicit import (
     Explicit,
     MoreOrdersError,
@@ -31,12 +38,14 @@ from gpebo_cli.reduction.explicit import (
     product,
     row_weights,
 )
-from gpebo_cli.reduction.structure import without_equations
+from gpebo_cli.reduction.structure import Structure, analyse, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
-from gpebo_cli.simulation.known import MARGIN, inputs_resolved, known_joined
+from gpebo_cli.simulation.known import MARGIN, SHORT, inputs_resolved, known_joined
 from gpebo_cli.simulation.signals import Signals, Simulation
 
 SMALL = 8  # states, up to which dense matrices are faster in any case
+_FULL = 50  # states, beyond which full or stiff constant plants are simulated here, too
+_ENTRIES = 4  # per row of E; with more of them E counts as full
 _NOTHING = 8.0 * EPS  # of what it is made of: a state that is smaller is rounding itself
 _ROUNDING = 32.0  # units in the last place by which a consistent state may miss one asked for
 _VALUE = 32.0  # units in the last place that any value may be wrong by
@@ -73,7 +82,8 @@ class _Plant:
     def __init__(self, system: DescriptorSystem, most: int) -> None:
         self.system, self.most, self.order = system, most, 0
         self.found: Entries
-        self.form: Explicit
+        self.form: Explicit | ConstantForm
+        self.constant: ConstantForm | None = None  # what is the same at all times
         self.at: Mesh | None = None  # of both, and
         self.eliminated = False  # whether ``form`` is of ``found``
 
@@ -85,7 +95,7 @@ class _Plant:
         )
         return self.found.values
 
-    def eliminate(self, mesh: Mesh) -> Explicit:
+    def eliminate(self, mesh: Mesh) -> Explicit | ConstantForm:
         """The explicit form from the entries at the points of a mesh.
 
         Raises:
@@ -96,7 +106,7 @@ class _Plant:
         while not self.eliminated:
             f = forcing(self.found, self.system.n)
             try:
-                self.form = explicit_form(self.found, self.system.n, f)
+                self.form = self._form(f)
             except MoreOrdersError:
                 if self.order == self.most:
                     raise
@@ -106,9 +116,33 @@ class _Plant:
                 self.eliminated = True
         return self.form
 
+    def _form(self, f: Array) -> Explicit | ConstantForm:
+        n, (E, A) = self.system.n, (getattr(self.found.values, name) for name in "EA")
+        may_be_full = n > _FULL and E.shape[1] == A.shape[1] == 1
+        if self.constant is None and not (may_be_full and E.shape[2] > _ENTRIES * n):
+            try:
+                return explicit_form(self.found, n, f)
+            except UndecidedError as error:
+                if isinstance(error, MoreOrdersError) or not may_be_full:
+                    raise
+        if self.constant is None:
+            full = np.zeros((2, n, n))
+            for matrix, name, values in zip(full, "EA", (E, A), strict=True):
+                matrix[self.found.places[name]] = values[0, 0]
+            self.constant = constant_form(full[0], full[1], self.most - 1)
+        return self.constant.along(f)
+
+    def structure(self) -> Structure:
+        """As elimination found it."""
+        form = self.form
+        return replace(
+            without_equations(), mu=form.mu, a=self.system.n - form.d, d=form.d,
+            smallest_singular_value=form.pivot, time_invariant=len(self.matrix().entries) == 1,
+        )
+
     def matrix(self) -> sweeps.Sparse:
         """M."""
-        return sweeps.Sparse(self.form.rows, self.form.columns, self.form.entries)
+        return sweeps.Sparse(*self.form.matrix)
 
 
 def large_simulation(
@@ -130,17 +164,41 @@ def large_simulation(
         return None
 
 
+def structure_of(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
+) -> Structure:
+    """The structure of a plant over a horizon, by elimination where that decides it.
+
+    Raises:
+        ModelError: see :func:`gpebo_cli.reduction.structure.analyse`.
+    """
+    start, stop = time.start, time.start + time.horizon
+    if system.n > SMALL:
+        plant = _Plant(system, solver.max_strangeness_index + 1)
+        mesh = initial_mesh(start, stop, np.zeros(0), 1, radau_rule(solver.stages))
+        with np.errstate(all="ignore"), suppress(UndecidedError):
+            plant.eliminate(mesh)
+            return plant.structure()
+    return analyse(
+        system, start, stop, max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol
+    )
+
+
 def _simulated(
     plant: _Plant, mesh: Mesh, cuts: Array, solver: SolverSettings, *, bounded: bool
 ) -> Simulation | None:
     system, tol = plant.system, solver.tol
     plant.entries(mesh)
     form = plant.eliminate(mesh)
-    if len(cuts) and (form.mu or form.shifts):
+    if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
         return None  # what jumps then is for the derivative array to say
     M, units = plant.matrix(), form.units
-    longest = 0.75 * sweeps.LENGTH / max(M.norms(M.sizes(mesh), units[form.states]).max(), _TINY)
+    longest = 0.75 * sweeps.LENGTH / max(M.norms(M.sizes(mesh), units).max(), _TINY)
     parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
+    stiff = system.n > _FULL and len(M.entries) == 1 and parts.sum() > sweeps.MOST_ELEMENTS
+    if stiff:
+        enough = SHORT / float(mesh.steps.max())
+        parts = np.maximum(np.ceil(mesh.steps * (M.growth(enough) / SHORT)), 1.0)
     if not parts.sum() <= solver.max_elements:
         return None
     given = mesh = mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
@@ -158,7 +216,8 @@ def _simulated(
         mesh, c = known_joined(system, plant.entries, mesh, c, cuts, MARGIN * tol, longest)
     form = plant.eliminate(mesh)
     x0, z0 = _start(plant)
-    floor = form.sizes_from(SHARE * np.abs(x0[form.states, None]))
+    floor_z = SHARE * np.abs(form.reduced(x0))[:, None]
+    floor = form.sizes_from(floor_z)
 
     def equation(mesh: Mesh) -> tuple[sweeps.Sparse, Array, tuple[Array, ...]]:
         form = plant.eliminate(mesh)
@@ -177,11 +236,11 @@ def _simulated(
 
     problem = LinearProblem(
         _no_coefficients, z0[:, None], monitor, f"plant {system.name}",
-        floor[form.states], apart=True,
+        floor_z, apart=True,
     )
     solution = sweeps.solve(
-        problem, equation, mesh, units=units[form.states], tol=tol,
-        max_elements=solver.max_elements,
+        problem, equation, mesh, units=units, tol=tol, max_elements=solver.max_elements,
+        stiff=stiff,
     )
     if solution is None:
         return None
@@ -230,10 +289,7 @@ def _start(plant: _Plant) -> tuple[Array, Array]:
     is kept as far as it may be: ‖W E (x − x_0)‖ is least.
     """
     form, x0 = plant.form, plant.system.initial_state
-    shifted = x0.copy()
-    for j, row in form.shifts:
-        shifted[j] += sum(w[0] * x0[k] for k, w in row.items())
-    z = shifted[form.states]
+    z = form.reduced(x0)
     first = form.at_first()
 
     def differential(z: Array) -> Array:
@@ -245,7 +301,7 @@ def _start(plant: _Plant) -> tuple[Array, Array]:
     missed = differential(z)
     size = np.abs(form.sizes_from(np.abs(z)[:, None])[:, 0]).max(initial=0.0)
     if np.abs(missed).max(initial=0.0) > _ROUNDING * EPS * max(size, np.abs(x0).max(initial=0.0)):
-        weights = row_weights(plant.found)
+        weights = row_weights(plant.found) if form.weights is None else form.weights
         moves = np.array([weights * (differential(z + e) - missed) for e in np.eye(len(z))]).T
         z = z - np.linalg.lstsq(moves, weights * missed, rcond=None)[0]
     x = first.states_from(z[None, :, None])[0, :, 0]
@@ -260,22 +316,19 @@ def _result(
     mesh, z = solution.trajectory.mesh, solution.trajectory.values
     form, (x, y, u) = plant.form, _signals(plant, z)
     own_z, own = np.abs(z).max(axis=(0, 1)), np.abs(x).max(axis=(0, 1))
-    made_of = np.maximum(form.sizes_from(own_z)[:, 0], own)
+    made_of = np.maximum(form.sizes_from(own_z)[:, 0] + form.known, own)
     tail = legendre_tail(x, mesh.rule, np.maximum(np.abs(x).max(axis=1), _TINY)).max(axis=0)
-    wrong = form.sizes_from(solution.errors * own_z)[:, 0] + tail + _VALUE * EPS * made_of
+    wrong = form.sizes_from(solution.errors * own_z)[:, 0] + tail
+    wrong += _VALUE * EPS * form.loss * made_of
     scale = np.maximum(np.where(own > _NOTHING * made_of, own, made_of), _TINY)
     state_errors = np.where(wrong > 0.0, wrong / scale, 0.0)
-    structure = replace(
-        without_equations(), mu=form.mu, a=len(x0) - len(form.states), d=len(form.states),
-        smallest_singular_value=form.pivot, time_invariant=len(form.entries) == 1,
-    )
     jumps = []
     for cut in map(float, cuts):
         k = int(np.searchsorted(mesh.edges, cut))
         jumps.append((cut, x[k - 1, -1], Jump(x[k, 0], np.zeros((0, len(x0))))))
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
-        structure=structure, initial_state=x0, jumps=tuple(jumps),
+        structure=plant.structure(), initial_state=x0, jumps=tuple(jumps),
         error_estimate=max(solution.error_estimate, float(state_errors.max(initial=0.0))),
         bounded=bounded, state_errors=state_errors, lost=solution.lost,
     )

@@ -1,0 +1,196 @@
+"""From E x' = A x + f with constant, full E and A of any index to z' = M z + g, once for all times.
+
+Equations that have no derivative are constraints. Differentiated, they take the places of those
+rows of E that vanished; what vanishes then is a hidden constraint (Luenberger's shuffle), until E
+is regular. Each step is one singular value decomposition of n rows of unit length, where the
+derivative array of :mod:`.derivative_array` has (μ + 1) n of them. A singular value that is neither
+rounding nor clear of it is left to the derivative array.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import factorial
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.reduction.explicit import MoreOrdersError, UndecidedError
+
+_ROUNDING, _CLEAR = 1e-12, 1e-5  # relative singular values: zero below, sure above
+_SCALED = 16  # rounds in which rows and columns are brought to the size one
+_TINY = float(np.finfo(float).tiny)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantForm:
+    """z' = M z + f and x = T z + offset at N times, with what ``explicit.Explicit`` has."""
+
+    dynamics: Array  # (d, d) M
+    basis: Array  # (n, d) T
+    inverse: Array  # (d, n) z = this x
+    constraints: Array  # (μ + 1, n, n) offset = Σ this f^(j)
+    forced: Array  # (d, n) f = this f(t) + ``through`` offset
+    through: Array  # (d, n)
+    mu: int
+    pivot: float  # the smallest singular value that counts, relative
+    weights: Array  # (n,) see ``derivative_array.Scaling``
+    offset: Array  # (N, n)
+    f: Array  # (N, d)
+    # Sizes of the terms of the offset (n,)
+    known: Array | float = 0.0
+
+    def along(self, f: Array) -> ConstantForm:
+        """With what is known in the equations, Taylor coefficients (orders, N, n).
+
+        Raises:
+            MoreOrdersError: they end too early.
+        """
+        if len(f) < len(self.constraints):
+            raise MoreOrdersError
+        offset = sum(
+            (factorial(j) * f[j] @ S.T for j, S in enumerate(self.constraints)),
+            np.zeros(f.shape[1:]),
+        )
+        known = sum(
+            factorial(j) * np.abs(S) @ np.abs(f[j]).max(axis=0)
+            for j, S in enumerate(self.constraints)
+        )
+        return replace(
+            self, offset=offset, known=known, f=f[0] @ self.forced.T + offset @ self.through.T
+        )
+
+    @property
+    def loss(self) -> float:
+        """By how much elimination may have made rounding grow."""
+        return 1.0 / self.pivot
+
+    @property
+    def d(self) -> int:
+        """Number of differential equations."""
+        return len(self.dynamics)
+
+    @property
+    def units(self) -> Array:
+        """Of z (d,)."""
+        return np.ones(self.d)
+
+    @property
+    def matrix(self) -> tuple[IntArray, IntArray, Array]:
+        """M by its rows: where each begins, its columns, its entries (1, d²)."""
+        d = self.d
+        return np.arange(0, d * d + 1, max(d, 1)), np.tile(np.arange(d), d), self.dynamics.reshape(
+            1, -1
+        )
+
+    def reduced(self, x: Array) -> Array:
+        """z (d,) of a state (n,)."""
+        return np.asarray(self.inverse @ x)
+
+    def at_first(self) -> ConstantForm:
+        """At the first of the times."""
+        return replace(self, offset=self.offset[:1], f=self.f[:1])
+
+    def states_from(self, z: Array) -> Array:
+        """x (N, n, c) from z (N, d, c)."""
+        return np.asarray(np.moveaxis(np.tensordot(self.basis, z, axes=(1, 1)), 0, 1)
+                          + self.offset[:, :, None])
+
+    def sizes_from(self, size: Array) -> Array:
+        """What states (n, c) are made of at most, from sizes of z (d, c)."""
+        return np.asarray(np.abs(self.basis) @ size)
+
+
+def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
+    """Of E and A (n, n), without anything known in the equations.
+
+    Raises:
+        UndecidedError: singular values do not decide the structure, or μ would exceed ``max_mu``.
+    """
+    n = len(E)
+    rows, columns, time = _scales(E, A)
+    size = np.linalg.norm(rows[:, None] * E * columns / time, axis=1)
+    rows /= np.exp2(np.rint(np.log2(np.where(size > 0.0, size, 1.0))))
+    e, a = rows[:, None] * E * columns / time, rows[:, None] * A * columns
+    found, least = _constraints(e, a, max_mu)
+    A2 = np.concatenate([np.zeros((0, n)), *(C for C, _ in found)])
+    count, levels = len(A2), max(len(found), 1)
+    known_in = np.zeros((levels, count, n))
+    place = 0
+    for C, p in found:
+        known_in[: len(p), place : place + len(C)] = np.array(p)
+        place += len(C)
+    size = np.maximum(np.linalg.norm(A2, axis=1), _TINY)[:, None]
+    A2, known_in = A2 / size, known_in / size
+    free = np.linalg.svd(A2)[2][count:].T if count else np.eye(n)
+    Z1 = np.linalg.svd(e @ free, full_matrices=False)[0]
+    whole = np.concatenate([Z1.T @ e, A2])
+    size = np.linalg.norm(whole, axis=1)
+    try:
+        inverse = np.linalg.inv(whole / size[:, None]) / size
+    except np.linalg.LinAlgError:
+        raise UndecidedError from None
+    if not np.linalg.norm(inverse * size) < 1.0 / _CLEAR:
+        raise UndecidedError
+    d = n - count
+    constrained = -columns[:, None] * inverse[:, d:]
+    # z = Nᵀx with an orthonormal basis N of what constraints leave: not Z1ᵀE x, of which the states
+    # may be small differences.
+    explicit = np.linalg.solve(Z1.T @ e @ free, Z1.T @ np.concatenate([a, e, np.eye(n)], axis=1))
+    of_a, of_e, of_f = (explicit[:, k * n : (k + 1) * n] for k in range(3))
+    powers = time ** np.arange(levels)[:, None, None]
+    return ConstantForm(
+        of_a @ free / time, columns[:, None] * free, of_e / columns,
+        constrained @ known_in * powers * rows, of_f * rows / time, of_a / columns / time,
+        levels - 1, least, 10.0 ** np.rint(np.log10(rows / rows[0])), np.zeros((1, n)),
+        np.zeros((1, d)),
+    )
+
+
+def _constraints(e: Array, a: Array, max_mu: int) -> tuple[list[tuple[Array, list[Array]]], float]:
+    """Constraints 0 = C x + Σ p_j d^j f/ds^j of e dx/ds = a x + f by their level; least pivot."""
+    n = len(e)
+    known = [np.eye(n)]  # now dx/ds = left x + Σ known_j d^j f/ds^j
+    now, left = e, a
+    found: list[tuple[Array, list[Array]]] = []
+    least = 1.0
+    for _ in range(max_mu + 2):
+        size = np.linalg.norm(now, axis=1)
+        inward = 1.0 / np.where(size > 0.0, size, 1.0)[:, None]
+        now, left, known = now * inward, left * inward, [p * inward for p in known]
+        U, sigma, _ = np.linalg.svd(now)
+        sigma /= max(sigma[0], _TINY)
+        rank = int((sigma > _CLEAR).sum())
+        if (sigma[rank:] > _ROUNDING).any():
+            raise UndecidedError
+        least = min(least, float(sigma[:rank].min(initial=1.0)))
+        if rank == n:
+            return found, least
+        kept, gone = U[:, :rank].T, U[:, rank:].T
+        found.append((gone @ left, [gone @ p for p in known]))
+        C, of_f = found[-1]
+        now, left = np.concatenate([kept @ now, C]), np.concatenate([kept @ left, np.zeros_like(C)])
+        nothing = np.zeros_like(C)
+        known = [
+            np.concatenate([kept @ p if p is not None else np.zeros((rank, n)), -q])
+            for p, q in zip([*known, None], [nothing, *of_f], strict=True)
+        ]
+    raise UndecidedError
+
+
+def _scales(E: Array, A: Array) -> tuple[Array, Array, float]:
+    """Of rows and columns (n,), and the unit of time, by which both matrices are of the size one.
+
+    Powers of two, so that scaling commits no rounding error.
+    """
+    E, A = np.abs(E), np.abs(A)
+    r, c, time = np.zeros(len(E)), np.zeros(len(E)), 0.0
+    for _ in range(_SCALED):
+        e, a = (X * np.exp2(r[:, None] + c) for X in (E * np.exp2(-time), A))
+        there = (e.max(axis=1) > 0.0) & (a.max(axis=1) > 0.0)
+        if there.any():
+            time += float(np.median(np.log2(e.max(axis=1)[there] / a.max(axis=1)[there])))
+        both = np.maximum(e, a)
+        size = [np.log2(np.where(x > 0.0, x, 1.0)) for x in (both.max(axis=1), both.max(axis=0))]
+        r, c = r - 0.5 * size[0], c - 0.5 * size[1]
+    return np.exp2(np.rint(r)), np.exp2(np.rint(c)), float(np.exp2(np.rint(time)))
