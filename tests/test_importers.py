@@ -632,7 +632,8 @@ def test_public_benchmarks(tmp_path):
 
     page = (Path(__file__).parents[1] / "docs" / "howto" / "import.md").read_text(encoding="utf-8")
     (source,) = [s for s in blocks(page, "python") if "cavity" in s]
-    said = python(source + f"np.save({str(tmp_path / 'x')!r}, [result[s] for s in plant.states])", BENCHMARKS)
+    saved = f"np.save({str(tmp_path / 'x')!r}, [result[name] for name in plant.states])"
+    said = python(source + saved, BENCHMARKS)
     assert "index 2, 602 differential and 240 algebraic" in said
     file = loadmat(f"{BENCHMARKS}/drivencavity__mats_NV722_Re1.mat")
     M, K, J, B = (file[name].toarray() for name in ("M", "A", "J", "B"))
