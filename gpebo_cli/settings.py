@@ -89,6 +89,7 @@ class OutputSettings:
     style: str | None = None  # one that comes with matplotlib; None: ours
     error: Literal["log", "linear"] = "log"  # |error| on a logarithmic axis, or with its sign
     max_rows: int = 100_000  # of estimates.csv; many cases keep fewer samples each
+    parquet: bool = False  # each table also as a Parquet file
 
 
 @dataclass(frozen=True)

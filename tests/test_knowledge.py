@@ -140,7 +140,8 @@ def test_a_recording_gives_numbers_with_deviations_and_says_what_is_left(half_se
     assert any("k1" in line and "1.999" in line and "s" in line for line in lines)
     assert any("k2" in line and "not determined" in line for line in lines)
     assert "up to white noise" in lines[-1]
-    assert {"fit.png", "parameters.png"} <= {p.name for p in (half_seen / "out/figures").iterdir()}
+    figures = {path.stem for path in (half_seen / "out/figures").iterdir()}
+    assert {"fit", "parameters", "whiteness"} <= figures
 
 
 def test_a_wrong_plant_is_noticed(half_seen):

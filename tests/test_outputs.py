@@ -47,6 +47,21 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return content
 
 
+def test_tables_as_parquet_have_the_same_numbers(tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow.parquet")
+    result = make_result(samples=51)
+    output = replace(result.settings.output, parquet=True)
+    write(replace(result, settings=replace(result.settings, output=output)), tmp_path)
+    for name in TABLES:
+        header, rows = read_table(tmp_path / name)
+        table = pyarrow.read_table((tmp_path / name).with_suffix(".parquet"))
+        assert table.column_names == header
+        columns = [[np.nan if v is None else v for v in c.to_pylist()] for c in table.columns]
+        np.testing.assert_array_equal(np.transpose(columns), rows)
+    write(result, tmp_path)
+    assert not list(tmp_path.glob("*.parquet"))
+
+
 def test_signals_round_trip_with_their_names(tmp_path: Path) -> None:
     result = make_result(samples=5001)  # more rows than one chunk
     header, table = read_table(write(result, tmp_path) / "signals.csv")

@@ -74,10 +74,13 @@ def run_job(
     from gpebo_cli.experiment.pipeline import run_experiment
     from gpebo_cli.results.figures import check_names
     from gpebo_cli.results.folder import write_run
+    from gpebo_cli.results.tables import check_parquet
 
     settings = job.settings
     if isinstance(settings.output.figures, list):
         check_names(settings.output.figures)
+    if settings.output.parquet:
+        check_parquet()
     with Progress(quiet=quiet, loud=loud) as progress:
         result = run_experiment(settings, job.system, progress)
         progress("write")

@@ -213,7 +213,7 @@ other keys, with their defaults:
   figures.formats=[png]  figures.width=column        png, pdf, svg; column, page or inches
   figures.dpi=200  figures.style=null                a style of matplotlib's; null: ours
   figures.error=log                                  linear: errors with their sign
-  output.max_rows=100000                             of estimates.csv
+  output.max_rows=100000  output.parquet=false       of estimates.csv; tables as Parquet, too
   hydra.run.dir=FOLDER                               where to write
   gpebo run --cfg job prints every key with its value
 

@@ -558,5 +558,6 @@ def _explained(
         ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
     ])
     return replace(
-        fit, outputs=fitted, correlation=correlation, band=1.96 / np.sqrt(count * seen.sum())
+        fit, outputs=fitted, correlation=correlation, lag=stride * float(t[1] - t[0]),
+        band=1.96 / np.sqrt(count * seen.sum()),
     )

@@ -185,6 +185,7 @@ class Fit:
     size: float  # the same of ‖Y‖
     outputs: Array | None = None  # (N, r) ŷ of the best case at the times of the signals
     correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
+    lag: float = np.nan  # seconds
     band: float = np.nan  # 95 % of the correlations of white noise are within
     ratio: float | None = None  # of the residual to what the sensors' noise makes of it, √χ²/dof
 

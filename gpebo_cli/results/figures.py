@@ -133,6 +133,21 @@ def fit(result: RunResult) -> list[Panel]:
     return panels
 
 
+def whiteness(result: RunResult) -> list[Panel]:
+    """Autocorrelation of the residual, of a recording, with the band of white noise."""
+    found = result.fit
+    if found is None or found.correlation is None:
+        return []
+    lags: Array = found.lag * np.arange(1.0, len(found.correlation) + 1)
+    band = np.full(len(lags), found.band)
+    curves = (
+        Curve(lags, found.correlation, "correlation", replace(line(0), dots=True)),
+        Curve(lags, band, "95 % of white noise", style.SPREAD, down_to=-band),
+    )
+    axis = Axis("lag", "lag", "s")
+    return [Panel("autocorrelation of the residual", curves, axis=axis, legend=True)]
+
+
 def parameter_error(result: RunResult) -> list[Panel]:
     """Fig. 6: error of every parameter (for the circuit, the initial conditions).
 

@@ -56,6 +56,8 @@ def write_run(
         tables.write_cases(folder / "cases.csv", estimation, result.metrics)
     if estimation is not None and result.noise is not None:
         tables.write_noise(folder / NOISE_TABLE, estimation, result.noise)
+    if result.settings.output.parquet:
+        tables.write_parquet(folder / name for name in (*TABLES, NOISE_TABLE))
     for name, figure in figures:
         make_folder(folder / "figures")
         for suffix in result.settings.output.formats:
@@ -65,5 +67,6 @@ def write_run(
 
 def _remove_earlier(folder: Path) -> None:
     """Remove what an earlier run left, by name: a folder may hold files that are not ours."""
-    remove_files(folder / name for name in ("summary.json", *TABLES, NOISE_TABLE))
+    made = [folder / name for name in ("summary.json", *TABLES, NOISE_TABLE)]
+    remove_files(path.with_suffix(suffix) for path in made for suffix in (path.suffix, ".parquet"))
     remove_files(folder / "figures" / f"{name}.{s}" for name in FIGURES for s in FORMATS)

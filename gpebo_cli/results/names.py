@@ -9,6 +9,7 @@ FIGURE_NAMES = (
     "estimates_b",
     "parameters",
     "fit",
+    "whiteness",
     "parameter_error",
     "state_error",
     "state_error_a",

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment.result import (
@@ -127,6 +130,26 @@ def write_estimates(
     """
     header = estimates_header(states, estimation)
     write_file(path, _estimate_chunks(header, estimation))
+
+
+def check_parquet() -> None:
+    """Refuse Parquet files where nothing can write them; worth doing before a long run.
+
+    Raises:
+        ConfigError: names what is missing.
+    """
+    if find_spec("pyarrow") is None:
+        raise ConfigError("output.parquet needs pyarrow: pip install 'gpebo[parquet]'")
+
+
+def write_parquet(made: Iterable[Path]) -> None:
+    """Those of the tables ``made`` that exist once more, as Parquet files of the same numbers."""
+    reader, parquet = import_module("pyarrow.csv"), import_module("pyarrow.parquet")
+    for path in made:
+        if path.exists():
+            buffer = io.BytesIO()
+            parquet.write_table(reader.read_csv(path), buffer)
+            write_file(path.with_suffix(".parquet"), [buffer.getvalue()])
 
 
 def write_cases(path: Path, estimation: EstimationResult, metrics: Metrics) -> None:
