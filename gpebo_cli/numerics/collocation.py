@@ -112,8 +112,11 @@ def solve(
             f"the solution of the {problem.name} is not finite from t = {mesh.edges[whole]:.6g} "
             "on: it grows beyond all numbers; is a sign wrong? Else shorten time.horizon"
         )
+    noise = maps.noise
+    if restarts:
+        noise = _with_instants(noise, Trajectory(mesh, values), np.array(list(restarts)))
     errors, lost = estimated_errors(
-        problem, mesh, maps.homogeneous[:, -1], maps.particular[:, -1], maps.noise, values
+        problem, mesh, maps.homogeneous[:, -1], maps.particular[:, -1], noise, values
     )
     estimate = max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0)))
     return LinearSolution(
@@ -308,6 +311,21 @@ def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
     inverse, singular = inverse_or_none(at_points(c.E, k, s)[:, -1])
     inverse[singular] = 0.0
     return np.asarray(np.abs(inverse) @ found)
+
+
+def _with_instants(noise: Array, solution: Trajectory, cuts: Array) -> Array:
+    """Noise, see :func:`_noise`, and by how much rounding of instants (C,) moves X.
+
+    Between an instant and where it should be, X has the slope of the wrong side.
+    """
+    mesh, n = solution.mesh, noise.shape[1]
+    after = np.searchsorted(mesh.edges, cuts)
+    slopes = solution.derivative().values
+    found = np.array(np.broadcast_to(noise, (mesh.size, *noise.shape[1:])))
+    found[after, :, n:] += np.abs(cuts)[:, None, None] * np.abs(
+        slopes[after, 0] - slopes[after - 1, -1]
+    )
+    return found
 
 
 def equal_lengths(h: Array) -> IntArray:
