@@ -250,8 +250,9 @@ def test_starting_value_of_the_extension_is_free():
     np.testing.assert_allclose(truth, [0, -1, -2], atol=1e-12)
 
 
+@pytest.mark.parametrize("observer", ["gpebo", "kalman_bucy"])
 @pytest.mark.parametrize("speed", [1.0, 7.3])
-def test_an_output_that_sees_nothing_is_not_exciting_though_the_kernel_of_E_turns(speed):
+def test_an_output_that_sees_nothing_is_not_exciting_though_the_kernel_of_E_turns(speed, observer):
     """z1' = −z1, 0 = z2 − u, y = z2 for x = R(t)ᵀz: 𝒜w is zero by cancelling, and so is ψ."""
     c, s = f"cos({speed}*t)", f"sin({speed}*t)"
     result = experiment({
@@ -259,7 +260,7 @@ def test_an_output_that_sees_nothing_is_not_exciting_though_the_kernel_of_E_turn
         "E": [[c, s], [0, 0]], "B": [[0], [-1]], "C": [[f"-{s}", c]],
         "A": [[f"-{c} + {speed}*{s}", f"-{s} - {speed}*{c}"], [f"-{s}", c]],
         "initial_state": {"a": 1, "b": 0},
-    }).details
+    }, observer=observer).details
     assert not result.regression.psi.any()
     assert not result.excitation.is_ie
     assert "not determined by the data: a, b, e0_a" in result.verdict

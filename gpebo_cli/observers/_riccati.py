@@ -41,6 +41,7 @@ _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
 # resolved less: P as a matrix does not hold them, for its rounding is that of its largest entry.
 _SMALLEST = 3e-5
 _FALL = 1e12  # of P over the horizon: beyond, a double does not hold both ends
+_UNSEEN = 1e-12  # of P, by which measurements change it over the horizon: as much as none
 _LEFT = 3e-3  # of the rounding of P(0): it falls as well, if less
 _GROWTH = 1e3  # of X₁ within an element: as many digits of P are lost
 
@@ -163,6 +164,7 @@ def run_filter(
     max_elements: int,
     monitor: Monitor | None = None,
     name: str = "Kalman-Bucy filter",
+    floor: Array | float = 0.0,
 ) -> Filtered:
     """Solve Riccati equation and filter on ``mesh``, refined until P and ζ̂ are resolved.
 
@@ -177,6 +179,7 @@ def run_filter(
         max_elements: refuse to go beyond.
         monitor: further signals to resolve, from ζ̂ and the model's extras.
         name: of the filter, for messages.
+        floor: sizes (n,) below which ζ̂ is not resolved for its own sake.
 
     Raises:
         SolverError: the tolerance cannot be reached, or P is not positive semidefinite.
@@ -186,12 +189,12 @@ def run_filter(
     deviation = np.sqrt(np.diag(P0))
     unit = _units(m.A, deviation, horizon)
     P0, start = P0 / np.outer(unit, unit), start / unit[:, None]
+    least = float((floor / unit).max(initial=0.0))
     W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0, initial=0.0)
     # A common factor of all covariances changes nothing. It is chosen so that W is of order 1:
-    # entries of 1e7 would be taken as pivots, and mix the equations.
-    variance = 1.0 / max(float((W * np.outer(unit, unit)).max(initial=0.0)), np.finfo(float).tiny)
-    if not np.isfinite(variance):
-        variance = 1.0
+    # entries of 1e7 would be taken as pivots, and mix the equations. A W that moves P by nothing
+    # is rounding, and is not made larger.
+    variance = 1.0 / max(float((W * np.outer(unit, unit)).max(initial=0.0)), _UNSEEN / horizon)
     fall = float((W * np.outer(deviation, deviation)).max(initial=0.0)) * horizon
     if fall > _FALL:
         raise SolverError(
@@ -215,7 +218,8 @@ def run_filter(
         d = np.maximum(d, _SMALLEST * d.max(axis=1, initial=1e-100, keepdims=True))
         own = P / (d[:, None, :, None] * d[:, None, None, :])
         found: list[Kind] = [
-            (own.reshape(*own.shape[:2], -1), 0.0), (estimate.reshape(*estimate.shape[:2], -1), 0.0)
+            (own.reshape(*own.shape[:2], -1), 0.0),
+            (estimate.reshape(*estimate.shape[:2], -1), least),
         ]
         if monitor is not None:
             found += monitor(unit[:, None] * estimate, extras)

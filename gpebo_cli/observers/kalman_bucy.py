@@ -48,6 +48,7 @@ from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings, SolverSettings
 
 _LEVEL = 1e-8  # of M's largest eigenvalue over all windows, in units of P(0)⁻¹: below, no evidence
+_ROUNDING = 8.0 * float(np.finfo(float).eps)  # of the terms of a sum
 _INITIAL_VARIANCE = 10.0  # of what observer.P0 leaves out
 
 
@@ -86,7 +87,10 @@ def filter_model(
     q, k = o.from_unknowns.shape[2], basis.shape[1]
     signals = np.concatenate([v, y], axis=1)
     A = np.zeros((count, q + k, q + k))
-    A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
+    # w = P w: rounding off the range of P(t), which turns, is damped, lest it grows on its own.
+    off = np.eye(k) - basis.T @ o.projector @ basis
+    damping = np.linalg.norm(o.dynamics, axis=(1, 2))[:, None, None] * off
+    A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics - damping
     inward = np.zeros((count, q + k, signals.shape[1]))
     inward[:, q:] = o.from_signals
     g = np.broadcast_to(o.g_signals, (count, *o.g_signals.shape[1:]))
@@ -233,9 +237,12 @@ class KalmanBucy:
         start = np.concatenate([np.zeros(q), w0])
         P0 = _initial_covariance(self.P0, names, known)
         process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
-        model_noise = noise_model(
-            reduced(mesh.points.ravel(), mesh.inside.ravel()), noise, process, self.regularisation
-        )
+        known_of = reduced(mesh.points.ravel(), mesh.inside.ravel())
+        model_noise = noise_model(known_of, noise, process, self.regularisation)
+        # What w is beside the part of x that is known may be rounding of that, added up.
+        turns = 1.0 + float(np.abs(known_of.A).max() * (mesh.edges[-1] - mesh.edges[0]))
+        beside = turns * np.abs(basis.T) @ np.abs(known_of.offset).max(axis=0)
+        floor = _ROUNDING / solver.tol * np.concatenate([np.zeros(q), beside])
 
         def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
             s = reduced(t, inside)
@@ -249,7 +256,7 @@ class KalmanBucy:
         name = f"Kalman-Bucy filter of plant {system.name}"
         filtered = run_filter(
             model, start[:, None], P0, mesh, tol=solver.tol, max_elements=solver.max_elements,
-            monitor=monitor, name=name,
+            monitor=monitor, name=name, floor=floor,
         )
         offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
 
