@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
 import subprocess
 import sys
 from itertools import pairwise
@@ -571,12 +572,25 @@ def test_mistakes_in_archives(content, message, tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_files_that_claim_or_unpack_to_too_much(tmp_path):
-    savemat(tmp_path / "bomb.mat", {"A": np.zeros((5001, 5000))}, do_compression=True)
-    assert (tmp_path / "bomb.mat").stat().st_size < 1_000_000
+def test_files_that_claim_or_unpack_to_too_much(tmp_path, monkeypatch):
+    monkeypatch.setattr("gpebo_cli.model.archive.MAX_BYTES", 100_000)
+    savemat(tmp_path / "bomb.mat", {"A": np.zeros((150, 150))}, do_compression=True)
+    assert (tmp_path / "bomb.mat").stat().st_size < 1_000
     head = "%%MatrixMarket matrix array real general\n1000000 1000000\n1\n"
     (tmp_path / "A.mtx").write_text(head)
-    for path, message in ((tmp_path / "bomb.mat", "unpacks to more"), (tmp_path, "at most 2000")):
+    content = (tmp_path / "bomb.mat").read_bytes()
+    savemat(tmp_path / "behind.mat", {"x": np.eye(2)})  # a bomb behind what is not packed
+    (tmp_path / "behind.mat").write_bytes((tmp_path / "behind.mat").read_bytes() + content[128:])
+    cell = np.array([[1.0]], dtype=object)
+    savemat(tmp_path / "cell.mat", {"A": cell})
+    content, size = (tmp_path / "cell.mat").read_bytes(), struct.pack("<IIii", 5, 8, 1, 1)
+    assert size in content
+    many = struct.pack("<IIii", 5, 8, 40000, 40000)  # an array of objects, made before it is read
+    (tmp_path / "cell.mat").write_bytes(content.replace(size, many, 1))
+    for path, message in (
+        (tmp_path / "bomb.mat", "unpacks to more"), (tmp_path / "behind.mat", "unpacks to more"),
+        (tmp_path / "cell.mat", "no matrix A"), (tmp_path, "at most 2000"),
+    ):
         with pytest.raises(ConfigError, match=message):
             from_file(path, "p")
 

@@ -23,6 +23,7 @@ from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.metrics import STANDING
 from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model import archive
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.recordings.guess import _factor, guess
@@ -290,6 +291,68 @@ def test_a_file_and_a_stream_agree_whatever_stands_there(tmp_path_factory, rows,
         assert said == wrong or (not wrong and len(streamed) < 2 and "rows below" in said)
 
 
+HEAD, ROWS = "t,V,y\n", "0,1,2\n1,2,3\n"
+WHOLE = {  # what is read, or in which line it is refused
+    "plain": (HEAD + ROWS, 0), "a byte order mark": ("\ufeff" + HEAD + ROWS, 0),
+    "two marks": ("\ufeff\ufeff" + HEAD + ROWS, 1), "a mark below": (HEAD + "\ufeff" + ROWS, 2),
+    "CRLF": ((HEAD + ROWS).replace("\n", "\r\n"), 0), "CR": ((HEAD + ROWS).replace("\n", "\r"), 1),
+    "CR inside": (HEAD + "0,1\r,2\n", 2), "two CR": (HEAD + "0,1,2\r\r\n1,1,1\n", 2),
+    "no last newline": (HEAD + ROWS.rstrip(), 0), "a blank line": (HEAD + "0,1,2\n\n1,2,3\n", 3),
+    "blank first": ("\n" + HEAD + ROWS, 1), "blank last": (HEAD + ROWS + "\n \n", 0),
+    "a separator behind each": ((HEAD + ROWS).replace("\n", ",\n"), 0),
+    "a separator behind rows": (HEAD + ROWS.replace("\n", ",\n"), 2),
+    "a name twice": ("t,V,V,y\n0,1,1,2\n", 1),
+    "an unread name twice": ("t,V,y,a,a\n0,1,2,x,z\n1,1,1,,\n", 0),
+    "quoted names": ('"t","V","y"\n' + ROWS, 0), "quoted lines": (HEAD + '0,"1\n",2\n', 2),
+    "quotes inside": (HEAD + '0,1"2,3\n', 2), "quotes behind": (HEAD + '0,"1"2,3\n', 2),
+    "a blank before quotes": (HEAD + '0, "1",2\n', 2),
+    "semicolons": ((HEAD + ROWS).replace(",", ";"), 1),
+    "a NUL": (HEAD + "0,1\0,2\n", 2), "no ASCII space": (HEAD + "0,1\u2003,2\n", 2),
+    "a line separator": (HEAD + "0,1,2\u20281,2,3\n", 2),
+    "next line": (HEAD + "0,1,2\x851,2,3\n", 2),
+    "a comment": (HEAD + "# 0\n" + ROWS, 2), "decimal comma": (HEAD + "0,1,5,2\n", 2),
+    **{f"the cell {cell!r}": (HEAD + f"0,1,{cell}\n1,2,3\n", 2) for cell in (
+        "１.５", "٣", "1\u00a0", "\v1", "1\f", "1_000", "1e999", "-1e999", "nan", "NaN",
+        "inf", "-Infinity", "0x10", "0b1", "1e", "e5", "1.5.2", "--1", "+ 1", "1 2", "true",
+        "None", "", " ", "1j", "1d5", "∞", "−1",
+    )},
+    **{f"the number {cell!r}": (HEAD + f"0,1,{cell}\n1,2,3\n", 0) for cell in (
+        " 1", "1\t", "+1", "-0", "1.", ".5", "1E5", "1e-400", "007", '"2"', '" 2"', "9" * 300,
+    )},
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_file_and_a_stream_have_one_strict_reading(tmp_path, name):
+    text, line = WHOLE[name]
+    path = tmp_path / "r.csv"
+    path.write_bytes(text.encode())
+    streamed, wrong = LineReader(str(path), DataSettings("csv"), shipped("circuit")).feed(
+        text.encode(), last=True
+    )
+    if line:
+        with pytest.raises(ConfigError) as error:
+            read_table(DataSettings("csv", str(path)), shipped("circuit"))
+        assert str(error.value) == wrong
+        assert wrong.startswith(f"{path}, line {line}")
+        assert "\n" not in wrong
+    else:
+        found = read_table(DataSettings("csv", str(path)), shipped("circuit")).samples
+        read = np.column_stack([found.t, found.inputs, found.outputs]).tolist()
+        assert (read, "") == (streamed, wrong)
+        assert len(read) == 2
+
+
+def test_files_that_would_fill_the_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "MAX_BYTES", 100_000)
+    savemat(tmp_path / "packed.mat", {"t": np.zeros(20_000)}, do_compression=True)
+    with open(tmp_path / "sparse.csv", "wb") as stream:
+        stream.truncate(1 << 40)
+    for name, said in (("packed.mat", "or unpacks to more"), ("sparse.csv", "at most 500000000")):
+        with pytest.raises(ConfigError, match=said):
+            read_table(DataSettings("csv", str(tmp_path / name)), shipped("circuit"))
+
+
 @pytest.mark.parametrize("blank", ["\n\n", "\n \n\t\n", "\r\n\r\n"])
 def test_blank_lines_count_unless_they_are_the_last(tmp_path, blank):
     path = tmp_path / "r.csv"
@@ -443,7 +506,7 @@ def test_settings_that_do_not_fit_the_file(tmp_path, settings, part):
 def test_a_device_or_a_pipe_is_no_recording(tmp_path, name):
     os.mkfifo(tmp_path / "pipe")
     path = os.path.join(tmp_path, name)  # an absolute name stays as it is
-    with pytest.raises(ConfigError, match="a device or a pipe, not a regular file"):
+    with pytest.raises(ConfigError, match="is not a regular file"):
         read_table(DataSettings("csv", path), shipped("circuit"))
 
 

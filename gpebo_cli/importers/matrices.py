@@ -9,17 +9,15 @@ from __future__ import annotations
 import ast
 import os
 import re
-import struct
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
-from gpebo_cli.model.archive import MAX_BYTES, read_archive
+from gpebo_cli.model.archive import MAX_BYTES, read_archive, read_mat
 from gpebo_cli.model.entries import is_sparse
 from gpebo_cli.reading import open_regular, read_text
 from gpebo_cli.schema import shown
@@ -141,41 +139,13 @@ def read_matrices(path: Path) -> dict[str, Any]:
 
 
 def _matlab(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat
-
-    with open_regular(path) as stream:
-        _check_unpacked(stream, path)
-    try:
-        content = loadmat(path, variable_names=[*_NAMES, "M", "K"])
-    except (ValueError, NotImplementedError, OSError, TypeError, zlib.error) as error:
-        raise ConfigError(
-            f"{path} cannot be read ({error}); save it with -v7 and the matrices E, A, B, C, D"
-        ) from None
+    content = read_mat(str(path), [*_NAMES, "M", "K"])
     found = {key: content[key] for key in _NAMES if key in content}
     if {"M", "K"} <= content.keys():  # of a second-order system beside it, whose damping is D
         found.pop("D", None)
     if "A" not in found:
         raise ConfigError(f"{path} has no matrix A; expected A and, if there are any, E, B, C, D")
     return found
-
-
-def _check_unpacked(stream: BinaryIO, path: Path) -> None:
-    """Refuse a file whose compressed elements (of type 15) become too large."""
-    size = os.fstat(stream.fileno()).st_size
-    order = "<" if stream.read(128)[126:] == b"IM" else ">"
-    while size <= MAX_BYTES and len(tag := stream.read(8)) == 8:
-        kind, length = struct.unpack(f"{order}II", tag)
-        if kind != 15:  # plain, or no such file at all, which its reader says better
-            break
-        packed, unpacker = stream.read(length), zlib.decompressobj()
-        while packed and size <= MAX_BYTES:
-            try:
-                size += len(unpacker.decompress(packed, 1 << 20))
-            except zlib.error:
-                break
-            packed = unpacker.unconsumed_tail
-    if size > MAX_BYTES:
-        raise ConfigError(f"{path} has more than {MAX_BYTES} bytes, or unpacks to more")
 
 
 def _matrix_market(folder: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Matrices of numbers in one file beside a plant: NumPy's ``.npz``, sparse, without pickles.
+"""Files of arrays of numbers: NumPy's ``.npz`` beside a plant, sparse, without pickles; ``.mat``.
 
 A matrix X is one array ``X``, or its entries ``X.row``, ``X.col``, ``X.data`` and ``X.shape``.
 """
@@ -8,9 +8,10 @@ from __future__ import annotations
 import io
 import math
 import os
+import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import index
 from typing import Any
 
@@ -27,6 +28,9 @@ MAX_BYTES = 200_000_000
 """Of a file of matrices, unpacked."""
 
 _MAX_PACKED = 20_000_000  # a longer list of contents takes memory before anything can be counted
+_COMPRESSED = 15
+_NUMBERS = ("double", "single", "sparse", "logical",
+            *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 _PARTS = ("row", "col", "data", "shape")
 _BROKEN = (ValueError, KeyError, OSError, EOFError, RuntimeError, NotImplementedError,
            zipfile.BadZipFile, zlib.error)
@@ -82,6 +86,55 @@ def read_archive(path: str) -> dict[str, Any]:
         matrix: arrays[matrix] if matrix in arrays else _sparse(arrays, matrix, path)
         for matrix in MATRICES if any(key.partition(".")[0] == matrix for key in arrays)
     }
+
+
+def read_mat(path: str, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """The arrays of numbers in a MATLAB file up to version 7 (None: all of them), by name.
+
+    Raises:
+        ConfigError: no regular file, none that can be read, or one that is too large.
+    """
+    from scipy.io import loadmat, whosmat
+
+    with open_regular(path) as stream:
+        content = stream.read(MAX_BYTES + 1)
+    if _unpacked(content) > MAX_BYTES:
+        raise ConfigError(f"{path} has more than {MAX_BYTES} bytes, or unpacks to more")
+    try:
+        # The head of a cell array may claim any size, and memory is taken for it at once.
+        numbers = [
+            name for name, _, kind in whosmat(io.BytesIO(content))  # type: ignore[arg-type]
+            if kind in _NUMBERS and (names is None or name in names)
+        ]
+        found: dict[str, Any] = loadmat(
+            io.BytesIO(content), variable_names=numbers  # type: ignore[arg-type]
+        )
+    except Exception as error:  # noqa: BLE001  a stranger's bytes: whatever a library says of them
+        raise ConfigError(
+            f"{path} cannot be read ({shown(str(error))}); save it with -v7"
+        ) from None
+    return {name: found[name] for name in numbers if name in found}
+
+
+def _unpacked(content: bytes) -> int:
+    """Bytes of a MATLAB file when its compressed elements (of type 15) are unpacked, or too many.
+
+    What is no such file counts as it stands; its reader says better what it is.
+    """
+    size, at = len(content), 128
+    tag = struct.Struct("<II" if content[126:128] == b"IM" else ">II")
+    while size <= MAX_BYTES and at + tag.size <= len(content):
+        kind, length = tag.unpack_from(content, at)
+        at += tag.size
+        packed, unpacker = content[at : at + length], zlib.decompressobj()
+        at += length
+        while kind == _COMPRESSED and packed and size <= MAX_BYTES:
+            try:
+                size += len(unpacker.decompress(packed, 1 << 20))
+            except zlib.error:
+                break
+            packed = unpacker.unconsumed_tail
+    return size
 
 
 def _sparse(arrays: Mapping[str, Any], matrix: str, path: str) -> Any:

@@ -13,16 +13,17 @@ import io
 import math
 import os
 import re
-import stat
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.archive import read_mat
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.reading import open_regular
 from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import DataSettings
 
@@ -38,6 +39,7 @@ _NUMBER = r"[ \t]*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[ \t]*"
 _MISSING = ("", "nan", "na", "n/a", "null", "none")  # where data.missing allows it
 _BLANK = b" \t\r"
 _PIECE = 1 << 16  # rows that are text at the same time
+_MOST_BYTES, _MOST_CELLS = 500_000_000, 25_000_000
 _LONGEST_LINE, _MOST_BLANK = 1 << 20, 1000
 _DATE = "a date and time as in 2024-05-31T12:00:00.250"
 
@@ -110,20 +112,18 @@ def read_file(path: str) -> bytes:
     """The content of a regular file: a device or a pipe might never end.
 
     Raises:
-        ConfigError: it is none, or cannot be read.
+        ConfigError: it is none, cannot be read, or is too large.
     """
+    if os.path.isdir(path):
+        raise ConfigError(f"data.file: {path} is a folder, not a file")
     try:
-        kind = os.stat(path).st_mode
-        if stat.S_ISDIR(kind):
-            raise ConfigError(f"data.file: {path} is a folder, not a file")
-        if not stat.S_ISREG(kind):
-            raise ConfigError(f"data.file: {path} is a device or a pipe, not a regular file")
-        with open(path, "rb") as stream:
-            return stream.read()
-    except OSError as error:
-        raise ConfigError(f"data.file: {path} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # a NUL in the name
-        raise ConfigError(f"data.file: {shown(path)} is no name of a file") from error
+        with open_regular(path) as stream:
+            size = os.fstat(stream.fileno()).st_size
+            if size <= _MOST_BYTES:
+                return stream.read(_MOST_BYTES)
+    except ConfigError as error:
+        raise ConfigError(f"data.file: {error}") from None
+    raise ConfigError(f"data.file: {path} has {size} bytes; at most {_MOST_BYTES} are read")
 
 
 def check_text(path: str, content: bytes) -> None:
@@ -351,7 +351,7 @@ def _table(
 def _read_body(header: Header, data: DataSettings, body: bytes) -> Array:
     """The rows below the header, (N, columns): by pandas, or one by one."""
     plain = data.missing == "refuse" and data.time_unit != "datetime"
-    if plain and not re.search(rb'["\r\v\f\0]', body) and _even(header, data, body):
+    if plain and not re.search(rb'\A\xef\xbb\xbf|["\r\v\f\0]', body) and _even(header, data, body):
         values = _by_pandas(header, data, body)
         if values is not None and not np.any(np.diff(values[:, 0]) <= 0):
             return values
@@ -399,17 +399,19 @@ def _frame(path: str, kind: str, content: bytes) -> DataFrame:
     """A Parquet file, or the vectors of equal length in a MAT file."""
     import pandas as pd
 
-    try:
-        if kind == ".parquet":
-            return pd.read_parquet(io.BytesIO(content))
-        from scipy.io import loadmat
+    if kind == ".parquet":
+        try:
+            from pyarrow.parquet import read_metadata  # type: ignore[import-untyped,unused-ignore]
 
-        found = loadmat(cast("Any", io.BytesIO(content)), squeeze_me=True)
-    except ImportError as error:
-        raise ConfigError(f"data.file: {path}: {error}") from error
-    except Exception as error:  # a stranger's bytes: whatever a library says of them
-        raise ConfigError(f"data.file: {path} cannot be read as {kind}: {error}") from error
-    vectors = {k: v for k, v in found.items() if getattr(v, "ndim", 0) == 1}
+            head = read_metadata(io.BytesIO(content))
+            cells = head.num_rows * head.num_columns
+            if cells <= _MOST_CELLS:
+                return pd.read_parquet(io.BytesIO(content), engine="pyarrow")
+        except Exception as error:  # a stranger's bytes: whatever a library says of them
+            raise ConfigError(f"data.file: {path} cannot be read as {kind}: {error}") from error
+        raise ConfigError(f"data.file: {path} has {cells} cells; at most {_MOST_CELLS} are read")
+    arrays = {k: v.squeeze() for k, v in read_mat(path).items() if isinstance(v, np.ndarray)}
+    vectors = {k: v for k, v in arrays.items() if v.ndim == 1}
     longest = max(map(len, vectors.values()), default=0)
     return pd.DataFrame({k: v for k, v in vectors.items() if len(v) == longest})
 
