@@ -16,7 +16,9 @@ from test_cli import gpebo
 from gpebo_cli import run
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.assumptions import examine
-from gpebo_cli.settings import Settings
+from gpebo_cli.experiment.sensors import candidates
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.settings import Settings, TimeSettings
 
 
 # The last ones: an A_0 that hides something, and states that no parameter has part in.
@@ -110,6 +112,36 @@ def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):
     assert set(first["gained"]) == UNSEEN
     assert all(not sensor["gained"] for sensor in content["sensors"][1:])
     assert all(sensor["fall"] >= 1.0 for sensor in content["sensors"])
+
+
+def test_the_next_sensors_make_deviations_fall_as_runs_with_them_say():
+    """By the covariance of a run with one more row of C; the best first, each beside those above."""
+    plant = yaml.safe_load((CONF / "plant" / "descriptor.yaml").read_text())
+    settings = Settings({}, {"name": "ls_drem"}, TimeSettings(horizon=5.0), observer={
+        "name": "gpebo", "form": "strangeness_free",
+    })
+    tried = candidates(settings, plant_from_mapping(plant))
+    x = run(plant, observer="none", time={"horizon": 5})
+    size = np.abs(x["y"]).max()
+
+    def deviations(states):
+        rows = [[f"{size / np.abs(x[name]).max()}*{float(name == own)}" for own in plant["states"]]
+                for name in states]
+        larger = {**plant, "C": [*plant["C"], *rows],
+                  "outputs": [*plant["outputs"], *(f"{name}_seen" for name in states)]}
+        return examine(settings, plant_from_mapping(larger)).deviations
+
+    alone = deviations([])
+    for k, sensor in enumerate(tried):
+        for states, fall in (
+            ([sensor.state], sensor.fall), ([s.state for s in tried[: k + 1]], sensor.fall_together)
+        ):
+            now = deviations(states)
+            ratio = np.exp(np.mean([np.log(alone[name] / now[name]) for name in alone]))
+            assert fall == pytest.approx(ratio, rel=1e-2)
+    assert len({s.state for s in tried}) == len(plant["states"])
+    assert all(np.diff([s.fall_together for s in tried]) > 0.0)
+    assert all(np.diff([s.log_det for s in tried]) > 0.0)
 
 
 def test_only_all_sensors_can_be_asked_for(half_seen):

@@ -109,15 +109,15 @@ def _knowledge(examined: Examination) -> list[str]:
 
 
 def _sensors(tried: Sequence[Sensor]) -> list[str]:
-    """A row for each state as a further output, the best first."""
+    """A row for each state as a further output, the best first, then the best beside it."""
     if not tried:
         return []
     from gpebo_cli.results.report import columns
 
-    rows = [["measure too", "estimable", "gained", "deviations fall by"]]
+    rows = [["measure too", "estimable", "gained", "deviations fall by", "with those above by"]]
     rows += [
-        [s.state, str(len(s.estimable)), ", ".join(s.gained) or "nothing", f"{s.fall:.3g}"]
-        if not s.problem else [s.state, "none", s.problem, ""]
+        [s.state, str(len(s.estimable)), ", ".join(s.gained) or "nothing", f"{s.fall:.3g}",
+         f"{s.fall_together:.3g}"]
         for s in tried
     ]
     return columns(rows)
