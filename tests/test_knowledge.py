@@ -115,7 +115,7 @@ def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):
 
 
 def test_the_next_sensors_make_deviations_fall_as_runs_with_them_say():
-    """By the covariance of a run with one more row of C; the best first, each beside those above."""
+    """By the covariance of a run with one more row of C; the best first, beside those above."""
     plant = yaml.safe_load((CONF / "plant" / "descriptor.yaml").read_text())
     settings = Settings({}, {"name": "ls_drem"}, TimeSettings(horizon=5.0), observer={
         "name": "gpebo", "form": "strangeness_free",
