@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
-from typing import BinaryIO
+from math import isfinite
+from typing import Any, BinaryIO
 
 from gpebo_cli.errors import ConfigError
 
@@ -42,6 +43,33 @@ def read_text(path: str | os.PathLike[str], limit: int) -> str:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not text in UTF-8 (byte {error.start})") from error
+
+
+def strict_json(text: str | bytes) -> Any:
+    """The content of JSON text in which all numbers are finite.
+
+    Raises:
+        ValueError: it is none.
+        RecursionError: it is too deep.
+    """
+    import json
+
+    return json.loads(
+        text, parse_float=finite, parse_constant=finite,
+        parse_int=lambda digits: int(digits) if finite(digits) else 0,
+    )
+
+
+def finite(value: str | float) -> float:
+    """The number that ``value`` is.
+
+    Raises:
+        ValueError: it is none that is finite.
+    """
+    number = float(value)
+    if not isfinite(number):
+        raise ValueError(f"{value} is not a finite number")
+    return number
 
 
 def beside(file: str, source: str, where: str) -> str:

@@ -186,6 +186,13 @@ def test_plants_and_horizons_have_figures_of_their_own(inside):
     ("file", "change", "said"),
     [
         ("cases.csv", lambda text: text.replace("100000000,", "1.2x3,", 1), "line 2, column gamma"),
+        *(
+            ("cases.csv", lambda text, cell=cell: text.replace("100000000,", f"{cell},", 1),
+             "line 2, column gamma: ") for cell in ("1e999", "1_0", "１", " 1", "nan", "0x1")
+        ),
+        ("cases.csv", lambda text: text.replace("\n0,", "\ninf,", 1), "line 2, column case"),
+        ("summary.json", lambda text: text.replace('"value": ', '"value": 1e999, "": ', 1), "JSON"),
+        ("summary.json", lambda text: text.replace('"value": ', '"x": NaN, "value": ', 1), "JSON"),
         ("cases.csv", lambda text: text + "1,2\n", "line 4: 2 cells; the header has"),
         ("cases.csv", lambda text: text.replace("case,", "csae,", 1), "there is no column case"),
         ("cases.csv", lambda text: text.replace("\n0,", "\n,", 1), "line 2, column case"),

@@ -278,7 +278,13 @@ def test_a_finished_sweep_resumes_to_itself(tmp_path, uninterrupted):
 # The files ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"status": "done"}', '{"status": "odd"}'])
+RECORD = '{"status": "done", "overrides": {"a": "1"}, "seconds": 1, "error": "", "cases": [%s]}'
+
+
+@pytest.mark.parametrize("text", [
+    "", "{", "[]", '{"status": "done"}', '{"status": "odd"}',
+    *(RECORD % case for case in ('{"x": 1e999}', '{"x": NaN}', '{"x": "y"}', "1", '{"x": [1]}')),
+])
 def test_what_is_no_result_is_a_missing_job(tmp_path, text):
     (tmp_path / "0").mkdir()
     (tmp_path / "0" / "result.json").write_text(text)

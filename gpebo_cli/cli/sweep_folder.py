@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.reading import open_regular
+from gpebo_cli.reading import finite, open_regular, strict_json
 from gpebo_cli.results.files import remove_files, write_text
 
 PLAN = "sweep.json"
@@ -75,7 +75,7 @@ def read_plan(folder: Path) -> Plan | None:
             return None
         raise
     try:
-        content = json.loads(text)
+        content = strict_json(text)
         jobs = tuple({str(k): str(v) for k, v in job.items()} for job in content["jobs"])
         return Plan(jobs, str(content["configuration"]))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -105,7 +105,7 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
     missing = JobRecord(number, overrides, "missing")
     try:
         with open_regular(job_folder(folder, number) / RESULT) as stream:
-            content: Any = json.loads(stream.read())
+            content: Any = strict_json(stream.read())
         if content["status"] not in ("done", "failed") or content["overrides"] != dict(overrides):
             return missing
         return JobRecord(
@@ -114,9 +114,11 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
             content["status"],
             float(content["seconds"]),
             str(content["error"]),
-            [dict(case) for case in content["cases"]],
+            [{str(k): None if v is None else finite(v) for k, v in case.items()}
+             for case in content["cases"]],
         )
-    except (ConfigError, OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (ConfigError, OSError, ValueError, KeyError, TypeError, AttributeError,
+            RecursionError):
         return missing
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,11 @@ from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.reading import open_regular
+from gpebo_cli.reading import open_regular, strict_json
 from gpebo_cli.schema import shown
 
+_NUMBER = re.compile(r"-?(?:[0-9]+(?:\.[0-9]+)?(?:e[+-]?[0-9]+)?|inf)")
+_MOST_BYTES = 200_000_000  # of a file; as cells they take eight times as many
 _TAIL = 1 << 16  # bytes in which the last row of a table is
 
 
@@ -189,7 +191,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     path = folder / "summary.json"
     try:
-        content = json.loads(_bytes(path))
+        content = strict_json(_bytes(path))
     except OSError as error:
         raise GpeboError(f"{path}: {error.strerror or error}") from error
     except (ValueError, RecursionError):
@@ -207,7 +209,11 @@ def _estimator(summary: Mapping[str, Any]) -> str:
 def _bytes(path: Path) -> bytes:
     """The content of a regular file; a pipe under its name would be waited for."""
     with _opened(path) as stream:
-        return stream.read()
+        content = stream.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        size = path.stat().st_size
+        raise GpeboError(f"{path} has {size} bytes; at most {_MOST_BYTES} are read")
+    return content
 
 
 def _opened(path: Path) -> BinaryIO:
@@ -248,20 +254,30 @@ def read_columns(path: Path, *filled: str, present: Sequence[str] = ()) -> dict[
         if len(row) != len(header):
             raise GpeboError(f"{path}, line {line}: {len(row)} cells; the header has {len(header)}")
     try:
-        numbers = np.array([[float(cell or "nan") for cell in row] for row in rows])
+        numbers = np.array([[_number(cell) for cell in row] for row in rows])
     except ValueError:
         raise GpeboError(_wrong_cell(path, header, rows)) from None
     for name in filled:
-        for gap in np.flatnonzero(np.isnan(numbers[:, header.index(name)])):
+        for gap in np.flatnonzero(~np.isfinite(numbers[:, header.index(name)])):
             raise GpeboError(f"{path}, line {gap + 2}, column {name}: there is no number")
     return dict(zip(header, numbers.T, strict=True))
+
+
+def _number(cell: str) -> float:
+    """A cell as runs write them: ``%.17g`` of a number, of infinity, too, or nothing, NaN."""
+    if cell and _NUMBER.fullmatch(cell) is None:
+        raise ValueError
+    value = float(cell or "nan")
+    if np.isinf(value) and not cell.endswith("inf"):  # 1e999
+        raise ValueError
+    return value
 
 
 def _wrong_cell(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     for line, row in enumerate(rows, start=2):
         for name, cell in zip(header, row, strict=True):
             try:
-                float(cell or "nan")
+                _number(cell)
             except ValueError:
                 return f"{path}, line {line}, column {name}: {shown(cell)} is not a number"
     raise AssertionError("every cell is a number")
