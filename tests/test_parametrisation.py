@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from regressions import adjugate, integrate
 from scipy.optimize import least_squares
 
-from gpebo_cli import ConfigError, run
+from gpebo_cli import ConfigError, estimators, run
+from gpebo_cli.estimators import LinearRegression
 from gpebo_cli.regression.text import regression_from_mapping
 
 TEXT = {
@@ -122,3 +126,100 @@ def test_mistakes(change, message):
 def test_at_samples_it_is_refused():
     with pytest.raises(ConfigError, match="S works in continuous time only"):
         run(regression=TEXT, observer={"sample_time": 0.01}, estimator="least_squares")
+
+
+# The gradient of a monotone S ------------------------------------------------------------------
+
+IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
+MONOTONE = {"name": "monotone", "gamma": 3e3, "lambda": [0.3, 0.5, 0.7, 0.9], "T": IDENTITY}
+
+
+def given(disturbance=None, horizon=6.0):
+    """The regression of TEXT without the text, its Y disturbed."""
+    def psi(t):
+        return np.stack(
+            [np.sin(t), np.ones_like(t), np.cos(2 * t), np.sin(t) * np.cos(t)], axis=-1
+        )[..., None, :]
+
+    def Y(t):
+        return psi(t) @ S(np.array([2.0, 0.5])) + (0.0 if disturbance is None else disturbance(t))
+
+    made = LinearRegression.from_functions(psi, Y, ["e1", "e2", "e3", "e4"], horizon)
+    return replace(made, parametrisation=regression_from_mapping(TEXT).parametrisation), psi, Y
+
+
+def wobble(t):
+    return 0.2 * np.sin(3.0 * np.asarray(t))[..., None]
+
+
+def test_the_monotone_gradient_against_an_integration_of_its_odes():
+    made, psi, Y = given(wobble)
+    t, rates = np.linspace(0.0, 6.0, 31), np.array(MONOTONE["lambda"])
+
+    def f(t, x):
+        omega, calY, theta = x[:16].reshape(4, 4), x[16:20], x[20:]
+        row, y = psi(np.array(t))[0], Y(np.array(t))[0]
+        delta = np.linalg.det(omega)
+        rest = adjugate(omega) @ calY - delta * S(theta)
+        return np.concatenate([
+            (-rates[:, None] * (omega - np.outer(row, row))).ravel(), -rates * (calY - row * y),
+            3e3 * delta * np.array(IDENTITY) @ rest,
+        ])
+
+    expected = integrate(f, np.concatenate([np.zeros(20), [2.55, 1.55]]), t)[:, 20:]
+    eta = estimators.build(MONOTONE).estimate(made, t).parameters(slice(None))[0]
+    np.testing.assert_allclose(eta, S(expected), atol=1e-9)
+    # ... and what is reported for θ is that θ, also before anything is exciting.
+    weight = made.gram(t)[..., :4]
+    np.testing.assert_allclose(made.parametrisation.fitted(eta, weight), expected, atol=1e-6)
+
+
+def test_errors_of_the_monotone_gradient_are_its_linearisation():
+    made, *_ = given()
+    t, small = np.linspace(0.0, 6.0, 13), 1e-6
+    estimator = estimators.build(MONOTONE)
+    disturbed, *_ = given(lambda t: small * wobble(t))
+    change = [
+        estimator.estimate(one, t).parameters(slice(None))[0] for one in (disturbed, made)
+    ]
+    (errors,) = estimator.errors(made)
+
+    def f(t, s):
+        found = errors(np.array([t]), np.array([t]))
+        return found.A[0] @ s + found.B[0] @ wobble(t)
+
+    s = integrate(f, np.zeros(6), t)
+    expected = np.einsum("nij,nj->ni", errors(t, t).C, s)
+    np.testing.assert_allclose((change[0] - change[1]) / small, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("entries", "T", "message"), [
+    (["a", "b", "a*b", "exp(-b)"], IDENTITY, None),
+    (["a", "b", "a*b", "exp(-b)"], None, None),
+    (["a", "b**2 - b", "1", "2"], IDENTITY, r"T∇S .* is not positive at a = .*, b = 0\.4"),
+    (["a", "b", "1", "2"], [[1.0, 0.0]], "2 rows of 4 numbers"),
+    (["sqrt(a)", "b", "1", "2"], IDENTITY, None),
+])
+def test_monotony_is_verified_on_the_whole_box(entries, T, message):
+    p = regression_from_mapping({**TEXT, "S": entries}).parametrisation
+    made = replace(given()[0], parametrisation=p)
+    estimator = estimators.build({**MONOTONE, "T": T})
+    if message is not None:
+        with pytest.raises(ConfigError, match=message):
+            estimator.estimate(made, np.array([1.0]))
+        return
+    found = estimator.estimate(made, np.array([1.0]))
+    theta = np.random.default_rng(0).uniform(p.low, p.high, (1000, 2))
+    slope = found.T @ p.jacobian(theta)
+    least = np.linalg.eigvalsh(slope + np.swapaxes(slope, 1, 2))[:, 0].min()
+    assert 0.0 < 2.0 * found.mu <= least
+    assert found.mu > 0.1 * least
+
+
+def test_the_monotone_gradient_is_for_parametrisations():
+    with pytest.raises(ConfigError, match="is for a regression with S and box"):
+        run("circuit", estimator="monotone", time={"horizon": 1})
+    found = run(regression=TEXT, estimator=MONOTONE, time={"horizon": 12}, noise={
+        "name": "gaussian", "outputs": 0.01, "sample_time": 0.1})
+    assert abs(found.estimates["a"][0, -1] - 2.0) < 0.05
+    assert {"a_std", "eta_3_std"} <= set(found.to_pandas("estimates").columns)

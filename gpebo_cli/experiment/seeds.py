@@ -142,6 +142,7 @@ def _added(
         yield LinearRegression(
             Trajectory(mesh, regression.Y.values[..., None] + added),
             regression.psi, regression.parameters, regression.scale,
+            parametrisation=regression.parametrisation,
         )
 
 

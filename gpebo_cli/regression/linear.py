@@ -14,6 +14,7 @@ from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.parametrisation import Parametrisation
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
 _SINGULAR = 1e-10  # singular values of ψ with columns of equal size that count as zero, relatively
@@ -37,6 +38,7 @@ class LinearRegression:
     resets: tuple[Reset, ...] = ()  # at edges of the mesh, in the order of time
     floor: float = 0.0  # size below which parameters are rounding
     dynamics: Dynamics | None = None  # of parameters that move; then there are no resets
+    parametrisation: Parametrisation | None = None  # η = S(θ)
 
     @classmethod
     def from_functions(

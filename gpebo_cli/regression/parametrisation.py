@@ -12,17 +12,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.model.expressions import Tape
+from gpebo_cli.model.expressions.intervals import Interval
 from gpebo_cli.schema import number, shown
 
 _ROUNDS = 60  # of Levenberg and Marquardt
 _STILL = 1e-15  # a step of this share of the box changes nothing
 _STUCK = 1e3  # damping from which on no shorter step helps: what is left is rounding
+_UNSEEN = 1e-14  # relative weight of directions without excitation
+_SHARP = 0.5  # of an eigenvalue, by which intervals may spread
+_CELLS = 1 << 14  # boxes that are looked at at once
 _DAMPING = 1e-3  # at first, relative to the largest singular value squared
 
 
@@ -30,6 +35,7 @@ _DAMPING = 1e-3  # at first, relative to the largest singular value squared
 class Parametrisation:
     """S on a box."""
 
+    names: tuple[str, ...]  # of θ
     tape: Tape  # k outputs, of q signals that stand for θ
     low: Array  # (q,)
     high: Array  # (q,)
@@ -48,6 +54,59 @@ class Parametrisation:
         t = np.zeros(len(theta))
         columns = [self.tape.taylor(t, 1, None, np.stack([theta, v]))[1] for v in along]
         return np.stack(columns, axis=2)
+
+    def slopes(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Bounds of ∂S/∂θ (N, k, q) over boxes from ``low`` to ``high`` (N, q), by intervals."""
+        t, count = np.zeros(len(low)), low.shape[1]
+        bounds = np.zeros((2, len(low), len(self.tape.outputs), count))
+        for j in range(count):
+            theta: list[list[Any]] = [
+                [Interval(low[:, i], high[:, i]), float(i == j)] for i in range(count)
+            ]
+            with np.errstate(all="ignore"):
+                places: list[list[Any]] = self.tape.run(t, 1, t, theta)
+            for i, place in enumerate(self.tape.outputs):
+                slope = places[place][1] if len(places[place]) > 1 else 0.0
+                ends = (slope.low, slope.high) if isinstance(slope, Interval) else (slope, slope)
+                bounds[0, :, i, j], bounds[1, :, i, j] = ends
+        return bounds[0], bounds[1]
+
+    def monotone(self, T: Array) -> float:
+        """A number that λ_min(T∇S + (T∇S)ᵀ) is nowhere below in the box, for T (q, k).
+
+        The box is halved until intervals say so everywhere.
+
+        Raises:
+            ConfigError: at some θ, which is named, it is not positive; or no end is in sight.
+        """
+        low, high, least, axis = self.low[None], self.high[None], np.inf, 0
+        while True:
+            ends = np.stack(self.slopes(low, high))
+            middle, radius = T @ ends.mean(axis=0), np.abs(T) @ (0.5 * np.ptp(ends, axis=0))
+            known = np.isfinite(radius).all(axis=(1, 2))
+            symmetric = np.where(known[:, None, None], middle + np.swapaxes(middle, 1, 2), 0.0)
+            spread = (radius + np.swapaxes(radius, 1, 2)).sum(axis=2).max(axis=1)
+            eigenvalue = np.linalg.eigvalsh(symmetric)[:, 0]
+            done = known & (spread < _SHARP * eigenvalue)
+            least = min(least, float((eigenvalue - spread)[done].min(initial=np.inf)))
+            low, high = low[~done], high[~done]
+            if done.all():
+                break
+            theta = 0.5 * (low + high)
+            slope = T @ self.jacobian(theta)
+            poor = np.linalg.eigvalsh(slope + np.swapaxes(slope, 1, 2))[:, 0] <= 0.0
+            if poor.any() or len(low) > _CELLS:
+                at = theta[np.argmax(poor)]
+                text = ", ".join(f"{n} = {x:.4g}" for n, x in zip(self.names, at, strict=True))
+                what = "is not positive" if poor.any() else "cannot be shown to be positive"
+                raise ConfigError(
+                    f"estimator.T: T∇S + (T∇S)ᵀ {what} at {text}; give another T or a smaller box"
+                )
+            upper, lower = high.copy(), low.copy()
+            upper[:, axis] = lower[:, axis] = theta[:, axis]
+            low, high = np.concatenate([low, lower]), np.concatenate([upper, high])
+            axis = (axis + 1) % len(self.low)
+        return least
 
     def fitted(self, eta: Array, weight: Array) -> Array:
         """θ̂ (N, q) of η̂ (N, k) with the weights G (N, k, k); NaN where η̂ is.
@@ -95,7 +154,7 @@ def _root(weight: Array) -> Array:
     """L with LᵀL = G/‖G‖ (N, k, k)."""
     values, vectors = np.linalg.eigh(weight)
     size = np.maximum(values[:, -1:], np.finfo(float).tiny)
-    scale = np.sqrt(np.maximum(values / size, 0.0))
+    scale = np.sqrt(np.maximum(values / size, _UNSEEN))  # η̂ says at least something
     return np.asarray(scale[..., None] * np.swapaxes(vectors, -1, -2))
 
 

@@ -126,7 +126,7 @@ class TextRegression:
         )
         regression = LinearRegression(
             Trajectory(mesh, right), Trajectory(mesh, psi), self.system.unknowns,
-            float(np.abs(psi).max(initial=0.0)),
+            float(np.abs(psi).max(initial=0.0)), parametrisation=self.parametrisation,
         )
         return regression, error
 
@@ -296,7 +296,7 @@ def _parametrisation(
     known = {name: signal(name, k, "an unknown") for k, name in enumerate(names)}
     entries = _list(mapping, "S", where)
     tape = record([parse(text, known, f"{where}: S[{j}]") for j, text in enumerate(entries)])
-    parametrisation = Parametrisation(tape, low, high)
+    parametrisation = Parametrisation(names, tape, low, high)
     size = len(names)
     eta = parametrisation.values(truth[None])[0]
     return parametrisation, {
