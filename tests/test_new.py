@@ -44,7 +44,7 @@ def test_it_can_be_written_elsewhere(tmp_path):
 def test_an_observer_passes_its_test(tmp_path):
     done = gpebo("new", "observer", "mine_too", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "2 passed" in shell(f"{shlex.quote(sys.executable)} -m pytest -q -p no:xdist", tmp_path)
+    assert "3 passed" in shell(f"{shlex.quote(sys.executable)} -m pytest -q -p no:xdist", tmp_path)
     entry = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]["entry-points"]
     assert entry == {"gpebo.observers": {"mine_too": "mine_too:MineToo"}}
 

@@ -38,7 +38,7 @@ when you have changed it:  gpebo check --config-dir {folder} {kind}={name}
 _INSTALLED = """\
 its test passes as it stands:       python -m pytest {folder}
 to use it, install it, then run it: pip install -e {folder}
-                                    gpebo run --config-dir {folder} {kind}={name}
+                                    gpebo run --config-dir {folder} {kind}={name} plant=window
 """
 
 

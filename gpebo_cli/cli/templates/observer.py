@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli import DescriptorSystem, SolverSettings
+from gpebo_cli import ConfigError, DescriptorSystem, SolverSettings
 from gpebo_cli.observers import (
     AffineStateMap,
     InitialError,
@@ -42,6 +42,8 @@ class Mine:
 
         def equation(t: Array, inside: Array) -> LinearEquation:
             c = system.coefficients.taylor(t, 0, inside)
+            if not (c.E[0] == np.eye(n)).all():
+                raise ConfigError(f"plant {system.name}: this observer takes plants with E = I")
             f = np.zeros((len(t), n, 1 + q + n))
             f[:, :, :1] = c.B[0] @ signals.inputs(t, inside)[:, :, None]
             f[:, :, 1 : 1 + q] = c.F[0]

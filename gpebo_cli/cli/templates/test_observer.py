@@ -6,10 +6,11 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 from mine import Mine
 
-from gpebo_cli import SolverSettings, TimeSettings, estimators, load_plant, simulate
+from gpebo_cli import ConfigError, SolverSettings, TimeSettings, estimators, load_plant, simulate
 from gpebo_cli.observers import Measurements
 
 PLANT = {
@@ -31,6 +32,14 @@ def test_it_finds_the_unknown_and_the_start() -> None:
     estimates = estimators.estimate(estimator, observation.regression, t)
     found = estimates.parameters(slice(None))[0, -1]
     np.testing.assert_allclose(found, [0.7, -1.0, 1.0], atol=1e-6)
+
+
+def test_other_plants_are_refused() -> None:
+    system = load_plant({**PLANT, "E": [[1, 0], [0, 2]]})
+    signals = simulate(system, TimeSettings(), SolverSettings()).signals
+    seen = Measurements(signals.inputs, signals.outputs)
+    with pytest.raises(ConfigError, match="E = I"):
+        Mine().observe(system, seen, SolverSettings())
 
 
 def test_the_settings_file_says_what_the_class_says() -> None:
