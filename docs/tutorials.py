@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 DOCS = Path(__file__).parent
-PAGES = ("tutorial", "tutorial_recording", "tutorial_estimator")
+PAGES = ("tutorial", "tutorial_recording", "tutorial_estimator", "tutorial_paper")
 _BLOCK = re.compile(
     r'^```(sh|python|diff)(?: title="([^"]*)")?\n(.*?)^```', re.MULTILINE | re.DOTALL
 )

@@ -88,6 +88,7 @@ def test_a_tutorial_runs_as_it_stands(page, tmp_path):
         for line in shown.splitlines()[1:]:
             if "gpebo: error" in line or "FAILS" in line or "exit code" in line:
                 assert line in said
+    assert page != "tutorial_paper" or blocks(text, "text")[0] in said
     figures = tutorials.figures(text)
     assert figures
     for name, (run, figure) in figures.items():
