@@ -77,7 +77,7 @@ def assess(
     sizes = np.broadcast_to(regression.scale, (mesh.size, p))
 
     def beside(at: Array) -> tuple[Array, Array, float]:
-        element = np.maximum(np.searchsorted(mesh.edges, at, side="left") - 1, 0)
+        element = mesh.edges[1:-1].searchsorted(at, side="left")
         return sizes[element], at - mesh.edges[0], tol
 
     ends = gram.mesh.edges[1:]

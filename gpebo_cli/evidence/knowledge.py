@@ -172,5 +172,5 @@ def _sizes(sizes: Array, terms: Array, elapsed: Array, tol: float) -> tuple[Arra
     whole = terms * np.sqrt(np.maximum(elapsed, 0.0))[:, None]
     rounding = _UNRESOLVED * tol * whole
     seen = sizes > rounding
-    level = np.divide(rounding, sizes, out=np.ones_like(sizes), where=seen) ** 2
+    level = np.square(np.divide(rounding, sizes, out=np.ones(sizes.shape), where=seen))
     return np.maximum(np.where(seen, sizes, whole), _TINY), np.maximum(level, _SINGULAR)

@@ -151,14 +151,16 @@ def settled(t: Array, last: Array, before: Array, after: Array, level: Array) ->
     tiny = np.finfo(float).tiny
     high, low, wanted = (np.log(np.maximum(e, tiny)) for e in (before, after, level))
     with np.errstate(over="ignore"):  # where it does not fall, and the result is another one
-        share = np.clip((high - wanted) / np.maximum(high - low, tiny), 0.0, 1.0)
-    k = np.clip(last, 0, max(len(t) - 2, 0)).astype(np.intp)
-    crossed = t[k] + share * (t[np.minimum(k + 1, len(t) - 1)] - t[k]) - t[0]
+        share = np.maximum((high - wanted) / np.maximum(high - low, tiny), 0.0)
+    k = np.maximum(np.minimum(last, len(t) - 2), 0).astype(np.intp)
+    before, after = t[k], t[np.minimum(k + 1, len(t) - 1)]
+    crossed = before + np.minimum(share, 1.0) * (after - before) - t[0]
     return np.where(last < 0, 0.0, np.where(last < len(t) - 1, crossed, np.nan))
 
 
 def time_rms(t: Array, squares: Array) -> Array:
     """Root mean square over time (trapezoidal) of norms whose squares are (g, M), shape (g,)."""
-    steps = np.diff(t)
-    weights = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+    weights = np.zeros(len(t))
+    weights[1:] = steps = 0.5 * (t[1:] - t[:-1])
+    weights[:-1] += steps
     return np.asarray(np.sqrt(squares @ (weights / (t[-1] - t[0]))))

@@ -29,7 +29,7 @@ from gpebo_cli.evidence.metrics import (
 )
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
-from gpebo_cli.experiment.noise import noise_levels, signal_noise
+from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
@@ -76,8 +76,8 @@ class Estimated:
 
 
 def continuous(
-    settings: Settings, system: DescriptorSystem, source: Source, observer: Observer,
-    estimator: estimators.Estimator, stage: Stage,
+    settings: Settings, system: DescriptorSystem, source: Source, levels: NoiseLevels,
+    observer: Observer, estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
     """Observer and estimator as differential equations.
 
@@ -86,7 +86,6 @@ def continuous(
         ModelError: an assumption of the observer fails.
         SolverError: a tolerance cannot be reached.
     """
-    levels = noise_levels(settings.noise, system)
     t = source.t
 
     def observe(signals: Source | Signals) -> Observation:
@@ -163,8 +162,8 @@ def continuous(
 
 
 def at_samples(
-    settings: Settings, system: DescriptorSystem, source: Source, samples: Sampling,
-    estimator: estimators.Estimator, stage: Stage,
+    settings: Settings, system: DescriptorSystem, source: Source, levels: NoiseLevels,
+    samples: Sampling, estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
     """Observer and estimator at samples of the signals, ``samples.step`` apart.
 
@@ -181,7 +180,6 @@ def at_samples(
         t = sample_times(samples.step, start, stop)
         u, y = source.inputs(t), source.outputs(t)
         first = np.append(u[0], y[0])
-        levels = noise_levels(settings.noise, system)
 
         def fed(by: estimators.Estimator, *, last: bool) -> tuple[Online, list[OnlineEstimates]]:
             wanted = (

@@ -59,7 +59,7 @@ class NoiseLevels:
     @property
     def silent(self) -> bool:
         """Whether what is measured is what is there."""
-        return not (self.noisy_inputs.any() or self.noisy_outputs.any())
+        return not (self.inputs.any() or self.outputs.any() or self.steps.any())
 
 
 def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLevels:

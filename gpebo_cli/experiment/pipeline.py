@@ -91,14 +91,14 @@ def run_experiment(
     check_seeds(settings.noise, levels, settings.time.horizon)
     check_memory(settings, system, levels, 0 if estimator is None else len(estimator.cases))
     stage = _Clock(progress)
-    recorded = settings.data.name == "csv"
+    recorded, samples = settings.data.name == "csv", sampling(observer)
     with stage("read" if recorded else "simulate"):
         read = sources.recorded if recorded else sources.simulated
-        files = settings.data.file if isinstance(settings.data.file, list) else [settings.data.file]
-        source = several.joined_source([
-            read(replace(settings, data=replace(settings.data, file=file)), system, levels)
-            for file in files
-        ])
+        file = settings.data.file
+        each = [settings] if not isinstance(file, list) else [
+            replace(settings, data=replace(settings.data, file=one)) for one in file
+        ]
+        source = several.joined_source([read(one, system, levels, samples) for one in each])
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
         excitation=None, estimation=None, metrics=None, assumptions=source.assumptions,
@@ -107,11 +107,10 @@ def run_experiment(
     if observer is None or estimator is None:
         refuse_seeds(settings.noise)
         return result
-    samples = sampling(observer)
     found = (
-        continuous(settings, system, source, observer, estimator, stage)
+        continuous(settings, system, source, levels, observer, estimator, stage)
         if samples is None
-        else at_samples(settings, system, source, samples, estimator, stage)
+        else at_samples(settings, system, source, levels, samples, estimator, stage)
     )
     warned = warnings(found.observed)
     told = verdict(

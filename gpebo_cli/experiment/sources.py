@@ -15,7 +15,7 @@ from gpebo_cli.experiment.verdict import simulation_verdict
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers import build, sampling
+from gpebo_cli.observers import Sampling, build, sampling
 from gpebo_cli.recordings.load import Recording, load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
@@ -47,15 +47,18 @@ class Source:
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
 
-def simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) -> Source:
-    """Signals of the plant.
+def simulated(
+    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None
+) -> Source:
+    """Signals of the plant, for an observer that runs at ``samples`` or in continuous time.
 
     Raises:
         ConfigError: an impulse that an observer cannot be driven by.
         ModelError: the plant cannot be simulated.
         SolverError: a tolerance cannot be reached.
     """
-    t = _grid(settings, settings.time.start, settings.time.start + settings.time.horizon)
+    start = settings.time.start
+    t = _grid(settings, samples, start, start + settings.time.horizon)
     simulation = simulation_of(system, settings.time, settings.solver)
     measured = measure(simulation.signals, settings.noise, levels)
     simulated = _sample_simulation(system, simulation, t)
@@ -78,14 +81,16 @@ def simulated(settings: Settings, system: DescriptorSystem, levels: NoiseLevels)
     )
 
 
-def recorded(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) -> Source:  # noqa: ARG001  a source like the other
+def recorded(
+    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None  # noqa: ARG001  a source like the other
+) -> Source:
     """Signals of a recording; nobody knows what θ was when it was made.
 
     Raises:
         ConfigError: the file is wrong, or does not reach as far as it should.
     """
     recording = load(system, settings.data, settings.time, settings.solver.tol)
-    t = _grid(settings, *recording.span)
+    t = _grid(settings, samples, *recording.span)
     return Source(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
@@ -148,9 +153,8 @@ def check_stream(settings: Settings, system: DescriptorSystem) -> None:
         )
 
 
-def _grid(settings: Settings, start: float, stop: float) -> Array:
+def _grid(settings: Settings, samples: Sampling | None, start: float, stop: float) -> Array:
     """The output grid (N,): evenly spaced; of an observer at samples, some of those."""
-    samples = sampling(build(settings.observer))
     if samples is None:
         return np.linspace(start, stop, settings.time.samples)
     t = sample_times(samples.step, start, stop)

@@ -19,7 +19,6 @@ import numpy as np
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import largest_within
 from gpebo_cli.numerics.mesh import SHARE, Mesh, used_coefficients
 from gpebo_cli.numerics.problem import LinearProblem
 
@@ -60,9 +59,11 @@ def estimated_errors(
     K, points, n, columns = values.shape
     rule, used, width = mesh.rule, used_coefficients(mesh.rule), 2 * _SIGNS * columns
     with np.errstate(over="ignore", invalid="ignore"):
-        sizes = largest_within(values)
+        turned = np.ascontiguousarray(np.swapaxes(values, 0, 1))
+        sizes = np.abs(turned).max(axis=0)
         size = np.maximum(sizes, _TINY)
-        shown = np.abs(np.tensordot(rule.to_legendre[-4:], values, axes=(1, 1)))
+        shown = np.abs(rule.to_legendre[-4:] @ turned.reshape(points, -1))
+        shown = shown.reshape(-1, K, n, columns)
         to_next = points / np.arange(points - used, points)  # (ρ^j)^this = ρ^(s + 1)
         shares = np.minimum(shown[-used:] / size, 1.0) ** to_next[:, None, None, None]
         share = shares.max(axis=0)

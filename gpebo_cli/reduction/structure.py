@@ -384,10 +384,8 @@ def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
     A dip is a local minimum far below the column's maximum, given as its column and its place;
     the deepest of each column come first. There is none in columns that are not finite.
     """
-    if (smallest.min(axis=0) >= _DIP * smallest.max(axis=0)).all():
-        return True, []
     steady, dips = True, []
-    for column in range(3):
+    for column in (smallest.min(axis=0) < _DIP * smallest.max(axis=0)).nonzero()[0].tolist():
         values = smallest[:, column]
         if not np.isfinite(values).all():
             continue
