@@ -324,15 +324,18 @@ def _estimate(
         found, parameters[part], estimated[part] = evaluate(eta)
         numbers[:, part] = found[: len(numbers)]
         share(part.stop / size)
+    checks = state_map.checks(kept, estimated)
+    parameters[..., np.isnan(told[0])] = np.nan
+    estimated[..., np.isnan(told[1])] = np.nan
     result = EstimationResult(
         cases=cases,
         t=kept,
         names=observation.parameters,
-        parameters=parameters * told[0],
+        parameters=parameters,
         true_parameters=truth[chosen],
-        states=estimated * told[1],
+        states=estimated,
         delta=estimates.delta(kept),
-        checks=state_map.checks(kept, estimated),
+        checks=checks,
         requirement=estimates.requirement,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
     )
@@ -472,22 +475,26 @@ def _evaluation(
 
     def errors(eta: Array, at: IntArray) -> Array:
         """Of η̂ and x̂ (g, p + n) at one time for each quantity of each case, indices ``at``."""
-        case = np.arange(len(eta))[:, None]
-        of_eta = eta[case, at[:, :p], np.arange(p)] - truth[at[:, :p], np.arange(p)]
-        m, i = at[:, p:], np.arange(at.shape[1] - p)
-        x_hat = offset[m, i] + (gain[m, i] * eta[case, m]).sum(axis=2)
-        return np.concatenate([of_eta, x_hat - x[m, i]], axis=1)
+        place = len(grid) * np.arange(len(eta))[:, None] + at  # in all cases, one after the other
+        j, m, i = np.arange(p), at[:, p:], np.arange(at.shape[1] - p)
+        of_eta = eta.ravel().take(place[:, :p] * p + j) - truth[at[:, :p], j]
+        gains = gain.reshape(-1, p).take(m * len(i) + i, axis=0)
+        seen = np.einsum("gip,gip->gi", gains, eta.reshape(-1, p).take(place[:, p:], axis=0))
+        return np.concatenate([of_eta, offset[m, i] + seen - x[m, i]], axis=1)
+
+    def errors_at(eta: Array, k: int) -> list[Array]:
+        """Of η̂ (g, p) and x̂ (g, n) at one time."""
+        return [eta[:, k] - truth[k], offset[k] + eta[:, k] @ gain[k].T - x[k]]
 
     def evaluate_affine(eta: Array) -> tuple[Array, Array, Array]:
         """The norms, with x̂ only where it is needed: on the grid its errors are numbers."""
         eta = np.asarray(eta, dtype=np.float64)
-        of_eta = eta[:, -1] - truth[-1]
-        of_x = offset[-1] + eta[:, -1] @ gain[-1].T - x[-1]
+        of_eta, of_x = errors_at(eta, -1)
         in_eta = _weights(sizes[0], judged & ~np.isnan(of_eta[0]))
         in_x = _weights(sizes[1], ~np.isnan(of_x[0]))
         level = None
         if each:
-            level = levels(errors(eta, np.zeros((len(eta), len(size)), dtype=np.intp)), size)
+            level = levels(np.concatenate(errors_at(eta, 0), axis=1), size)
         *squares, last = kernels.laws.squared_errors(
             eta, truth, in_eta, offset, gain, x, in_x, level
         )
