@@ -62,13 +62,13 @@ def interpolation(
     """
     element = edges[1:-1].searchsorted(belongs, side="right")
     left = edges[element]
-    distance = ((t - left) / (edges[element + 1] - left))[:, None] - places
-    row, point = (np.abs(distance) < exact).nonzero()
-    distance[row, point] = 1.0
-    weights = barycentric / distance
+    distance = (t - left) / (edges[element + 1] - left) - places[:, None]
+    point, row = (np.abs(distance) < exact).nonzero()
+    distance[point, row] = 1.0
+    weights = barycentric[:, None] / distance  # of all times in a row: that is fast
+    weights = np.ascontiguousarray((weights / weights.sum(axis=0)).T)
     weights[row] = 0.0
     weights[row, point] = 1.0
-    weights /= (weights @ np.ones(len(places)))[:, None]
     return element, weights
 
 

@@ -170,6 +170,8 @@ def _determined(found: Observation, system: DescriptorSystem, solver: SolverSett
     known = knowledge(
         regression.gram.final[None], scale[-1:], np.array([stop - start]), solver.tol
     )
+    if known.parameters.all():
+        return system.q + system.n
     seen = known.states(state_map.gain(np.linspace(start, stop, 11)), state_map.units)[-1]
     return int(known.parameters[0, : system.q].sum() + seen.sum())
 
