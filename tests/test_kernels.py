@@ -105,12 +105,11 @@ def _samples(rng, k=6, points=5, c=4, count=50):
     return rng.integers(0, k, count), weights, values
 
 
-def _filtered(rng, k=6, s=5):
-    rates = np.array([0.1, 3.0, 0.1, 1e6])
-    return (
-        radau_rule(s).differentiation, rng.uniform(0.1, 1.0, size=k),
-        rng.normal(size=(k, s + 1, 4)), rates, rng.normal(size=4),
-    )
+def _places(rng, k=6, s=5, count=50):
+    rule, edges = radau_rule(s), np.cumsum(rng.uniform(0.1, 1.0, size=k + 1))
+    at_points = (edges[:-1, None] + np.diff(edges)[:, None] * rule.points).ravel()
+    t = np.concatenate([rng.uniform(edges[0] - 0.1, edges[-1] + 0.1, count), at_points])
+    return edges, rule.points, rule.barycentric, t, t + rng.choice([0.0, 0.01], len(t)), 4.0 * EPS
 
 
 def _model(rng, times=19, n=3, constant=False):
@@ -213,7 +212,8 @@ CASES: list[tuple[str, str, Case]] = [
     ("signals", "tails", partial(_signal, least=True)),
     ("signals", "sample", _samples),
     ("signals", "sample", partial(_samples, c=33)),
-    ("signals", "low_pass", _filtered),
+    ("signals", "interpolation", _places),
+    ("signals", "interpolation", partial(_places, k=1, s=2)),
     ("laws", "eigenvalues", _symmetric),
     ("laws", "eigenvalues", partial(_symmetric, p=9, c=0)),
     ("laws", "eigenvalues", partial(_symmetric, count=1, p=1)),
@@ -304,8 +304,8 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("tails", partial(_signal, least=True), 6, np.s_[:-1]),
     ("sample", _samples, 1, np.s_[:-1]),
     ("sample", _samples, 2, np.s_[:2]),
-    ("low_pass", _filtered, 1, np.s_[:-1]),
-    ("low_pass", _filtered, 3, np.s_[:-1]),
+    ("interpolation", _places, 2, np.s_[:-1]),
+    ("interpolation", _places, 4, np.s_[:-1]),
     *(("bounds", _bounds, place, np.s_[:-1]) for place in (2, 3, 6, 7, 9)),
     ("levels", _levels, 1, np.s_[:, :, :, :-1]),
     ("levels", _levels, 0, np.s_[:1]),

@@ -1,4 +1,4 @@
-/* How well a mesh resolves signals, sampling, filters; see signals_numpy.py. */
+/* How well a mesh resolves signals, sampling; see signals_numpy.py. */
 #include "elements.h"
 
 /* The largest of the last coefficients of each element, to the power that makes of degree j one of
@@ -77,65 +77,43 @@ static Outcome sample(Call *call)
     return DONE;
 }
 
-/* The columns `chosen` of Z, which share a rate, from `state` on through all elements; W holds
-   s row_length(s, 1 + count) numbers. 0 if a system is singular. */
-static int filter(const Call *call, const npy_intp *chosen, npy_intp count, double *state,
-                  double *W)
+/* The weights (points,) at a place in an element; nearer than `exact` to a point, its value is taken. */
+static void weigh(double *weights, double place, const double *places, const double *barycentric,
+                  npy_intp points, double exact)
 {
-    const npy_intp K = SIZE(K), s = SIZE(s), c = SIZE(c), length = row_length(s, 1 + count);
-    const double *D = call->in[0];
-    for (npy_intp k = 0; k < K; k++) {
-        const double hl = call->in[3][chosen[0]] * call->in[1][k];
-        const double *values = call->in[2] + k * (s + 1) * c;
-        double *out = call->out[0] + k * (s + 1) * c;
-        memset(W, 0, s * length * sizeof(double));
-        for (npy_intp i = 0; i < s; i++) {
-            double *row = W + i * length;
-            for (npy_intp j = 0; j < s; j++) {
-                row[j] = D[i * s + j];
-                row[s] += D[i * s + j]; /* the response to the left end */
-            }
-            row[i] += hl;
-            for (npy_intp b = 0; b < count; b++)
-                row[s + 1 + b] = hl * values[(i + 1) * c + chosen[b]];
-        }
-        if (!eliminate(W, s, 1 + count))
-            return 0;
-        for (npy_intp b = 0; b < count; b++) {
-            out[chosen[b]] = state[b];
-            for (npy_intp i = 0; i < s; i++)
-                out[(i + 1) * c + chosen[b]] =
-                    W[i * length + s] * state[b] + W[i * length + s + 1 + b];
-            state[b] = out[s * c + chosen[b]];
-        }
+    npy_intp hit = -1;
+    double sum = 0.0;
+    for (npy_intp j = 0; j < points; j++) {
+        const double distance = place - places[j];
+        if (fabs(distance) < exact)
+            hit = j;
+        else
+            sum += weights[j] = barycentric[j] / distance;
     }
-    return 1;
+    for (npy_intp j = 0; j < points; j++)
+        weights[j] = hit < 0 ? weights[j] / sum : j == hit;
 }
 
-/* D, steps, values, rates (c,), start -> Z of Z' = −λ (Z − S); columns that share a rate share a
-   factorisation. */
-static Outcome low_pass(Call *call)
+/* Edges of elements, places of their points, barycentric weights, times, times that decide about
+   the element, what is near enough -> elements (N,) and weights (N, points). */
+static Outcome interpolation(Call *call)
 {
-    const npy_intp s = SIZE(s), c = SIZE(c);
-    const double *rates = call->in[3];
-    double *W = scratch(call, s * row_length(s, 1 + c) + c);
-    npy_intp *chosen = W ? scratch_indices(call, c) : NULL;
-    if (chosen == NULL)
-        return ERROR;
-    double *state = W + s * row_length(s, 1 + c);
-    for (npy_intp first = 0; first < c; first++) {
-        npy_intp count = 0, before = 0;
-        for (; before < first && rates[before] != rates[first]; before++)
-            continue;
-        if (before < first)
-            continue;
-        for (npy_intp b = first; b < c; b++)
-            if (b == first || rates[b] == rates[first]) {
-                state[count] = call->in[4][b];
-                chosen[count++] = b;
-            }
-        if (!filter(call, chosen, count, state, W))
-            return DECLINED;
+    const npy_intp K = SIZE(K), t = SIZE(t);
+    const double *edges = call->in[0];
+    if (K < 1)
+        return refused("elements", K);
+    for (npy_intp i = 0; i < SIZE(N); i++) {
+        npy_intp low = 0, high = K - 1;
+        while (low < high) {
+            const npy_intp middle = (low + high) / 2;
+            if (edges[middle + 1] > call->in[4][i])
+                high = middle;
+            else
+                low = middle + 1;
+        }
+        const double place = (call->in[3][i] - edges[low]) / (edges[low + 1] - edges[low]);
+        call->index_out[0][i] = low;
+        weigh(call->out[1] + i * t, place, call->in[1], call->in[2], t, call->number[5]);
     }
     return DONE;
 }
@@ -143,6 +121,6 @@ static Outcome low_pass(Call *call)
 const Kernel signal_kernels[] = {
     {"tails", "Ktc tt %u # # # |c", "K", tails},
     {"sample", "@N Nt Ktc", "Nc", sample},
-    {"low_pass", "ss K Ks+c c c", "Ks+c", low_pass},
+    {"interpolation", "K+ t t N N #", "@N Nt", interpolation},
     {NULL, NULL, NULL, NULL},
 };

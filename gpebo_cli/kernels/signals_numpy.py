@@ -1,4 +1,4 @@
-"""Signals on a mesh: whether it resolves them, interpolation, filters."""
+"""Signals on a mesh: whether it resolves them, and interpolation."""
 
 from __future__ import annotations
 
@@ -79,35 +79,4 @@ def sample(element: IntArray, weights: Array, values: Array) -> Array:
     for i in range(0, len(out), chunk):
         part = slice(i, i + chunk)
         out[part] = np.matmul(weights[part, None, :], values[element[part]])[:, 0]
-    return out
-
-
-def low_pass(D: Array, steps: Array, values: Array, rates: Array, start: Array) -> Array:
-    """Z (K, s + 1, c) of Z' = −λ (Z − S), one rate λ for each column of S.
-
-    Args:
-        D: the differentiation matrix of the rule (s, s).
-        steps: lengths of the elements (K,).
-        values: S (K, s + 1, c).
-        rates: λ (c,).
-        start: Z at the start (c,).
-
-    Raises:
-        LinAlgError: a system is singular.
-    """
-    out = np.empty_like(values)
-    s = len(D)
-    for rate in np.unique(rates):
-        columns = np.flatnonzero(rates == rate)
-        hl = rate * steps[:, None, None]
-        right = np.empty((len(steps), s, 1 + len(columns)))
-        right[..., 0] = D.sum(axis=1)  # the response to the left end
-        right[..., 1:] = hl * values[:, 1:, columns]
-        solved = np.linalg.solve(D + hl * np.eye(s), right)
-        state = start[columns]
-        for k, element in enumerate(solved):
-            out[k, 0, columns] = state
-            inner = element[:, :1] * state + element[:, 1:]
-            out[k, 1:, columns] = inner.T
-            state = inner[-1]
     return out

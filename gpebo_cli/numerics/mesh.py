@@ -11,8 +11,7 @@ from math import prod
 import numpy as np
 from numpy.polynomial import legendre
 
-from gpebo_cli.kernels import signals
-from gpebo_cli.kernels.signals_numpy import interpolation
+from gpebo_cli.kernels import elements, signals
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.radau import RadauRule
 
@@ -156,7 +155,7 @@ class Mesh:
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
         rule = self.rule
         belongs = t + _SNAP * np.abs(t) if inside is None else inside
-        return Sampler(*interpolation(
+        return Sampler(*signals.interpolation(
             self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
         ))
 
@@ -280,9 +279,15 @@ class Trajectory:
         shape = self.values.shape[2:]
         rates = np.broadcast_to(np.asarray(rate, dtype=np.float64), shape).ravel()
         at_start = np.zeros(len(rates)) if start is None else start.ravel()
-        filtered = signals.low_pass(
-            rule.differentiation, mesh.steps, _flat(self.values), rates, at_start
-        )
+        values, own = _flat(self.values), np.arange(mesh.size)
+        filtered = np.empty(values.shape)
+        for one in sorted({*rates.tolist()}):
+            some = (rates == one).nonzero()[0]
+            maps = elements.element_maps(
+                rule.differentiation, mesh.steps, None, np.full((1, 1, 1), -one),
+                (one * values[..., some]).reshape(-1, 1, len(some)), None, None, own, len(own),
+            )
+            filtered[..., some] = elements.chain(*maps, at_start[None, some])[0][:, :, 0]
         return Trajectory(mesh, filtered.reshape(self.values.shape))
 
 
