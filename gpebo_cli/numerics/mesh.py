@@ -13,6 +13,7 @@ from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import elements, signals
 from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.numerics.linalg import largest_within
 from gpebo_cli.numerics.radau import RadauRule
 
 # Functions that jump are decided this far (relative to the element) inside its ends, so that both
@@ -123,7 +124,7 @@ class Mesh:
             seen = values[together].reshape(len(first), len(back), values.shape[2])
             change = np.abs(back @ (there @ seen) - seen)
             change = change.reshape(*together.shape, len(there), values.shape[2])
-            fits = (change <= allowed[together]).all(axis=(1, 2, 3))
+            fits = (change <= allowed[together]).reshape(len(first), -1).all(axis=1)
             stays[together[fits, 1:]] = False
             free[together[fits]] = False
         return self if stays.all() else Mesh(self.edges[stays], self.rule)
@@ -353,7 +354,7 @@ def _scale_so_far(values: Array, counts: IntArray) -> Array:
     Also floored at a share of the final size, so that the foot of a pulse costs nothing. Components
     of one kind, ``counts`` of them, stand together and share a floor.
     """
-    size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
+    size = np.maximum.accumulate(largest_within(values), axis=0)
     size = np.maximum(size, _FOOT * size[-1])
     level = SHARE * np.maximum.reduceat(size, np.cumsum(counts) - counts, axis=1)
     return np.asarray(np.maximum(size, np.repeat(np.maximum(level, _TINY), counts, axis=1)))
