@@ -14,7 +14,9 @@ import tempfile
 from pathlib import Path
 
 DOCS = Path(__file__).parent
-PAGES = ("tutorial", "tutorial_recording", "tutorial_estimator", "tutorial_paper")
+PAGES = (
+    "tutorial", "tutorial_recording", "tutorial_estimator", "tutorial_paper", "howto/mechanism",
+)
 _BLOCK = re.compile(
     r'^```(sh|python|diff)(?: title="([^"]*)")?\n(.*?)^```', re.MULTILINE | re.DOTALL
 )
@@ -47,7 +49,7 @@ def _edit(file: str, diff: str) -> str:
 
 def figures(text: str) -> dict[str, tuple[str, str]]:
     """By the name of a figure on a page the folder of the run, and its name there."""
-    found = re.findall(r"\(img/tutorial/((\w+)-(\w+)\.png)\)", text)
+    found = re.findall(r"\((?:\.\./)?img/tutorial/((\w+)-(\w+)\.png)\)", text)
     return {name: (run, f"{figure}.png") for name, run, figure in found}
 
 

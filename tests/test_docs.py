@@ -85,6 +85,7 @@ def test_a_tutorial_runs_as_it_stands(page, tmp_path):
         words = body.replace("python -m pytest", f"{shlex.quote(sys.executable)} -m pytest")
         said += {"sh": shell, "python": python, "text": lambda *_: ""}[kind](words, tmp_path)
     for shown in re.findall(r"^```text\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        assert not page.startswith("howto/") or shown in said
         for line in shown.splitlines()[1:]:
             if "gpebo: error" in line or "FAILS" in line or "exit code" in line:
                 assert line in said
@@ -138,12 +139,6 @@ def test_the_plant_page_runs(tmp_path):
     (tmp_path / "plant" / "heater.yaml").write_text(plant)
     (source,) = blocks(text, "python")
     (shown,) = blocks(text, "text")
-    assert python(source, tmp_path) == shown
-
-
-def test_the_mechanism_page_runs(tmp_path):
-    text = (ROOT / "docs" / "howto" / "mechanism.md").read_text()
-    (source,), (shown,) = blocks(text, "python"), blocks(text, "text")
     assert python(source, tmp_path) == shown
 
 

@@ -18,6 +18,8 @@ from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.sensors import candidates
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.results import style
+from gpebo_cli.results.figures import describe
 from gpebo_cli.settings import Settings, TimeSettings
 
 
@@ -97,6 +99,18 @@ def test_a_run_goes_on_without_what_is_not_determined(half_seen):
     rows = list(csv.DictReader((half_seen / "out" / "cases.csv").read_text().splitlines()))
     times = {name: rows[0][f"seconds_to_1pct_{name}"] for name in SEEN | UNSEEN}
     assert {name for name, time in times.items() if time} == SEEN
+
+
+def test_what_is_not_determined_is_dashed_in_the_figures():
+    result = run(yaml.safe_load(HALF_SEEN)).details
+    described = describe(result, ["estimates_a", "parameters"])
+    panels = [panel for found in described.values() for panel in found]
+    assert {panel.name for panel in panels} == SEEN | UNSEEN
+    for panel in panels:
+        drawn = {curve.label for curve in panel.curves if np.isfinite(curve.y).any()}
+        dashed = any(curve.style is style.UNKNOWN for curve in panel.curves)
+        assert dashed == (panel.name in UNSEEN)
+        assert ("ls_drem" in drawn) == (panel.name in SEEN)
 
 
 def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):

@@ -104,7 +104,9 @@ def parameters(result: RunResult) -> list[Panel]:
     for i, name in enumerate(estimation.names):
         if varies and name not in result.system.unknowns:
             continue
-        curve = Curve(estimation.t, truth[:, i], "true", style.VARYING if varies else style.TRUTH)
+        curve = _truth(result, name, estimation.t, truth[:, i])
+        if varies and _known_by_data(result, name):
+            curve = replace(curve, style=style.VARYING)
         panels.append(
             _estimate(result, name, estimation.parameters[:, :, i], curve, behind=not varies)
         )
@@ -545,12 +547,28 @@ def _state_estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
     estimation, signals = result.estimation, result.signals
     if estimation is None:
         return []
-    panels = [
-        _estimate(result, result.system.states[i], estimation.states[:, :, i],
-                  Curve(signals.t, signals.states[:, i], "true", style.TRUTH))
-        for i in _seen(result, members)
-    ]
+    seen, panels = _seen(result, members), []
+    for i in members:
+        name = result.system.states[i]
+        truth = _truth(result, name, signals.t, signals.states[:, i])
+        if i in seen:
+            panels.append(_estimate(result, name, estimation.states[:, :, i], truth))
+        elif not _known_by_data(result, name) and np.isfinite(truth.y).any():
+            panels.append(Panel(name, (truth,), _unit(result, name),
+                                typeset(name, result.system.labels), legend=True))
     return _with_legend(panels, _note(estimation))
+
+
+def _known_by_data(result: RunResult, name: str) -> bool:
+    """Whether the data determine a parameter or state, where that has been found out."""
+    return result.estimable.get(name, 0.0) is not None
+
+
+def _truth(result: RunResult, name: str, t: Array, values: Array) -> Curve:
+    """The truth (M,) at the times t (M,), dashed where the data do not determine it."""
+    if _known_by_data(result, name):
+        return Curve(t, values, "true", style.TRUTH)
+    return Curve(t, values, "true, not determined by the data", style.UNKNOWN)
 
 
 def _estimate_limits(truth: Array, guesses: Array) -> tuple[float, float] | None:

@@ -174,6 +174,7 @@ MEASURED = Line("#9A9A9A", (), 0.5)  # thin and pale: noise fills an area
 RESIDUAL = Line("#D55E00", (), 0.5)  # thin: noise, whose dashes would be its own
 VARYING = Line("#000000", (4, 2), 0.9)  # a truth that varies, over what follows it
 SPREAD = Line("#0072B2", (2.0, 1.5), 0.8)  # what an estimator says of its own error
+UNKNOWN = Line("#777777", (4, 2), 1.1)  # the truth of what the data do not determine
 LIMIT = Line("#000000", (1.0, 1.5), 0.9)  # a level
 INSTANT = Line("#777777", (), 0.8)  # a time
 
