@@ -36,7 +36,7 @@ STRANGE = [None, "x", [], {}, [[]], [["t"], ["t", "t"]], {"a": {"b": 1}}, "\x00"
            10**400]
 CHOICES = {
     "estimator": ["drem", "gradient", "least_squares", "ls_drem", "lion", "fct", "mre", "power",
-                  "exciting", "instrumental", "annihilator", "no"],
+                  "exciting", "instrumental", "annihilator", "monotone", "no"],
     "observer": ["gpebo", "canonical", "kalman_bucy", "none", "no"],
     "solver": ["collocation", "ivp", "no"],
     "noise": ["none", "gaussian", "no"],

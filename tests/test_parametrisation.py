@@ -123,9 +123,27 @@ def test_mistakes(change, message):
     assert message in str(error.value)
 
 
-def test_at_samples_it_is_refused():
-    with pytest.raises(ConfigError, match="S works in continuous time only"):
-        run(regression=TEXT, observer={"sample_time": 0.01}, estimator="least_squares")
+def test_at_samples_the_fit_is_that_of_the_sums_so_far():
+    noise = {"name": "gaussian", "outputs": 0.1, "sample_time": 0.05}
+    found = run(
+        regression=TEXT, observer={"sample_time": 0.05, "hold": "linear"}, noise=noise,
+        estimator={"name": "least_squares", "f0": [1e-12, 1e-9]}, time={"horizon": 10},
+    )
+    p = regression_from_mapping(TEXT).parametrisation
+    rows = np.column_stack([np.sin(found.estimates_t), np.ones_like(found.estimates_t),
+                            np.cos(2 * found.estimates_t),
+                            np.sin(found.estimates_t) * np.cos(found.estimates_t)])
+    G = rows.T @ rows * 0.05  # near that of linear pieces
+    eta = np.array([found.estimates[f"eta_{k}"][:, -1] for k in range(1, 5)]).T
+    theta = np.array([found.estimates[name][:, -1] for name in ("a", "b")]).T
+    np.testing.assert_allclose(p.fitted(eta, np.array([G, G])), theta, atol=2e-3)
+    assert np.abs(theta - [2.0, 0.5]).max() < 0.1
+    # Deviations are those of continuous time, but for the hold.
+    held = run(regression=TEXT, noise=noise, time={"horizon": 10},
+               estimator={"name": "least_squares", "f0": 1e-12})
+    for name in ("a_std", "b_std"):
+        ours, other = (r.to_pandas("estimates")[name].iloc[-1] for r in (found, held))
+        assert ours == pytest.approx(other, rel=0.1)
 
 
 # The gradient of a monotone S ------------------------------------------------------------------

@@ -338,10 +338,11 @@ class SampledDeviations:
             observer: errors of [u; y] to those of Y and of the state's offset.
             cases: errors of Y to those of η̂.
             regression: at the samples.
-            gain: of x = offset + gain η, (K, n, p).
+            gain: of x = offset + gain η, (K, n, p), or of each case its own, (G, K, n, p).
             roots: S of all data so far, without forgetting, (K, p + 1, p + 1).
         """
-        count, n, p = gain.shape
+        count, n, p = gain.shape[-3:]
+        gains = np.broadcast_to(gain, (len(cases), count, n, p))
         k, rows, signals = observer.step.shape[1], observer.C.shape[1] - n, len(self._deviations)
         C, D = observer.C, observer.D
         before = (C[:1], D[:1]) if self._before is None else self._before
@@ -374,7 +375,7 @@ class SampledDeviations:
             L = self._recursion(g, M, fresh, slice(k, k + signals))
             eta = case.C @ L[:, k + signals :]
             own = eta[:, -p:]
-            x = gain @ own + C[:, rows:] @ L[:, :k] + D[:, rows:] @ L[:, k : k + signals]
+            x = gains[g] @ own + C[:, rows:] @ L[:, :k] + D[:, rows:] @ L[:, k : k + signals]
             out[g] = np.linalg.norm(np.concatenate([own, x], axis=1), axis=2)
             if g == 0 and self._relative:
                 of_Y = C[:, :rows] @ L[:, :k] + D[:, :rows] @ L[:, k : k + signals]

@@ -19,6 +19,7 @@ from gpebo_cli.experiment.result import Fit
 from gpebo_cli.experiment.uncertainty import MOST_CASES
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.observers.reduced.sampled import TOLERANCE
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
@@ -143,18 +144,22 @@ class Online:
         for k, holds in enumerate(reached):
             if self._t_c[k] is None and holds.any():
                 self._t_c[k] = float(t[np.argmax(holds)])
+        gain = block.gain
+        states = block.offset + np.einsum("knp,gkp->gkn", gain, made.parameters)
+        if block.fit is not None:
+            states, gain = block.fit(made.parameters, transpose(S) @ S)
         std, level = None, None
         if self._deviations is not None and block.errors is not None and made.errors is not None:
             std, level = self._deviations.update(
-                block.errors, made.errors(), block.regression, block.gain, roots[:, 0]
+                block.errors, made.errors(), block.regression, gain, roots[:, 0]
             )
-        gain = np.einsum("knp,gkp->gkn", block.gain, made.parameters)
         eigenvalues = sigma[:, ::-1] ** 2
         self._final = made.parameters[:, -1].copy()
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
-            block.regression, made.parameters, block.offset + gain, made.delta,
-            eigenvalues, known, known.states(block.gain, block.units), block.extension, std, level,
+            block.regression, made.parameters, states, made.delta, eigenvalues, known,
+            known.states(gain if gain.ndim == 3 else gain[0], block.units), block.extension,
+            std, level,
         )
 
     def truth(self, extension: Array) -> observers.Truth:

@@ -177,6 +177,10 @@ class Observation:
         return self.regression.parameters if self.names is None else self.names
 
 
+# (η̂ (g, K, p), G (K, p, p)) -> x̂ (g, K, n) and ∂x̂/∂η̂ (g, K, n, p)
+Fit = Callable[[Array, Array], tuple[Array, Array]]
+
+
 @dataclass(frozen=True, eq=False)
 class SampledBlock:
     """The regression at K samples, and how parameters give the state there."""
@@ -188,3 +192,4 @@ class SampledBlock:
     scale: Array  # (K, p) of the terms of each column of ψ so far
     errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset
     units: Array | None = None  # (n,) as of ``AffineStateMap``
+    fit: Fit | None = None  # where the state is not affine in η: instead of offset and gain

@@ -87,15 +87,9 @@ class Given:
         """The regression's recursion, whose first sample [u; y] (m + r,) is at ``start``.
 
         Raises:
-            ConfigError: the system is a plant, or has a parametrisation S.
+            ConfigError: the system is a plant.
         """
-        given = _text_of(system)
-        if given.parametrisation is not None:
-            raise ConfigError(
-                f"regression {system.name}: S works in continuous time only; at samples and in "
-                "streams estimate its entries"
-            )
-        return GivenAtSamples(given, hold)
+        return GivenAtSamples(_text_of(system), hold)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,13 +144,23 @@ class GivenAtSamples:
             ConfigError: an expression without a finite value; names it and the time.
         """
         state, regression, scale = advance(self.text, self.hold, state, t, u, y)
-        count, none = len(t), np.zeros((len(t), 0, len(self.parameters)))
+        count, S = len(t), self.text.parametrisation
+        none = np.zeros((count, self.text.system.n, len(self.parameters)))
         errors = None
         if self.text.Y is None:
             o = _errors_of_outputs(self.text.system, self.text.rows)(t, t)
             whole = (np.broadcast_to(part, (count, *part.shape[1:])) for part in (o.C, o.D))
             errors = ErrorSteps(np.zeros((count, 0, 2 * o.D.shape[2])), *whole)
-        return state, SampledBlock(regression, none[:, :, 0], none, none, scale, errors)
+
+        def fit(eta: Array, weight: Array) -> tuple[Array, Array]:
+            assert S is not None  # noqa: S101  else it is not called
+            theta = np.array([S.fitted(of_case, weight) for of_case in eta])
+            return theta, np.array([S.gain(of_case, weight) for of_case in theta])
+
+        return state, SampledBlock(
+            regression, none[:, :, 0], none, none[:, :0], scale, errors,
+            fit=None if S is None else fit,
+        )
 
     def assumptions(self, reached: TextState) -> tuple[Assumption, ...]:  # noqa: ARG002  protocol
         """None is made."""
