@@ -13,6 +13,7 @@ For β = 0, z = 1 and these are the Gram matrix and ∫ψᵀY: regularised batch
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -40,14 +41,50 @@ class Information:
         """[G_z | h_z] and z at the end."""
         return ExtensionState(self.gram.final, self.level, float(self.memory.final))
 
+    def at(self, t: Array, inside: Array | None = None) -> InformationAt:
+        """At the times t (M,)."""
+        sampler = self.gram.mesh.sampler(t, inside)
+        return InformationAt(sampler(self.gram.values), sampler(self.memory.values))
+
     def spectrum(self, t: Array, inside: Array | None = None) -> Spectrum:
         """G_z = V diag(λ) Vᵀ at the times t (M,)."""
-        sampler = self.gram.mesh.sampler(t, inside)
-        values = sampler(self.gram.values)
-        p = values.shape[-2]
-        eigenvalues, vectors = np.linalg.eigh(values[..., :p])
-        rotated = transpose(vectors) @ values[..., p:]
-        return Spectrum(np.maximum(eigenvalues, 0.0), vectors, rotated, sampler(self.memory.values))
+        return self.at(t, inside).spectrum
+
+
+@dataclass(frozen=True, eq=False)
+class InformationAt:
+    """G_z, h_z and z at M times."""
+
+    values: Array  # (M, p, p + c) [G_z | h_z]
+    memory: Array  # (M,)
+
+    @cached_property
+    def spectrum(self) -> Spectrum:
+        """G_z = V diag(λ) Vᵀ."""
+        p = self.values.shape[-2]
+        eigenvalues, vectors = np.linalg.eigh(self.values[..., :p])
+        rotated = transpose(vectors) @ self.values[..., p:]
+        return Spectrum(np.maximum(eigenvalues, 0.0), vectors, rotated, self.memory)
+
+    @cached_property
+    def smallest(self) -> float:
+        """The smallest eigenvalue of G_z at the last time."""
+        return max(float(np.linalg.eigvalsh(self.values[-1, :, : self.values.shape[1]])[0]), 0.0)
+
+    def solution(self, alpha: float, f0: float, start: Array) -> Array | None:
+        """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z), shape (M, p, c); None where that is singular.
+
+        Without the spectrum, which many gains share.
+        """
+        p = len(start)
+        weight = (self.memory * f0)[:, None, None]
+        right = weight * start[:, None] + alpha * self.values[..., p:]
+        try:
+            return np.asarray(
+                np.linalg.solve(weight * np.eye(p) + alpha * self.values[..., :p], right)
+            )
+        except np.linalg.LinAlgError:
+            return None
 
 
 @dataclass(frozen=True, eq=False)

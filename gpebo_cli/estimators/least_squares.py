@@ -10,7 +10,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._following import SolvedEstimates
-from gpebo_cli.estimators._information import Spectrum, information
+from gpebo_cli.estimators._information import InformationAt, Spectrum, information
 from gpebo_cli.estimators._recursive import InformationRoot, integrating, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
@@ -22,6 +22,9 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import number
+
+_FEW = 3  # gains, and
+_SMALL = 8  # parameters, from which on a few systems are solved instead of taking eigenvectors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,12 +66,12 @@ class LeastSquares(ResumableEstimator):
         """M, or None."""
         return None if self.bound is None else number(self.bound, "estimator.bound")
 
-    def spectra(
+    def known_at(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> list[tuple[Spectrum, ExtensionState]]:
-        """Of every case the spectrum of G_z at the times t (M,), and G_z at the end."""
+    ) -> list[tuple[InformationAt, ExtensionState]]:
+        """Of every case G_z, h_z and z at the times t (M,), and at the end."""
         bound = self.covariance_bound
-        made: dict[tuple[float, ...], tuple[Spectrum, ExtensionState]] = {}
+        made: dict[tuple[float, ...], tuple[InformationAt, ExtensionState]] = {}
         out = []
         for i, case in enumerate(self.cases):
             key: tuple[float, ...] = (case["beta"],)
@@ -79,7 +82,7 @@ class LeastSquares(ResumableEstimator):
                     regression, case["alpha"], case["f0"], case["beta"], bound,
                     known[i] if known else None,
                 )
-                made[key] = info.spectrum(t), info.reached
+                made[key] = info.at(t), info.reached
             out.append(made[key])
         return out
 
@@ -149,10 +152,10 @@ class LeastSquares(ResumableEstimator):
 
         After a reset the prior z f₀ I is about the new parameters, centred at the estimate there.
         """
-        found = self.spectra(regression, t, known)
+        found = self.known_at(regression, t, known)
         return LeastSquaresEstimates(
             self.cases,
-            [spectrum for spectrum, _ in found],
+            [information for information, _ in found],
             self.start(regression.parameters),
             tuple(reached for _, reached in found),
             regression.realisations,
@@ -164,7 +167,7 @@ class LeastSquaresEstimates:
     """The regularised solution of every case."""
 
     cases: tuple[Mapping[str, float], ...]
-    spectra: list[Spectrum]
+    known: list[InformationAt]
     start: Array  # (p,)
     reached: tuple[ExtensionState, ...]  # of each case
     realisations: tuple[int, ...] = ()
@@ -177,30 +180,33 @@ class LeastSquaresEstimates:
     def requirement(self) -> Requirement:
         """α λ_min(G)/f₀ at the horizon: the slowest direction's error has shrunk by 1 + that."""
         ratios = [
-            case["alpha"] * float(s.eigenvalues[-1, 0]) / (case["f0"] * float(s.memory[-1]))
-            if s.memory[-1] > 0
+            case["alpha"] * own.smallest / (case["f0"] * float(own.memory[-1]))
+            if own.memory[-1] > 0
             else np.inf
-            for case, s in zip(self.cases, self.spectra, strict=True)
+            for case, own in zip(self.cases, self.known, strict=True)
         ]
         return ratio_requirement(float(min(ratios)))
 
     def weights(self, case: int) -> Array:
         """z f₀I + αG_z (M, p, p)."""
-        s, gains = self.spectra[case], self.cases[case]
+        s, gains = self.known[case].spectrum, self.cases[case]
         values = s.memory[:, None] * gains["f0"] + gains["alpha"] * s.eigenvalues
         return np.asarray((s.vectors * values[:, None]) @ transpose(s.vectors))
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
-        chosen, spectra = self.cases[cases], self.spectra[cases]
+        chosen, known = self.cases[cases], self.known[cases]
         starts = np.broadcast_to(
             self.start if start is None else start, (len(chosen), len(self.start))
         )
-        eta = np.array([
-            solution(spectrum, case["alpha"], case["f0"], own)
-            for case, spectrum, own in zip(chosen, spectra, starts, strict=True)
-        ])
-        return eta.reshape(*eta.shape[:3], *self.realisations)
+        few = len(self.cases) <= _FEW and len(self.start) > _SMALL
+        eta = []
+        for case, at, own in zip(chosen, known, starts, strict=True):
+            gains = case["alpha"], case["f0"], own
+            solved = at.solution(*gains) if few else None
+            eta.append(solution(at.spectrum, *gains) if solved is None else solved)
+        found = np.array(eta)
+        return found.reshape(*found.shape[:3], *self.realisations)
 
 
 def ratio_requirement(reached: float) -> Requirement:

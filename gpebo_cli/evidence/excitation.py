@@ -264,11 +264,19 @@ def between(signal: Trajectory, a: Array, b: Array) -> Array:
 
 def _window_sums(signal: Trajectory, start: Sampler, stop: Sampler, columns: int) -> Array:
     """:func:`between` of the first columns, with the times where these samplers look."""
-    mesh = signal.mesh
-    within = Trajectory(mesh, signal.values[..., :columns]).local_integral().values
-    totals = within[:, -1]
-    head = start(within)  # from the left end of a's element to a
-    tail = stop(within)
+    mesh, R = signal.mesh, signal.mesh.rule.integration
+    totals = mesh.steps[:, None, None] * np.tensordot(
+        signal.values[:, 1:], R[-1], axes=(1, 0)
+    )
+
+    def within(places: Sampler) -> Array:
+        """From the left ends of elements to places in them."""
+        weights = np.zeros_like(places.weights)
+        weights[:, 1:] = mesh.steps[places.element, None] * (places.weights[:, 1:] @ R)
+        found: Array = Sampler(places.element, weights)(signal.values)
+        return found[..., :columns]
+
+    totals, head, tail = totals[..., :columns], within(start), within(stop)
     # Sums of totals[first:last] for every window: pairs of indices to reduceat.
     padded = np.concatenate([totals, np.zeros_like(totals[:1])])
     pairs = np.stack([start.element, stop.element], axis=1).ravel().astype(np.intp)

@@ -77,7 +77,7 @@ class Knowledge:
         kernel, slack = self._kernel
         return np.asarray(_row_norms(kernel) <= slack[:, None])
 
-    @property
+    @cached_property
     def independent(self) -> IntArray:
         """Parameters that can be estimated together at the last time, the determined ones included.
 

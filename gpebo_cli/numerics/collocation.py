@@ -274,7 +274,7 @@ def _solve_elements(
     groups = int(group.max(initial=-1)) + 1
     solve = elements.element_maps
     if _is_constant(c) and s * c.A.shape[1] > _DIRECT:
-        solve = _decoupled_maps
+        solve = decoupled_maps
     try:
         homogeneous, particular = solve(
             rule.differentiation, h, c.E, c.A, c.f, basis, offset, group, groups
@@ -343,7 +343,7 @@ def equal_lengths(h: Array) -> IntArray:
     return np.asarray(np.argsort(np.argsort(first))[by_length])
 
 
-def _decoupled_maps(
+def decoupled_maps(
     D: Array, h: Array, E: Array | None, A: Array, f: Array, basis: Array | None,
     offset: Array | None, group: IntArray, groups: int,
 ) -> tuple[Array, Array]:

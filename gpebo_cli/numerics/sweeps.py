@@ -23,6 +23,7 @@ from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.collocation import (
     LinearSolution,
     at_points,
+    decoupled_maps,
     equal_lengths,
     unresolved_signals,
 )
@@ -41,6 +42,8 @@ _SPARSE = 0.1  # share of entries, up to which factors are sparse
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
 _TINY = float(np.finfo(float).tiny)
 _FEW_COLUMNS = 4  # whose errors are carried one by one
+_MANY_COLUMNS = 8  # from which on maps of elements that are alike cost less than sweeps, and
+_MANY_ALIKE = 4  # how many elements of one length that takes
 
 March = Callable[..., tuple[Array, Array]]  # as elements.sweeps
 
@@ -143,7 +146,11 @@ def solve(
 
     def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
         A, f, extras = equation(mesh)
-        values, change = _swept(march, A, f, problem, mesh, units, tol, restarts or {})
+        mapped = not stiff and len(A.entries) == 1 and problem.start.shape[1] > _MANY_COLUMNS
+        mapped = mapped and _MANY_ALIKE * equal_lengths(mesh.steps).max() < mesh.size
+        values, change = _swept(
+            _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {}
+        )
         made_of, moved = _terms(A, f, mesh, values)
         found = _Found(A, values, change, made_of, moved, extras)
         return found, unresolved_signals(
@@ -207,6 +214,28 @@ class _Found(NamedTuple):
     made_of: Array  # (K, d, c) sizes of what right ends are the sum of
     moved: Array  # (K, d, c) what rounding of the equation's terms moves
     extras: tuple[Array, ...]
+
+
+def _mapped(
+    R: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array,
+    kicks: Array | None, start: Array, *_: object,
+) -> tuple[Array, Array]:
+    """As ``elements.sweeps`` for one constant A and many columns, by maps of elements."""
+    s, (d, c), group = len(R), start.shape, equal_lengths(h)
+    first = slice(0, f.shape[2])
+    h = (np.bincount(group, weights=h) / np.bincount(group))[group]
+    D = np.asarray(np.linalg.inv(R), dtype=np.float64)
+    full = Sparse(rows, columns, entries).full()[None]
+    maps, forced = decoupled_maps(
+        D, h, None, full, f, None, None, group, int(group.max()) + 1
+    )
+    values, state = np.empty((len(h), s + 1, d, c)), start
+    for k, X in enumerate(values):
+        X[0] = state
+        np.matmul(maps[group[k]], state, out=X[1:])
+        X[1:, :, first] += forced[k]
+        state = X[-1] if kicks is None else X[-1] + kicks[k]
+    return values, np.zeros(len(h))
 
 
 class _Solved:

@@ -23,6 +23,8 @@ from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.settings import SolverSettings
 
+_GROWN = 2.0  # the largest entry of Φ, from which on A_0 counts as unstable
+_SOUND = 1e-8  # relative singular values that are surely not zero
 _NOTE = "; observer on the strangeness-free form, {}"
 
 
@@ -91,12 +93,14 @@ class Gpebo:
         known, everything = -1, system.q + system.n
         try:
             found = self._on("auto", *arguments)
-            known = everything if found.note else _determined(found, system, solver)
+            if not found.note and not _same_on_both_forms(found, system, signals):
+                known = _determined(found, system, solver)
+            else:
+                known = everything
             why = "which determines more than the equations as given"
         except SolverError as error:
             found, why = error, "for as given its signals are not resolved"
         if known < everything:
-            # On both forms the same can be known, but an unstable A_0 hides it.
             try:
                 other = self._on("strangeness_free", *arguments, _NOTE.format(why))
                 if _determined(other, system, solver) > known:
@@ -158,6 +162,24 @@ class Gpebo:
                 f"observer.remedy={name} works in continuous time only; at samples "
                 "(observer.sample_time, streams) there is none"
             )
+
+
+def _same_on_both_forms(
+    found: Observation, system: DescriptorSystem, signals: Measurements
+) -> bool:
+    """Whether the equations as given hide nothing: no hidden constraints, and Φ does not grow."""
+    if found.growth is None or found.growth > _GROWN or system.coefficients.signals:
+        return False
+    mesh = signals.mesh
+    c = system.coefficients.taylor(mesh.points[0, :1], 0, mesh.inside[0, :1])
+    U, sigma, V = np.linalg.svd(c.E[0, 0])
+    rank = int((sigma > _SOUND * sigma[0]).sum())
+    algebraic = U[:, rank:].T @ c.A[0, 0]  # of index 1 where it is regular on the kernel of E
+    size = np.linalg.norm(algebraic, axis=1, keepdims=True)
+    if not (size > 0.0).all():
+        return False
+    left = np.linalg.svd(algebraic / size @ V[rank:].T, compute_uv=False)
+    return bool(left.min(initial=1.0) > _SOUND)
 
 
 def _determined(found: Observation, system: DescriptorSystem, solver: SolverSettings) -> int:
