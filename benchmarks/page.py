@@ -27,9 +27,9 @@ def page(data: Data) -> str:
         "`python -m benchmarks circuit cold` measures some parts and keeps the others."),
         ("Ours and a peer run in turns in one process; seconds are medians, a ratio is the peer's "
         "over ours. Each solver gets the loosest tolerance whose measured error meets the target, "
-        "the same for all; if none does, that with the smallest error. **An error above the target "
-        "loses, whatever the time.** Compiling (jax, CasADi, SymPy) is done before the clock "
-        "starts."),
+        "the same for all; if none does, that with the smallest error. A solver whose error is "
+        "above the target has not solved the problem, whatever its time. Compiling (jax, CasADi, "
+        "SymPy) is done before the clock starts."),
         _reached(data),
         "## Machine",
         _machines(data),
@@ -250,11 +250,11 @@ def _problems(part: Data, rows: list[Row]) -> list[str]:
                 for name in names
             ],
         ),
-        ("Deriving apart: *reading* parses the text; *recording*, once for each plant and order, "
-        "turns it into a program of elementary operations for Taylor coefficients, as CasADi and "
-        "SymPy compile theirs before the clock starts. *taylor* runs it once, for all derivatives "
-        "at all points, and is part of *solving*. *From text* is all of it, by a plant nobody has "
-        "seen before."),
+        ("Deriving is measured apart: *reading* parses the text; *recording*, once for each plant "
+        "and order, turns it into a program of elementary operations for Taylor coefficients, as "
+        "CasADi and SymPy compile theirs before the clock starts. *taylor* runs it once, for all "
+        "derivatives at all points, and is part of *solving*. *From text* is all of it, for a "
+        "plant that is seen for the first time."),
         table(
             ["problem", "index", "states", "reading", "recording", "taylor", "solving",
              "from text", "error", "points"],
@@ -265,7 +265,7 @@ def _problems(part: Data, rows: list[Row]) -> list[str]:
                 for e in part.get("deriving", [])
             ],
         ),
-        "Every row; what fails says why in its own words:",
+        "These are all rows. What fails says why in its own words:",
         _rows_table(rows, named=True),
     ]
 
@@ -337,8 +337,8 @@ def _floor(part: Data, _: list[Row]) -> list[str]:
         ("The calls of `numpy.linalg` and `scipy.linalg` that a run without the compiled kernels "
         "makes (`GPEBO_KERNELS=numpy`) are recorded and made again on the same arrays, with "
         "nothing in between: the floor of a program in NumPy; products of matrices are not "
-        "counted. Elsewhere NumPy and Python themselves are the larger part of that run, by far: "
-        "that is what the kernels are for."),
+        "counted. The rest of that run is spent in NumPy and Python themselves, and kernels make "
+        "this part smaller."),
         table(
             ["", "whole", "whole over LAPACK", "in NumPy", "LAPACK alone", "its share", "calls"],
             [
