@@ -106,8 +106,8 @@ def errors_over_seeds(
         deviations = standard_deviations(
             observation, estimator, source, noise, levels, t, source.states(t)[None]
         )
-        if deviations is None:
-            raise ValueError(f"{estimator} has no deviations")
+        if isinstance(deviations, str):
+            raise TypeError(f"{estimator} has no deviations: {deviations}")
         predicted = np.concatenate([each[0] for each in deviations], axis=1)
         names = (*regression.parameters, *system.states)
         yield Errors(names, np.concatenate(own, axis=2), predicted)

@@ -247,3 +247,46 @@ WRONG = {
     "A": [["-1.05", "1/2 + sin(t)/4", 1], ["-1/2", "-1/2 - cos(t)/4", "1/2"],
           ["1/2", -1, "2 + sin(t)"]],
 }
+
+
+NOISE = {"name": "gaussian", "outputs": 0.05, "sample_time": 0.1}
+
+
+@pytest.mark.parametrize("plant", ["descriptor", "circuit"])
+def test_resets_change_no_deviation_of_least_squares(plant):
+    """They carry over all that is known: θ̂ and x̂ are those without, and so is their noise."""
+    def stds(**remedy):
+        e = run(plant, estimator="least_squares", observer={"name": "gpebo", **remedy},
+                noise=NOISE, time={"horizon": 12, "samples": 13}).details.estimation
+        q = sum(not name.startswith("e0_") for name in e.names)
+        return np.concatenate([e.parameters_std[0, 8:, :q], e.states_std[0, 8:]], axis=1)
+
+    kept = stds(remedy="reset", reset_times=[3.33, 7.0])  # one of them between two samples
+    np.testing.assert_allclose(kept, stds(), rtol=2e-3)
+    assert (stds(remedy="reset", reset_times=[7.0], reset_keep=0.0) > 1.2 * kept).any()
+
+
+@pytest.mark.parametrize("estimator", [("ls_drem", 10), ("drem", 1e14)])
+def test_errors_with_resets_are_of_the_size_that_is_said(estimator):
+    errors = []
+    for k in range(8):
+        found = run("descriptor", estimator=estimator[0], gamma=estimator[1], solver={"tol": 1e-5},
+                    observer={"name": "gpebo", "remedy": "reset", "reset_interval": 2.5},
+                    noise={**NOISE, "seed": k}, time={"horizon": 8, "samples": 5}).details
+        e = found.estimation
+        if k == 0:
+            said = np.hstack([e.parameters_std[0], e.states_std[0]])[2:]
+        errors.append(np.hstack([
+            e.parameters[0] - e.true_parameters, e.states[0] - found.simulation.states
+        ])[2:])
+    size = np.sqrt(np.mean((np.array(errors) / said) ** 2, axis=0))
+    assert 0.7 < np.sqrt(np.mean(size**2)) < 1.4
+    assert size.max() < 2.2
+
+
+def test_a_run_without_deviations_says_why():
+    verdict = run("descriptor", noise=NOISE, gamma="logspace(0,2,33)", time={"horizon": 2}).verdict
+    assert "no standard deviations: more than 32 cases" in verdict
+    verdict = run("boost", noise=NOISE, time={"horizon": 0.5}).verdict
+    assert "no standard deviations: noise of the signals is in the matrices" in verdict
+    assert "no standard deviations" not in run("boost", time={"horizon": 0.5}).verdict

@@ -61,11 +61,13 @@ class FilteredEstimator(ResumableEstimator):
             realisations=regression.realisations,
         )
 
-    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+    def errors(
+        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
+    ) -> tuple[ErrorsAt, ...]:
         """δ𝒴 behind the filters, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂), of every case."""
         names, p = regression.parameters, regression.p
         rates = filter_rates(self.rates, names)
-        extended = self.extend(regression, rates, None)
+        extended = self.extend(regression, rates, known[0].values if known else None)
 
         def of_case(gain: Array) -> ErrorsAt:
             def at(t: Array, inside: Array) -> ErrorSystem:

@@ -63,9 +63,11 @@ class FiniteTime(ResumableEstimator):
             raise ConfigError(f"estimator.mu must lie between 0 and 1, got {mu:g}")
         return self.inner.axes()
 
-    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+    def errors(
+        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
+    ) -> tuple[ErrorsAt, ...]:
         """δη̂_f = δη̂/(1 − w_c), of every case."""
-        inner = self.inner.resume(regression, regression.mesh.edges[-1:], ())
+        inner = self.inner.resume(regression, regression.mesh.edges[-1:], known)
         mu, gains = float(self.mu), inner.gains
 
         def of_case(errors: ErrorsAt, path: ScalarPath, gain: Array) -> ErrorsAt:
@@ -79,7 +81,7 @@ class FiniteTime(ResumableEstimator):
 
         return tuple(
             of_case(errors, inner.groups[i // len(gains)], gains[i % len(gains)])
-            for i, errors in enumerate(self.inner.errors(regression))
+            for i, errors in enumerate(self.inner.errors(regression, known))
         )
 
     def resume(

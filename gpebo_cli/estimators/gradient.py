@@ -46,7 +46,9 @@ class Gradient(ResumableEstimator):
             requirement=persistent(information, float(gains.min())),
         )
 
-    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+    def errors(
+        self, regression: LinearRegression, known: Sequence[ExtensionState] = (),  # noqa: ARG002
+    ) -> tuple[ErrorsAt, ...]:
         """δη̂' = Γψᵀ(δY − ψ δη̂), of every case."""
         p = regression.p
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 
@@ -86,13 +87,15 @@ class LeastSquares(ResumableEstimator):
             out.append(made[key])
         return out
 
-    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+    def errors(
+        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
+    ) -> tuple[ErrorsAt, ...]:
         """δh_z' = −β δh_z + ψᵀδY, δη̂ = α (z f₀ I + α G_z)⁻¹ δh_z, of every case."""
         bound = self.covariance_bound
 
-        def of_case(case: Mapping[str, float]) -> ErrorsAt:
+        def of_case(case: Mapping[str, float], before: ExtensionState | None) -> ErrorsAt:
             alpha, f0 = case["alpha"], case["f0"]
-            info = information(regression, alpha, f0, case["beta"], bound)
+            info = information(regression, alpha, f0, case["beta"], bound, before)
 
             def at(t: Array, inside: Array) -> ErrorSystem:
                 s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
@@ -104,7 +107,7 @@ class LeastSquares(ResumableEstimator):
 
             return at
 
-        return tuple(map(of_case, self.cases))
+        return tuple(map(of_case, self.cases, known or repeat(None)))
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLeastSquares:
         """The same at samples.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 
@@ -61,14 +62,18 @@ class LsDrem(ResumableEstimator):
         self.least_squares.axes()
         return super().axes()
 
-    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+    def errors(
+        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
+    ) -> tuple[ErrorsAt, ...]:
         """δh_z as of least squares, δη̂' = γΔ(adj(H) αF δh_z − Δ δη̂), of every case."""
         part = self.least_squares
         bound = part.covariance_bound
 
-        def of_case(case: Mapping[str, float], gain: Array) -> ErrorsAt:
+        def of_case(
+            case: Mapping[str, float], gain: Array, before: ExtensionState | None
+        ) -> ErrorsAt:
             alpha, f0 = case["alpha"], case["f0"]
-            info = information(regression, alpha, f0, case["beta"], bound)
+            info = information(regression, alpha, f0, case["beta"], bound, before)
 
             def at(t: Array, inside: Array) -> ErrorSystem:
                 s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
@@ -81,7 +86,8 @@ class LsDrem(ResumableEstimator):
             return at
 
         gains = self.gains("gamma", regression.parameters)
-        return tuple(of_case(case, gain) for case in part.cases for gain in gains)
+        pairs = zip(part.cases, known or repeat(None), strict=False)
+        return tuple(of_case(case, gain, before) for case, before in pairs for gain in gains)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLsDrem:
         """The same at samples.

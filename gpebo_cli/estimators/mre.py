@@ -52,11 +52,13 @@ class MemoryExtension(ResumableEstimator):
         state = reached(largest(regression.outer.values), extended, known)
         return replace(self._estimates(regression, extended, t), reached=(state,))
 
-    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+    def errors(
+        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
+    ) -> tuple[ErrorsAt, ...]:
         """δ𝒴' = −λ(δ𝒴 − ψᵀδY), δη̂' = Γ(δ𝒴 − Ω δη̂), of every case."""
         p = regression.p
         rates = self._rates(p)
-        extended = kreisselmeier(regression, rates)
+        extended = kreisselmeier(regression, rates, known[0].values if known else None)
 
         def of_case(gain: Array) -> ErrorsAt:
             def at(t: Array, inside: Array) -> ErrorSystem:

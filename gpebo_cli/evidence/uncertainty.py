@@ -23,6 +23,7 @@ from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.regression.samples import SampledRegression
 
 _STAGES = 4  # order 7: a deviation needs three digits, and elements end at the samples
@@ -50,11 +51,35 @@ def deviations(
         t: ascending.
         starts: edges at which ζ begins anew, of several experiments; None: at the first one only.
     """
+    of_eta, of_x, _ = propagated(
+        observer, estimator, gain, edges, instants, variances, t, None, starts
+    )
+    return of_eta, of_x
+
+
+def propagated(
+    observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, instants: Array,
+    variances: Array, t: Array, L: Array | None, starts: Array | None = None,
+) -> tuple[Array, Array, Array]:
+    """:func:`deviations`, and the factor L of cov [ζ; s; e] at the end, from L at the start.
+
+    Args:
+        observer: as there, with the further arguments.
+        estimator: see there.
+        gain: see there.
+        edges: see there.
+        instants: see there.
+        variances: see there.
+        t: see there.
+        L: at the first edge; None: everything is known there.
+        starts: see there.
+    """
     n, p = gain.shape[1:]
     mesh, fresh = _mesh(edges, instants)
+    if L is not None:  # an error of the last sample is held on
+        fresh[0] = bool((np.abs(instants - edges[0]) < 1e-3 * mesh.steps[0]).any())
     sampler = mesh.sampler(t)
     of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
-    L: Array | None = None
     stretch = _stretch(observer, estimator, mesh, n)
     anew = np.zeros(mesh.size, dtype=bool)
     if starts is not None:
@@ -83,7 +108,38 @@ def deviations(
         x = gain[chosen] @ eta
         x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ factors[own, size:]
         of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
-    return of_eta, of_x
+    return of_eta, of_x, np.zeros((0, 0)) if L is None else L
+
+
+def after_reset(
+    L: Array, estimator: ErrorsAt, end: tuple[Array, Array], reset: Reset,
+    known: ExtensionState | None,
+) -> Array:
+    """L of [ζ; s; e] after a reset, where w goes on from what it was estimated to be.
+
+    η₊ = T η + τ + V ζ and ζ₊ = 0. What is left in 𝒴 becomes S δ𝒴 − Ω₊ V ζ, and an estimate, where
+    the estimator goes on from one, T δη̂ − V ζ.
+
+    Args:
+        L: before.
+        estimator: of the segment that ends.
+        end: its end, as time and where functions that jump are decided, (1,) each.
+        reset: with ``errors`` V.
+        known: [Ω | 𝒴] at the end; None: the estimator has no extension.
+    """
+    system = estimator(*end)
+    V = np.zeros((0, 0)) if reset.errors is None else reset.errors
+    (p, zeta), own = V.shape, system.A.shape[1]
+    J = np.zeros((own, zeta + own))
+    if known is not None:
+        J[:p, zeta : zeta + p] = known.carries(reset)
+        J[:p, :zeta] = -known.after(reset).values[:, :p] @ V
+    if known is None or own > p:  # the last p of s are δη̂ itself
+        J[-p:, zeta:], J[-p:, :zeta] = reset.transform @ system.C[0], -V
+    out = L.copy()
+    out[:zeta] = 0.0
+    out[zeta : zeta + own] = J @ L[: zeta + own]
+    return out
 
 
 def of_least_squares(

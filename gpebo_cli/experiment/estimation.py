@@ -128,6 +128,7 @@ def continuous(
                     estimator, (estimation, metrics) = raised, estimated(raised)
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
+    note = observation.note
     if settings.uncertainty and observation.estimator is None:
         with stage("uncertainty"):
             reduced, columns = _reduced(observation, known.independent)
@@ -135,7 +136,9 @@ def continuous(
                 reduced, estimator, source, settings.noise, levels, estimation.t,
                 estimation.states,
             )
-            if found is not None:
+            if isinstance(found, str):
+                note += f"; no standard deviations: {found}" if found else ""
+            else:
                 deviations = np.full(estimation.parameters.shape, np.nan)
                 deviations[..., columns] = found[0]
                 deviations[np.isnan(estimation.parameters)] = np.nan
@@ -157,7 +160,7 @@ def continuous(
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
         fit, times, noise,
-        observation.estimator is not None, observation.note,
+        observation.estimator is not None, note,
     )
 
 

@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from gpebo_cli.evidence.uncertainty import SampledDeviations, deviations, noise_level
+from gpebo_cli.estimators import ResumableEstimator
+from gpebo_cli.evidence.uncertainty import (
+    SampledDeviations,
+    after_reset,
+    deviations,
+    noise_level,
+    propagated,
+)
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers._observation import Differentiable, Observation
+from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.estimator import Affine, Estimator
+from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.settings import NoiseSettings
 
 MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not of a measurement
@@ -68,23 +81,25 @@ def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
 def standard_deviations(
     observation: Observation, estimator: Estimator, source: Source, noise: NoiseSettings,
     levels: NoiseLevels, t: Array, states: Array,
-) -> tuple[Array, Array] | None:
-    """Of parameters (G, M, p) and ``states`` (G, M, n) at the times t (M,).
+) -> tuple[Array, Array] | str:
+    """Of parameters (G, M, p) and ``states`` (G, M, n) at the times t (M,), or why there are none.
 
-    None where they are not known: an observer that cannot tell how it responds to noise, an
-    estimator that is not ``Affine``, more than 32 cases, a simulation without noise, and where
-    there is nothing to estimate. Rounding to
-    steps q counts as noise of variance q²/12. Of a recording without levels, the one level that
-    all outputs share is that of the residual.
+    No reason is given, and none is needed, of a simulation without noise and where there is nothing
+    to estimate. Rounding to steps q counts as noise of variance q²/12. Of a recording without
+    levels, the one level that all outputs share is that of the residual.
     """
-    state_map, errors = observation.state_map, observation.errors
-    if levels.silent and not source.recording:
-        return None
-    if errors is None or not isinstance(state_map, Differentiable) or not observation.regression.p:
-        return None
-    if not isinstance(estimator, Affine) or len(estimator.cases) > MOST_CASES:
-        return None
-    regression = observation.regression
+    state_map, errors, regression = (
+        observation.state_map, observation.errors, observation.regression
+    )
+    if (levels.silent and not source.recording) or not regression.p:
+        return ""
+    if errors is None or not isinstance(state_map, Differentiable):
+        return "noise of the signals is in the matrices, or this remedy cannot tell what it does"
+    goes_on = isinstance(estimator, ResumableEstimator) or not regression.resets
+    if not isinstance(estimator, Affine) or not goes_on:
+        return "the estimator does not say what errors of Y do to it"
+    if len(estimator.cases) > MOST_CASES:
+        return f"more than {MOST_CASES} cases"
     edges = regression.mesh.edges
     instants = (
         source.inputs.mesh.edges[:-1] if source.recording
@@ -92,13 +107,68 @@ def standard_deviations(
     )
     variances = _variances(noise, levels)
     if levels.silent:
-        variances *= noise_level(
-            errors, regression, instants, variances, observation.starts
-        ) ** 2
-    found = [
-        deviations(errors, of_case, gain, edges, instants, variances, t, observation.starts)
-        for of_case, gain in zip(
-            estimator.errors(regression), state_map.gains(t, states), strict=True
-        )
-    ]
+        variances *= _level(errors, regression, instants, variances, observation.starts) ** 2
+    gains = state_map.gains(t, states)
+    if regression.resets and isinstance(estimator, ResumableEstimator):
+        found = list(_over_resets(errors, estimator, regression, gains, instants, variances, t))
+    else:
+        found = [
+            deviations(errors, of_case, gain, edges, instants, variances, t, observation.starts)
+            for of_case, gain in zip(estimator.errors(regression), gains, strict=True)
+        ]
     return np.array([eta for eta, _ in found]), np.array([x for _, x in found])
+
+
+def _level(
+    errors: ErrorsAt, regression: LinearRegression, instants: Array, variances: Array,
+    starts: Array | None,
+) -> float:
+    """σ of a recording; with resets the mean square of what each segment says."""
+    segments = regression.segments
+    squares = [
+        noise_level(errors, own, _within(instants, own.mesh), variances, starts) ** 2
+        for own in segments
+    ]
+    lengths = np.array([own.mesh.edges[-1] - own.mesh.edges[0] for own in segments])
+    told = np.isfinite(squares)
+    weights = lengths * told
+    return float(np.sqrt(np.nansum(weights * squares) / weights.sum())) if told.any() else np.nan
+
+
+def _within(instants: Array, mesh: Mesh) -> Array:
+    """Those from a mesh's start to before its end."""
+    near = 1e-6 * float(mesh.steps.min())
+    low, high = mesh.edges[[0, -1]] - near
+    return np.asarray(instants[(instants >= low) & (instants < high)])
+
+
+def _over_resets(
+    errors: ErrorsAt, estimator: ResumableEstimator, regression: LinearRegression, gains: Array,
+    instants: Array, variances: Array, t: Array,
+) -> Iterator[tuple[Array, Array]]:
+    """Of every case, from segment to segment."""
+    segments, resets = regression.segments, regression.resets
+    cuts = np.searchsorted(t, [reset.time for reset in resets], side="left")
+    parts = np.split(np.arange(len(t)), cuts)
+    known: tuple[ExtensionState, ...] = ()
+    factors: list[Array | None] = [None] * len(gains)
+    found: list[list[tuple[Array, Array]]] = [[] for _ in gains]
+    for segment, own, reset in zip(segments, parts, (*resets, None), strict=True):
+        mesh = segment.mesh
+        end = mesh.edges[-1:], mesh.inside[-1, -1:]
+        systems = estimator.errors(segment, known)  # type: ignore[attr-defined]
+        reached = estimator.resume(segment, mesh.edges[-1:], known).reached
+        for g, system in enumerate(systems):
+            *of, L = propagated(
+                errors, system, gains[g][own], mesh.edges, _within(instants, mesh), variances,
+                t[own], factors[g],
+            )
+            found[g].append((of[0], of[1]))
+            if reset is not None:
+                state = reached[g * len(reached) // len(systems)] if reached else None
+                factors[g] = after_reset(L, system, end, reset, state)
+        if reset is not None:
+            known = tuple(state.after(reset) for state in reached)
+    for own_parts in found:
+        eta, x = zip(*own_parts, strict=True)
+        yield np.concatenate(eta), np.concatenate(x)

@@ -114,7 +114,10 @@ class Affine(Protocol):
     """An estimator whose estimates are affine in Y, and that says how: for their deviations."""
 
     def errors(self, regression: LinearRegression) -> Sequence[ErrorsAt]:
-        """For each case how errors of Y become errors of η̂, in continuous time, without resets."""
+        """For each case how errors of Y become errors of η̂, in continuous time, without resets.
+
+        One that can go on after a reset takes what was ``known`` before as a second argument.
+        """
         ...
 
 

@@ -22,6 +22,7 @@ class Reset:
     shift: Array  # (p,) τ
     floor: float  # size below which η₊ is rounding: it may be the difference of known numbers
     keep: float = 1.0  # share of what is known that still counts
+    errors: Array | None = None  # (p, k) what an error ζ of w adds to η₊; None: nobody knows
 
     def parameters(self, eta: Array) -> Array:
         """η₊ of η (..., p)."""
@@ -73,6 +74,14 @@ class ExtensionState:
             left *= _share(left, limit * np.sqrt(len(left)))
         values = U @ left @ np.column_stack([right @ U.T, rhs])
         return replace(self, values=reset.keep * values)
+
+    def carries(self, reset: Reset) -> Array:
+        """S (p, p) of :meth:`after`: what it makes of an error of 𝒴."""
+        omega, plain = self.values[:, :-1], replace(reset, shift=np.zeros_like(reset.shift))
+        return np.column_stack([
+            replace(self, values=np.column_stack([omega, one])).after(plain).values[:, -1]
+            for one in np.eye(len(omega))
+        ])
 
 
 def _share(rows: Array, limit: float) -> Array:

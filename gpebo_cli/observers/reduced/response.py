@@ -76,3 +76,11 @@ def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) 
         )
     algebraic, direct = solution.extras
     return np.asarray(algebraic @ solution.trajectory.values + direct)
+
+
+def noisy_matrices(reduced: ReducedSystem) -> bool:
+    """Whether something that matrices depend on may be noisy: any output, inputs that are."""
+    system, noise = reduced.system, reduced.signals.noise
+    names = frozenset[str]().union(*system.coefficients.signals.values())
+    noisy = np.flatnonzero(np.zeros(0) if noise is None else noise.inputs)
+    return system.depends_on_outputs or any(system.inputs[j] in names for j in noisy)

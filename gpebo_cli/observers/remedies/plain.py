@@ -9,7 +9,7 @@ import numpy as np
 from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions, extend
 from gpebo_cli.observers.reduced.regression import on_mesh
-from gpebo_cli.observers.reduced.response import errors_of, respond
+from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices, respond
 from gpebo_cli.regression.linear import LinearRegression
 
 
@@ -33,7 +33,7 @@ class Plain:
         all_kept = len(kept) == final.Y.shape[1]
         start, stop = reduced.signals.span
         # Along noisy signals the matrices change, too, and Y is not affine in the noise.
-        errors = None if _noisy_matrices(reduced) else errors_of(reduced, kept)
+        errors = None if noisy_matrices(reduced) else errors_of(reduced, kept)
         return Observation(
             regression=LinearRegression(
                 Y=on_mesh(mesh, final.Y if all_kept else final.Y[:, kept]),
@@ -57,11 +57,3 @@ class Plain:
             ),
             note=reduced.note if reduced.lost is None else "",  # a warning says it
         )
-
-
-def _noisy_matrices(reduced: ReducedSystem) -> bool:
-    """Whether something that matrices depend on may be noisy: any output, inputs that are."""
-    system, noise = reduced.system, reduced.signals.noise
-    names = frozenset[str]().union(*system.coefficients.signals.values())
-    noisy = np.flatnonzero(np.zeros(0) if noise is None else noise.inputs)
-    return system.depends_on_outputs or any(system.inputs[j] in names for j in noisy)

@@ -41,6 +41,7 @@ from gpebo_cli.observers.reduced.extension import (
     extend,
 )
 from gpebo_cli.observers.reduced.regression import Assembled, on_mesh
+from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
@@ -162,7 +163,8 @@ def _restart(
     transform[q:, :q], transform[q:, q:] = -basis.T @ xi_b, basis.T @ Phi
     shift = np.concatenate([np.zeros(q), basis.T @ (after - xi_a)])
     floor = _FLOOR * max(float(np.abs(part).max(initial=0.0)) for part in (eta[:q], after))
-    return Reset(time, transform, shift, floor), _Start(time, begin, after)
+    errors = np.concatenate([np.zeros((q, reduced.basis.shape[1])), basis.T @ reduced.basis])
+    return Reset(time, transform, shift, floor, errors=errors), _Start(time, begin, after)
 
 
 def _joined(
@@ -208,6 +210,7 @@ def _joined(
         assumptions=assumptions(reduced, mesh, whole),
         note=reduced.note,
         growth=max(e.growth(q) for e in extensions),
+        errors=None if noisy_matrices(reduced) else errors_of(reduced, kept),
         growth_rate=sum(e.logarithm(q) for e in extensions) / float(mesh.edges[-1] - mesh.edges[0]),
     )
 
