@@ -68,7 +68,7 @@ def errors_over_seeds(
     noise = NoiseSettings(name="gaussian", outputs=LEVEL, sample_time=SAMPLE_TIME)
     settings = Settings(plant={}, estimator={}, noise=noise, time=TimeSettings(horizon=20.0))
     levels = noise_levels(noise, system)
-    source = sources.simulated(settings, system, levels)
+    source = sources.simulated(settings, system, levels, None)
     made = build(observer or {"name": "gpebo"})
     if made is None:
         raise ValueError("there has to be an observer")
