@@ -27,6 +27,8 @@ if typing.TYPE_CHECKING:
 
 T = TypeVar("T")
 
+LARGEST = 1e50
+"""Of the numbers in plants, settings and samples: squares of products of them are still numbers."""
 _SHOWN = 60  # characters of a wrong value that a message repeats
 
 
@@ -222,7 +224,9 @@ _WANTED = {
 }
 
 
-def number(value: object, where: str, accept: Accepted = "positive") -> float:
+def number(
+    value: object, where: str, accept: Accepted = "positive", largest: float = LARGEST
+) -> float:
     """One number, which may come as text.
 
     Raises:
@@ -234,6 +238,8 @@ def number(value: object, where: str, accept: Accepted = "positive") -> float:
     low = {"positive": 5e-324, "nonnegative": 0.0, "finite": -math.inf}[accept]
     if found is None or not math.isfinite(found) or found < low:
         raise ConfigError(f"{where}: expected {_WANTED[accept]}, got {shown(value)}")
+    if abs(found) > largest:
+        raise ConfigError(f"{where}: {found:g} is too large; numbers go up to {largest:g} here")
     return found
 
 

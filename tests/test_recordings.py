@@ -314,10 +314,10 @@ WHOLE = {  # what is read, or in which line it is refused
     **{f"the cell {cell!r}": (HEAD + f"0,1,{cell}\n1,2,3\n", 2) for cell in (
         "１.５", "٣", "1\u00a0", "\v1", "1\f", "1_000", "1e999", "-1e999", "nan", "NaN",
         "inf", "-Infinity", "0x10", "0b1", "1e", "e5", "1.5.2", "--1", "+ 1", "1 2", "true",
-        "None", "", " ", "1j", "1d5", "∞", "−1",
+        "None", "", " ", "1j", "1d5", "∞", "−1", "1e300", "-2e50",
     )},
     **{f"the number {cell!r}": (HEAD + f"0,1,{cell}\n1,2,3\n", 0) for cell in (
-        " 1", "1\t", "+1", "-0", "1.", ".5", "1E5", "1e-400", "007", '"2"', '" 2"', "9" * 300,
+        " 1", "1\t", "+1", "-0", "1.", ".5", "1E5", "1e-400", "007", '"2"', '" 2"', "9" * 50,
     )},
 }
 
@@ -470,7 +470,7 @@ def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
     ("change", "part"),
     [
         ({"V": ["a", "b", "c"]}, "column V: "),
-        ({"V": [1.0, np.nan, 2.0]}, "row 1, column V: nan is not a finite number"),
+        ({"V": [1.0, np.nan, 2.0]}, "row 1, column V: nan is no number within"),
         ({"t": [0.0, 1.0, 1.0]}, "times must increase"),
         ({"t": [0.0, np.nan, 1.0]}, "row 1, column t"),
         ({"V": [True, False, True]}, "column V: bool"),

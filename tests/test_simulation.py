@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from plants import reference, shipped
 from scipy.integrate import solve_ivp
 
+from gpebo_cli import ConfigError, GpeboError, run
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -382,3 +385,40 @@ def test_states_that_nothing_drives_are_no_signals():
     end = solve_ivp(reduced, (0, 20), start, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     expected = [end[0] / (2 - np.cos(40.0)), end[1] / (2 - np.exp(-20.0))]
     np.testing.assert_allclose(states.values[-1, -1, [1, 2]], expected, atol=1e-9)
+
+
+HUGE = {
+    "A[1][1] is -1e+300 at t = 0": {"A": [[-1, 1], [1, "-1e300"]]},
+    "E[0][0] is 1e+300 at t = 0": {"E": [["1e300", 0], [0, 0]]},
+    "inputs.u is 1.86e+299 at t = 0.25": {"inputs": {"u": "1e300*sin(3*t/4)"}},
+    "initial_state.x is 1e+300;": {"initial_state": {"x": 1e300, "z": 0}},
+    "unknowns.w is -1e+300": {"unknowns": {"w": -1e300}},
+    "phi[1] is 1e+60 at t = 0": {"phi": [0, "1e60*cos(t)"]},
+    "inputs.u = '2**1023*t' has no finite value": {"inputs": {"u": "2**1023*t"}},
+}
+
+
+@pytest.mark.parametrize("said", HUGE)
+def test_numbers_whose_products_overflow_are_named(said):
+    """Without a warning, and not as a plant that grows or cannot be observed."""
+    plant = {
+        "name": "p", "states": ["x", "z"], "inputs": {"u": "sin(t)"}, "unknowns": {"w": 1},
+        "outputs": ["y"], "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, -2]], "B": [[1], [0]],
+        "F": [[1], [0]], "C": [[1, 1]], "initial_state": {"x": 1, "z": 0.5}, **HUGE[said],
+    }
+    with pytest.raises(ConfigError) as caught:
+        run(plant, time={"horizon": 2.0})
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(("said", "settings"), [
+    ("time.start = 1e+300", {"time": {"start": 1e300}}),
+    ("time.horizon = 1e-300 s is too short", {"time": {"horizon": 1e-300}}),
+    ("shorten time.horizon", {"time": {"horizon": 1e300}}),
+    ("estimator.beta: 1e+300 is too large", {"beta": 1e300}),
+    ("estimator.initial: 1e+300 is too large", {"initial": 1e300}),
+    ("noise.outputs: 1e+300 is too large", {"noise": {"name": "gaussian", "outputs": 1e300}}),
+])
+def test_settings_out_of_all_proportion_are_named(said, settings):
+    with pytest.raises(GpeboError, match=re.escape(said)):
+        run("circuit", **settings)

@@ -25,9 +25,10 @@ from gpebo_cli.regression.errors import ErrorSystem
 from gpebo_cli.regression.estimator import Estimates, ResumableEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
-from gpebo_cli.schema import Accepted, number, per_name
+from gpebo_cli.schema import LARGEST, Accepted, number, per_name
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
+_LARGEST = 1e300  # of gains, which make up for the units of the regression
 _MAX_CASES = 1_000_000
 _AMPLE = 10.0  # times the least gain that would do: 1 % long before the end
 _MANY = 8  # numbers, from which on looking at them one by one is what takes the time
@@ -221,9 +222,10 @@ def axis(value: object, where: str, accept: Accepted = "positive") -> tuple[floa
         raise ConfigError(f"{where} is an empty list; give a number, a list or logspace(a, b, n)")
     if len(items) > _MANY and set(map(type, items)) <= {float, np.float64}:
         values = np.array(items)
-        if np.isfinite(values).all() and values.min() > 0.0:
+        if values.max() <= _LARGEST and values.min() > 0.0:
             return tuple(values.tolist())
-    return tuple(number(item, where, accept) for item in items)
+    largest = _LARGEST if accept == "positive" else LARGEST
+    return tuple(number(item, where, accept, largest) for item in items)
 
 
 def _from_text(text: str, where: str) -> object:

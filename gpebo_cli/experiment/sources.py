@@ -19,11 +19,13 @@ from gpebo_cli.observers import Sampling, build, sampling
 from gpebo_cli.recordings.load import Recording, load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
+from gpebo_cli.schema import LARGEST
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals, Simulation
 
 _MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
 _ROUNDING = 1e-12  # by which a sample may miss the end of the horizon
+_RESOLVED = 1e-10  # of the start: shorter horizons have steps of few roundings
 _MAX_SAMPLES = 1_000_000
 
 
@@ -123,6 +125,11 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
         raise ConfigError(f"time.horizon must be a positive number of seconds, got {time.horizon}")
     if not np.isfinite(time.start):
         raise ConfigError(f"time.start must be a finite time, got {time.start}")
+    if time.horizon < max(abs(time.start) * _RESOLVED, 1.0 / LARGEST):
+        raise ConfigError(
+            f"time.horizon = {time.horizon:g} s is too short to be resolved beside time.start = "
+            f"{time.start:g}"
+        )
     if time.samples < 2:
         raise ConfigError(f"time.samples must be at least 2, got {time.samples}")
 

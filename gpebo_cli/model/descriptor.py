@@ -10,11 +10,15 @@ D nor H. θ is constant to whoever estimates it; in a simulation it may vary all
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.schema import LARGEST
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -170,3 +174,35 @@ class DescriptorSystem:
     def r(self) -> int:
         """Number of outputs."""
         return len(self.outputs)
+
+
+def check_sizes(system: DescriptorSystem, t: Array) -> None:
+    """Refuse numbers whose squares and products overflow: all that came of them would be wrong.
+
+    Args:
+        system: a plant; of matrices that depend on outputs only values without signals are seen.
+        t: times (N,) at which to look; an entry that is not finite there is reported by others.
+
+    Raises:
+        ConfigError: names the entry, its value and the time.
+    """
+    initial = np.atleast_1d(system.initial_state)
+    entries: dict[str, Array] = {"initial_state": initial[None, None]}
+    source = system.coefficients
+    with np.errstate(all="ignore"), suppress(ConfigError):
+        source = source.of_time if system.depends_on_outputs else source
+        entries |= source.taylor(t, 0)._asdict()
+    named = {"initial_state": ("initial_state", system.states), "u": ("inputs", system.inputs),
+             "theta": ("unknowns", system.unknowns)}
+    for name, values in entries.items():
+        sizes = np.abs(distinct(values)[0])
+        too_large = np.argwhere(np.isfinite(sizes) & (sizes > LARGEST))
+        for at, *place in too_large[:1].tolist():
+            where = name + "".join(f"[{k}]" for k in place)
+            if name in named:
+                where = f"{named[name][0]}.{named[name][1][place[0]]}"
+            when = "" if name == "initial_state" else f" at t = {t[at]:.6g}"
+            raise ConfigError(
+                f"plant {system.name}: {where} is {values[0][(at, *place)]:.3g}{when}; "
+                f"numbers go up to {LARGEST:g}, products of larger ones overflow; use other units"
+            )

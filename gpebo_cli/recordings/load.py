@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.recordings.hold import held, on_mesh, recording_mesh
@@ -68,6 +68,7 @@ def load(
     table = read_table(data, system)
     span = _span(table, time)
     samples = table.samples
+    check_sizes(system, np.array(span))
     m = system.m
     values = np.concatenate([samples.inputs, samples.outputs], axis=1)
     mesh = recording_mesh(samples.t, values, data.hold, span, system.coefficients, tol)

@@ -24,7 +24,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import read_mat
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.reading import open_regular
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import LARGEST, nearest, shown
 from gpebo_cli.settings import DataSettings
 
 if TYPE_CHECKING:
@@ -285,6 +285,10 @@ class RowReader:
         value = float(cell.replace(self._data.decimal, "."))
         if not math.isfinite(value):
             raise ConfigError(f"{where}: {shown(cell.strip())} is not a finite number")
+        if abs(value) > LARGEST:
+            raise ConfigError(
+                f"{where}: {shown(cell.strip())} is too large; numbers go up to {LARGEST:g} here"
+            )
         return value
 
 
@@ -392,7 +396,7 @@ def _by_pandas(header: Header, data: DataSettings, body: bytes) -> Array | None:
         numbers = np.array([list(map(float, cells)) for cells in columns])
         pieces.append(numbers.T * header.scale)
     values = np.concatenate(pieces)
-    return values if np.isfinite(values).all() else None
+    return values if (np.abs(values) <= LARGEST).all() else None
 
 
 def _frame(path: str, kind: str, content: bytes) -> DataFrame:
@@ -442,15 +446,17 @@ def _from_frame(
             raise ConfigError(f"{source}, column {name}: {column.dtype} is not numbers")
         columns.append(values)
     values = np.column_stack(columns)
-    wrong = ~np.isfinite(values) if data.missing == "refuse" else np.isinf(values)
+    wrong = np.abs(values) > LARGEST
+    if data.missing == "refuse":
+        wrong |= np.isnan(values)
     if data.missing != "drop":
         wrong[:, 0] |= np.isnan(values[:, 0])
     if len(values) < 2:
         raise ConfigError(f"{source} has {len(values)} rows; at least 2 are needed")
     for row, k in np.argwhere(wrong)[:1]:
         raise ConfigError(
-            f"{source}, row {row}, column {header.names[k]}: {values[row, k]} is not a finite "
-            "number; data.missing says what to do about gaps"
+            f"{source}, row {row}, column {header.names[k]}: {values[row, k]} is no number "
+            f"within ±{LARGEST:g}; data.missing says what to do about gaps"
         )
     t = values[~np.isnan(values[:, 0]), 0]
     for row in np.flatnonzero(np.diff(t) <= 0)[:1]:

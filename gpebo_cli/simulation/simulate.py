@@ -13,6 +13,7 @@ from gpebo_cli.model.descriptor import (
     Array,
     Coefficients,
     DescriptorSystem,
+    check_sizes,
     distinct,
 )
 from gpebo_cli.numerics.collocation import LinearSolution, solve
@@ -54,8 +55,9 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     Raises:
         ModelError: not uniquely solvable, index too high, or a rank changes within the horizon.
         SolverError: the tolerance cannot be reached, or the solution ends within the horizon.
-        ConfigError: an entry without a finite value.
+        ConfigError: an entry without a finite value, or one that is too large to compute with.
     """
+    check_sizes(system, time.start + time.horizon * np.linspace(0.0, 1.0, 9))
     if not system.depends_on_outputs:
         simulation = None
         if system.n > SMALL and solver.name == "collocation":
