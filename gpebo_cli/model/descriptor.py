@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
+_FEW = 100  # states: matrices of more are never made dense
 MATRIX_NAMES = ("E", "A", "B", "F", "C", "u", "theta", "phi", "D", "H")
 
 
@@ -191,7 +192,8 @@ def check_sizes(system: DescriptorSystem, t: Array) -> None:
     source = system.coefficients
     with np.errstate(all="ignore"), suppress(ConfigError):
         source = source.of_time if system.depends_on_outputs else source
-        entries |= source.taylor(t, 0)._asdict()
+        if system.n <= _FEW:
+            entries |= source.taylor(t, 0)._asdict()
     named = {"initial_state": ("initial_state", system.states), "u": ("inputs", system.inputs),
              "theta": ("unknowns", system.unknowns)}
     for name, values in entries.items():

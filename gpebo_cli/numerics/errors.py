@@ -63,7 +63,7 @@ def estimated_errors(
         sizes = np.abs(turned).max(axis=0)
         size = np.maximum(sizes, _TINY)
         shown = np.abs(rule.to_legendre[-4:] @ turned.reshape(points, -1))
-        shown = shown.reshape(-1, K, n, columns)
+        shown = shown.reshape(len(shown), K, n, columns)
         to_next = points / np.arange(points - used, points)  # (ρ^j)^this = ρ^(s + 1)
         shares = np.minimum(shown[-used:] / size, 1.0) ** to_next[:, None, None, None]
         share = shares.max(axis=0)
