@@ -27,7 +27,7 @@ ESTIMATORS = (
     {"name": "least_squares", "beta": 0.3, "f0": 0.1, "bound": 1e3}, {"name": "ls_drem"},
     {"name": "ls_drem", "beta": 0.2}, {"name": "drem", "gamma": 1e14}, {"name": "mre"},
     {"name": "lion", "gamma": 1e10}, {"name": "fct", "gamma": 1e14},
-    {"name": "instrumental"}, {"name": "annihilator"},
+    {"name": "instrumental"}, {"name": "annihilator"}, {"name": "exciting"},
 )
 
 

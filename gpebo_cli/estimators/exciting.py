@@ -18,13 +18,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
-from gpebo_cli.estimators._mixed import MixedEstimates
+from gpebo_cli.estimators._extension import kreisselmeier
+from gpebo_cli.estimators._mixed import MixedEstimates, filter_rates
 from gpebo_cli.estimators._mixing import filled
 from gpebo_cli.estimators._scalar import scalar_path
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 
 _TOLERANCE, _MAX_ELEMENTS = 1e-12, 200_000
@@ -49,11 +52,9 @@ class Exciting(GainEstimator):
 
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
         """Extend, mix, rotate, and keep what the closed form needs at the times t (M,)."""
-        plain = Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
-        inner = plain.resume(regression, t, ())
+        inner, kappa = self._mixed(regression, t)
         (path,) = inner.groups
-        columns, energy = 1 + path.quotient.shape[-1], float(path.energy[-1, -1])
-        kappa = 0.5 * np.pi / max(energy, 1e-300) if self.kappa is None else self.kappa
+        columns = 1 + path.quotient.shape[-1]
 
         def rotation(t: Array, inside: Array) -> LinearEquation:
             delta, Y, _ = path.signals(t, inside)
@@ -80,6 +81,45 @@ class Exciting(GainEstimator):
         quotient = filled(right / np.where(usable, new, 1.0)[..., None], usable)
         law = scalar_path(found.mesh, signals, new, quotient, np.asarray(t), None, path.floor)
         return replace(inner, groups=(law,), condition="IE")
+
+    def _mixed(self, regression: LinearRegression, t: Array) -> tuple[MixedEstimates, float]:
+        """𝐘 = Δη as of ``drem``, and κ."""
+        plain = Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
+        inner = plain.resume(regression, t, ())
+        energy = max(float(inner.groups[0].energy[-1, -1]), 1e-300)
+        return inner, 0.5 * np.pi / energy if self.kappa is None else self.kappa
+
+    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+        """δ𝒴 as of ``drem``, δe' = κΔ²[[0, −1], [1, 0]] δe + κΔ (0, adj(Ω) δ𝒴), of every case.
+
+        Then δη̂' = γΦ_21 (δe_2 − Φ_21 δη̂).
+        """
+        names, p, end = regression.parameters, regression.p, regression.mesh.edges[-1:]
+        rates, kappa = filter_rates(self.rates, names), self._mixed(regression, end)[1]
+        extended = kreisselmeier(regression, rates)
+        (law,) = self.estimate(regression, end).groups
+        filtered, first, second, last = (np.arange(p) + k * p for k in range(4))
+
+        def of_case(gain: Array) -> ErrorsAt:
+            def at(t: Array, inside: Array) -> ErrorSystem:
+                omega = extended(t, inside)[..., :p]
+                delta, adjugate, _ = determinant_and_adjugate_action(
+                    omega, np.broadcast_to(np.eye(p), omega.shape)
+                )
+                new, psi = law.signals(t, inside)[0][:, None], regression.psi(t, inside)
+                A = np.zeros((len(t), 4 * p, 4 * p))
+                A[:, filtered, filtered] = -rates
+                A[:, first, second] = -kappa * delta[:, None] ** 2
+                A[:, second, first] = kappa * delta[:, None] ** 2
+                A[:, 2 * p : 3 * p, :p] = kappa * delta[:, None, None] * adjugate
+                A[:, last, second], A[:, last, last] = gain * new, -gain * new**2
+                B = np.zeros((len(t), 4 * p, psi.shape[1]))
+                B[:, :p] = rates[:, None] * transpose(psi)
+                return ErrorSystem(A, B, np.eye(4 * p)[None, 3 * p :], np.zeros_like(B[:1, :p]))
+
+            return at
+
+        return tuple(map(of_case, self.gains("gamma", names)))
 
 
 ESTIMATOR = Exciting
