@@ -26,6 +26,7 @@ from gpebo_cli.settings import ExcitationSettings
 WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hundredfold
 _TINY = float(np.finfo(float).tiny)
 _ROUNDS, _SAME_TIME = 30, 1e-12
+_AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
 _AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
 WINDOWS = 10  # default PE window: this many per horizon
 
@@ -185,7 +186,8 @@ def _first_time(
         points = points[np.append(True, points[1:] > points[:-1])]
         level = reached(points, piece(points))
         level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
-    return high
+    start, stop = float(mesh.edges[0]), float(mesh.edges[-1])
+    return high if high - start > _AT_ONCE * (stop - start) else start
 
 
 def _where_zero(levels: list[float], t: list[float]) -> float:

@@ -24,6 +24,7 @@ from gpebo_cli.observers import Measurements, Observation, Observer, build
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.recordings.load import load
+from gpebo_cli.reduction.derivative_array import balance
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
@@ -219,7 +220,10 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
     """
     t = simulation.signals.mesh.edges[:1]
     c = system.coefficients.of_time.taylor(t, 0)
-    E, A, C = c.E[0, 0], c.A[0, 0], c.C[0, 0]
+    units = balance(c)
+    weight = units.rows[:, None] * units.columns
+    E, A, C = weight * c.E[0, 0], weight * c.A[0, 0], units.columns * c.C[0, 0]
+    C = C / np.maximum(np.linalg.norm(C, axis=1, keepdims=True), np.finfo(float).tiny)
     n, size = system.n, max(float(np.linalg.norm(A)), np.finfo(float).tiny)
     scale = float(np.linalg.norm(E) / size) or 1.0
     # det(λE − A) is a polynomial of degree ≤ n: it vanishes identically if it does at n + 1 points.

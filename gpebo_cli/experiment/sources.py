@@ -23,7 +23,8 @@ from gpebo_cli.schema import LARGEST
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals, Simulation
 
-_MOVED = 1e-9  # changes of a state below this share of the largest state are rounding
+_MOVED = 1e-9  # changes of a state below this share of its size are rounding
+_NEVER = 1e-6  # in the plant's units, of the largest state: a state that is smaller is nothing
 _ROUNDING = 1e-12  # by which a sample may miss the end of the horizon
 _RESOLVED = 1e-10  # of the start: shorter horizons have steps of few roundings
 _MAX_SAMPLES = 1_000_000
@@ -219,10 +220,13 @@ def _sample_simulation(
     signals, structure = simulation.signals, simulation.structure
     sampler = signals.mesh.sampler(t)
     start = float(signals.mesh.edges[0])
+    size = np.abs(signals.states.values).max(axis=(0, 1), initial=0.0)
+    units = structure.scaling.columns if len(structure.scaling.columns) else np.ones(system.n)
+    size = np.maximum(size, _NEVER * units * (size / units).max(initial=0.0))
     jumps = [
         change
         for when, before, jump in simulation.jumps
-        for change in _changes(system, before, jump.after, when)
+        for change in _changes(system, before, jump.after, when, size)
     ]
     impulses = [
         (when, state)
@@ -240,7 +244,9 @@ def _sample_simulation(
         differential=structure.d,
         algebraic=structure.a,
         initial_state=simulation.initial_state,
-        moved=tuple(_changes(system, system.initial_state, simulation.initial_state, start)),
+        moved=tuple(
+            _changes(system, system.initial_state, simulation.initial_state, start, size)
+        ),
         jumps=tuple(jumps),
         impulses=tuple(impulses),
         error_estimate=simulation.error_estimate,
@@ -251,14 +257,15 @@ def _sample_simulation(
 
 
 def _changes(
-    system: DescriptorSystem, before: Array, after: Array, time: float
+    system: DescriptorSystem, before: Array, after: Array, time: float, size: Array
 ) -> list[StateChange]:
-    given, used = before.tolist(), after.tolist()
-    scale = max(map(abs, (0.0, *given, *used)))
+    scale = _MOVED * np.maximum(size, np.maximum(np.abs(before), np.abs(after)))
     return [
         StateChange(state, old, new, time)
-        for state, old, new in zip(system.states, given, used, strict=True)
-        if abs(new - old) > _MOVED * scale
+        for state, old, new, least in zip(
+            system.states, before.tolist(), after.tolist(), scale.tolist(), strict=True
+        )
+        if abs(new - old) > least
     ]
 
 

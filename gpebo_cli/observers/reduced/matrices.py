@@ -32,6 +32,7 @@ from gpebo_cli.observers.reduced.split import (
 )
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
 
+_BALANCING = 6  # rounds of scaling rows and columns
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
@@ -301,7 +302,7 @@ def _eliminate(
     """Q1 and H of K = (𝒜 Q)⁺ = H Q1ᵀ, and a bound of the singular value behind Assumption 1.
 
     With Q = V2 V2ᵀ and 𝒜 V2 = Q1 R1, (𝒜 Q)⁺ = V2 R1⁻¹ Q1ᵀ. σ_min(R1) is at least 1/‖R1⁻¹‖_F;
-    it is computed itself only where that bound leaves a doubt.
+    it is computed itself, in units of the rows and columns, only where that bound leaves a doubt.
     """
     on_kernel = algebraic @ kernel
     size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), TINY)
@@ -316,7 +317,9 @@ def _eliminate(
         inverse, bound = R1, np.zeros(len(R1))
     doubtful = np.flatnonzero(~(bound > rank_tol))
     if len(doubtful):
-        smallest = np.linalg.svd(R1[doubtful], compute_uv=False)[:, -1] / size[doubtful]
+        sigma = np.linalg.svd(_balanced(on_kernel[doubtful]), compute_uv=False)
+        smallest = sigma[:, -1] / np.maximum(sigma[:, 0], TINY)
+        bound[doubtful] = smallest
         if (smallest <= rank_tol).any():
             k = int(np.argmax(smallest <= rank_tol))
             raise NotObservableError(
@@ -326,6 +329,15 @@ def _eliminate(
                 "observer.form=strangeness_free"
             )
     return Q1, kernel @ inverse, bound
+
+
+def _balanced(matrices: Array) -> Array:
+    """Rows and columns of matrices (N, a, b) brought to comparable size, whatever their units."""
+    for _ in range(_BALANCING):
+        for axis in (2, 1):
+            size = np.sqrt(np.abs(matrices).max(axis=axis, keepdims=True, initial=0.0))
+            matrices = matrices / np.where(size > 0.0, size, 1.0)
+    return matrices
 
 
 def _eliminate_in_part(

@@ -1,0 +1,112 @@
+"""Change of units: physics stays the same, and so does everything that is said about it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from plants import CONF
+from random_systems import HORIZON, random_system
+from units import drawn, in_units
+
+from gpebo_cli import run
+from gpebo_cli.model.plant import plant_from_mapping
+
+SHIPPED = sorted(
+    path.relative_to(CONF / "plant").as_posix().removesuffix(".yaml")
+    for path in (CONF / "plant").rglob("*.yaml") if path.stem != "none"
+)
+RANDOM = [seed for seed in range(13) if seed % 5 < 4]  # of index 0 to 3
+SHORT = {"lorenz": 1.0, "motor": 0.5, "duffing": 4.0, "generator": 2.0,
+         "published/ascher_petzold": 1.0}
+
+
+def both(name, decades, kept=(), **settings):
+    """Details of a run of a plant, of one in other units but for those kept, and the units."""
+    if isinstance(name, int):
+        content, horizon = random_system(name)[0], HORIZON
+    else:
+        content = yaml.safe_load((CONF / "plant" / f"{name}.yaml").read_text(encoding="utf-8"))
+        content = {key: content[key] for key in content if key not in ("units", "labels")}
+        horizon = SHORT.get(name, 10.0)
+    units = drawn(np.random.default_rng(5), plant_from_mapping(content), decades=decades)
+    units = units._replace(**{kind: np.ones_like(getattr(units, kind)) for kind in kept})
+    units = units._replace(time=float(units.time))
+
+    one, other = (
+        run(made, time={"horizon": horizon * unit, "samples": 101}, **settings).details
+        for made, unit in ((content, 1.0), (in_units(content, units), units.time))
+    )
+    return one, other, units
+
+
+@pytest.mark.parametrize("decades", [True, False])
+@pytest.mark.parametrize("name", [*SHIPPED, *RANDOM])
+def test_a_simulation_is_the_same_in_any_units(name, decades):
+    """States, unknowns, inputs, outputs, equations and time, each by a factor of its own."""
+    one, other, units = both(name, decades, observer="none")
+    a, b = one.simulation, other.simulation
+    assert (a.index, a.differential, a.algebraic) == (b.index, b.differential, b.algebraic)
+    assert [change.state for change in a.moved] == [change.state for change in b.moved]
+    size = np.maximum(np.abs(a.states).max(axis=0), 1e-6)
+    assert (np.abs(b.states / units.states - a.states) <= 1e-9 * size).all()
+    assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+
+
+@pytest.mark.parametrize("name", [*SHIPPED, *RANDOM])
+def test_evidence_is_the_same_in_any_units(name):
+    """Unknowns, inputs and, for the shipped plants, time.
+
+    The observer's projectors, and the weights of outputs beside equations, are those of the units
+    in which states, equations and outputs are given; the unit of time is in those of equations.
+    """
+    kept = ("states", "equations", "outputs", *(["time"] if isinstance(name, int) else []))
+    one, other, units = both(name, False, kept)
+    a, b, T = one.excitation, other.excitation, units.time
+    assert a.is_ie == b.is_ie
+    assert b.level == pytest.approx(a.level, abs=1e-8)
+    horizon = float(a.t[-1])
+    for x, y in ((a.t_c, b.t_c), *zip(a.determined_at.values(), b.determined_at.values(),
+                                      strict=True)):
+        assert (x is None) == (y is None)
+        assert x is None or y / T == pytest.approx(x, rel=1e-6, abs=1e-8 * horizon)
+    known, again = ({name for name, since in run.estimable.items() if since is not None}
+                    for run in (one, other))
+    assert known == again
+    assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+
+
+def ladder(ampere):
+    """Three RC sections behind a source, with an unknown leakage current at the last node."""
+    g, C = 1e-3, 2e-6  # siemens, farads
+    return {
+        "name": "ladder", "states": ["v1", "v2", "v3"], "inputs": {"V": "5 + sin(900*t)"},
+        "unknowns": {"leak": 2e-6 * ampere}, "outputs": ["y"],
+        "E": (C * np.eye(3)).tolist(), "B": [[g], [0], [0]], "F": [[0], [0], [-1 / ampere]],
+        "A": [[-2 * g, g, 0], [g, -2 * g, g], [0, g, -g]], "C": [[1, 0, 0]],
+        "initial_state": [1.0, 0.5, 0.0],
+    }
+
+
+def test_a_leakage_current_is_as_well_seen_in_amperes_as_in_milliamperes():
+    one, other = (run(ladder(unit), time={"horizon": 0.1, "samples": 101}).details
+                  for unit in (1.0, 1e3))
+    assert one.excitation.is_ie
+    assert other.excitation.is_ie
+    assert other.excitation.t_c == pytest.approx(one.excitation.t_c, abs=1e-7)
+    assert None not in (*one.estimable.values(), *other.estimable.values())
+
+
+def test_three_tanks_in_SI_units_pass_every_check():
+    """Levels in metres, flows in m³/s, an unknown leak of some 1e-5 m³/s."""
+    area, k = 0.0154, 2.3e-4
+    result = run({
+        "name": "tanks", "states": ["h1", "h2", "h3"], "unknowns": {"leak": 2e-5},
+        "inputs": {"Q": "1e-4*(1 + sin(0.02*t)/2)"}, "outputs": ["h1m"],
+        "E": (area * np.eye(3)).tolist(), "B": [[1], [0], [0]], "F": [[0], [-1], [0]],
+        "A": [[-k, k, 0], [k, -2 * k, k], [0, k, -2 * k]], "C": [[1, 0, 0]],
+        "initial_state": [0.4, 0.3, 0.2],
+    }, time={"horizon": 2000, "samples": 201}, estimator={"name": "least_squares", "f0": 1e-30})
+    assert result.details.excitation.is_ie
+    assert all(assumption.holds for assumption in result.details.assumptions)
+    assert result.estimates["leak"].ravel()[-1] == pytest.approx(2e-5, rel=1e-6)
