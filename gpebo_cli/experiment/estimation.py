@@ -481,8 +481,9 @@ def _evaluation(
         place = len(grid) * np.arange(len(eta))[:, None] + at  # in all cases, one after the other
         j, m, i = np.arange(p), at[:, p:], np.arange(at.shape[1] - p)
         of_eta = eta.ravel().take(place[:, :p] * p + j) - truth[at[:, :p], j]
-        gains = gain.reshape(-1, p).take(m * len(i) + i, axis=0)
-        seen = np.einsum("gip,gip->gi", gains, eta.reshape(-1, p).take(place[:, p:], axis=0))
+        flat = eta.reshape(eta.shape[0] * eta.shape[1], p)  # spelled out: p may be 0
+        gains = gain.reshape(len(gain) * len(i), p).take(m * len(i) + i, axis=0)
+        seen = np.einsum("gip,gip->gi", gains, flat.take(place[:, p:], axis=0))
         return np.concatenate([of_eta, offset[m, i] + seen - x[m, i]], axis=1)
 
     def errors_at(eta: Array, k: int) -> list[Array]:
