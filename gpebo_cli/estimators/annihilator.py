@@ -7,7 +7,8 @@ common with the perturbed columns of ψ only. Of the means of [ψ(t) ; ψ(t − 
     𝒴 = Ω η + B b,   b the unknown bias, B the unit vectors of the perturbed rows of ψ(t),
 
 and N with N B = 0 annihilates it: (NΩ)ᵀNΩ η = (NΩ)ᵀN𝒴, then mixing. The rows of ψ(t − d) stay, w
-being forgotten within d; without perturbed columns this is least squares on twice the rows.
+being forgotten within d; without perturbed columns this is least squares on twice the rows. The
+choice of rows is ours; the equations were derived, not copied.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ estimation of unknown constant parameters, arXiv:2104.02210: to 𝐘 = Δη_i be
 whose state (η_i, z) an observer follows up to e = Φ (η_i, 0), Φ' = [[0, u1], [u2 Δ, u3]] Φ, as a
 GPEBO does. Its second row is the new regression e_2 = Φ_21 η_i, and u1, u2, u3 are free. Here
 u1 = −κΔ², u2 = κΔ and u3 = 0, with which Φ is a rotation: Φ_21 = sin(κ∫Δ²) stays where it is when
-Δ ends, and is persistently exciting unless κ∫Δ² stops at a multiple of π.
+Δ ends, and is persistently exciting unless κ∫Δ² stops at a multiple of π. This choice is ours; the
+equations were derived, not copied.
 """
 
 from __future__ import annotations

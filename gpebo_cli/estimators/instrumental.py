@@ -6,6 +6,9 @@ has nothing in common with w: the mean of ζY goes to the mean of ζψ times η.
 it was d seconds ago, which needs w to forget within d:
 
     Ω' = (ζψ − Ω)/(T₀ + t),   𝒴' = (ζY − 𝒴)/(T₀ + t),   ζ(t) = ψ(t − d)ᵀ,   then mixing, as in drem.
+
+The instrument is ours, because an estimator sees ψ and no reference signal; the equations were
+derived, not copied.
 """
 
 from __future__ import annotations
