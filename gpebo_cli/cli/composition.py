@@ -145,7 +145,7 @@ def session(arguments: Arguments) -> Iterator[Hydra]:
     """
     before = os.environ.get("HYDRA_FULL_ERROR", "")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # without it Hydra prints its errors and exits with 1
-    logging.raiseExceptions = False  # a reader that has seen enough is no news
+    logging.raiseExceptions = False  # a reader may close the pipe
     hydra = Hydra("gpebo", Loader(arguments.config_dir))
     GlobalHydra.instance().clear()
     GlobalHydra.instance().initialize(hydra)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # every command waits for what is imported here
 class Remembered:
     """While it is entered, SIGINT is remembered; at its end what was lost until then is raised."""
 
-    received = False  # of the process: there is one Ctrl-C
+    received = False  # by the process as a whole, not by one object
 
     def __enter__(self) -> None:
         Remembered.received = False
@@ -33,7 +33,7 @@ class Remembered:
         sys.unraisablehook = self._hook
         if hasattr(self, "_handler"):
             signal.signal(signal.SIGINT, self._handler)
-        lost, Remembered.received = Remembered.received, False  # whoever comes next is not meant
+        lost, Remembered.received = Remembered.received, False  # it is not meant for later work
         if lost and kind is None:
             raise KeyboardInterrupt
 

@@ -52,7 +52,7 @@ class Progress:
 
     def __enter__(self) -> Self:
         if self._terminal:
-            self._timer.start()  # says something even if the first stage takes for ever
+            self._timer.start()  # says something even while a long first stage runs
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,4 +1,4 @@
-"""What a run will hold, estimated before it is allocated: a machine that swaps answers nobody."""
+"""What a run will hold, estimated before it is allocated: a machine that swaps stands still."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def verdict(
         parts.append(f"not determined by the data: {', '.join(unknown)}")
     best = None if metrics is None else _best_case(metrics)
     if metrics is not None and best is not None:
-        if isfinite(metrics.settled[best]):  # that an error is small just now is chance
+        if isfinite(metrics.settled[best]):  # under noise it is chance that an error is small now
             reached = f"all within ±2σ of the end after {metrics.settled[best]:.4g} s"
         else:
             seconds = metrics.seconds_to_1pct_states[best]

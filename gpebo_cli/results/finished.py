@@ -219,7 +219,7 @@ def _bytes(path: Path) -> bytes:
 def _opened(path: Path) -> BinaryIO:
     try:
         return open_regular(path)
-    except ConfigError as error:  # nobody configured it: a run should have written it
+    except ConfigError as error:  # no user wrote this file: a run should have
         reason = getattr(error.__cause__, "strerror", None) or "not a regular file"
         raise GpeboError(f"{path}: {reason}") from error
 

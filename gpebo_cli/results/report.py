@@ -69,7 +69,7 @@ def case_table(result: RunResult) -> list[str]:
     gains = list(cases[0])
     settled = [name for name in rows[0] if name.startswith(STANDING)]
     headings = dict(_HEADINGS)
-    if any(math.isfinite(rows[0][name]) for name in settled):  # with noise 1 % is chance
+    if any(math.isfinite(rows[0][name]) for name in settled):  # noise decides the time to 1 %
         for name in _TIMES:
             del headings[name]
         headings = {"settled": "within ±2σ of the end", **headings}
