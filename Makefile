@@ -77,7 +77,7 @@ $(VENV)/installed-dev: pyproject.toml | $(VENV)/bin/pip
 # Those it is compared with, one by one: one that does not install here is a row that says so.
 $(VENV)/installed-bench: pyproject.toml | $(VENV)/bin/pip
 	$(BIN)/pip install --quiet --editable '.[bench]' || { \
-		$(BIN)/pip install --quiet --editable . sympy threadpoolctl; \
+		$(BIN)/pip install --quiet --editable . sympy; \
 		for p in casadi scikit-sundae solve-dae diffrax; do \
 			$(BIN)/pip install --quiet $$p || true; \
 		done; }

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh, null_space
 from scipy.sparse import csr_matrix
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError
@@ -370,3 +371,18 @@ def test_a_stiff_sparse_plant_agrees_with_dense_collocation(monkeypatch):
     np.testing.assert_allclose(
         found.signals.states.final, dense.signals.states.final, rtol=1e-8, atol=1e-12
     )
+
+
+@pytest.mark.parametrize(("cells", "one"), [(1, False), (5, True)])
+def test_blas_has_one_thread_where_matrices_are_of_a_middle_size(cells, one):
+    asked = []
+
+    def looked(_stage):
+        asked.append({p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"})
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = threadpool_info()
+        run(plant(ladder, cells=cells), progress=looked, time={"horizon": 1.0})
+        assert threadpool_info() == before
+    assert asked
+    assert all((1 in found) == one for found in asked)

@@ -7,10 +7,11 @@ estimation at samples as its rows come.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import cache
 from time import perf_counter
-from typing import Self
+from typing import Any, Self
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
@@ -27,6 +28,8 @@ from gpebo_cli.experiment.verdict import simulation_note, verdict
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
+
+_SMALL, _LARGE = 8, 200  # states, between which one thread is as fast as several
 
 
 class Stage(str):
@@ -83,6 +86,30 @@ def run_experiment(
         ModelError: the plant cannot be simulated, or Assumption 1 fails.
         SolverError: a tolerance cannot be reached.
     """
+    with _threads(system.n):
+        return _experiment(settings, system, progress, estimator)
+
+
+def _threads(n: int) -> AbstractContextManager[object]:
+    """One thread of BLAS where more of them would mostly wait for each other, for n states."""
+    if not _SMALL < n <= _LARGE:
+        return nullcontext()
+    limited: AbstractContextManager[object] = _pools().limit(limits=1, user_api="blas")
+    return limited
+
+
+@cache
+def _pools() -> Any:
+    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
+
+    return ThreadpoolController()
+
+
+def _experiment(
+    settings: Settings, system: DescriptorSystem, progress: Callable[[str], None],
+    estimator: estimators.Estimator | None,
+) -> RunResult:
+    """:func:`run_experiment`, with as many threads as there are."""
     levels = noise_levels(settings.noise, system)
     sources.check(settings, levels)
     observer = build(settings.observer)
