@@ -20,13 +20,15 @@ from gpebo_cli.estimators._recursive import ScalarLaw, integrating, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares
 from gpebo_cli.findings import Requirement
-from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
+
+_AT_ONCE = 4096  # elements
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,17 +170,23 @@ def mix_least_squares(
         Y = s.vectors @ (weights[..., None] * s.rotated)
         return delta, Y.reshape(len(t), -1), s.digits
 
-    s = info.spectrum(mesh.points.ravel(), mesh.inside.ravel())
-    usable: BoolArray = np.asarray(s.digits > SINGULAR)
-    inverse = np.divide(
-        s.rotated, s.eigenvalues[..., None], out=np.zeros_like(s.rotated),
-        where=usable[:, None, None],
-    )
-    quotient = s.vectors @ inverse  # 𝐘/Δ = G_z⁻¹ h_z
-    delta = np.prod(_shares(s, alpha, f0), axis=1)
     shape = mesh.points.shape
-    quotient = filled(quotient.reshape(*shape, -1), usable.reshape(shape))
-    return scalar_path(mesh, signals, delta.reshape(shape), quotient, t, floor=floor)
+    usable, delta = np.empty(shape, dtype=bool), np.empty(shape)
+    rows, columns = info.gram.values.shape[-2:]
+    quotient = np.empty((*shape, rows * (columns - rows)))
+    for first in range(0, mesh.size, _AT_ONCE):  # all spectra at once are what takes the memory
+        part = slice(first, first + _AT_ONCE)
+        points = mesh.points[part]
+        s = info.spectrum(points.ravel(), mesh.inside[part].ravel())
+        own = s.digits > SINGULAR
+        inverse = np.divide(
+            s.rotated, s.eigenvalues[..., None], out=np.zeros_like(s.rotated),
+            where=own[:, None, None],
+        )
+        usable[part] = own.reshape(points.shape)
+        quotient[part] = (s.vectors @ inverse).reshape(*points.shape, -1)  # 𝐘/Δ = G_z⁻¹ h_z
+        delta[part] = np.prod(_shares(s, alpha, f0), axis=1).reshape(points.shape)
+    return scalar_path(mesh, signals, delta, filled(quotient, usable), t, floor=floor)
 
 
 def _adjugate(s: Spectrum, alpha: float, f0: float) -> tuple[Array, Array]:

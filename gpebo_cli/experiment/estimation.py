@@ -290,8 +290,10 @@ def _estimate(
     regression, state_map = observation.regression, observation.state_map
     cases, t = estimator.cases, source.t
     kept = t[kept_samples(len(cases), len(t), settings.output.max_rows)]
-    # Each time with bounds is a programme of its own: they are for the samples that are kept.
-    points = kept if observation.bounds else regression.mesh.points.ravel()
+    # Where nobody knows the truth there is nothing to measure between the samples that are kept;
+    # and each time with bounds is a programme of its own.
+    blind = source.recording is not None and not source.recording.known_states
+    points = kept if observation.bounds or blind else regression.mesh.points.ravel()
     grid = np.unique(np.concatenate([points, state_map.times, kept]))
     chosen = np.searchsorted(grid, kept)
 

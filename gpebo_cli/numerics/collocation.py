@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -166,10 +166,9 @@ def unresolved_signals(
     """
     size, points, n, columns = values.shape
     least = least_sizes(problem, made_of, tol).reshape(n * columns)
-    kinds: list[Kind] = [(values.reshape(size, points, n * columns), least)]
-    if problem.monitor is not None:
-        kinds += problem.monitor(values, extras)
-    return unresolved_kinds(kinds, rule)
+    own: Kind = (values.reshape(size, points, n * columns), least)
+    further = () if problem.monitor is None else problem.monitor(values, extras)
+    return unresolved_kinds(chain([own], further), rule)
 
 
 def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArray) -> _ElementMaps:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from itertools import pairwise
@@ -322,9 +322,9 @@ def unresolved(values: Array, rule: RadauRule, floor: float | Array = 0.0) -> Ar
     )
 
 
-def unresolved_kinds(kinds: Sequence[Kind], rule: RadauRule) -> Array:
+def unresolved_kinds(kinds: Iterable[Kind], rule: RadauRule) -> Array:
     """:func:`unresolved` of signals of several kinds (values, floor), the worst; shape (K,)."""
-    return np.asarray(reduce(np.maximum, [unresolved(kind[0], rule, kind[1]) for kind in kinds]))
+    return np.asarray(reduce(np.maximum, (unresolved(kind[0], rule, kind[1]) for kind in kinds)))
 
 
 def used_coefficients(rule: RadauRule) -> int:

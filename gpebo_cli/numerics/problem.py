@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -30,7 +30,7 @@ class LinearEquation(NamedTuple):
 
 
 # (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind
-Monitor = Callable[[Array, tuple[Array, ...]], Sequence[tuple[Array, float | Array]]]
+Monitor = Callable[[Array, tuple[Array, ...]], Iterable[tuple[Array, float | Array]]]
 
 
 class Renewal(Protocol):

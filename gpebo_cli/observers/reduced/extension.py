@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -407,7 +407,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
 
     latest: list[Assembled] = []
 
-    def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
+    def monitor(values: Array, extras: tuple[Array, ...]) -> Iterator[tuple[Array, float]]:
         """Everything to resolve; SolverError if the extension is beyond all bounds."""
         if largest_entry(values) > _LARGEST:
             raise SolverError(
@@ -418,9 +418,9 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         z, *seen = map(_over_time, (values, *extras))
         assembled = regression_signals(z, q, basis, AlgebraicEquations(*seen))
         latest[:] = [assembled]
-        return [
+        return (
             (signal.reshape(*values.shape[:2], -1), floor) for signal, floor in assembled.kinds()
-        ]
+        )
 
     problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
     if solver.name == "ivp":

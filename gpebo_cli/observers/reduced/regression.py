@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,23 +32,24 @@ class Assembled:
     elimination: Array  # (N, n, n_b) and
     injectivity: Array  # (N,) as in ``ObserverMatrices``
 
-    def kinds(self) -> list[tuple[Array, float]]:
-        """Everything the mesh has to resolve, with the size below which it is rounding."""
+    def kinds(self) -> Iterator[tuple[Array, float]]:
+        """Everything the mesh has to resolve, with the size below which it is rounding.
+
+        One after the other: of a long recording all together would be what takes the memory.
+        """
         columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
         psi = self.psi / np.tile(columns, (self.psi.shape[1], 1))
         states = (np.abs(self.gain).max(axis=0) / columns).max(axis=1, initial=0.0)
         if self.Y_scale > 0.0:  # a state that no parameter has part in is no signal to resolve
             own = np.abs(self.offset).max(axis=0, initial=0.0) / self.Y_scale
             states = np.maximum(states, 1e-3 * own)
+        yield self.Y, 1e-3 * self.Y_scale
+        yield psi, 1e-3
+        yield self.offset, 0.0
+        yield self.gain / (np.where(states > 0.0, states, 1.0)[:, None] * columns), 0.0
         squares, right = _products(psi, self.Y)
-        return [
-            (self.Y, 1e-3 * self.Y_scale),
-            (psi, 1e-3),
-            (self.offset, 0.0),
-            (self.gain / (np.where(states > 0.0, states, 1.0)[:, None] * columns), 0.0),
-            (squares, 1e-3),
-            (right, 1e-3 * self.Y_scale),
-        ]
+        yield squares, 1e-3
+        yield right, 1e-3 * self.Y_scale
 
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
