@@ -24,6 +24,7 @@ _LOOKS = 40  # times within each first element at which known functions are look
 _MOST_LOOKS = 1 << 16
 _SURPRISE = 100.0  # times what the nodes let expect: then something stands between them
 _LOOK_ROUNDS = 8
+_NOTHING = 1e-12  # of what an input stands beside: less is rounding
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
 MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
@@ -48,7 +49,7 @@ def inputs_resolved(
         bounded: nothing narrow hides between the nodes.
     """
     for _ in range(0 if bounded else _LOOK_ROUNDS):
-        overlooked = _overlooked(system, c, looked_at, mesh, solver.tol)
+        overlooked = _overlooked(system, c, looked_at, mesh, solver.tol, beside)
         if not overlooked.any():
             break
         mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
@@ -84,7 +85,7 @@ def known_joined(
 
 def _overlooked(
     system: DescriptorSystem, c: Coefficients, looked_at: Callable[[Array], Coefficients],
-    mesh: Mesh, tol: float,
+    mesh: Mesh, tol: float, beside: Array,
 ) -> BoolArray:
     """Elements (K,) with something narrow between their nodes, a pulse of an input for instance.
 
@@ -101,7 +102,13 @@ def _overlooked(
     t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
     seen = looked_at(t.ravel())
     least = max(tol, 1e-12)
-    pairs = [array for name in names for array in (getattr(c, name), getattr(seen, name))]
+    # An input that is rounding of what stands beside it in its equations is not looked at.
+    u = np.concatenate([c.u[0], seen.u[0]])
+    audible = np.abs(u).max(axis=0, initial=0.0) > _NOTHING * beside
+    pairs = [
+        array * audible if name == "u" else array
+        for name in names for array in (getattr(c, name), getattr(seen, name))
+    ]
     missed = _missed_between(between, *pairs)
     for name, far in zip(names, missed, strict=True):
         if far.max(initial=0.0) <= _SURPRISE * least:
