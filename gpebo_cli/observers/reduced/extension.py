@@ -161,6 +161,7 @@ class ReducedSystem:
     regression: str  # projected: all rows of the residual, paper: the last r
     note: str = ""  # which form is used, where that was not said, and why
     lost: BoolArray | None = None  # (n,) states that a failure of Assumption 1 touches
+    units: Array | None = None  # (n,) of the states then
     injection: Injection | None = None
 
     @property
@@ -263,7 +264,7 @@ def reduced_system(
     mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
     at = signals.at(t, inside) if system.coefficients.signals else None
-    lost = None
+    lost = units = None
     try:
         used, first, note = choose_form(
             system, t, inside, at, signals.derivatives, solver, form, weights
@@ -273,7 +274,7 @@ def reduced_system(
         left = untouched(used, t, inside, at, solver.rank_tol) if in_part else None
         if left is None:
             raise
-        frame, lost = left
+        frame, lost, units = left
         first = observer_matrices(
             used, t, inside, solver.rank_tol, normalise=True,
             output_scale=output_scale(weights, system), signals=at, frame=frame,
@@ -282,7 +283,7 @@ def reduced_system(
     whole = ReducedSystem(
         used, signals, solver, mesh, first,
         start_at(used, *_beginning(used, first, signals)), np.zeros(0), regression, note,
-        lost,
+        lost, units,
     )
     begin, start = whole.begin, begin_at(xi_a0, system, first, whole.begin)
     if unknown is not None:

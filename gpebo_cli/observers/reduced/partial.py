@@ -15,7 +15,7 @@ import numpy as np
 
 from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import exact_product, transpose
+from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.observers.reduced.matrices import row_sizes
 from gpebo_cli.observers.reduced.split import (
     TINY,
@@ -25,6 +25,7 @@ from gpebo_cli.observers.reduced.split import (
     initial_basis,
     within_frame,
 )
+from gpebo_cli.reduction.derivative_array import balance
 from gpebo_cli.reduction.form import EquationForm
 
 _DRIVEN = 1e-9  # of the largest entry of Λ V2 N: less is rounding
@@ -33,8 +34,8 @@ _DIP = 1e-3  # of the largest of a singular value over time: where less, it may 
 
 def untouched(
     form: EquationForm, t: Array, inside: Array, signals: Array | None, rank_tol: float
-) -> tuple[Frame, BoolArray] | None:
-    """The frame of E without what is given up, and which states are lost (n,).
+) -> tuple[Frame, BoolArray, Array] | None:
+    """The frame of E without what is given up, which states are lost, and all states' units, (n,).
 
     Args:
         form: as given.
@@ -60,6 +61,8 @@ def untouched(
         kept, _ = initial_basis(
             frame.projector - given_up @ given_up.T, split.rank - given_up.shape[1], states
         )
+        # A state that is none of what is left must not look like a little of it.
+        kept = without_rounding(kept[None], np.ones((1, 1, 1)))[0]
         kernel = np.hstack([frame.kernel, given_up])
         _, sigma, Vt = np.linalg.svd(algebraic @ kernel)
         ranks = (sigma > rank_tol * size[:, None]).sum(axis=1)
@@ -74,6 +77,10 @@ def untouched(
         driven = sizes > _DRIVEN * max(float(np.linalg.norm(drive @ kernel)), TINY)
         if not driven.any():
             lost = (np.linalg.norm(free, axis=2) > _DRIVEN).any(axis=0)
-            return None if lost.all() else (left, lost)
+            if lost.all():
+                return None
+            along = form.along(t, inside, signals, 0)
+            units = balance(form.system.coefficients.taylor(t, 0, inside, along)).columns
+            return left, lost, units
         given_up = np.hstack([given_up, kept @ U[:, driven]])
     return None

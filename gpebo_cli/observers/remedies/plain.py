@@ -42,7 +42,8 @@ class Plain:
                 scale=extension.scale(q),
             ),
             state_map=AffineStateMap(
-                on_mesh(mesh, final.offset), on_mesh(mesh, final.gain), reduced.form.scales
+                on_mesh(mesh, final.offset), on_mesh(mesh, final.gain),
+                reduced.form.scales if reduced.units is None else reduced.units,
             ),
             truth=InitialError(
                 reduced.initial_basis, reduced.xi_a0, reduced.basis, extension.solution.trajectory
