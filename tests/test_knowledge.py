@@ -237,6 +237,14 @@ def test_a_change_of_units_changes_no_evidence(plant):
             )
 
 
+@pytest.mark.parametrize("plant", ["battery", "bioreactor", "boost", "descriptor", "window"])
+def test_a_run_without_any_choice_converges_where_psi_is_exciting(plant):
+    """Also where parameters of very different size are hardly told apart, as in the bioreactor."""
+    result = run(plant).details
+    assert result.excitation.is_ie
+    assert np.isfinite(result.metrics.seconds_to_1pct_parameters).all()
+
+
 def test_check_tells_the_deviation_that_a_run_with_noise_has():
     """Per unit of noise: times σ it is that of least squares in a run."""
     settings = Settings({}, {"name": "least_squares", "f0": 1e-12})

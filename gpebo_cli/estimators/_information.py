@@ -19,6 +19,7 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.estimators._extension import low_pass
+from gpebo_cli.estimators._mixing import SINGULAR
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
@@ -26,6 +27,8 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 
 _PICARD_ROUNDS = 200
+
+_OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +88,23 @@ class InformationAt:
             )
         except np.linalg.LinAlgError:
             return None
+
+    def quotient(self) -> tuple[Array, Array]:
+        """G_z⁻¹ h_z (M, p, c), and to how many digits, λ_min/λ_max (M,).
+
+        In units of each parameter's own size: those they happen to have may hide most digits.
+        """
+        values, p = self.values, self.values.shape[-2]
+        size = np.sqrt(np.maximum(np.einsum("mii->mi", values[..., :p]), 0.0))
+        size = np.where(size > 0.0, size, 1.0)[..., None]
+        eigenvalues, V = np.linalg.eigh(values[..., :p] / size / transpose(size))
+        found = Spectrum(np.maximum(eigenvalues, 0.0), V, V, size)
+        digits = _OWN * found.digits
+        inverse = np.where(digits[:, None] > SINGULAR, 1.0, 0.0) / np.where(
+            eigenvalues > 0.0, eigenvalues, 1.0
+        )
+        rotated = transpose(V) @ (values[..., p:] / size)
+        return (V @ (inverse[..., None] * rotated)) / size, digits
 
 
 @dataclass(frozen=True, eq=False)

@@ -167,8 +167,12 @@ def mix_least_squares(
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         s = info.spectrum(t, inside)
         delta, weights = _adjugate(s, alpha, f0)
-        Y = s.vectors @ (weights[..., None] * s.rotated)
-        return delta, Y.reshape(len(t), -1), s.digits
+        Y, digits = s.vectors @ (weights[..., None] * s.rotated), s.digits
+        if in_own_units:
+            quotient, digits = info.at(t, inside).quotient()
+            known = (digits > SINGULAR)[:, None, None]
+            Y = np.where(known, delta[:, None, None] * quotient, Y)
+        return delta, Y.reshape(len(t), -1), digits
 
     shape = mesh.points.shape
     usable, delta = np.empty(shape, dtype=bool), np.empty(shape)
@@ -186,6 +190,14 @@ def mix_least_squares(
         usable[part] = own.reshape(points.shape)
         quotient[part] = (s.vectors @ inverse).reshape(*points.shape, -1)  # 𝐘/Δ = G_z⁻¹ h_z
         delta[part] = np.prod(_shares(s, alpha, f0), axis=1).reshape(points.shape)
+    # Where the units of the parameters never leave a digit, in those of each parameter's own size.
+    in_own_units = not usable.any()
+    for first in range(0, mesh.size if in_own_units else 0, _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        points = mesh.points[part]
+        found, digits = info.at(points.ravel(), mesh.inside[part].ravel()).quotient()
+        usable[part] = (digits > SINGULAR).reshape(points.shape)
+        quotient[part] = found.reshape(*points.shape, -1)
     return scalar_path(mesh, signals, delta, filled(quotient, usable), t, floor=floor)
 
 
