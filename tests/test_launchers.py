@@ -213,3 +213,25 @@ def test_a_launcher_that_is_not_installed_is_one_line_with_the_extra(tmp_path):
     assert "pip install 'gpebo[ray]'" in done.stderr
 
 
+
+
+BLOCKED = """
+import signal
+from joblib.externals.loky.backend import resource_tracker
+from gpebo_cli.cli import workers
+
+def launch():
+    resource_tracker.ensure_running()
+    return signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+print(signal.SIGINT in workers.apart(launch))
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("joblib") is None, reason="needs joblib")
+def test_workers_do_not_hear_ctrl_c_whatever_was_started_before_them():
+    """Starting loky's tracker takes the signal's block away."""
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCKED], check=False, capture_output=True, text=True
+    )
+    assert done.stdout == "True\n", done.stderr

@@ -12,6 +12,8 @@ import os
 import signal
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing import resource_tracker
 from pathlib import Path
 from threading import Thread
 from threading import enumerate as threads
@@ -37,8 +39,9 @@ def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
     raised: list[BaseException] = []
 
     def run() -> None:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children inherit it
         try:
+            _start_trackers()
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children inherit it
             returned.append(launch())
         except BaseException as error:  # noqa: BLE001  raised again below
             raised.append(error)
@@ -64,6 +67,17 @@ def stranded() -> bool:
     Its own threads do, too, and Python would wait for these before it ends.
     """
     return any(thread.name == _LAUNCHER for thread in threads())
+
+
+def _start_trackers() -> None:
+    """Start the processes that clean up, now: whoever starts them no longer blocks SIGINT then."""
+    resource_tracker.ensure_running()
+    with suppress(ImportError):
+        from joblib.externals.loky.backend import (  # type: ignore[import-untyped,unused-ignore]
+            resource_tracker as of_loky,
+        )
+
+        of_loky.ensure_running()
 
 
 def _wait(thread: Thread, patience: float) -> None:
