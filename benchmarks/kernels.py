@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -55,8 +56,9 @@ def without(*names: str) -> Iterator[None]:
 
 
 def workloads() -> dict[str, Callable[[], object]]:
-    """The circuit, many gains, long horizons, published problems, and ladders."""
+    """The circuit, published problems, their text read anew, many gains, long horizons, ladders."""
     from benchmarks import circuit, growth, problems
+    from gpebo_cli import run
 
     published = [problems.ours(problem)(1e-9) for problem in problems.problems()]
 
@@ -64,9 +66,15 @@ def workloads() -> dict[str, Callable[[], object]]:
         for solve in published:
             solve()
 
+    def new_plants() -> None:
+        for problem in problems.problems():
+            problems.ours(problem)(1e-9)()
+
     return {
         "circuit": circuit.ours(1e-9),
+        "`run`, 1,001 samples": partial(run, "circuit", estimator="drem"),
         "published problems": all_published,
+        "new plants": new_plants,
         "5,000 gains": growth.experiment(gains=5_000),
         "1,000 s": growth.experiment(1_000.0),
         "ladder, n = 25": growth.chain(25, varying=True),
