@@ -44,6 +44,7 @@ from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
+_AT_ONCE = 1 << 15  # points
 _SMALL = 8  # coordinates of w, up to which dense collocation is faster
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 
@@ -370,7 +371,9 @@ class Extension:
         """Size of the terms of each column of ψ so far, element by element, (K, p)."""
         trajectory = self.solution.trajectory
         z, *seen = map(_over_time, (trajectory.values, *self.solution.extras))
-        sizes = term_sizes(z, q, AlgebraicEquations(*seen))
+        sizes = np.concatenate([
+            term_sizes(z[part], q, _at(seen, part)) for part in _pieces(len(z))
+        ])
         largest = sizes.reshape(*trajectory.values.shape[:2], -1).max(axis=1)
         return np.maximum.accumulate(largest, axis=0)
 
@@ -444,10 +447,27 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         )
     z, *seen = map(_over_time, (solution.trajectory.values, *solution.extras))
-    offset, gain = resolved(
-        latest[0], z, system, basis, AlgebraicEquations(*seen), reduced.form.scales
+    found = latest[0]
+    offset, gain = zip(*[
+        resolved(
+            replace(found, Y=found.Y[part], psi=found.psi[part], offset=found.offset[part],
+                    gain=found.gain[part]),
+            z[part], system, basis, _at(seen, part), reduced.form.scales,
+        )
+        for part in _pieces(len(z))
+    ], strict=True)
+    return Extension(
+        solution, replace(found, offset=np.concatenate(offset), gain=np.concatenate(gain))
     )
-    return Extension(solution, replace(latest[0], offset=offset, gain=gain))
+
+
+def _pieces(count: int) -> Iterator[slice]:
+    """Of many points: what is made of all of them at once is what takes the memory."""
+    return (slice(first, first + _AT_ONCE) for first in range(0, count, _AT_ONCE))
+
+
+def _at(seen: Sequence[Array], part: slice) -> AlgebraicEquations:
+    return AlgebraicEquations(*(each if len(each) == 1 else each[part] for each in seen))
 
 
 def _driven(o: ObserverMatrices, v: Array, y: Array, columns: int) -> tuple[Array, Array]:
