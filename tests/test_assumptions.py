@@ -80,6 +80,17 @@ def test_constant_coefficients_get_regularity_and_the_rank_condition():
     assert not blind["Assumption 1"].holds
 
 
+def test_the_pencil_is_judged_in_no_units():
+    """Equations times 1e-12 and 1e9, v in units of 1e-15, the output in units of 1e14, t in ns."""
+    plain = found(lti())
+    other = found(lti(E=[[1e-21, 0], [0, 0]], A=[[-1e-12, 1e-27], [1e9, 1e-6]], C=[[1e-14, 0]],
+                      initial_state=[1, -1e15]))
+    for name in ("Regularity", "Rank condition D2"):
+        assert other[name].holds
+        for key, value in plain[name].evidence.items():
+            assert other[name].evidence[key] == pytest.approx(value, rel=0.3)
+
+
 def test_an_unsolvable_plant_stops_at_the_first_assumption():
     names = found(lti(E=[[1, 0], [0, 0]], A=[[-1, 1], [0, 0]]))
     assert list(names) == ["Solvability"]

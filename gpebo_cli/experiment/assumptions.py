@@ -24,7 +24,7 @@ from gpebo_cli.observers import Measurements, Observation, Observer, build
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.recordings.load import load
-from gpebo_cli.reduction.derivative_array import balance
+from gpebo_cli.reduction.constant import scales_of
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
@@ -220,21 +220,20 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
     """
     t = simulation.signals.mesh.edges[:1]
     c = system.coefficients.of_time.taylor(t, 0)
-    units = balance(c)
-    weight = units.rows[:, None] * units.columns
-    E, A, C = weight * c.E[0, 0], weight * c.A[0, 0], units.columns * c.C[0, 0]
-    C = C / np.maximum(np.linalg.norm(C, axis=1, keepdims=True), np.finfo(float).tiny)
-    n, size = system.n, max(float(np.linalg.norm(A)), np.finfo(float).tiny)
-    scale = float(np.linalg.norm(E) / size) or 1.0
+    E, A, C = c.E[0, 0], c.A[0, 0], c.C[0, 0]
+    rows, columns, time = scales_of(E, A)
+    E, A, C = rows[:, None] * E * columns / time, rows[:, None] * A * columns, C * columns
+    C = C / np.maximum(np.abs(C).max(axis=1, keepdims=True), np.finfo(float).tiny)
+    n = system.n
     # det(λE − A) is a polynomial of degree ≤ n: it vanishes identically if it does at n + 1 points.
     # Those with Im λ < 0 say nothing new; of many states one point where it does not will do.
     if n <= _EVERY_POINT:
-        points = np.exp(2j * np.pi * np.arange((n + 1) // 2 + 1) / (n + 1)) / scale
+        points = np.exp(2j * np.pi * np.arange((n + 1) // 2 + 1) / (n + 1))
         smallest = np.linalg.svd(points[:, None, None] * E - A, compute_uv=False)[:, -1]
     else:
-        inverse, _ = inverse_or_none(np.array([1.0, -1.0])[:, None, None] / scale * E - A)
+        inverse, _ = inverse_or_none(np.array([1.0, -1.0])[:, None, None] * E - A)
         smallest = 1.0 / np.linalg.norm(inverse, axis=(1, 2))
-    regular = float(smallest.max() / size)
+    regular = float(smallest.max() / max(np.linalg.norm(A), np.finfo(float).tiny))
     # Where the rows of E have ended, rank [E A; 0 C; 0 E] = rank E + rank [ZᵀA; C; E].
     U, sigma, _ = np.linalg.svd(E)
     rank = int((sigma > sigma[0] * n * np.finfo(float).eps).sum())

@@ -108,7 +108,7 @@ def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
         UndecidedError: singular values do not decide the structure, or μ would exceed ``max_mu``.
     """
     n = len(E)
-    rows, columns, time = _scales(E, A)
+    rows, columns, time = scales_of(E, A)
     size = np.linalg.norm(rows[:, None] * E * columns / time, axis=1)
     rows /= np.exp2(np.rint(np.log2(np.where(size > 0.0, size, 1.0))))
     e, a = rows[:, None] * E * columns / time, rows[:, None] * A * columns
@@ -178,10 +178,15 @@ def _constraints(e: Array, a: Array, max_mu: int) -> tuple[list[tuple[Array, lis
     raise UndecidedError
 
 
-def _scales(E: Array, A: Array) -> tuple[Array, Array, float]:
-    """Of rows and columns (n,), and the unit of time, by which both matrices are of the size one.
+def scales_of(E: Array, A: Array) -> tuple[Array, Array, float]:
+    """Of rows and columns (n,), and the unit of time, by which E/τ and A are of the size one.
 
-    Powers of two, so that scaling commits no rounding error.
+    Args:
+        E: (n, n).
+        A: (n, n).
+
+    Returns:
+        Powers of two, so that scaling commits no rounding error.
     """
     E, A = np.abs(E), np.abs(A)
     r, c, time = np.zeros(len(E)), np.zeros(len(E)), 0.0
