@@ -97,6 +97,8 @@ def test_functions_that_raise_say_so():
     """Whoever raises an error of ours in its own body names its kind under Raises."""
     missing = []
     for path in PACKAGE.rglob("*.py"):
+        if path.parent.name == "templates":
+            continue
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
                 continue

@@ -61,17 +61,17 @@ def propagated(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, instants: Array,
     variances: Array, t: Array, L: Array | None, starts: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """:func:`deviations`, and the factor L of cov [ζ; s; e] at the end, from L at the start.
+    """As :func:`deviations`, from a factor L of cov [ζ; s; e] at the start, and L at the end.
 
     Args:
-        observer: as there, with the further arguments.
+        observer: as there, with all arguments but L.
         estimator: see there.
-        gain: see there.
+        gain: see there, (M, n, p).
         edges: see there.
         instants: see there.
         variances: see there.
         t: see there.
-        L: at the first edge; None: everything is known there.
+        L: at the first edge, (size, ·); None: everything is known there.
         starts: see there.
     """
     n, p = gain.shape[1:]

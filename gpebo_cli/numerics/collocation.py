@@ -346,7 +346,7 @@ def decoupled_maps(
     D: Array, h: Array, E: Array | None, A: Array, f: Array, basis: Array | None,
     offset: Array | None, group: IntArray, groups: int,
 ) -> tuple[Array, Array]:
-    """As ``elements.element_maps`` for constant E, A and T: stages are decoupled."""
+    """As ``elements.element_maps`` for constant E, A (1, d, n) and T: stages are decoupled."""
     k, s, columns = len(h), len(D), f.shape[2]
     d, n = A.shape[1:]
     forcing = forcing_at_nodes(D, h, E, A, f, offset)
