@@ -230,12 +230,19 @@ def _in_stages(
 def _differs(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float, a: int) -> bool:
     """Whether stages find another number of constraints at one time.
 
-    A rate λ has singular values of λ^−2μ, which may count as zero.
+    A rate λ has singular values of λ^−2μ, which may count as zero. In E, [E A] or [E; A] it has
+    some of 1/λ: stages are looked at only where there are any.
     """
     middle, s = len(t) // 2, scaling
-    one = slice(middle, middle + 1)
-    E, A = (x if x.shape[1] == 1 else x[:, one] for x in (c.E, c.A))
+    there = slice(middle, middle + 1)
+    E, A = (x if x.shape[1] == 1 else x[:, there] for x in (c.E, c.A))
     e, aa = scaled(E, A, s.rows, s.columns, s.time, len(E))
+    e0, a0 = e[0, 0], aa[0, 0]
+    both = np.array([np.concatenate([e0, a0], axis=1), np.concatenate([e0.T, a0.T], axis=1)])
+    spread = np.concatenate([np.linalg.svd(x, compute_uv=False) for x in (e0[None], both)])
+    spread = spread / np.maximum(spread[:, :1], np.finfo(float).tiny)
+    if not ((spread > rank_tol) & (spread < _APART)).any():
+        return False
     try:
         stages = in_stages(e, aa, np.zeros((len(e), 1, len(s.rows), 0)), rank_tol, 1)
     except UnclearError:
@@ -374,6 +381,7 @@ def _why_not(t: Array, smallest: Array, rank_tol: float) -> str:
 
 _MASS = 1e3  # by how much more entries of E than those of A decide about scales in stages
 _BLURRED = 1e-4  # singular values below this are no structure in stages, whose rows are orthonormal
+_APART = 0.05  # singular values of the scaled E and A that say of no rate beside others
 _UNCLEAR = 1e-3  # with singular values below this, stages may be clearer
 _PLAIN = 1e-5  # bounds of singular values above this need no closer look
 
