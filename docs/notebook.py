@@ -27,13 +27,14 @@ def main() -> None:
     NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
     if "--write" in sys.argv[1:]:
         nbformat.write(_plain(notebook), NOTEBOOK)
-    TUTORIALS.mkdir(exist_ok=True)
     for page in PAGES:
         made = of_page((DOCS / f"{page}.md").read_text(encoding="utf-8"))
         with tempfile.TemporaryDirectory() as folder:
             resources = {"metadata": {"path": folder}}
             NotebookClient(made, timeout=300, kernel_name="python3", resources=resources).execute()
-        nbformat.write(_plain(made), TUTORIALS / f"{page}.ipynb")
+        target = TUTORIALS / f"{page}.ipynb"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        nbformat.write(_plain(made), target)
 
 
 def of_page(text: str) -> nbformat.NotebookNode:

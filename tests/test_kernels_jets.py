@@ -219,7 +219,7 @@ def known_functions(draw):
 def test_what_is_overlooked(known, tol):
     system, mesh, c, _ = known
     one, other = by_both(lambda: at_known._overlooked(
-        system, c, lambda t: system.coefficients.taylor(t, 0), mesh, tol
+        system, c, lambda t: system.coefficients.taylor(t, 0), mesh, tol, np.zeros(system.m)
     ))
     np.testing.assert_array_equal(one, other)
 

@@ -143,7 +143,7 @@ import subprocess, threading
 from gpebo_cli.cli import app, workers
 
 def launch():
-    subprocess.Popen(["true"])
+    child = subprocess.Popen(["true"])  # dropped, it would be collected
     threading.Thread(target=threading.Event().wait, daemon=False).start()  # Python waits for it
     threading.Event().wait()
 

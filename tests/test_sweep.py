@@ -103,8 +103,7 @@ def test_logspace_has_the_numbers_of_the_axis_of_one_run():
         logspace("logspace(0,1,2.5)", "estimator.gamma")
 
 
-def test_logspace_is_an_axis_without_m_and_where_it_is_quoted():
-    assert parse(["g=logspace(0,1,2)"]).overrides == ("g='logspace(0,1,2)'",)
+def test_logspace_is_a_sweep_with_m_but_not_where_it_is_quoted():
     assert parse(["-m", "g=logspace(0,1,2)"]).overrides == ("g=1,10",)
     assert parse(["-m", "g='logspace(0,1,2)'"]).overrides == ("g='logspace(0,1,2)'",)
 
