@@ -259,7 +259,9 @@ def test_a_quotient_that_is_rounding_moves_nothing():
 # What there is not ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["gradient", "mre", "fct", "power", "instrumental", "monotone"])
+@pytest.mark.parametrize(
+    "name", ["gradient", "mre", "lion", "fct", "power", "exciting", "instrumental", "monotone"]
+)
 def test_estimators_of_continuous_time_say_what_there_is(name):
     with pytest.raises(ConfigError, match="drem, least_squares, ls_drem"):
         estimators.able(estimators.build({"name": name}), estimators.Recursive, "samples")
