@@ -13,6 +13,7 @@ import signal
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from multiprocessing import resource_tracker
 from pathlib import Path
 from threading import Thread
 from threading import enumerate as threads
@@ -39,7 +40,7 @@ def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
 
     def run() -> None:
         try:
-            _start_tracker()
+            _start_trackers()
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children inherit it
             returned.append(launch())
         except BaseException as error:  # noqa: BLE001  raised again below
@@ -68,8 +69,9 @@ def stranded() -> bool:
     return any(thread.name == _LAUNCHER for thread in threads())
 
 
-def _start_tracker() -> None:
-    """Start joblib's process that cleans up, now: who starts it no longer blocks SIGINT then."""
+def _start_trackers() -> None:
+    """Start the processes that clean up, now: whoever starts them no longer blocks SIGINT then."""
+    resource_tracker.ensure_running()
     with suppress(ImportError):
         from joblib.externals.loky.backend import (  # type: ignore[import-untyped,unused-ignore]
             resource_tracker as of_loky,
