@@ -405,7 +405,9 @@ def _frame(path: str, kind: str, content: bytes) -> DataFrame:
 
     if kind == ".parquet":
         try:
-            from pyarrow.parquet import read_metadata  # type: ignore[import-untyped,unused-ignore]
+            from pyarrow.parquet import (  # type: ignore[import-not-found,import-untyped,unused-ignore]
+                read_metadata,
+            )
 
             head = read_metadata(io.BytesIO(content))
             cells = head.num_rows * head.num_columns
