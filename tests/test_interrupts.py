@@ -40,6 +40,16 @@ def test_what_is_dropped_in_the_last_stage_is_raised_at_the_end():
     interrupts.check()
 
 
+def test_what_fails_after_a_signal_was_dropped_is_an_interruption():
+    def run():
+        with interrupts.Remembered():
+            Finaliser()
+            raise ImportError("numpy was broken off")
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+
+
 def test_without_a_signal_nothing_happens_and_all_is_as_before():
     handler, hook = signal.getsignal(signal.SIGINT), sys.unraisablehook
     with interrupts.Remembered():

@@ -34,7 +34,7 @@ class Remembered:
         if hasattr(self, "_handler"):
             signal.signal(signal.SIGINT, self._handler)
         lost, Remembered.received = Remembered.received, False  # it is not meant for later work
-        if lost and kind is None:
+        if lost and kind is not KeyboardInterrupt:  # an import that it broke off is an ImportError
             raise KeyboardInterrupt
 
 
