@@ -35,7 +35,7 @@ BEGIN, END = "<!-- table: begin, by docs/uncertainty.py -->\n", "<!-- table: end
 
 SEEDS, BATCH = 2000, 100
 LEVEL, SAMPLE_TIME = 0.05, 0.1
-PLANTS = ("circuit", "descriptor", "strangeness_free", "battery")
+PLANTS = ("circuit", "descriptor", "strangeness_free")
 ESTIMATORS: tuple[Mapping[str, object], ...] = (
     {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3}, {"name": "ls_drem"},
     {"name": "drem", "gamma": 1e14}, {"name": "fct", "gamma": 1e14}, {"name": "gradient"},
