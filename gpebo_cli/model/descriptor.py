@@ -198,6 +198,8 @@ def check_sizes(system: DescriptorSystem, t: Array) -> None:
              "theta": ("unknowns", system.unknowns)}
     for name, values in entries.items():
         sizes = np.abs(distinct(values)[0])
+        if sizes.max(initial=0.0) <= LARGEST:
+            continue
         too_large = np.argwhere(np.isfinite(sizes) & (sizes > LARGEST))
         for at, *place in too_large[:1].tolist():
             where = name + "".join(f"[{k}]" for k in place)
