@@ -25,6 +25,7 @@ from gpebo_cli.results import style, symbols
 from gpebo_cli.results.figures import FIGURES, draw
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import Provenance
+from gpebo_cli.results.series import blocks
 
 CIRCUIT_FIGURES = {
     "regressor",
@@ -222,6 +223,19 @@ def test_time_axis_of_other_scales() -> None:
     for result, label in ((make_result(samples=9), "s"), (at_times(0.0, 2e-6), "10⁻⁶ s")):
         [(_, figure)] = draw(result, ["states"])
         assert figure.axes[-1].get_xlabel() == f"time $t$ ({label})"
+
+
+def test_a_band_has_both_its_edges_in_the_figure_and_in_the_table() -> None:
+    t, edge = np.arange(3.0), np.full(3, 0.5)
+    band = style.Curve(t, edge, "band", replace(style.line(0), dots=True), down_to=-edge)
+    panel = style.Panel("y", (band,))
+    axes = style.compose([panel]).axes[0]
+    assert [line.get_ydata()[0] for line in axes.lines[:2]] == [0.5, -0.5]
+    low, high = axes.get_xlim()
+    assert (low < t[0], high > t[-1]) == (True, True), "whole dots at either end"
+    [block] = blocks([panel])
+    assert [c.values[0] for c in block.columns] == [0.5, -0.5]
+    assert [c.name for c in block.columns] == ["y: band", "y: band, lower edge"]
 
 
 def test_power_of_ten_stands_with_the_unit() -> None:

@@ -525,11 +525,8 @@ def _estimate(
     deviation = _deviation(result, name)
     if deviation is not None:
         low, high = values[0] - 2 * deviation, values[0] + 2 * deviation
-        curves = (
-            *curves,
-            Curve(estimation.t, high, "± 2σ", style.SPREAD, r"$\pm\,2\sigma$", down_to=low),
-            Curve(estimation.t, low, "", style.SPREAD),
-        )
+        band = Curve(estimation.t, high, "± 2σ", style.SPREAD, r"$\pm\,2\sigma$", down_to=low)
+        curves = (*curves, band)
     known = bool(np.isfinite(truth.y).any())
     if known:
         curves = (truth, *curves) if behind else (*curves, truth)
@@ -612,8 +609,6 @@ def _error(result: RunResult, name: str, error: Array, size: float) -> Panel:
         up, down = 2 * deviation, -2 * deviation if signed else None
         label, text = ("± 2σ", r"$\pm\,2\sigma$") if signed else ("2σ", r"$2\sigma$")
         curves = (*curves, Curve(estimation.t, up, label, style.SPREAD, text, down_to=down))
-        if down is not None:
-            curves = (*curves, Curve(estimation.t, down, "", style.SPREAD))
     labels = result.system.labels
     return Panel(f"error of {name}", curves, _unit(result, name),
                  error_of(name, labels, signed=signed), log=not signed, size=size)

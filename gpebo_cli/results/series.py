@@ -64,14 +64,19 @@ def blocks(panels: Sequence[Panel]) -> list[Block]:
     for panel in panels[:MAX_PANELS]:
         for curve in panel.curves:
             name = f"{panel.label}: {curve.label}" if curve.label else panel.label
-            column = Column(name, drawn(panel, curve), panel.log, panel.size)
+            columns: tuple[Column, ...] = (
+                Column(name, drawn(panel, curve), panel.log, panel.size),
+            )
+            if curve.down_to is not None:
+                lower = Column(f"{name}, lower edge", curve.down_to, panel.log, panel.size)
+                columns = (*columns, lower)
             for k, block in enumerate(found):
                 if np.array_equal(block.x, curve.x):
-                    found[k] = Block(block.name, block.x, (*block.columns, column))
+                    found[k] = Block(block.name, block.x, (*block.columns, *columns))
                     break
             else:
                 x = panel.axis.name
-                found.append(Block(f"{x} of {name}" if found else x, curve.x, (column,)))
+                found.append(Block(f"{x} of {name}" if found else x, curve.x, columns))
         if panel.vertical is not None:
             time, name = panel.vertical
             found.append(Block(name, np.array([time]), ()))

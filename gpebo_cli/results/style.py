@@ -380,6 +380,7 @@ def _fill(axes: Axes, panel: Panel, height: float) -> None:
         axes.plot(curve.x, drawn(panel, curve), label=curve.text or escaped(curve.label) or "_",
                   **curve.style.keywords)
         if curve.down_to is not None:
+            axes.plot(curve.x, curve.down_to, **curve.style.keywords)
             axes.fill_between(curve.x, curve.down_to, curve.y, color=curve.style.color,
                               alpha=0.15, linewidth=0.0)
     if all(np.isnan(drawn(panel, curve)).all() for curve in panel.curves):
@@ -407,7 +408,9 @@ def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
         margin = (high / low) ** 0.02
         axes.set_xlim(low / margin, high * margin)
     else:
-        axes.set_xlim(low, high)
+        dots = any(curve.style.dots for panel in panels for curve in panel.curves)
+        margin = 0.02 * (high - low) if dots else 0.0  # half a dot at either end would be cut
+        axes.set_xlim(low - margin, high + margin)
     power = _set_ticks(axes.xaxis, 7, log=axis.log)
     if axis.log and np.ceil(np.log10(low)) + 1 > np.floor(np.log10(high) + 1e-9):
         # There are less than two whole decades to label: the ends are.
