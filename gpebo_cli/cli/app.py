@@ -2,13 +2,13 @@
 
 Dispatch is by hand because Hydra owns the rest of the command line and declines to share it with
 argparse or click; and because ``gpebo --help`` should cost no more than starting Python. So this
-module imports nothing that the interpreter has not loaded already.
+module imports nothing but ``signal`` that the interpreter has not loaded already.
 """
 
 from __future__ import annotations
 
-import _signal  # type: ignore[import-not-found]  # signal itself takes milliseconds to import
 import os
+import signal
 import sys
 
 from gpebo_cli.errors import ConfigError, GpeboError
@@ -34,7 +34,7 @@ COMMANDS = {
 def entry() -> None:
     """The process ``gpebo``: :func:`main`, and a Ctrl-C that comes when all is done is too late."""
     # Before main() is inside its own handler nothing is there that would have to be cleaned up.
-    _signal.signal(_signal.SIGINT, lambda *_: _interrupted())
+    signal.signal(signal.SIGINT, lambda *_: _interrupted())
     if not sys.warnoptions:  # of libraries, for whoever writes programs; -W shows them
         import warnings
 
@@ -42,7 +42,7 @@ def entry() -> None:
         os.environ["PYTHONWARNINGS"] = "ignore"  # of workers, too
     try:
         code = main()
-        _signal.signal(_signal.SIGINT, _signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     except KeyboardInterrupt:
         code = _interrupted()
     workers = sys.modules.get("gpebo_cli.cli.workers")  # of a sweep
@@ -158,7 +158,7 @@ def _interrupted() -> int:
     """
     import atexit
 
-    _signal.signal(_signal.SIGINT, _signal.SIG_IGN)  # once is enough
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # once is enough
     _report("interrupted", 130)
     atexit._run_exitfuncs()  # noqa: SLF001  there is no public way to run them early
     _leave(130)

@@ -32,7 +32,7 @@ from gpebo_cli.numerics.errors import estimated_errors, least_sizes
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_within
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, unresolved_kinds
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
-from gpebo_cli.numerics.radau import RadauRule, differentiation_schur
+from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
 
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
@@ -266,10 +266,7 @@ def _solve_elements(
     basis, offset = (None, None) if c.constraints is None else c.constraints
     group = np.arange(k)
     if _is_constant(c):
-        # One length for all that are equal would be wrong each time in the same direction, and over
-        # many elements that adds up; what their mean is wrong by adds up to nothing.
-        group = equal_lengths(h)
-        h = (np.bincount(group, weights=h) / np.bincount(group))[group]
+        group, h = equal_lengths(h)
     groups = int(group.max(initial=-1)) + 1
     solve = elements.element_maps
     if _is_constant(c) and s * c.A.shape[1] > _DIRECT:
@@ -327,19 +324,20 @@ def _with_instants(noise: Array, solution: Trajectory, cuts: Array) -> Array:
     return found
 
 
-def equal_lengths(h: Array) -> IntArray:
-    """Group (K,) of each length; those that differ by rounding only count as equal.
+def equal_lengths(h: Array) -> tuple[IntArray, Array]:
+    """Group (K,) of each length, and the group's mean in its place.
 
-    Groups are numbered as they first appear.
+    Lengths that differ by rounding only count as equal. One of them for all would be wrong each
+    time in the same direction, and over many elements that adds up; what their mean is wrong by
+    adds up to nothing. Groups are numbered as they first appear.
     """
-    if h.max(initial=0.0) - h.min(initial=np.inf) <= _EQUAL * h.max(initial=0.0):
-        return np.zeros(len(h), dtype=np.intp)
-    order = np.argsort(h, kind="stable")
-    new = np.diff(h[order]) > _EQUAL * h.max()
-    by_length = np.empty(len(h), dtype=np.intp)
-    by_length[order] = np.append(0, np.cumsum(new))
-    first = np.unique(by_length, return_index=True)[1]
-    return np.asarray(np.argsort(np.argsort(first))[by_length])
+    group = np.zeros(len(h), dtype=np.intp)
+    if h.max(initial=0.0) - h.min(initial=np.inf) > _EQUAL * h.max(initial=0.0):
+        order = np.argsort(h, kind="stable")
+        group[order] = np.append(0, np.cumsum(np.diff(h[order]) > _EQUAL * h.max()))
+        first = np.unique(group, return_index=True)[1]
+        group = np.argsort(np.argsort(first))[group]
+    return group, np.asarray((np.bincount(group, weights=h) / np.bincount(group))[group])
 
 
 def decoupled_maps(
@@ -371,19 +369,31 @@ def decoupled_maps(
 
 
 def solve_constant(s: int, step: float, E: Array, A: Array, right: Array) -> Array:
-    """(D/h ⊗ E − I ⊗ A) Z = ``right`` for constant E, A (d, d); Z and ``right`` (s, d, columns).
+    """(D/h ⊗ E − I ⊗ A) Z = ``right`` for constant E, A (d, d); Z and ``right`` (s, d, columns)."""
+    def solve(shift: complex, r: ComplexArray) -> ComplexArray:
+        return np.asarray(np.linalg.solve(shift * E - A, r), dtype=np.complex128)
+
+    return decoupled(s, step, right, solve, E)
+
+
+def decoupled(
+    s: int, step: float, right: Array, solve: Callable[[complex, ComplexArray], ComplexArray],
+    E: Array | None = None,
+) -> Array:
+    """:func:`solve_constant` by what solves (shift E − A) y = r, y and r (d, columns).
 
     With D = U T Uᴴ the stages decouple from the last to the first: s systems of size d instead of
-    one of size s·d.
+    one of size s·d. ``E`` (d, d): None is the identity.
     """
     U, T = differentiation_schur(s)
     T = T / step
     Y = np.tensordot(U.conj().T, right, axes=1)
-    EY = np.empty_like(Y)
+    EY = Y if E is None else np.empty_like(Y)
     for i in range(s - 1, -1, -1):
         later = np.tensordot(T[i, i + 1 :], EY[i + 1 :], axes=1)
-        Y[i] = np.linalg.solve(T[i, i] * E - A, Y[i] - later)
-        EY[i] = E @ Y[i]
+        Y[i] = solve(complex(T[i, i]), Y[i] - later)
+        if E is not None:
+            EY[i] = E @ Y[i]
     return np.asarray(np.tensordot(U, Y, axes=1).real)
 
 

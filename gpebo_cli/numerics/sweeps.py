@@ -12,7 +12,6 @@ factorisation for all elements of one length.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -23,6 +22,7 @@ from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.collocation import (
     LinearSolution,
     at_points,
+    decoupled,
     decoupled_maps,
     equal_lengths,
     unresolved_signals,
@@ -30,7 +30,7 @@ from gpebo_cli.numerics.collocation import (
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, legendre_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.numerics.radau import ComplexArray, differentiation_schur
+from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
 
 LENGTH = 4.0  # h‖A‖ of an element at most
@@ -147,7 +147,7 @@ def solve(
     def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
         A, f, extras = equation(mesh)
         mapped = not stiff and len(A.entries) == 1 and problem.start.shape[1] > _MANY_COLUMNS
-        mapped = mapped and _MANY_ALIKE * equal_lengths(mesh.steps).max() < mesh.size
+        mapped = mapped and _MANY_ALIKE * equal_lengths(mesh.steps)[0].max() < mesh.size
         values, change = _swept(
             _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {}
         )
@@ -221,9 +221,9 @@ def _mapped(
     kicks: Array | None, start: Array, *_: object,
 ) -> tuple[Array, Array]:
     """As ``elements.sweeps`` for one constant A and many columns, by maps of elements."""
-    s, (d, c), group = len(R), start.shape, equal_lengths(h)
+    s, (d, c) = len(R), start.shape
     first = slice(0, f.shape[2])
-    h = (np.bincount(group, weights=h) / np.bincount(group))[group]
+    group, h = equal_lengths(h)
     D = np.asarray(np.linalg.inv(R), dtype=np.float64)
     full = Sparse(rows, columns, entries).full()[None]
     maps, forced = decoupled_maps(
@@ -241,12 +241,11 @@ def _mapped(
 class _Solved:
     """As ``elements.sweeps`` for one constant A, by solving (D/h ⊗ I − I ⊗ A) X = D𝟙/h x_0 + f.
 
-    With D = U T Uᴴ the stages decouple from the last to the first, see
-    :func:`gpebo_cli.numerics.collocation.solve_constant`.
+    See :func:`gpebo_cli.numerics.collocation.decoupled`.
     """
 
     def __init__(self, A: Sparse) -> None:
-        self._A, self._solvers = A.full(), dict[str, list[Callable[[Array], Array]]]()
+        self._A, self._solvers = A.full(), dict[str, Callable[[ComplexArray], ComplexArray]]()
         self._sparse = len(A.columns) < _SPARSE * self._A.size
 
     def __call__(
@@ -254,42 +253,37 @@ class _Solved:
         kicks: Array | None, start: Array, *_: object,
     ) -> tuple[Array, Array]:
         s, (d, columns) = len(R), start.shape
-        U, T = differentiation_schur(s)
-        inward, from_left = U.conj().T, np.linalg.inv(R).sum(axis=1)[:, None, None]
-        group = equal_lengths(h)
-        h = (np.bincount(group, weights=h) / np.bincount(group))[group]
+        from_left = np.linalg.inv(R).sum(axis=1)[:, None, None]
+        h = equal_lengths(h)[1]
         values, state = np.empty((len(h), s + 1, d, columns)), start
         for k, step in enumerate(h.tolist()):
             right = np.broadcast_to(from_left / step * state, (s, d, columns)).copy()
             points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
             right[:, :, : f.shape[2]] += f if len(f) == 1 else f[points]
-            Y = np.tensordot(inward, right, axes=1)
-            for i, solved in zip(range(s - 1, -1, -1), self._at(step, T), strict=True):
-                Y[i] = solved(Y[i] - np.tensordot(T[i, i + 1 :] / step, Y[i + 1 :], axes=1))
-            values[k, 0], values[k, 1:] = state, np.tensordot(U, Y, axes=1).real
+            values[k, 0], values[k, 1:] = state, decoupled(s, step, right, self._solve)
             state = values[k, -1] if kicks is None else values[k, -1] + kicks[k]
         return values, np.zeros(len(h))
 
-    def _at(self, step: float, T: ComplexArray) -> list[Callable[[Array], Array]]:
-        """What solves (T_ii/h I − A) y = r, of the last stage first."""
-        known = f"{step:.13e}"
+    def _solve(self, shift: complex, right: ComplexArray) -> ComplexArray:
+        """(shift I − A) y = r, with one factorisation for what is equal but for rounding."""
+        known = f"{shift:.13e}"
         if known not in self._solvers:
-            shifts = (np.diagonal(T)[::-1] / step).tolist()
-            self._solvers[known] = [self._factorised(shift) for shift in shifts]
-        return self._solvers[known]
+            self._solvers[known] = self._factorised(shift)
+        return self._solvers[known](right)
 
-    def _factorised(self, shift: complex) -> Callable[[Array], Array]:
+    def _factorised(self, shift: complex) -> Callable[[ComplexArray], ComplexArray]:
         matrix = -self._A.astype(np.complex128)
         matrix[np.diag_indices(len(matrix))] += shift
         if self._sparse:
             from scipy.sparse import csc_matrix
             from scipy.sparse.linalg import splu
 
-            solve: Callable[[Array], Array] = splu(csc_matrix(matrix)).solve
+            solve: Callable[[ComplexArray], ComplexArray] = splu(csc_matrix(matrix)).solve
             return solve
         from scipy.linalg import lu_factor, lu_solve
 
-        return partial(lu_solve, lu_factor(matrix, overwrite_a=True), check_finite=False)
+        factors = lu_factor(matrix, overwrite_a=True)
+        return lambda r: np.asarray(lu_solve(factors, r, check_finite=False), dtype=np.complex128)
 
 
 def _swept(
