@@ -181,6 +181,9 @@ def _constraints(e: Array, a: Array, max_mu: int) -> tuple[list[tuple[Array, lis
 def scales_of(E: Array, A: Array) -> tuple[Array, Array, float]:
     """Of rows and columns (n,), and the unit of time, by which E/τ and A are of the size one.
 
+    By largest entries: means of logarithms, as in ``derivative_array.balance``, count the smallest
+    ones as much, and of full matrices those are rounding (the driven cavity is then undecided).
+
     Args:
         E: (n, n).
         A: (n, n).
