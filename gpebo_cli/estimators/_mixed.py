@@ -72,9 +72,7 @@ class FilteredEstimator(ResumableEstimator):
         def of_case(gain: Array) -> ErrorsAt:
             def at(t: Array, inside: Array) -> ErrorSystem:
                 omega = extended(t, inside)[..., :p]
-                delta, adjugate, _ = determinant_and_adjugate_action(
-                    omega, np.broadcast_to(np.eye(p), omega.shape)
-                )
+                delta, adjugate, _ = determinant_and_adjugate_action(omega)
                 into = rates[:, None] * self.seen(regression.psi(t, inside))
                 return scalar_errors(rates, into, delta, adjugate, gain)
 

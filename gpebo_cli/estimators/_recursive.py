@@ -217,9 +217,7 @@ class KreisselmeierFilter:
 def inverse_sampled(extended: Array) -> Array:
     """Ω⁻¹ (K, p, p) of [Ω | 𝒴] (K, p, p + 1), zero where it is rounding."""
     omega = extended[..., :-1]
-    delta, adjugate, reciprocal = determinant_and_adjugate_action(
-        omega, np.broadcast_to(np.eye(omega.shape[1]), omega.shape)
-    )
+    delta, adjugate, reciprocal = determinant_and_adjugate_action(omega)
     usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))[:, None, None]
     return np.divide(
         adjugate, delta[:, None, None], out=np.zeros_like(omega), where=usable

@@ -104,9 +104,7 @@ class Exciting(GainEstimator):
         def of_case(gain: Array) -> ErrorsAt:
             def at(t: Array, inside: Array) -> ErrorSystem:
                 omega = extended(t, inside)[..., :p]
-                delta, adjugate, _ = determinant_and_adjugate_action(
-                    omega, np.broadcast_to(np.eye(p), omega.shape)
-                )
+                delta, adjugate, _ = determinant_and_adjugate_action(omega)
                 new, psi = law.signals(t, inside)[0][:, None], regression.psi(t, inside)
                 A = np.zeros((len(t), 4 * p, 4 * p))
                 A[:, filtered, filtered] = -rates

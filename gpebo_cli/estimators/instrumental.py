@@ -82,9 +82,7 @@ class Instrumental(GainEstimator):
             def at(t: Array, inside: Array) -> ErrorSystem:
                 rows = means(t, inside)
                 left = self.left(rows, names)
-                delta, adjugate, _ = determinant_and_adjugate_action(
-                    left @ rows[..., :p], np.broadcast_to(np.eye(p), (len(t), p, p))
-                )
+                delta, adjugate, _ = determinant_and_adjugate_action(left @ rows[..., :p])
                 rate = (1.0 / (self.settle + t - began))[:, None, None]
                 weighted = delta[:, None, None] * gain[:, None]
                 A = np.zeros((len(t), 3 * p, 3 * p))

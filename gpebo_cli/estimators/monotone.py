@@ -94,9 +94,7 @@ class Monotone(GainEstimator):
 
             def at(t: Array, inside: Array) -> ErrorSystem:
                 omega = extended(t, inside)[..., :k]
-                delta, adjugate, _ = determinant_and_adjugate_action(
-                    omega, np.broadcast_to(np.eye(k), omega.shape)
-                )
+                delta, adjugate, _ = determinant_and_adjugate_action(omega)
                 slope, weighted = S.jacobian(path(t)), gamma * delta[:, None, None] * T
                 psi = regression.psi(t, inside)
                 A = np.zeros((len(t), k + q, k + q))

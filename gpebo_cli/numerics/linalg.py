@@ -69,11 +69,14 @@ def orthonormal_complement(basis: Array) -> Array:
     return np.eye(basis.shape[-2]) - basis @ transpose(basis)
 
 
-def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Array, Array]:
+def determinant_and_adjugate_action(
+    omega: Array, rhs: Array | None = None
+) -> tuple[Array, Array, Array]:
     """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p) or (..., p, c), singular Ω too.
 
-    With Ω = U Σ Vᵀ, adj(Ω) = det(U) det(V) V diag(∏_{j≠i} σ_j) Uᵀ. The usual det(Ω)·inv(Ω) is
-    rejected: it is undefined at the start, where every extension begins at Ω = 0.
+    Without b it is adj(Ω) itself. With Ω = U Σ Vᵀ, adj(Ω) = det(U) det(V) V diag(∏_{j≠i} σ_j) Uᵀ.
+    The usual det(Ω)·inv(Ω) is rejected: it is undefined at the start, where every extension begins
+    at Ω = 0.
 
     Returns:
         det(Ω) of shape (...,), adj(Ω) b of the shape of b, and the reciprocal condition number
@@ -86,6 +89,8 @@ def determinant_and_adjugate_action(omega: Array, rhs: Array) -> tuple[Array, Ar
         (0.0, [0.0, 0.0])
     """
     p = omega.shape[-1]
+    if rhs is None:
+        rhs = np.broadcast_to(np.eye(p), omega.shape)
     u, sigma, vt = np.linalg.svd(omega)
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     # Products of all singular values but one, by prefix and suffix products: no division.
