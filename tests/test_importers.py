@@ -99,6 +99,9 @@ NETLISTS = {  # name: (netlist, what is measured, index)
     "damped sine": (
         "sin\nV1 a 0 SIN(0.5 1 0.4 1 0.2)\nR1 a b 1\nC1 b 0 1 ic=0\n", "v(b)", 1,
     ),
+    "late sine that is damped at once": (
+        "sin\nV1 a 0 SIN(0.5 1 0.4 4 200 30)\nR1 a b 1\nC1 b 0 1 ic=0\n", "v(b)", 1,
+    ),
     "exp": ("exp\nI1 0 b EXP(0 1 1 0.5 4 2)\nR1 b 0 1\nC1 b 0 1 ic=0\n", "v(b)", 0),
     "cv loop": (
         "cv\nV1 a 0 SIN(0 1 0.3)\nC1 a b 1 ic=0\nC2 b 0 2 ic=0\nR1 b 0 1\n", "v(b),i(V1)", 2,

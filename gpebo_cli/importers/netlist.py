@@ -520,8 +520,8 @@ def _sin(numbers: Sequence[float]) -> str:
     offset, amplitude, frequency, delay, damping, phase = _padded(numbers, 3, [0.0] * 6)
     since = f"(t - {delay!r})" if delay else "t"
     wave = f"sin(2*pi*{frequency!r}*{since}" + (f" + {phase!r}*pi/180)" if phase else ")")
-    if damping:
-        wave += f"*exp(-{damping!r}*{since})"
+    if damping:  # abs: before the delay it would grow beyond all numbers, and step times that
+        wave += f"*exp(-{damping!r}*{f'abs{since}' if delay else since})"
     if delay:  # before it the source stands at its first value
         first = f"sin({phase!r}*pi/180)" if phase else "0"
         wave = f"({first} + ({wave} - {first})*step(t - {delay!r}))"
