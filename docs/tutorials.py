@@ -39,11 +39,11 @@ def parts(text: str) -> list[tuple[str, str]]:
 
 
 def _edit(file: str, diff: str) -> str:
-    old, new = (line[1:] for line in diff.splitlines())
+    lines = diff.splitlines()
+    old, new = ("\n".join(x[1:] for x in lines if x[0] in kept) for kept in (" -", " +"))
     return (
-        f"from pathlib import Path\n\nfile = Path({file!r})\n"
-        "lines = file.read_text().splitlines()\n"
-        f"lines[lines.index({old!r})] = {new!r}\nfile.write_text('\\n'.join([*lines, '']))\n"
+        f"from pathlib import Path\n\nfile = Path({file!r})\ntext = file.read_text()\n"
+        f"assert text.count({old!r}) == 1\nfile.write_text(text.replace({old!r}, {new!r}))\n"
     )
 
 

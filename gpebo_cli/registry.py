@@ -113,7 +113,8 @@ class Registry(Generic[T]):
         article = "an" if self.noun[0] in "aeiou" else "a"
         raise ConfigError(
             f"{self.noun}.name: {name!r} is not {article} {self.noun}; known: "
-            f"{', '.join(self.names())}" + nearest(str(name), self.names())
+            f"{', '.join(self.names())}{nearest(str(name), self.names())}; one of your own has to "
+            "be installed: pip install -e FOLDER"
         )
 
     def _load(self, entry: EntryPoint) -> type:

@@ -474,6 +474,10 @@ def test_symbol(gain: str, text: str) -> None:
     assert symbols.symbol(gain) == text
 
 
+def test_products_of_units_have_a_dot() -> None:
+    assert symbols.with_unit("load", "N*m") == "load (N·m)"
+
+
 def test_every_figure_is_found_by_the_name_of_its_file() -> None:
     assert set(FIGURES) >= CIRCUIT_FIGURES
     assert set(UNITS) >= {"e1", "V", "y"}

@@ -19,6 +19,7 @@ from scipy.integrate import trapezoid
 from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
 from gpebo_cli.cli.progress import Progress
+from gpebo_cli.cli.sweep import _overrides
 from gpebo_cli.cli.sweep_folder import (
     JobRecord,
     Plan,
@@ -506,6 +507,16 @@ def test_where_jobs_run_is_no_part_of_the_table(tmp_path):
     (tmp_path / "sweep" / "1" / "result.json").unlink()
     assert gpebo(*words, "resume=sweep", cwd=tmp_path).returncode == 0
     assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "done"]
+
+
+@pytest.mark.parametrize(("word", "shown"), [
+    ("plant.inputs.V='3 + \\'t'", "3 + 't"),
+    ('plant.inputs.V="sin(2*t)"', "sin(2*t)"),
+    ('observer.xi_a0=["a b"]', '["a b"]'),
+    ("estimator.gamma=1e8", "1e8"),
+])
+def test_a_formula_is_shown_as_it_was_written(word, shown):
+    assert list(_overrides([word]).values()) == [shown]
 
 
 def test_a_folder_from_a_stranger_cannot_bring_launchers(tmp_path):

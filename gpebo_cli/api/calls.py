@@ -48,7 +48,7 @@ def run(
     time: Mapping[str, object] | None = None,
     excitation: Mapping[str, object] | None = None,
     config_dir: Folder | None = None,
-    progress: Callable[[str], None] = lambda _stage: None,
+    progress: Callable[[str], None] | None = None,
     **gains: object,
 ) -> Result:
     """Simulate a plant, observe it, estimate its parameters and state, collect the evidence.
@@ -78,6 +78,10 @@ def run(
         gains: settings of the estimator, as in ``gamma=[1e8, 1e10]``; every combination of
             lists is one case. ``lambda`` is a word of Python's: ``**{"lambda": 0.2}``.
 
+    Returns:
+        What the run found, by name: ``result["il"]`` (N,), ``result.estimates["il"]`` (cases, M),
+        ``result.parameters``, ``result.verdict``; see :class:`Result`.
+
     Raises:
         ConfigError: a wrong name, key, value or plant; the texts are the command line's.
         ModelError: the plant cannot be simulated, or an assumption of the observer fails.
@@ -106,7 +110,7 @@ def run(
             )
         config["estimator"] = {"name": type(own).__name__}
         settings = replace(settings, estimator=config["estimator"])
-    return Result(run_experiment(settings, system, progress, own), config)
+    return Result(run_experiment(settings, system, progress or (lambda _: None), own), config)
 
 
 def check(

@@ -15,6 +15,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.core.utils import JobStatus
 from omegaconf import DictConfig, OmegaConf
@@ -233,9 +234,17 @@ def _overrides(job: Sequence[str]) -> dict[str, str]:
     """What a job is; where it runs is no part of it, so a sweep may be gone on with elsewhere."""
     pairs = (text.partition("=") for text in job)
     return {
-        key.lstrip("+"): value for key, _, value in pairs
+        key.lstrip("+"): _unquoted(value) for key, _, value in pairs
         if key != "launcher" and not key.startswith("~")
     }
+
+
+def _unquoted(value: str) -> str:
+    """A text as it was written, without the quotes that Hydra's grammar needs around a formula."""
+    if not value.startswith(("'", '"')):
+        return value
+    parsed = OverridesParser.create().parse_override(f"value={value}").value()
+    return parsed if isinstance(parsed, str) else value
 
 
 def _digest(config: DictConfig) -> str:
@@ -375,6 +384,6 @@ def _jobs(count: int) -> str:
 
 def _shown(cell: str) -> str:
     try:
-        return f"{float(cell):.4g}" if "." in cell else cell
+        return f"{float(cell):.4g}" if "." in cell or len(cell) > 6 else cell
     except ValueError:
         return cell

@@ -41,6 +41,14 @@ th:first-child, td:first-child, .text th, .text td { text-align: left; }
 .verdict { font-weight: 600; }
 .fails td { color: #a40000; }
 pre { overflow-x: auto; background: #f5f5f5; padding: .75rem; font-size: .8rem; line-height: 1.4; }
+@media (max-width: 40rem) {  /* on a telephone rows of text stand one cell below the other */
+  table { font-size: .75rem; }
+  th { min-width: 0; }
+  th, td { padding-right: .5rem; }
+  .text thead { display: none; }
+  .text tr { display: block; padding: .3rem 0; border-bottom: 1px solid #ddd; }
+  .text td { display: block; padding: 0; border: 0; overflow-wrap: anywhere; }
+}
 summary { cursor: pointer; margin-top: .75rem; }
 footer { margin-top: 3rem; padding-top: .75rem; border-top: 1px solid #bbb; font-size: .85rem; }
 code { font-size: .92em; overflow-wrap: anywhere; }

@@ -496,8 +496,9 @@ def _set_name(axes: Axes, name: str, unit: str, height: float) -> None:
         broken = f"{head}$\n$- {tail}" if tail and head.count("{") == head.count("}") else name
     else:
         broken = "\n".join(textwrap.wrap(name.replace("_", "_ "), 22)).replace("_ ", "_")
-    for text in (with_unit(name, unit), f"{name}\n({unit})", f"{broken}\n({unit})"):
-        axes.set_ylabel(text.removesuffix("\n()"))
+    for words, between in ((name, " "), (name, "\n"), (broken, "\n")):
+        text = with_unit(words, unit, between)
+        axes.set_ylabel(text)
         if len(text) < 12:
             return
         length = axes.yaxis.label.get_window_extent().height / axes.figure.dpi

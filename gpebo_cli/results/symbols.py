@@ -18,9 +18,9 @@ _LETTERS = {
 _WORD = re.compile(r"([A-Za-z]+)(\d*)")
 
 
-def with_unit(name: str, unit: str) -> str:
-    """Name of an axis: ``e1 (V)``, or the bare name where no unit is known."""
-    return f"{name} ({unit})" if unit else name
+def with_unit(name: str, unit: str, between: str = " ") -> str:
+    """Name of an axis: ``e1 (V)``, ``load (N·m)``, or the bare name where no unit is known."""
+    return f"{name}{between}({unit.replace('*', '·')})" if unit else name
 
 
 def power_of_ten(exponent: int) -> str:
