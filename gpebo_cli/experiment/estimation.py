@@ -189,7 +189,9 @@ def at_samples(
                 sampled_deviations(settings.noise, levels, source)
                 if settings.uncertainty and last else None
             )
-            online = Online(settings, system, samples.hold, start, first, by, wanted)
+            online = Online(
+                settings, system, samples.hold, start, first, by, wanted, source.derivatives
+            )
             made = []
             for i in range(0, len(t), _SAMPLES_AT_ONCE):
                 part = slice(i, i + _SAMPLES_AT_ONCE)
@@ -239,19 +241,33 @@ def at_samples(
         level = sampled_window_level(made.regression, window)[chosen]
         excitation = online.excitation(made, chosen, level, window)
     rows = made.regression.rows[1:][chosen]
+    metrics = _metrics(numbers, online.parameters, system)
     return Estimated(
         online,
         RegressionResult(
             t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
         ),
         excitation, estimation,
-        _standing(
-            estimation, _metrics(numbers, online.parameters, system), None,
-            np.arange(len(online.parameters)), system,
-        ),
+        _standing(estimation, metrics, None, np.arange(len(online.parameters)), system),
         online.fit() if source.recording else None,
         estimable(excitation, online.parameters, system.states, made.seen[chosen]),
+        note=online.note
+        + (_held(samples, metrics) if levels.silent and not source.recording else ""),
     )
+
+
+def _held(samples: Sampling, metrics: Metrics) -> str:
+    """What the hold has to do with estimates that did not get as close as 1 %."""
+    if np.isfinite(metrics.seconds_to_1pct_states).any() or not np.isfinite(
+        metrics.final_error_states
+    ).any():
+        return ""
+    if samples.hold == "zoh":
+        return (
+            "; the error of signals that are held between samples falls with "
+            "observer.sample_time, and faster with observer.hold=linear"
+        )
+    return "; the error of straight lines between samples falls with observer.sample_time squared"
 
 
 def _standing(

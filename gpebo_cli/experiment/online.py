@@ -21,6 +21,7 @@ from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.observers.reduced.sampled import TOLERANCE
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 
@@ -78,6 +79,7 @@ class Online:
         self, settings: Settings, system: DescriptorSystem, hold: str, start: float, sample: Array,
         estimator: estimators.Estimator | None = None,
         deviations: SampledDeviations | None = None,
+        derivatives: InputDerivatives | None = None,
     ) -> None:
         """Prepare for samples of which the first is at ``start``.
 
@@ -89,6 +91,7 @@ class Online:
             sample: the first one, [u; y] (m + r,).
             estimator: used instead of the one that the settings name.
             deviations: of what is estimated; None: nobody asks for them.
+            derivatives: of the inputs, as far as they are known.
 
         Raises:
             ConfigError: the observer or the estimator works in continuous time only.
@@ -97,7 +100,7 @@ class Online:
         self._observer = observers.able(
             observers.build(settings.observer), observers.AtSamples,
             "observer.sample_time and streams need an observer that runs at samples",
-        ).at_samples(system, settings.solver, hold, start, sample)
+        ).at_samples(system, settings.solver, hold, start, sample, derivatives)
         if estimator is None:
             estimator = estimators.build(settings.estimator)
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases
@@ -195,6 +198,12 @@ class Online:
     def assumptions(self) -> tuple[Assumption, ...]:
         """Those of the observer, as far as it got."""
         return self._observer.assumptions(self.reached)
+
+    @property
+    def note(self) -> str:
+        """What the last line has to say of the equations, from "; " on."""
+        evidence = [each.evidence for each in self.assumptions]
+        return "".join(f"; {each['because']}" for each in evidence if "because" in each)
 
     def excitation(
         self, made: OnlineEstimates | None = None, shown: IntArray = _NEWEST,

@@ -189,4 +189,5 @@ def stream_verdict(online: Online) -> str:
     return (
         f"{online.count} rows, t = {online.start:.6g} to {online.reached.t:.6g}; "
         + verdict(excitation, online.cases, online.requirement, fit=fit)
+        + online.note
     )

@@ -94,7 +94,10 @@ def standard_deviations(
     if (levels.silent and not source.recording) or not regression.p:
         return ""
     if errors is None or not isinstance(state_map, Differentiable):
-        return "noise of the signals is in the matrices, or this remedy cannot tell what it does"
+        return (
+            "noise of the signals is in the matrices or differentiated, or this remedy cannot tell "
+            "what it does"
+        )
     goes_on = isinstance(estimator, ResumableEstimator) or not regression.resets
     if not isinstance(estimator, Affine) or not goes_on:
         return "the estimator does not say what errors of Y do to it"

@@ -150,9 +150,12 @@ class AtSamples(Observer, Protocol):
 
     def at_samples(
         self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
-        sample: Array,
+        sample: Array, derivatives: InputDerivatives | None,
     ) -> Recursion:
-        """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``."""
+        """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``.
+
+        ``derivatives`` of the inputs are for constraints that contain them; None: nobody knows any.
+        """
         ...
 
 

@@ -21,6 +21,7 @@ from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observe
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
 from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import SolverSettings
 
 _GROWN = 2.0  # the largest entry of Φ, from which on A_0 counts as unstable
@@ -131,7 +132,7 @@ class Gpebo:
 
     def at_samples(
         self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
-        sample: Array,
+        sample: Array, derivatives: InputDerivatives | None,
     ) -> SampledObserver:
         """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``.
 
@@ -141,7 +142,7 @@ class Gpebo:
         """
         self._refuse_what_needs_the_past()
         return sampled_observer(
-            system, solver, hold, start, sample,
+            system, solver, hold, start, sample, derivatives,
             xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=self.form,
         )
 

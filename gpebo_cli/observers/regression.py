@@ -21,6 +21,7 @@ from gpebo_cli.observers._observation import (
     StateMap,
     Truth,
 )
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.parametrisation import Parametrisation
@@ -82,7 +83,7 @@ class Given:
 
     def at_samples(
         self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,  # noqa: ARG002  protocol
-        sample: Array,  # noqa: ARG002
+        sample: Array, derivatives: InputDerivatives | None,  # noqa: ARG002
     ) -> GivenAtSamples:
         """The regression's recursion, whose first sample [u; y] (m + r,) is at ``start``.
 

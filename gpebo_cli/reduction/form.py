@@ -27,6 +27,7 @@ from gpebo_cli.model.descriptor import (
     CoefficientSource,
     DescriptorSystem,
 )
+from gpebo_cli.model.matrix import listed
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.reduction.strangeness_free import (
@@ -69,6 +70,7 @@ class InputDerivatives:
     known: BoolArray  # (m,) of which inputs they are
     # times (N,), where functions that jump are decided, order -> Taylor coefficients
     taylor: Callable[[Array, Array, int], Array]  # (order + 1, N, m)
+    exact: bool = True  # whether they are those of the inputs, not of what stands for their samples
 
     @classmethod
     def of_plant(cls, system: DescriptorSystem, known: BoolArray) -> InputDerivatives | None:
@@ -87,7 +89,7 @@ class InputDerivatives:
                 found.append(signal(t, inside) / factorial(k))
             return np.array(found)
 
-        return cls(np.ones(inputs.values.shape[2], dtype=bool), taylor)
+        return cls(np.ones(inputs.values.shape[2], dtype=bool), taylor, exact=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +111,13 @@ class EquationForm:
     def known_term(self) -> bool:
         """Whether there is a φ."""
         return "phi" not in self.system.coefficients.zero
+
+    @property
+    def interpolated(self) -> tuple[int, ...]:
+        """Inputs whose derivatives are those of an interpolant."""
+        if self.inputs is None or self.inputs.exact:
+            return ()
+        return tuple(sorted({j for _, j in self.derivatives}))
 
     @property
     def scales(self) -> Array | None:
@@ -335,9 +344,13 @@ def strangeness_free(
         if size[m + place] / structure.scaling.time**k > _ABSENT * max(orders):
             used.append((k, j))
             if inputs is None or not inputs.known[j]:
+                # M is a projector: its rows, weighted by the column of the derivative, are that.
+                weight = np.abs(found.driving[:, :, m + place]).max(axis=0)
+                of = [x for x, w in zip(system.states, weight, strict=True)
+                      if w > _ABSENT * weight.max()]
                 raise ConfigError(_unknown(
                     system, system.inputs[j],
-                    f"a hidden constraint contains its derivative of order {k}",
+                    f"a hidden constraint on {listed(of)} contains its derivative of order {k}",
                 ))
     return replace(whole, derivatives=tuple(used))
 
@@ -377,7 +390,7 @@ def _unknown(system: DescriptorSystem, name: str, why: str) -> str:
     return (
         f"plant {system.name}: observer.form=strangeness_free needs the derivatives of the input "
         f"{name}, {why}; of samples and of noisy signals they are not known; of a recording, "
-        "data.hold=cubic takes those of its interpolant"
+        "data.hold=cubic takes those of its interpolant, which amplify its noise"
     )
 
 

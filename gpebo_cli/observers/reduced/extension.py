@@ -347,6 +347,9 @@ def choose_form(
         system, t, inside, signals, derivatives,
         max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol,
     )
+    for j in hidden.interpolated:
+        name = system.inputs[j]
+        note += f"; derivatives of {name} are its interpolant's, which amplify its noise"
     return hidden, matrices(hidden), note
 
 
@@ -492,6 +495,7 @@ def assumptions(
     frame = reduced.first.split.frame
     left = None if frame is None else frame.remaining
     rank = reduced.rank + (0 if left is None else left.given_up.shape[1])
+    of = "smallest_singular_value" + ("" if reduced.lost is None else "_of_the_rest")
     return (
         Assumption(
             "Rank of E", "rank E(t) is constant", True,
@@ -501,7 +505,7 @@ def assumptions(
             "Assumption 1",
             "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
             reduced.lost is None,
-            {"smallest_singular_value": smallest, "at": float(mesh.points.ravel()[where]),
+            {of: smallest, "at": float(mesh.points.ravel()[where]),
              **form_used(reduced.form, reduced.note)},
         ),
     )

@@ -79,8 +79,10 @@ def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) 
 
 
 def noisy_matrices(reduced: ReducedSystem) -> bool:
-    """Whether something that matrices depend on may be noisy: any output, inputs that are."""
+    """Whether noise is where the response to it does not go: in matrices, in slopes of inputs."""
     system, noise = reduced.system, reduced.signals.noise
     names = frozenset[str]().union(*system.coefficients.signals.values())
     noisy = np.flatnonzero(np.zeros(0) if noise is None else noise.inputs)
-    return system.depends_on_outputs or any(system.inputs[j] in names for j in noisy)
+    return system.depends_on_outputs or any(
+        system.inputs[j] in names or j in reduced.form.interpolated for j in noisy
+    )

@@ -33,7 +33,7 @@ from gpebo_cli.observers.reduced.regression import regression_signals, resolved,
 from gpebo_cli.observers.reduced.response import error_system
 from gpebo_cli.observers.reduced.split import split_in_frame
 from gpebo_cli.recordings.hold import edges, held
-from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.reduction.form import EquationForm, InputDerivatives
 from gpebo_cli.regression.errors import ErrorSteps
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import SolverSettings
@@ -75,8 +75,8 @@ class SampledObserver:
     errors: bool = False  # whether blocks say what errors of u and y do
 
     def responding(self) -> SampledObserver:
-        """The same with ``errors``, unless matrices follow the signals, too."""
-        return replace(self, errors=not self.form.follows_signals)
+        """The same with ``errors``, unless matrices or slopes of inputs follow the signals, too."""
+        return replace(self, errors=not (self.form.follows_signals or self.form.interpolated))
 
     @property
     def system(self) -> DescriptorSystem:
@@ -241,7 +241,8 @@ def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
 
 
 def sampled_observer(
-    system: DescriptorSystem, solver: SolverSettings, hold: str, start: float, sample: Array, *,
+    system: DescriptorSystem, solver: SolverSettings, hold: str, start: float, sample: Array,
+    derivatives: InputDerivatives | None, *,
     xi_a0: Mapping[str, float] | list[float] | None = None,
     weights: ByName | None = None,
     regression: str = "projected",
@@ -255,6 +256,7 @@ def sampled_observer(
         hold: zoh or linear.
         start: seconds.
         sample: [u; y] there, (m + r,).
+        derivatives: of the inputs, as far as they are known.
         xi_a0: ``observer.xi_a0``.
         weights: of the outputs, ``observer.weights``.
         regression: which rows of the residual to keep.
@@ -265,7 +267,7 @@ def sampled_observer(
         ModelError: Assumption 1 fails at the start.
     """
     t = np.array([start])
-    used, first, note = choose_form(system, t, t, sample[None], None, solver, form, weights)
+    used, first, note = choose_form(system, t, t, sample[None], derivatives, solver, form, weights)
     if not _kernel_is_fixed(used, first, t + _PROBED, sample, solver.rank_tol):
         split = replace(first.split, basis=np.eye(system.n), frame=None)
         first = replace(first, split=split, on_basis=first.algebraic)
