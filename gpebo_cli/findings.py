@@ -2,9 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import isfinite
+from typing import Any, Generic, TypeVar, overload
+
+T = TypeVar("T")
+
+
+class OnDemand(Generic[T]):
+    """A field that may be given as a function without arguments, called when it is first read."""
+
+    def __init__(self, default: Callable[[], T] | None = None) -> None:
+        self._default = default
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = f"_{name}"
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Callable[[], T]: ...
+    @overload
+    def __get__(self, instance: object, owner: type) -> T: ...
+    def __get__(self, instance: object | None, owner: type) -> Callable[[], T] | T:
+        if instance is None:  # dataclasses ask for the default
+            if self._default is None:
+                raise AttributeError
+            return self._default
+        values: dict[str, Any] = instance.__dict__
+        if callable(values[self._name]):
+            values[self._name] = values[self._name]()
+        found: T = values[self._name]
+        return found
+
+    def __set__(self, instance: object, value: T | Callable[[], T]) -> None:
+        instance.__dict__[self._name] = value
+
+
+def evaluated(instance: object) -> dict[str, Any]:
+    """What there is to be pickled of an instance: the values, and not how to find them."""
+    return {
+        name: value() if name.startswith("_") and callable(value) else value
+        for name, value in instance.__dict__.items()
+    }
 
 
 @dataclass(frozen=True)

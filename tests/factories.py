@@ -98,10 +98,10 @@ def make_result(
     k = np.arange(p)
     eigenvalues = 10.0 ** (2 * k - 4) * t[:, None] ** (5 - 2 * k)
     eigenvalues = np.sort(eigenvalues, axis=1)
+    known = knowledge(np.tile(np.eye(p), (len(t), 1, 1)), np.ones(p), t + 1.0)
     excitation = Excitation(
         t=t,
         gram_eigenvalues=eigenvalues,
-        normalised_min=1e-3 * (1 - np.exp(-t)),
         pe_level=0.01 * (1 - np.exp(-t)),
         window=2.0,
         is_ie=True,
@@ -110,8 +110,9 @@ def make_result(
         lambda_min=float(eigenvalues[-1].min(initial=np.inf)),
         condition=1e3,
         weakest_direction=Direction({name: 1 / np.sqrt(p) for name in parameters}),
-        determined_at=dict.fromkeys(parameters, 0.5),
-        known=knowledge(np.tile(np.eye(p), (len(t), 1, 1)), np.ones(p), t + 1.0),
+        parameters=tuple(parameters),
+        known=known,
+        final=known.at(slice(-1, None)),
     )
     coarse = t[::thin]
     delta = 1e-3 * (1 - np.exp(-0.02 * coarse**2)) ** 4 if mixing else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -113,3 +114,13 @@ def test_settling_time_counts_the_last_excursion():
 def test_time_rms():
     t = np.linspace(0, 2 * np.pi, 20_001)
     assert time_rms(t, np.sin(t)[None] ** 2)[0] == pytest.approx(np.sqrt(0.5), rel=1e-6)
+
+
+def test_evidence_at_all_times_is_computed_when_it_is_read_and_pickled_as_numbers():
+    found = assess(CLEAN, T, ExcitationSettings())
+    assert callable(vars(found)["_pe_level"])
+    back = pickle.loads(pickle.dumps(found))  # noqa: S301  our own
+    assert callable(vars(found)["_pe_level"])
+    np.testing.assert_array_equal(back.pe_level, found.pe_level)
+    assert vars(found)["_pe_level"] is found.pe_level
+    assert back.level == found.normalised_min[-1] == found.known.smallest[-1]

@@ -6,15 +6,15 @@ Interval excitation, as the paper's Assumption 2 means it, is G(t_c) = ∫ψᵀ�
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge, smallest_and_margin
 from gpebo_cli.evidence.metrics import DECAY
-from gpebo_cli.findings import Direction, Requirement
+from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
@@ -36,13 +36,11 @@ class Excitation:
     """Interval and persistent excitation, as evidence and not a bare yes.
 
     The verdict rests on what is known (:class:`Knowledge`) and on no unit, unless a level ρ of
-    λ_min(G) is asked for. ``gram_eigenvalues[i]`` are those of G(t_i), ascending.
+    λ_min(G) is asked for. ``gram_eigenvalues[i]`` are those of G(t_i), ascending. Spectra at all
+    times may be most of a run with many parameters: they are computed when they are looked at.
     """
 
     t: Array  # (N,)
-    gram_eigenvalues: Array  # (N, p)
-    normalised_min: Array  # (N,) smallest eigenvalue of G with unit diagonal
-    pe_level: Array  # (N,) smallest eigenvalue of the Gram matrix over the trailing window
     window: float
     is_ie: bool
     t_c: float | None  # first time at which all parameters can be told apart
@@ -50,19 +48,36 @@ class Excitation:
     lambda_min: float  # at the horizon
     condition: float  # largest over smallest eigenvalue of G with unit diagonal, at the horizon
     weakest_direction: Direction  # in units of each parameter's own size
-    determined_at: Mapping[str, float | None]  # from when on each parameter is well determined
-    known: Knowledge  # at the same times
+    parameters: tuple[str, ...]
+    final: Knowledge  # at the last of the times
+    known: OnDemand[Knowledge] = OnDemand()
+    gram_eigenvalues: OnDemand[Array] = OnDemand()  # (N, p)
+    # (N,) smallest eigenvalue of the Gram matrix over the trailing window
+    pe_level: OnDemand[Array] = OnDemand()
+
+    __getstate__ = evaluated
+
+    @property
+    def normalised_min(self) -> Array:
+        """Smallest eigenvalue of G with unit diagonal, (N,)."""
+        return self.known.smallest
 
     @property
     def level(self) -> float:
         """The last of ``normalised_min``."""
-        return float(self.normalised_min[-1]) if len(self.normalised_min) else 0.0
+        return float(self.final.smallest[-1])
+
+    @property
+    def determined_at(self) -> dict[str, float | None]:
+        """From when on each parameter is well determined."""
+        return dict(zip(self.parameters, since(self.t, self.known.share >= WELL), strict=True))
 
     @property
     def determined(self) -> float | None:
         """From when on all parameters are well determined."""
-        times = [t for t in self.determined_at.values() if t is not None]
-        return max(times) if times and len(times) == len(self.determined_at) else None
+        if not self.parameters or not (self.final.share >= WELL).all():
+            return None
+        return max(t for t in self.determined_at.values() if t is not None)
 
 
 def assess(
@@ -74,15 +89,9 @@ def assess(
     window = settings.window if settings.window is not None else horizon / WINDOWS
     rho, p = settings.rho, regression.p
     gram = regression.gram  # of parameters that move, on a mesh of its own
-    gram = Trajectory(gram.mesh, gram.values[..., :p])
-    sizes = np.broadcast_to(regression.scale, (mesh.size, p))
-
-    def beside(at: Array) -> tuple[Array, Array, float]:
-        element = mesh.edges[1:-1].searchsorted(at, side="left")
-        return sizes[element], at - mesh.edges[0], tol
-
+    evidence = _Evidence(regression, t, window, tol)
     ends = gram.mesh.edges[1:]
-    smallest, margin = smallest_and_margin(gram.values[:, -1], *beside(ends))
+    smallest, margin = smallest_and_margin(gram.values[:, -1], *evidence.beside(ends))
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
     # or half as well as they ever are.
     enough = min(WELL, 0.5 * float(smallest[margin >= 1.0].max(initial=0.0)))
@@ -92,52 +101,86 @@ def assess(
         if rho is not None:
             level = kernels.laws.eigenvalues(matrices)[:, 0] / rho
         elif enough:
-            same = at is ends
-            level, of = (smallest, margin) if same else smallest_and_margin(matrices, *beside(at))
+            level, of = (smallest, margin) if at is ends else smallest_and_margin(
+                matrices, *evidence.beside(at)
+            )
             level = np.minimum(level / enough, of)
         else:
             level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
-    values = gram(t)
+    # What is looked at later must not keep what is known of this regression by now.
+    later = replace(evidence, regression=replace(regression))
     return excitation(
-        knowledge(values, *beside(t)), t, regression.parameters,
-        np.maximum(kernels.laws.eigenvalues(values), 0.0),
-        segment_level(regression, t, window), window, _first_time(gram, ends, reached), rho,
+        evidence.known(t[-1:]), t, regression.parameters,
+        float(evidence.eigenvalues(t[-1:])[0, 0]) if p else 0.0, later.known, later.eigenvalues,
+        later.levels, window, _first_time(gram, ends, reached), rho,
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What a regression says at any times (M,), by default those of the evidence."""
+
+    regression: LinearRegression
+    t: Array
+    window: float
+    tol: float
+
+    def beside(self, at: Array) -> tuple[Array, Array, float]:
+        """What sizes are compared with, see :func:`knowledge`."""
+        mesh = self.regression.mesh
+        sizes = np.broadcast_to(self.regression.scale, (mesh.size, self.regression.p))
+        element = mesh.edges[1:-1].searchsorted(at, side="left")
+        return sizes[element], at - mesh.edges[0], self.tol
+
+    def known(self, at: Array | None = None) -> Knowledge:
+        """What is known of the parameters."""
+        at = self.t if at is None else at
+        return knowledge(self.regression.gram(at), *self.beside(at))
+
+    def eigenvalues(self, at: Array | None = None) -> Array:
+        """Those of G, (M, p)."""
+        gram = self.regression.gram(self.t if at is None else at)
+        return np.maximum(kernels.laws.eigenvalues(gram), 0.0)
+
+    def levels(self) -> Array:
+        """The smallest eigenvalue over each trailing window, (N,)."""
+        return segment_level(self.regression, self.t, self.window)
+
+
 def excitation(
-    known: Knowledge, t: Array, parameters: Sequence[str], gram_eigenvalues: Array,
-    pe_level: Array, window: float, t_c: float | None, rho: float | None,
+    final: Knowledge, t: Array, parameters: Sequence[str], lambda_min: float,
+    known: Knowledge | Callable[[], Knowledge], gram_eigenvalues: Array | Callable[[], Array],
+    pe_level: Array | Callable[[], Array], window: float, t_c: float | None, rho: float | None,
 ) -> Excitation:
-    """The evidence from what is known at the times t (N,), the last of which is the end."""
-    spectrum, well = known.eigenvalues[-1], known.share >= WELL
-    v = known.vectors[-1, :, 0] if len(parameters) else np.zeros(0)
+    """The evidence from what is known at the times t (N,) and at their end."""
+    spectrum = final.eigenvalues[-1]
+    v = final.vectors[-1, :, 0] if len(parameters) else np.zeros(0)
     sign = 1.0 if max(v, key=abs, default=1.0) >= 0.0 else -1.0
     smallest = float(spectrum[0]) if len(parameters) else 1.0
     return Excitation(
-        t=t, gram_eigenvalues=gram_eigenvalues, normalised_min=known.smallest, pe_level=pe_level,
-        window=window, is_ie=t_c is not None, t_c=t_c, rho=rho,
-        lambda_min=float(gram_eigenvalues[-1, 0]) if len(parameters) else 0.0,
+        t=t, gram_eigenvalues=gram_eigenvalues, pe_level=pe_level,
+        window=window, is_ie=t_c is not None, t_c=t_c, rho=rho, lambda_min=lambda_min,
         condition=max(spectrum.tolist(), default=1.0) / smallest if smallest > 0.0 else np.inf,
         weakest_direction=Direction(dict(zip(parameters, (sign * v).tolist(), strict=True))),
-        determined_at=dict(zip(parameters, since(t, well), strict=True)), known=known,
+        parameters=tuple(parameters), known=known, final=final,
     )
 
 
 def estimable(
-    excitation: Excitation, parameters: Sequence[str], states: Sequence[str], seen: BoolArray
+    known: Knowledge, t: Array, parameters: Sequence[str], states: Sequence[str], seen: BoolArray
 ) -> dict[str, float | None]:
     """From when on each parameter and state can be known; None: not even at the end.
 
     Args:
-        excitation: the evidence.
+        known: at the times
+        t: (N,), the last of which is the end.
         parameters: their names.
         states: their names; a parameter of the same name comes first.
-        seen: which states are determined at the times of the evidence, (N, n).
+        seen: which states are determined at the same times, (N, n).
     """
-    times = since(excitation.t, np.concatenate([excitation.known.parameters, seen], axis=1))
+    times = since(t, np.concatenate([known.parameters, seen], axis=1))
     of_states = dict(zip(states, times[len(parameters) :], strict=True))
     return of_states | dict(zip(parameters, times, strict=False))
 
@@ -157,17 +200,17 @@ def _first_time(
     else the secant, and at distances around it that fall by fours.
 
     Args:
-        gram: G (p, p).
+        gram: G (p, p), perhaps with further columns.
         edges: right ends of its elements (K,).
         reached: of times (M,) and G there.
     """
-    mesh, p = gram.mesh, gram.values.shape[2]
+    mesh = gram.mesh
     ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
     if len(ends) == 0:
         return None
     before = int(ends[0]) + 1  # elements up to the first at whose end it is reached
     t = mesh.points[:before].ravel()
-    level = reached(t, gram.values[:before].reshape(len(t), p, p))  # spelled out: p may be 0
+    level = reached(t, gram.values[:before].reshape(len(t), *gram.values.shape[2:]))
     level = level.reshape(before, -1)
     k = int(np.argmax((level >= 0.0).any(axis=1)))
     points, level = mesh.points[k], level[k]

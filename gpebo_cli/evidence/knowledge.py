@@ -94,20 +94,21 @@ class Knowledge:
         return np.sort(np.array(chosen, dtype=np.intp))
 
     def states(self, gain: Array, units: Array | None = None) -> BoolArray:
-        """Which states x = offset + gain η are, for gain (M, n, p): shape (M, n).
+        """Which states x = offset + gain η are, shape (M, n).
 
         Args:
-            gain: at ascending times; NaN for a state that nothing is known of.
+            gain: at ascending times, the last M of which are those (M or more, n, p); NaN for a
+                state that nothing is known of.
             units: of the states (n,), in which errors of a gain are of one size; None: not known.
         """
         kernel, slack = self._kernel
         if not kernel.any() and np.isfinite(gain).all():
-            return np.ones(gain.shape[:2], dtype=bool)
+            return np.ones((len(kernel), gain.shape[1]), dtype=bool)
         if units is not None:  # the row of a state that no parameter has part in is rounding
             own = np.abs(gain) / units[:, None]
             whole = own.max(axis=1, keepdims=True, initial=0.0, where=np.isfinite(own))
             gain = np.where(own <= _NOISE * np.maximum.accumulate(whole), 0.0, gain)
-        scaled = gain / self.sizes[:, None, :]
+        scaled = gain[len(gain) - len(kernel) :] / self.sizes[:, None, :]
         size = _row_norms(scaled)
         return np.asarray(_row_norms(scaled @ kernel) <= slack[:, None] * size)
 

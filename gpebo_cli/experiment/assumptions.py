@@ -6,8 +6,9 @@ first stage that cannot be carried out and reports that stage as the failed assu
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -106,8 +107,8 @@ def _of_observer(
     t = np.linspace(*seen.span, 101)
     excitation = assess(observation.regression, t, settings.excitation, settings.solver.tol)
     times = estimable(
-        excitation, observation.regression.parameters, system.states,
-        visible(observation, excitation.known, t, system.n),
+        excitation.known, t, observation.regression.parameters, system.states,
+        visible(observation, t, system.n)(excitation.known),
     )
     found += of_observation(observation, excitation, system)
     if both and isinstance(observer, Gpebo) and observer.form == "auto":
@@ -159,13 +160,13 @@ def _per_unit(
     return {name: found[name] for name, since in estimable.items() if since is not None}
 
 
-def visible(observation: Observation, known: Knowledge, t: Array, n: int) -> BoolArray:
-    """Which of the n states are determined at the times t (N,), shape (N, n)."""
+def visible(observation: Observation, t: Array, n: int) -> Callable[[Knowledge], BoolArray]:
+    """From what is known at the last M of the times t (N,) to which states are known, (M, n)."""
     state_map = observation.state_map
     if isinstance(state_map, AffineStateMap) and observation.names is None:
-        return known.states(state_map.gain(t), state_map.units)
+        return partial(Knowledge.states, gain=state_map.gain(t), units=state_map.units)
     # What it needs of the parameters is not known: all of them.
-    return np.repeat(known.parameters.all(axis=1, keepdims=True), n, axis=1)
+    return lambda known: np.repeat(known.parameters.all(axis=1, keepdims=True), n, axis=1)
 
 
 def _named(error: GpeboError) -> str:

@@ -69,7 +69,9 @@ class Estimated:
     estimation: EstimationResult
     metrics: Metrics
     fit: Fit | None  # of a recording
-    estimable: Mapping[str, float | None]  # from when on; None: never
+    # From when on each parameter and state can be known, None: never; or how that is found,
+    estimable: Mapping[str, float | None] | Callable[[], Mapping[str, float | None]]
+    unknown: Sequence[str]  # and of which it is never.
     noise: NoiseStatistics | None = None
     by_observer: bool = False  # the observer estimates by itself
     note: str = ""  # what the last line of a run has to say of it, from "; " on
@@ -110,14 +112,17 @@ def continuous(
     with stage("excitation"):
         excitation = assess(regression, t, settings.excitation, settings.solver.tol)
     with stage("estimate") as share:
-        known = excitation.known
-        determined = visible(observation, known, t, system.n)
+        known, seen_at = excitation.final, visible(observation, t, system.n)
+        seen, names = seen_at(known), (regression.parameters, system.states)
+        unknown = _never(estimable(known, t[-1:], *names, seen))
         estimator = estimators.tuned(estimator, regression)
-        times = estimable(excitation, regression.parameters, system.states, determined)
+
+        def times() -> dict[str, float | None]:
+            return estimable(excitation.known, t, *names, seen_at(excitation.known))
 
         def estimated(by: estimators.Estimator) -> tuple[EstimationResult, Metrics]:
             return _estimate(
-                settings, system, by, observation, source, known, determined[-1], share
+                settings, system, by, observation, source, known, seen[-1], share
             )
 
         try:
@@ -159,7 +164,7 @@ def continuous(
             )
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
-        fit, times, noise,
+        fit, times, unknown, noise,
         observation.estimator is not None, note,
     )
 
@@ -242,6 +247,9 @@ def at_samples(
         excitation = online.excitation(made, chosen, level, window)
     rows = made.regression.rows[1:][chosen]
     metrics = _metrics(numbers, online.parameters, system)
+    times = estimable(
+        excitation.known, excitation.t, online.parameters, system.states, made.seen[chosen]
+    )
     return Estimated(
         online,
         RegressionResult(
@@ -250,10 +258,14 @@ def at_samples(
         excitation, estimation,
         _standing(estimation, metrics, None, np.arange(len(online.parameters)), system),
         online.fit() if source.recording else None,
-        estimable(excitation, online.parameters, system.states, made.seen[chosen]),
+        times, _never(times),
         note=online.note
         + (_held(samples, metrics) if levels.silent and not source.recording else ""),
     )
+
+
+def _never(times: Mapping[str, float | None]) -> list[str]:
+    return [name for name, since in times.items() if since is None]
 
 
 def _held(samples: Sampling, metrics: Metrics) -> str:

@@ -220,9 +220,11 @@ class Online:
         t, known, eigenvalues = self._newest if made is None else (
             made.regression.t, made.known, made.gram_eigenvalues
         )
+        known, eigenvalues = known.at(shown), eigenvalues[shown]
         return excitation(
-            known.at(shown), t[shown], self.parameters, eigenvalues[shown], pe_level, window,
-            self._t_c[0] if self._t_c[1] is None else self._t_c[1], self._rho,
+            known.at(_NEWEST), t[shown], self.parameters,
+            float(eigenvalues[-1, 0]) if self.parameters else 0.0, known, eigenvalues, pe_level,
+            window, self._t_c[0] if self._t_c[1] is None else self._t_c[1], self._rho,
         )
 
     @property

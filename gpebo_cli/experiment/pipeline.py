@@ -142,7 +142,7 @@ def _experiment(
     warned = warnings(found.observed)
     told = verdict(
         found.excitation, found.estimation.cases, found.estimation.requirement, found.metrics,
-        found.fit, found.estimable, found.estimation.active,
+        found.fit, found.unknown, found.estimation.active,
     )
     return replace(
         result, regression=found.regression, excitation=found.excitation,

@@ -16,7 +16,7 @@ import numpy as np
 
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
-from gpebo_cli.findings import Assumption, Requirement
+from gpebo_cli.findings import Assumption, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.settings import Settings
 
@@ -223,8 +223,10 @@ class RunResult:
     recording: RecordingResult | None = None
     fit: Fit | None = None  # of a recording
     # From when on each parameter and state is determined by the data, None: never.
-    estimable: Mapping[str, float | None] = field(default_factory=dict)
+    estimable: OnDemand[Mapping[str, float | None]] = OnDemand(dict)
     warnings: tuple[str, ...] = ()  # what does not stop a run and spoils its result, one line each
+
+    __getstate__ = evaluated
 
     @property
     def signals(self) -> SignalsResult:

@@ -21,7 +21,7 @@ _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that sa
 def verdict(
     excitation: Excitation, cases: Sequence[Mapping[str, float]], requirement: Requirement,
     metrics: Metrics | None = None, fit: Fit | None = None,
-    estimable: Mapping[str, float | None] | None = None,
+    unknown: Sequence[str] = (),
     active: Mapping[int, Sequence[ActiveBound]] | None = None,
 ) -> str:
     """The last line: exciting or not and from when on, and how well the state is known.
@@ -39,7 +39,6 @@ def verdict(
     else:
         first = f"NOT interval-exciting: {level}; not excited: {excitation.weakest_direction}"
     parts = [first]
-    unknown = [name for name, since in (estimable or {}).items() if since is None]
     if unknown:
         parts.append(f"not determined by the data: {', '.join(unknown)}")
     best = None if metrics is None else _best_case(metrics)
