@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.honesty import made
+from gpebo_cli import load_plant
 from gpebo_cli.errors import ModelError
 from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
@@ -32,6 +33,19 @@ def case(seed, nu, extra, scale=0.0):
     found = made(np.random.default_rng(seed), nu + extra, nu, scale=scale)
     structure = analyse(found.system, 0.0, 5.0, max_mu=6, rank_tol=1e-10)
     return found, structure, strangeness_free_form(found.system, structure, ZERO, ZERO)
+
+
+def test_the_structure_of_a_text_is_found_once_for_a_horizon_and_a_tolerance():
+    """A plant from Python is analysed each time: its functions may have changed."""
+    def found(system, stop=5.0, rank_tol=1e-10):
+        return analyse(system, 0.0, stop, max_mu=6, rank_tol=rank_tol)
+
+    text = load_plant("circuit")
+    assert found(text) is found(text)
+    assert found(text, 4.0) is not found(text)
+    assert found(text, rank_tol=1e-9).rank_tol == 1e-9
+    made_here = made(np.random.default_rng(0), 3, 1).system
+    assert found(made_here) is not found(made_here)
 
 
 @settings(deadline=None, max_examples=40)

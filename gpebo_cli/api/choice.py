@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ def primary() -> dict[str, Any]:
     return files.shipped(PRIMARY)
 
 
+@cache
 def default(group: str) -> str:
     """The file of ``group`` that is taken where nothing is chosen."""
     entries = [entry for entry in primary()["defaults"] if isinstance(entry, Mapping)]

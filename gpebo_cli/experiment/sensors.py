@@ -119,7 +119,7 @@ class _Rows:
         start, stop = mesh.edges[[0, -1]]
         whole = square.integral().final
         self._gram, self._more = whole[:-n].sum(axis=0), whole[-n:]
-        self._terms = extension.scale(system.q)[-1:]
+        self._terms = extension.scale[-1:]
         self._elapsed = np.array([stop - start])
         self._parameters = (*system.unknowns, *reduced.names)
         self._gain = on_mesh(mesh, final.gain)(np.linspace(start, stop, _TIMES))

@@ -197,9 +197,10 @@ def check_sizes(system: DescriptorSystem, t: Array) -> None:
     named = {"initial_state": ("initial_state", system.states), "u": ("inputs", system.inputs),
              "theta": ("unknowns", system.unknowns)}
     for name, values in entries.items():
-        sizes = np.abs(distinct(values)[0])
-        if sizes.max(initial=0.0) <= LARGEST:
+        flat = distinct(values)[0].ravel()
+        if flat.dot(flat) <= LARGEST:  # then no entry is larger: no need to look at each
             continue
+        sizes = np.abs(distinct(values)[0])
         too_large = np.argwhere(np.isfinite(sizes) & (sizes > LARGEST))
         for at, *place in too_large[:1].tolist():
             where = name + "".join(f"[{k}]" for k in place)

@@ -187,6 +187,11 @@ class TextCoefficients:
         return {}
 
     @cached_property
+    def kept(self) -> dict[object, object]:
+        """What others have found out about these matrices, by what was asked; they never change."""
+        return {}
+
+    @cached_property
     def _bounds(self) -> Bounds:
         return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
 

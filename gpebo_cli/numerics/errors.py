@@ -21,6 +21,7 @@ from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import SHARE, Mesh, used_coefficients
 from gpebo_cli.numerics.problem import LinearProblem
+from gpebo_cli.numerics.radau import RadauRule
 
 EPS = float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
@@ -57,24 +58,23 @@ def estimated_errors(
         values: the solution.
     """
     K, points, n, columns = values.shape
-    rule, used, width = mesh.rule, used_coefficients(mesh.rule), 2 * _SIGNS * columns
+    rule, width = mesh.rule, 2 * _SIGNS * columns
+    powers = _to_next(rule)
     with np.errstate(over="ignore", invalid="ignore"):
-        turned = np.ascontiguousarray(np.swapaxes(values, 0, 1))
-        sizes = np.abs(turned).max(axis=0)
-        size = np.maximum(sizes, _TINY)
-        shown = np.abs(rule.to_legendre[-4:] @ turned.reshape(points, -1))
-        shown = shown.reshape(len(shown), K, n, columns)
-        to_next = points / np.arange(points - used, points)  # (ρ^j)^this = ρ^(s + 1)
-        shares = np.minimum(shown[-used:] / size, 1.0) ** to_next[:, None, None, None]
-        share = shares.max(axis=0)
-        visible = np.zeros((n, columns))
+        turned = np.ascontiguousarray(np.swapaxes(values, 0, 1)).reshape(points, -1)
+        most = np.zeros((5, K, n, columns))  # what counts with its largest value over time
+        carried, tail, sizes, visible, made_of = most
+        np.abs(turned).max(axis=0, out=sizes.ravel())
+        shown = np.abs(rule.to_legendre[-4:] @ turned)
+        share = np.minimum(shown[-len(powers) :] / np.maximum(sizes, _TINY).ravel(), 1.0) ** powers
+        share = share.max(axis=0).reshape(sizes.shape)
         if len(shown) == 4:
             before, after = np.maximum(shown[::2], shown[1::2])
-            visible = np.where(after >= LEVEL * before, after, 0.0).max(axis=0)
-        made_of = np.abs(last) @ np.abs(values[:, 0]) + np.abs(particular)
+            np.copyto(visible.ravel(), after, where=after >= LEVEL * before)
+        made_of[:] = np.abs(last) @ np.abs(values[:, 0]) + np.abs(particular)
         # End points are superconvergent, of order 2s − 1 against s + 1 inside: with ρ the decay per
         # coefficient their error is about ρ^(s−1) times the tail. Half that exponent is used.
-        tail = size * share
+        tail[:] = sizes * share
         kinds = np.empty((K, n, 2, 1, columns))
         kinds[:, :, 0, 0] = tail * share ** (0.5 - 0.5 / rule.stages)
         kinds[:, :, 1, 0] = EPS * (END * made_of + noise[..., :n] @ sizes + noise[..., n:])
@@ -94,28 +94,36 @@ def estimated_errors(
                     error = np.moveaxis(error, 0, 1).reshape(n, width)
                 ends[k] = error = last[k if len(last) > 1 else 0] @ error + added[k]
         squares = np.square(ends).reshape(K, n, 2, _SIGNS, columns).sum(axis=3)
-        rms = np.sqrt(squares / _SIGNS)
         rates = noise[..., :n] / mesh.steps[: len(noise), None, None]
         constant = bool((np.abs(rates - rates[0]) <= _SAME * rates[0]).all())
-        systematic = np.sqrt(np.arange(2, K + 2))[:, None, None]
-        by_chance = systematic if constant else np.minimum(systematic, _CHANCE)
-        carried = systematic * rms[:, :, 0] + by_chance * rms[:, :, 1]
-        return judged_errors(
-            problem, carried, tail.max(axis=0), sizes.max(axis=0), visible, made_of.max(axis=0)
-        )
+        factors = np.empty((K, 1, 2, 1))
+        factors[:, 0, :, 0] = np.arange(2, K + 2)[:, None]
+        if not constant:
+            np.minimum(factors[:, :, 1], _CHANCE**2, out=factors[:, :, 1])
+        np.sqrt(squares * (factors / _SIGNS)).sum(axis=2, out=carried)
+        return judged_errors(problem, carried, *most.max(axis=1))
+
+
+@lru_cache(maxsize=16)
+def _to_next(rule: RadauRule) -> Array:
+    """Powers (j, 1) that make of the last Legendre coefficients the next: (ρ^j)^this = ρ^(s+1)."""
+    points = rule.stages + 1
+    powers: Array = points / np.arange(points - used_coefficients(rule), points)[:, None]
+    powers.flags.writeable = False
+    return powers
 
 
 def judged_errors(
-    problem: LinearProblem, carried: Array, tail: Array, own: Array, noise: Array, made_of: Array
+    problem: LinearProblem, carried: Array, largest: Array, tail: Array, own: Array, noise: Array,
+    made_of: Array,
 ) -> Errors:
     """Errors from bounds of them at right ends (K, n, c), and the largest over time (n, c) each of
 
-    tails, values, noise that shows, and what right ends are made of.
+    these, tails, values, noise that shows, and what right ends are made of.
     """
-    K = len(carried)
     with np.errstate(over="ignore", invalid="ignore"):
         through = _through_constraints(problem, own)
-        total = carried.max(axis=0) + tail + noise + EPS * (_VALUE * own + through)
+        total = largest + tail + noise + EPS * (_VALUE * own + through)
         coupled = np.maximum(np.maximum(made_of, through), problem.floor)
         if problem.apart:
             scale = np.where(own > NOTHING * coupled, own, coupled)
@@ -124,10 +132,11 @@ def judged_errors(
         scale = np.maximum(scale, _TINY)
         # A state that is nothing beside the others is not lost: there is nothing to be known of it.
         known = np.maximum(scale, _FAINT * own.max(initial=0.0))
-        lost = ~(carried < known).all(axis=(1, 2))
+        lost = len(carried)
+        if not (largest < known).all():
+            lost = int(np.argmin((carried < known).all(axis=(1, 2))))
         relative = np.where(total > 0.0, total / scale, 0.0)
-    return Errors(np.where(np.isfinite(relative), relative, np.inf),
-                  int(np.argmax(lost)) if lost.any() else K)
+    return Errors(np.where(np.isfinite(relative), relative, np.inf), lost)
 
 
 def _signs(K: int, n: int) -> Array:

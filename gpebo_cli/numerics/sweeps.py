@@ -368,5 +368,6 @@ def _errors(
     systematic = np.arange(2, K + 2)[:, None, None]
     carried = np.sqrt(systematic * squares.mean(axis=2)) + np.zeros(columns)
     return judged_errors(
-        problem, carried, tail.max(axis=0), sizes.max(axis=0), noise, found.made_of.max(axis=0)
+        problem, carried, carried.max(axis=0), tail.max(axis=0), sizes.max(axis=0), noise,
+        found.made_of.max(axis=0),
     )

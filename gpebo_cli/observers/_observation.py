@@ -10,7 +10,6 @@ import numpy as np
 
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import spectral_norm
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps
 from gpebo_cli.regression.estimator import Estimator
@@ -138,8 +137,8 @@ def error_of_extension(W: Array, theta: Array, x: Array) -> Array:
 
 def log_norm(Phi: Array) -> float:
     """ln ‖Φ‖₂ of a matrix (n, n_a); Φ = 0 counts as the smallest number there is."""
-    size = spectral_norm(Phi, Phi.shape[1]) if Phi.size else 1.0
-    return float(np.log(max(size, np.finfo(float).tiny)))
+    sigma = np.linalg.svd(Phi, compute_uv=False)
+    return float(np.log(max(sigma.max(initial=0.0 if Phi.size else 1.0), np.finfo(float).tiny)))
 
 
 def largest_entry(values: Array, first: int = 0) -> float:

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from gpebo_cli.errors import ConfigError, GpeboError, SolverError
-from gpebo_cli.evidence.knowledge import knowledge
+from gpebo_cli.evidence.knowledge import knowledge, smallest_and_margin
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import Measurements, Sampling
 from gpebo_cli.observers._observation import AffineStateMap, Observation
@@ -190,11 +190,10 @@ def _determined(found: Observation, system: DescriptorSystem, solver: SolverSett
         return 0
     start, stop = regression.mesh.edges[[0, -1]]
     scale = np.broadcast_to(regression.scale, (regression.mesh.size, regression.p))
-    known = knowledge(
-        regression.gram.final[None], scale[-1:], np.array([stop - start]), solver.tol
-    )
-    if known.parameters.all():
+    asked = regression.gram.final[None], scale[-1:], np.array([stop - start]), solver.tol
+    if smallest_and_margin(*asked)[1][0] >= 1.0:
         return system.q + system.n
+    known = knowledge(*asked)
     seen = known.states(state_map.gain(np.linspace(start, stop, 11)), state_map.units)[-1]
     return int(known.parameters[0, : system.q].sum() + seen.sum())
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -122,11 +123,23 @@ def analyse(
 
     Three ranks decide (Kunkel & Mehrmann, Hypothesis 3.48): that of M, that of the constraints
     Â2 = Z2ᵀN, and that of E on their kernel. Each must be the same at every time; between the
-    probes, singular values that dip are followed to the bottom.
+    probes, singular values that dip are followed to the bottom. What is found out about a plant
+    given as text is kept with its matrices, for its next run.
 
     Raises:
         ModelError: no μ ≤ ``max_mu`` does it, or a rank changes; names the time and the values.
     """
+    kept: dict[object, Structure] = getattr(system.coefficients, "kept", {})
+    asked = start, stop, max_mu, rank_tol
+    if asked not in kept:
+        kept[asked] = _analysed(system, *asked)
+    return kept[asked]
+
+
+def _analysed(
+    system: DescriptorSystem, start: float, stop: float, max_mu: int, rank_tol: float
+) -> Structure:
+    """:func:`analyse` for the first time."""
     t = _probe_times(system, start, stop)
     c = system.coefficients.taylor(t, 0)
     scaling = balance(c)
@@ -234,17 +247,18 @@ def _differs(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float, a: in
     some of 1/λ: stages are looked at only where there are any.
     """
     middle, s = len(t) // 2, scaling
-    there = slice(middle, middle + 1)
+    there, n = slice(middle, middle + 1), len(s.rows)
     E, A = (x if x.shape[1] == 1 else x[:, there] for x in (c.E, c.A))
     e, aa = scaled(E, A, s.rows, s.columns, s.time, len(E))
-    e0, a0 = e[0, 0], aa[0, 0]
-    both = np.array([np.concatenate([e0, a0], axis=1), np.concatenate([e0.T, a0.T], axis=1)])
-    spread = np.concatenate([np.linalg.svd(x, compute_uv=False) for x in (e0[None], both)])
+    beside = np.zeros((3, n, 2 * n))
+    beside[:2, :, :n], beside[2, :, :n] = e[0, 0], e[0, 0].T
+    beside[1, :, n:], beside[2, :, n:] = aa[0, 0], aa[0, 0].T
+    spread = np.linalg.svd(beside, compute_uv=False)
     spread = spread / np.maximum(spread[:, :1], np.finfo(float).tiny)
     if not ((spread > rank_tol) & (spread < _APART)).any():
         return False
     try:
-        stages = in_stages(e, aa, np.zeros((len(e), 1, len(s.rows), 0)), rank_tol, 1)
+        stages = in_stages(e, aa, np.zeros((len(e), 1, n, 0)), rank_tol, 1)
     except UnclearError:
         return False
     return bool(stages.A2.shape[1] != a)
@@ -271,10 +285,9 @@ def _refuse_overflow(
     """
     with np.errstate(all="ignore"):
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
-        largest = max(np.abs(distinct(matrix)).max(initial=0.0) for matrix in (c.E, c.A))
-        finite = np.isfinite(largest * weight.max(initial=0.0)) or all(
-            np.isfinite(distinct(matrix) * weight).all() for matrix in (c.E, c.A)
-        )
+        whole = [distinct(matrix) * weight for matrix in (c.E, c.A)]
+        # A sum is finite only where all its terms are; a finite one says it at once.
+        finite = all(isfinite(x.sum()) or np.isfinite(x).all() for x in whole)
     if not finite:
         raise ModelError(
             f"{who(system)}: E and A change by more powers of ten than numbers hold; shorten "

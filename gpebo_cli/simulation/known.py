@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -167,13 +168,14 @@ def _known_kinds(
     high, low = whole[0].max(axis=1), whole[0].min(axis=1)
     moving = high > low
     kinds = list(whole[:, moving])
-    counts = np.add.reduceat(moving, np.cumsum([0, *(part.shape[1] for part in parts[:-1])]))
-    counts = np.tile(counts[counts > 0], len(kinds))
+    ends = accumulate([part.shape[1] for part in parts], initial=0)
+    counts = [int(np.count_nonzero(moving[a:b])) for a, b in pairwise(ends)]
+    counts *= len(kinds)
     if "E" not in system.coefficients.constant:
         first = slice(parts[0].shape[1])
         size = np.abs([high[first], low[first]])
         away = (size.min(axis=0) > _NEAR_ZERO * size.max(axis=0)) & (high[first] * low[first] > 0.0)
         kinds.append(1.0 / whole[0, first][moving[first] & away])
-        counts = np.append(counts, len(kinds[-1]))
+        counts.append(len(kinds[-1]))
     values = np.concatenate(kinds).T.reshape(*mesh.points.shape, -1)
-    return np.ascontiguousarray(values), counts[counts > 0]
+    return np.ascontiguousarray(values), np.array([k for k in counts if k], dtype=np.intp)

@@ -44,6 +44,7 @@ from gpebo_cli.simulation.linearised import Linearised
 from gpebo_cli.simulation.newton import follow
 from gpebo_cli.simulation.signals import Signals, Simulation
 
+_SHARES = np.linspace(0.0, 1.0, 9)  # of the horizon, where numbers may be too large
 _LOOKED_AT = 32  # times at which the mixing of states is looked at
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
 _TINY = float(np.finfo(float).tiny)
@@ -57,7 +58,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         SolverError: the tolerance cannot be reached, or the solution ends within the horizon.
         ConfigError: an entry without a finite value, or one that is too large to compute with.
     """
-    check_sizes(system, time.start + time.horizon * np.linspace(0.0, 1.0, 9))
+    check_sizes(system, time.start + time.horizon * _SHARES)
     if not system.depends_on_outputs:
         simulation = None
         if system.n > SMALL and solver.name == "collocation":
@@ -291,6 +292,8 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
 
     An input whose share of every equation is rounding of the others' is rounding itself.
     """
+    if not c.B.shape[3]:
+        return lambda _size: c.u[0, 0]
     A, B = (np.abs(distinct(matrix)[0]).max(axis=0) for matrix in (c.A, c.B))
 
     def terms(size: Array) -> Array:

@@ -44,7 +44,7 @@ from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
-_AT_ONCE = 1 << 15  # points
+_AT_ONCE = 1 << 15  # points: what is made of all of them at once is what takes the memory
 _SMALL = 8  # coordinates of w, up to which dense collocation is faster
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 
@@ -364,21 +364,12 @@ class Extension:
 
     solution: LinearSolution  # [ξ_a | ξ_b | Φ] (k, 1 + q + n_a)
     assembled: Assembled
+    scale: Array  # (K, p) size of the terms of each column of ψ so far, element by element
 
     @property
     def mesh(self) -> Mesh:
         """The mesh."""
         return self.solution.trajectory.mesh
-
-    def scale(self, q: int) -> Array:
-        """Size of the terms of each column of ψ so far, element by element, (K, p)."""
-        trajectory = self.solution.trajectory
-        z, *seen = map(_over_time, (trajectory.values, *self.solution.extras))
-        sizes = np.concatenate([
-            term_sizes(z[part], q, _at(seen, part)) for part in _pieces(len(z))
-        ])
-        largest = sizes.reshape(*trajectory.values.shape[:2], -1).max(axis=1)
-        return np.maximum.accumulate(largest, axis=0)
 
     def growth(self, q: int) -> float:
         """Largest entry of Φ."""
@@ -443,34 +434,49 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         ) if large else None
         if swept is not None:
-            return Extension(swept, latest[0])
+            return _assembled(reduced, swept, latest[0], as_found=True)
         if large:
             large, known = False, None
         solution = solve(
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         )
-    z, *seen = map(_over_time, (solution.trajectory.values, *solution.extras))
-    found = latest[0]
-    offset, gain = zip(*[
-        resolved(
-            replace(found, Y=found.Y[part], psi=found.psi[part], offset=found.offset[part],
-                    gain=found.gain[part]),
-            z[part], system, basis, _at(seen, part), reduced.form.scales,
+    return _assembled(reduced, solution, latest[0])
+
+
+def _assembled(
+    reduced: ReducedSystem, solution: LinearSolution, found: Assembled, *, as_found: bool = False
+) -> Extension:
+    """What was found on the mesh, :func:`resolved` but for ``as_found``, and sizes of its terms.
+
+    These are looked at where each element begins, in its middle and where it ends.
+    """
+    system, values = reduced.system, solution.trajectory.values
+    K, points = values.shape[:2]
+    places = [0, (points - 1) // 2, points - 1]
+    scale: list[Array] = []
+    states: tuple[list[Array], list[Array]] = [], []
+    for first in range(0, K, max(1, _AT_ONCE // points)):
+        part = slice(first, first + max(1, _AT_ONCE // points))
+        z, *seen = (
+            _over_time(e if e.shape[:2] == (1, 1) else e[part, places])
+            for e in (values, *solution.extras)
         )
-        for part in _pieces(len(z))
-    ], strict=True)
-    return Extension(
-        solution, replace(found, offset=np.concatenate(offset), gain=np.concatenate(gain))
-    )
-
-
-def _pieces(count: int) -> Iterator[slice]:
-    """Of many points: what is made of all of them at once is what takes the memory."""
-    return (slice(first, first + _AT_ONCE) for first in range(0, count, _AT_ONCE))
-
-
-def _at(seen: Sequence[Array], part: slice) -> AlgebraicEquations:
-    return AlgebraicEquations(*(each if len(each) == 1 else each[part] for each in seen))
+        terms, sizes = term_sizes(z, system.q, reduced.basis, AlgebraicEquations(*seen))
+        scale.append(sizes.reshape(-1, 3, sizes.shape[1]).max(axis=1))
+        if as_found:
+            continue
+        terms = terms.reshape(-1, 3, *terms.shape[1:]).max(axis=1).repeat(points, axis=0)
+        some = slice(first * points, part.stop * points)
+        here = replace(found, Y=found.Y[some], psi=found.psi[some], offset=found.offset[some],
+                       gain=found.gain[some])
+        for known, more in zip(
+            states, resolved(here, terms, system, reduced.form.scales), strict=True
+        ):
+            known.append(more)
+    if not as_found:
+        offset, gain = map(np.concatenate, states)
+        found = replace(found, offset=offset, gain=gain)
+    return Extension(solution, found, np.maximum.accumulate(np.concatenate(scale), axis=0))
 
 
 def _driven(o: ObserverMatrices, v: Array, y: Array, columns: int) -> tuple[Array, Array]:

@@ -93,51 +93,43 @@ def regression_signals(
 
 
 def resolved(
-    found: Assembled, z: Array, system: DescriptorSystem, basis: Array,
-    equations: AlgebraicEquations, scales: Array | None,
+    found: Assembled, terms: Array, system: DescriptorSystem, scales: Array | None
 ) -> tuple[Array, Array]:
     """The state's offset (N, n) and gain (N, n, p), on hidden constraints and without noise.
 
     Hidden constraints 0 = M x + … hold but for what has gathered in z, which is taken from the
     state; entries of the gain that are rounding of their terms are zero. Whether a state is
-    determined must not hang on noise. Some arguments are those of :func:`regression_signals`.
+    determined must not hang on noise.
 
     Args:
-        found: what that gave.
-        z: of the extension.
+        found: what :func:`regression_signals` gave.
+        terms: sizes of those of the gain, (N, n, p).
         system: the plant.
-        basis: of z.
-        equations: at the same times.
         scales: sizes of the states (n,) by which M was made a projector; None: there is no M.
     """
-    n, r, q = system.n, system.r, system.q
-    offset, gain, z = found.offset, found.gain, np.abs(z[:, :, 1:])
-    seen = np.abs(equations.on_basis) @ z
-    seen[:, :, :q] += np.abs(equations.G)
-    terms = np.abs(basis) @ z
-    terms += np.abs(equations.elimination) @ (np.abs(transpose(equations.range)) @ seen)
+    offset, gain = found.offset, found.gain
     if scales is not None:
-        rows = slice(-(n + r), -r)
+        rows = slice(-(system.n + system.r), -system.r)
         offset = offset - scales * found.Y[:, rows]
         gain = gain + scales[:, None] * found.psi[:, rows]
     return offset, np.where(np.abs(gain) <= _NOISE * terms, 0.0, gain)
 
 
-def term_sizes(z: Array, q: int, equations: AlgebraicEquations) -> Array:
-    """Size of the terms that each column of ψ is made of, at N times, (N, p).
+def term_sizes(
+    z: Array, q: int, basis: Array, equations: AlgebraicEquations
+) -> tuple[Array, Array]:
+    """Sizes of the terms of the gain (N, n, p), and of those of each column of ψ (N, p).
 
     An equation of large numbers counts as much as its projection can add to a residual, or as
-    much as the rounding of the projection does.
-
-    Args:
-        z: [ξ_a | ξ_b | Φ] in the coordinates of the basis, (N, k, 1 + q + n_a).
-        q: number of unknown parameters.
-        equations: at the same times.
+    much as the rounding of the projection does. Arguments are those of :func:`regression_signals`.
     """
-    terms = np.abs(equations.on_basis) @ np.abs(z[:, :, 1:])
-    terms[:, :, :q] += np.abs(equations.G)
-    projected = np.abs(orthonormal_complement(equations.range)) @ terms
-    return np.asarray(np.maximum(projected, _ROUNDING * terms).max(axis=1))
+    z, inward = np.abs(z[:, :, 1:]), transpose(equations.range)
+    seen = np.abs(equations.on_basis) @ z
+    seen[:, :, :q] += np.abs(equations.G)
+    terms = np.abs(basis) @ z
+    terms += np.abs(equations.elimination) @ (np.abs(inward) @ seen)
+    projected = np.abs(orthonormal_complement(equations.range)) @ seen
+    return terms, np.maximum(projected, _ROUNDING * seen).max(axis=1)
 
 
 def on_mesh(mesh: Mesh, signal: Array) -> Trajectory:

@@ -81,6 +81,8 @@ def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) 
 def noisy_matrices(reduced: ReducedSystem) -> bool:
     """Whether noise is where the response to it does not go: in matrices, in slopes of inputs."""
     system, noise = reduced.system, reduced.signals.noise
+    if not reduced.form.follows_signals:
+        return False
     names = frozenset[str]().union(*system.coefficients.signals.values())
     noisy = np.flatnonzero(np.zeros(0) if noise is None else noise.inputs)
     return system.depends_on_outputs or any(

@@ -194,7 +194,7 @@ class SampledObserver:
         previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
         growth = float(np.abs(z[..., 1 + system.q :]).max(initial=0.0))
         smallest = float(o.injectivity.min())
-        scale = term_sizes(z, system.q, equations)
+        terms, scale = term_sizes(z, system.q, self.basis, equations)
         if before is not None:
             growth, scale[0] = max(growth, before.growth), np.maximum(scale[0], before.scale)
             smallest = min(smallest, before.injectivity)
@@ -213,7 +213,7 @@ class SampledObserver:
             errors = ErrorSteps(step, *(
                 np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
             ))
-        offset, gain = resolved(assembled, z, system, self.basis, equations, self.form.scales)
+        offset, gain = resolved(assembled, terms, system, self.form.scales)
         return state, SampledBlock(
             regression, offset, gain, z, scale, errors, self.form.scales
         )

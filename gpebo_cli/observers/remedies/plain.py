@@ -39,7 +39,7 @@ class Plain:
                 Y=on_mesh(mesh, final.Y if all_kept else final.Y[:, kept]),
                 psi=on_mesh(mesh, final.psi if all_kept else final.psi[:, kept]),
                 parameters=(*system.unknowns, *reduced.names),
-                scale=extension.scale(q),
+                scale=extension.scale,
             ),
             state_map=AffineStateMap(
                 on_mesh(mesh, final.offset), on_mesh(mesh, final.gain),

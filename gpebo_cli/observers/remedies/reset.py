@@ -196,7 +196,7 @@ def _joined(
             Y=on_mesh(mesh, whole.Y[:, kept]),
             psi=on_mesh(mesh, whole.psi[:, kept]),
             parameters=(*system.unknowns, *reduced.names),
-            scale=np.concatenate([e.scale(q) for e in extensions]),
+            scale=np.concatenate([e.scale for e in extensions]),
             resets=tuple(resets),
         ),
         state_map=AffineStateMap(
