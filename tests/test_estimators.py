@@ -139,23 +139,24 @@ def power_ode(gamma, alpha, gamma2, beta, lam):
 
 
 def exciting_ode(gamma, kappa, lam):
-    """The observer of (η_i, z) with u1 = −κΔ², u2 = κΔ, u3 = 0, literally."""
+    """The observer of (η_i, z) with u1 = −φ', u2 = φ'/Δ, u3 = 0, literally; ∫Δ² beside it."""
     inner, x0, columns = drem_ode(1.0, lam, "kreisselmeier")
 
     def f(t, x):
-        omega, eta, Phi = x[:9].reshape(3, 3), x[12:15], x[24:].reshape(2, 2)
+        omega, eta, Phi = x[:9].reshape(3, 3), x[12:15], x[24:28].reshape(2, 2)
         delta = np.linalg.det(omega)
         z, xi1, xi2 = x[15:18], x[18:21], x[21:24]
-        u1, u2 = -kappa * delta**2, kappa * delta
+        u2 = 0.5 * np.pi * kappa * np.exp(-kappa * x[28]) * delta
+        u1 = -u2 * delta
         law = gamma * Phi[1, 0] * (z - xi2 - Phi[1, 0] * eta)
         Phi_t = np.array([[0.0, u1], [u2 * delta, 0.0]]) @ Phi
         mixed = adjugate(omega) @ x[9:12]
         return np.concatenate([
             inner(t, x[:15])[:12], law, u2 * mixed, u1 * xi2 - u1 * z, u2 * delta * xi1,
-            Phi_t.ravel(),
+            Phi_t.ravel(), [delta**2],
         ])
 
-    return f, np.concatenate([x0, np.zeros(9), np.eye(2).ravel()]), columns
+    return f, np.concatenate([x0, np.zeros(9), np.eye(2).ravel(), [0.0]]), columns
 
 
 def means_ode(gamma, delay, settle, rows):
@@ -241,13 +242,22 @@ def test_a_regressor_that_stays_exciting_when_the_excitation_ends():
     ends, t = regression(fading, ETA, horizon=40.0), np.linspace(0.0, 40.0, 81)
     rates = {"lambda": [0.3, 0.5, 0.7]}
     assert np.abs(run("drem", ends, t, gamma=1e4, **rates)[0, -1] - ETA).max() > 1.0
-    assert np.abs(run("exciting", ends, t, **rates)[0, -1] - ETA).max() < 1e-12
-    made = estimate("exciting", ends, t, **rates)
     energy = np.interp(t, ends.mesh.points.ravel(), mix_energy(ends, rates["lambda"]))
-    np.testing.assert_allclose(
-        made.delta(t)[0], np.sin(0.5 * np.pi * energy / energy[-1]), atol=1e-3
-    )
-    assert made.requirement.holds
+    for kappa in (1.0 / energy[-1], 1e3 / energy[-1]):
+        made = estimate("exciting", ends, t, kappa=kappa, **rates)
+        assert np.abs(made.parameters(slice(None))[0, -1] - ETA).max() < 1e-11
+        angle = 0.5 * np.pi * (1.0 - np.exp(-kappa * energy))
+        np.testing.assert_allclose(made.delta(t)[0], np.sin(angle), atol=2e-3)
+        assert made.requirement.holds
+
+
+def test_what_comes_later_does_not_change_the_estimates_of_exciting():
+    """It is causal: over the first half of the data it says the same as over all of them."""
+    t, half = np.linspace(0.0, 4.0, 21), regression(three, ETA, horizon=4.0, elements=20)
+    gains = {"kappa": 100.0, "lambda": [0.3, 0.5, 0.7]}
+    whole = run("exciting", CLEAN, t, **gains)[0]
+    assert np.abs(whole - run("exciting", half, t, **gains)[0]).max() < 1e-10
+    assert np.abs(whole[-1] - ETA).max() > 1e-6
 
 
 def mix_energy(regression, rates):
@@ -274,6 +284,14 @@ def test_instruments_and_annihilators_take_the_bias_away():
     assert error["least_squares"] > 0.3
     assert error["instrumental"] < 0.01
     assert error["annihilator"] < 0.01
+
+
+def test_nothing_delayed_has_arrived_before_the_delay():
+    """Ω is zero until then, and so is Δ; ∫Δ² is a number."""
+    made = estimate("instrumental", CLEAN, delay=3.0)
+    assert np.isfinite(made.groups[0].energy).all()
+    assert not made.delta(T[T < 3.0]).any()
+    assert made.delta(T[T > 3.5]).all()
 
 
 def test_finite_time_law_against_an_integration_with_its_energy():

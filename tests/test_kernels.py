@@ -323,6 +323,16 @@ def test_arrays_that_do_not_fit_each_other_are_refused(name, case, place, cut):
         getattr(import_module("gpebo_cli.kernels._compiled"), name)(*wrong)
 
 
+@pytest.mark.parametrize("scale", [0.0, 1e-310])
+def test_a_matrix_of_zeros_among_others_has_the_determinant_zero(scale):
+    (extended,) = _mixed(np.random.default_rng(0))
+    extended[11:22] *= scale
+    delta = kernels.laws.mixed(extended)[0]
+    assert not delta[11:22].any()
+    assert delta[:11].all()
+    assert delta[22:].all()
+
+
 @needs_kernels
 def test_what_is_large_is_left_to_numpy():
     rng = np.random.default_rng(0)

@@ -179,25 +179,27 @@ class ResumableEstimator(GainEstimator):
 
 
 def filtered_errors(
-    filters: Array, into: Array, law: Array, forcing: Array
+    filters: Array, into: Array, law: Array, forcing: Array, out: Array | None = None
 ) -> ErrorSystem:
-    """Errors of a filter 𝒴 behind Y and of a law behind the filter.
+    """Errors of filters with s states behind Y, and of a law with q behind the filters.
 
-        δ𝒴' = −filters δ𝒴 + into δY,      δη̂' = −law δη̂ + forcing δ𝒴
+        δf' = −filters δf + into δY,      δs' = −law δs + forcing δf,      δη̂ = out δs
 
     Args:
-        filters: rates (p,), or (N, p).
-        into: (N, p, rows).
-        law: (N, p, p).
-        forcing: (N, p, p).
+        filters: rates (s,) or (N, s), or matrices (N, s, s).
+        into: (N, s, rows).
+        law: (N, q, q).
+        forcing: (N, q, s).
+        out: (N, p, q); None: δη̂ = δs.
     """
-    count, p, rows = into.shape
-    A = np.zeros((count, 2 * p, 2 * p))
-    A[:, :p, :p] = -(filters[..., None] * np.eye(p))
-    A[:, p:, :p], A[:, p:, p:] = forcing, -law
-    B = np.concatenate([into, np.zeros_like(into)], axis=1)
-    C = np.concatenate([np.zeros((p, p)), np.eye(p)], axis=1)[None]
-    return ErrorSystem(A, B, C, np.zeros((1, p, rows)))
+    (count, s, rows), q = into.shape, law.shape[-1]
+    A = np.zeros((count, s + q, s + q))
+    A[:, :s, :s] = -(filters if filters.ndim == 3 else filters[..., None] * np.eye(s))
+    A[:, s:, :s], A[:, s:, s:] = forcing, -law
+    B = np.concatenate([into, np.zeros((count, q, rows))], axis=1)
+    out = np.eye(q)[None] if out is None else out
+    C = np.concatenate([np.zeros((*out.shape[:2], s)), out], axis=2)
+    return ErrorSystem(A, B, C, np.zeros((1, out.shape[1], rows)))
 
 
 def is_auto(value: object) -> bool:

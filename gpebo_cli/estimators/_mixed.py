@@ -96,18 +96,17 @@ class FilteredEstimator(ResumableEstimator):
 def scalar_errors(
     filters: Array, into: Array, delta: Array, adjugate: Array, gain: Array
 ) -> ErrorSystem:
-    """Errors of 𝒴 and of the scalar law behind it, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂).
+    """Errors of filters behind Y and of the scalar law behind them, δη̂' = γΔ(adj δf − Δ δη̂).
 
     Args:
-        filters: rates of 𝒴, (p,) or (N, p).
-        into: what 𝒴' takes of Y, (N, p, rows).
+        filters: as of ``filtered_errors``, with s states.
+        into: what the filters take of Y, (N, s, rows).
         delta: Δ (N,).
-        adjugate: adj(Ω) (N, p, p).
+        adjugate: adj(Ω), or what else makes δ𝐘 of the filters' errors, (N, p, s).
         gain: γ, (1,) or (p,).
     """
-    eye = np.eye(into.shape[1])
     weighted = delta[:, None, None] * gain[:, None]
-    law = weighted * delta[:, None, None] * eye
+    law = weighted * delta[:, None, None] * np.eye(adjugate.shape[1])
     return filtered_errors(filters, into, law, weighted * adjugate)
 
 

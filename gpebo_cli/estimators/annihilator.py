@@ -1,14 +1,16 @@
 """DREM with an annihilator: some regressors share a disturbance with Y, and their rows go.
 
-After Glushchenko and Lastochkin, Unbiased parameter estimation via DREM with annihilators,
-arXiv:2403.11076, which is bias-eliminated least squares. Y = ψη + w, where w has something in
-common with the perturbed columns of ψ only. Of the means of [ψ(t) ; ψ(t − d)]ᵀ Y those 2p rows are
+After the idea of Glushchenko and Lastochkin, Unbiased parameter estimation via DREM with
+annihilators, arXiv:2403.11076, which is bias-eliminated least squares. Y = ψη + w, where w has
+something in common with the perturbed columns of ψ only. Of the means of [ψ(t) ; ψ(t − d)]ᵀ Y those
+2p rows are
 
     𝒴 = Ω η + B b,   b the unknown bias, B the unit vectors of the perturbed rows of ψ(t),
 
 and N with N B = 0 annihilates it: (NΩ)ᵀNΩ η = (NΩ)ᵀN𝒴, then mixing. The rows of ψ(t − d) stay, w
 being forgotten within d; without perturbed columns this is least squares on twice the rows. The
-choice of rows is ours; the equations were derived, not copied.
+choice of rows is ours. Of the paper only the abstract and introduction were at hand, so these
+equations need not be its own.
 """
 
 from __future__ import annotations

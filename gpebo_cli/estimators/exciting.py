@@ -1,35 +1,41 @@
 """DREM behind a regressor that stays exciting when Δ is so for an interval only.
 
-After Bobtsov, Yi, Ortega and Astolfi, Generation of new exciting regressors for consistent on-line
-estimation of unknown constant parameters, arXiv:2104.02210: to 𝐘 = Δη_i belongs the system
+After the idea of Bobtsov, Yi, Ortega and Astolfi, Generation of new exciting regressors for
+consistent on-line estimation of unknown constant parameters, arXiv:2104.02210. To 𝐘 = Δη_i belongs
 
     η_i' = 0 = u1 z − u1 z,   z' = u2 𝐘 + u3 z = u2 Δ η_i + u3 z,   z(0) = 0
 
 whose state (η_i, z) an observer follows up to e = Φ (η_i, 0), Φ' = [[0, u1], [u2 Δ, u3]] Φ, as a
 GPEBO does. Its second row is the new regression e_2 = Φ_21 η_i, and u1, u2, u3 are free. Here
-u1 = −κΔ², u2 = κΔ and u3 = 0, with which Φ is a rotation: Φ_21 = sin(κ∫Δ²) stays where it is when
-Δ ends, and is persistently exciting unless κ∫Δ² stops at a multiple of π. This choice is ours; the
-equations were derived, not copied.
+
+    u1 = −φ',   u2 Δ = φ',   u3 = 0,   φ = (π/2) (1 − e^{−κ∫Δ²}),
+
+with which Φ is the rotation by φ: Φ_21 = sin φ never falls, and stays where it is when Δ ends.
+The paper was not at hand. The observer and this choice were derived from its abstract; they are
+what stands here, and need not be the paper's own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import MixedEstimates, filter_rates
-from gpebo_cli.estimators._mixing import filled
-from gpebo_cli.estimators._scalar import scalar_path
+from gpebo_cli.estimators._mixed import MixedEstimates, filter_rates, scalar_errors
+from gpebo_cli.estimators._mixing import filled, mix
+from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.schema import number
 
 _TOLERANCE, _MAX_ELEMENTS = 1e-12, 200_000
 _KNOWN = 1e-13  # of Φ_21, from which on e_2/Φ_21 is more than rounding
@@ -42,28 +48,36 @@ class Exciting(GainEstimator):
     Attributes:
         gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
             parameter (one gain each).
-        kappa: κ of the rotation; None is π/2 over ∫Δ² at the end, the most that never turns back.
+        kappa: κ of the rotation, of the size of 1/∫Δ²; with a larger one Φ_21 is there earlier, and
+            what comes later counts less.
         rates: λ of the filters, as of ``drem``.
         initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
     gamma: object = gain(10.0, by_parameter=True, auto=True)
-    kappa: float | None = None
+    kappa: float = 1e10
     rates: object = field(default=None, metadata={"key": "lambda"})
 
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
-        """Extend, mix, rotate, and keep what the closed form needs at the times t (M,)."""
-        inner, kappa = self._mixed(regression, t)
+        """Extend, mix, rotate, and keep what the closed form needs at the times t (M,).
+
+        Raises:
+            ConfigError: κ is not positive.
+        """
+        inner = Drem(gamma=self.gamma, rates=self.rates, initial=self.initial).resume(
+            regression, t, ()
+        )
         (path,) = inner.groups
-        columns = 1 + path.quotient.shape[-1]
+        columns, turning = 1 + path.quotient.shape[-1], self._turning(path)
 
         def rotation(t: Array, inside: Array) -> LinearEquation:
             delta, Y, _ = path.signals(t, inside)
             A = np.zeros((len(t), 2, 2))
-            A[:, 1, 0] = kappa * delta**2
+            turn = turning(t, inside) * delta  # u2
+            A[:, 1, 0] = turn * delta
             A[:, 0, 1] = -A[:, 1, 0]
             f = np.zeros((len(t), 2, columns))
-            f[:, 1, 1:] = kappa * delta[:, None] * Y
+            f[:, 1, 1:] = turn[:, None] * Y
             return LinearEquation(None, A, f)
 
         start = np.zeros((2, columns))
@@ -83,38 +97,38 @@ class Exciting(GainEstimator):
         law = scalar_path(found.mesh, signals, new, quotient, np.asarray(t), None, path.floor)
         return replace(inner, groups=(law,), condition="IE")
 
-    def _mixed(self, regression: LinearRegression, t: Array) -> tuple[MixedEstimates, float]:
-        """𝐘 = Δη as of ``drem``, and κ."""
-        plain = Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
-        inner = plain.resume(regression, t, ())
-        energy = max(float(inner.groups[0].energy[-1, -1]), 1e-300)
-        return inner, 0.5 * np.pi / energy if self.kappa is None else self.kappa
+    def _turning(self, path: ScalarPath) -> Callable[[Array, Array], Array]:
+        """φ'/Δ² = κ (π/2) e^{−κ∫Δ²} at times (N,)."""
+        kappa = number(self.kappa, "estimator.kappa")
+        energy = Trajectory(path.mesh, path.energy)
+        return lambda t, inside: 0.5 * np.pi * kappa * np.exp(-kappa * energy(t, inside))
 
     def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
-        """δ𝒴 as of ``drem``, δe' = κΔ²[[0, −1], [1, 0]] δe + κΔ (0, adj(Ω) δ𝒴), of every case.
+        """δ𝒴 as of ``drem``, δe' = φ'[[0, −1], [1, 0]] δe + φ'/Δ (0, adj(Ω) δ𝒴), of every case.
 
         Then δη̂' = γΦ_21 (δe_2 − Φ_21 δη̂).
         """
         names, p, end = regression.parameters, regression.p, regression.mesh.edges[-1:]
-        rates, kappa = filter_rates(self.rates, names), self._mixed(regression, end)[1]
+        rates = filter_rates(self.rates, names)
         extended = kreisselmeier(regression, rates)
+        turning = self._turning(mix(extended, end))
         (law,) = self.estimate(regression, end).groups
-        filtered, first, second, last = (np.arange(p) + k * p for k in range(4))
+        first, second = np.arange(p, 2 * p), np.arange(2 * p, 3 * p)
 
         def of_case(gain: Array) -> ErrorsAt:
             def at(t: Array, inside: Array) -> ErrorSystem:
                 omega = extended(t, inside)[..., :p]
                 delta, adjugate, _ = determinant_and_adjugate_action(omega)
-                new, psi = law.signals(t, inside)[0][:, None], regression.psi(t, inside)
-                A = np.zeros((len(t), 4 * p, 4 * p))
-                A[:, filtered, filtered] = -rates
-                A[:, first, second] = -kappa * delta[:, None] ** 2
-                A[:, second, first] = kappa * delta[:, None] ** 2
-                A[:, 2 * p : 3 * p, :p] = kappa * delta[:, None, None] * adjugate
-                A[:, last, second], A[:, last, last] = gain * new, -gain * new**2
-                B = np.zeros((len(t), 4 * p, psi.shape[1]))
-                B[:, :p] = rates[:, None] * transpose(psi)
-                return ErrorSystem(A, B, np.eye(4 * p)[None, 3 * p :], np.zeros_like(B[:1, :p]))
+                turn = (turning(t, inside) * delta)[:, None]
+                filters = np.zeros((len(t), 3 * p, 3 * p))
+                filters[:, :p, :p] = np.diag(rates)
+                filters[:, first, second] = turn * delta[:, None]
+                filters[:, second, first] = -filters[:, first, second]
+                filters[:, second, :p] = -turn[..., None] * adjugate
+                into = np.zeros((len(t), 3 * p, regression.psi.values.shape[2]))
+                into[:, :p] = rates[:, None] * transpose(regression.psi(t, inside))
+                e_2 = np.eye(3 * p)[None, 2 * p :]
+                return scalar_errors(filters, into, law.signals(t, inside)[0], e_2, gain)
 
             return at
 

@@ -1,14 +1,14 @@
 """DREM with an instrumental variable and averaging: unbiased behind coloured disturbances.
 
-After Glushchenko and Lastochkin, Instrumental variables based DREM for online asymptotic
-identification of perturbed linear systems, arXiv:2312.15631. Y = ψη + w, and an instrument ζ that
-has nothing in common with w: the mean of ζY goes to the mean of ζψ times η. Here ζ is ψ itself as
-it was d seconds ago, which needs w to forget within d:
+After the idea of Glushchenko and Lastochkin, Instrumental variables based DREM for online
+asymptotic identification of perturbed linear systems, arXiv:2312.15631. Y = ψη + w, and an
+instrument ζ that has nothing in common with w: the mean of ζY goes to the mean of ζψ times η. Here
+ζ is ψ itself as it was d seconds ago, which needs w to forget within d:
 
     Ω' = (ζψ − Ω)/(T₀ + t),   𝒴' = (ζY − 𝒴)/(T₀ + t),   ζ(t) = ψ(t − d)ᵀ,   then mixing, as in drem.
 
-The instrument is ours, because an estimator sees ψ and no reference signal; the equations were
-derived, not copied.
+The instrument is ours, because an estimator sees ψ and no reference signal. Of the paper only the
+abstract and introduction were at hand, so these equations need not be its own.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
 from gpebo_cli.estimators._extension import averaged, lagged
-from gpebo_cli.estimators._mixed import MixedEstimates
+from gpebo_cli.estimators._mixed import MixedEstimates, scalar_errors
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
@@ -83,15 +83,10 @@ class Instrumental(GainEstimator):
                 rows = means(t, inside)
                 left = self.left(rows, names)
                 delta, adjugate, _ = determinant_and_adjugate_action(left @ rows[..., :p])
-                rate = (1.0 / (self.settle + t - began))[:, None, None]
-                weighted = delta[:, None, None] * gain[:, None]
-                A = np.zeros((len(t), 3 * p, 3 * p))
-                A[:, : 2 * p, : 2 * p] = -rate * np.eye(2 * p)
-                A[:, 2 * p :, : 2 * p] = weighted * (adjugate @ left)
-                A[:, 2 * p :, 2 * p :] = -weighted * delta[:, None, None] * np.eye(p)
-                into = rate * lagged(regression, self.delay, t, inside)
-                B = np.concatenate([into, np.zeros_like(into[:, :p])], axis=1)
-                return ErrorSystem(A, B, np.eye(3 * p)[None, 2 * p :], np.zeros_like(B[:1, :p]))
+                rate = 1.0 / (self.settle + t - began)
+                rates = np.repeat(rate[:, None], 2 * p, axis=1)
+                into = rates[..., None] * lagged(regression, self.delay, t, inside)
+                return scalar_errors(rates, into, delta, adjugate @ left, gain)
 
             return at
 

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from gpebo_cli.errors import ConfigError, SolverError
-from gpebo_cli.estimators._base import GainEstimator, gain
+from gpebo_cli.estimators._base import GainEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import energy_requirement, filter_rates
 from gpebo_cli.estimators._mixing import mix
@@ -87,7 +87,7 @@ class Monotone(GainEstimator):
         rates = filter_rates(self.rates, names)
         extended = kreisselmeier(regression, rates)
         made = self.estimate(regression, regression.mesh.edges[-1:])
-        S, T, q = made.S, made.T, len(made.start)
+        S, T = made.S, made.T
 
         def of_case(gamma: float) -> ErrorsAt:
             path = made.solution(gamma, 0)
@@ -96,15 +96,9 @@ class Monotone(GainEstimator):
                 omega = extended(t, inside)[..., :k]
                 delta, adjugate, _ = determinant_and_adjugate_action(omega)
                 slope, weighted = S.jacobian(path(t)), gamma * delta[:, None, None] * T
-                psi = regression.psi(t, inside)
-                A = np.zeros((len(t), k + q, k + q))
-                A[:, :k, :k] = -np.diag(rates)
-                A[:, k:, :k] = weighted @ adjugate
-                A[:, k:, k:] = -delta[:, None, None] * (weighted @ slope)
-                B = np.zeros((len(t), k + q, psi.shape[1]))
-                B[:, :k] = rates[:, None] * transpose(psi)
-                C = np.concatenate([np.zeros((len(t), k, k)), slope], axis=2)
-                return ErrorSystem(A, B, C, np.zeros((1, k, psi.shape[1])))
+                law = delta[:, None, None] * (weighted @ slope)
+                into = rates[:, None] * transpose(regression.psi(t, inside))
+                return filtered_errors(rates, into, law, weighted @ adjugate, slope)
 
             return at
 

@@ -20,7 +20,7 @@ static double times_power(double one, double other, int *exponent)
 static double determinant(const Lane *A, npy_intp p, int l, double sign)
 {
     int exponent = 0;
-    for (npy_intp k = 0; k < p; k++)
+    for (npy_intp k = 0; k < p && sign != 0.0; k++) /* what follows a pivot of 0 is no number */
         sign = times_power(sign, 1.0 / A[k * p + k][l], &exponent);
     return exponent ? ldexp(sign, exponent) : sign;
 }
