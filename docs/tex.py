@@ -28,6 +28,7 @@ _MATHS = re.compile(
     r"|(?<=\w)'(?!\w)"
 )
 _NOT_MATHS = re.compile(r"gpebo|/\w+\.|\.(?:py|md|csv|json|yaml)|=\w+\.|\w+\.\w+=|\$ |--|\w+\(\)")
+_MATRIX = re.compile(r"\[(?=[^][]*(?:\w \d\b|\b\d \w))[^][]*\]")  # numbers side by side are its entries
 _WORD = re.compile(r"(?<![A-Za-z\\_^{])[a-z][A-Za-z]+(?![A-Za-z}])|[A-Z][a-z]{2,}")
 
 
@@ -45,6 +46,7 @@ def tex(text: str) -> str:
         return f" @{chr(0xE000 + len(notes) - 1)}@ "
 
     text = re.sub(r" {2,}", r" \\quad ", text.strip())
+    text = _MATRIX.sub(lambda m: re.sub(r"(?<=\w) (?=\w)", r"\\ \\ ", m[0]), text)
     text = re.sub(r"\((?:eq|eqs|for|the paper|d equations|a equations)[^()]*\)", note, text)
     text = unicodedata.normalize("NFD", text.replace("≠", r"\ne "))
     text = re.sub(r"(\w)([\u0302\u0303\u0304\u0307\u0308])",

@@ -120,6 +120,7 @@ def test_every_refusal_of_the_program_is_on_the_page_of_messages():
     ("η̂' = Γ", r"\hat{η}' = Γ"),
     ("Σ_{k≥j} (−1)^{k−j} C(k, k−j)", r"\sum _{k\ge j} (-1)^{k-j} C(k, k-j)"),
     ("w_{μ+1} = 0      (eq. 7, xa)", r"w_{μ+1} = 0 \quad  \text{(eq. 7, xa)} "),
+    ("Γ = [R1 0; 0 1]", r"Γ = [R_{1}\ \ 0; 0\ \ 1]"),
     ("rank(𝒜Q) = n_b", r"\operatorname{rank} (𝒜Q) = n_b"),
 ])
 def test_formulas_become_tex(text, expected):
