@@ -28,7 +28,7 @@ _MATHS = re.compile(
     r"|(?<=\w)'(?!\w)"
 )
 _NOT_MATHS = re.compile(r"gpebo|/\w+\.|\.(?:py|md|csv|json|yaml)|=\w+\.|\w+\.\w+=|\$ |--|\w+\(\)")
-_MATRIX = re.compile(r"\[(?=[^][]*(?:\w \d\b|\b\d \w))[^][]*\]")  # numbers side by side are its entries
+_MATRIX = re.compile(r"\[(?=[^][]*(?:\w \d\b|\b\d \w))[^][]*\]")  # with entries side by side
 _WORD = re.compile(r"(?<![A-Za-z\\_^{])[a-z][A-Za-z]+(?![A-Za-z}])|[A-Z][a-z]{2,}")
 
 

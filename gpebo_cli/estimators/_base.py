@@ -51,7 +51,7 @@ def gain(
     """A field of an estimator that is a gain: a number, a list, or ``logspace(a, b, n)``.
 
     Args:
-        default: its value where nothing is said.
+        default: its value where none is given.
         accept: which numbers it may be.
         by_parameter: whether it may also be a mapping by parameter, which makes one case.
         auto: whether it may be ``auto``, which :meth:`GainEstimator.tuned` replaces: the larger the
@@ -102,7 +102,7 @@ class GainEstimator(ABC):
         return combinations(self.axes())
 
     def tuned(self, requirement: Callable[[Self], Requirement]) -> Self:
-        """The same with a number for a gain that is ``auto``: ten times the least that would do.
+        """The estimator with a number for a gain that is ``auto``: ten times the least that does.
 
         The least is that of the ``requirement`` for γ = 1 over all of the data; where no gain
         would do, it is the default one.
@@ -117,9 +117,9 @@ class GainEstimator(ABC):
         return replace(self, **chosen)
 
     def raised(self, requirement: Requirement) -> Self:
-        """Itself, or with ten times the least gain that would do.
+        """The estimator itself, or one with ten times the least gain that would do.
 
-        The latter where nothing was said of the gain and the default is less than that.
+        It is the latter where no gain was given and the default is less than that.
 
         Args:
             requirement: what the estimates with the default turned out to need.
@@ -175,7 +175,7 @@ class ResumableEstimator(GainEstimator):
     def resume(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> ResumableEstimates:
-        """The same at the times t (M,), from the extensions that are known at the start."""
+        """Prepare the estimates at the times t (M,), with extensions known at the start."""
 
 
 def filtered_errors(

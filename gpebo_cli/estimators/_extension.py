@@ -36,7 +36,7 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
     fastest = float(np.max(rate))
     for _ in range(_ROUNDS):
         filtered, mesh = signal.low_pass(rate, start), signal.mesh
-        # Where elements are short beside the filter, it is the signal that is not resolved.
+        # Where elements are short beside the filter, the signal is what is not resolved.
         poor = (mesh.steps * fastest > 0.5) & (mesh.steps > smallest)
         if poor.any():
             flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
@@ -77,8 +77,8 @@ def lagged(regression: LinearRegression, delay: float, t: Array, inside: Array) 
 def averaged(regression: LinearRegression, delay: float, settle: float) -> Trajectory:
     """Means of [ψ(t) ; ψ(t − d)]ᵀ [ψ | Y], shape (2p, p + c): Z' = (product − Z)/(T₀ + t), Z = 0.
 
-    What a disturbance of Y has in common with a factor stays in the mean of that row; what it has
-    not goes away as the mean is taken over longer and longer. The mesh has edges where the delayed
+    What a disturbance of Y has in common with a factor stays in the mean of that row; the rest
+    vanishes as the mean is taken over longer and longer times. The mesh has edges where the delayed
     ψ has.
 
     Args:

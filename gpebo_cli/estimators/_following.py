@@ -16,7 +16,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.resets import ExtensionState
 
-_DIGITS = 1e-12  # reciprocal condition of Ω below which nothing is left of some direction
+_DIGITS = 1e-12  # reciprocal condition of Ω below which some direction is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class FollowingEstimates:
 
     @property
     def requirement(self) -> Requirement:
-        """γ∫Δ², less what η grows by, has to pull the error down."""
+        """γ∫Δ² has to be larger than the growth of η, so that the error falls."""
         energy = float(Trajectory(self.mixed.mesh, self.mixed.values**2).integral().final)
         gain = float(self.gains.min())
         needed = self.grown + DECAY

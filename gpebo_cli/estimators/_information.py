@@ -45,7 +45,7 @@ class Information:
         return ExtensionState(self.gram.final, self.level, float(self.memory.final))
 
     def at(self, t: Array, inside: Array | None = None) -> InformationAt:
-        """At the times t (M,)."""
+        """G_z, h_z and z at the times t (M,)."""
         sampler = self.gram.mesh.sampler(t, inside)
         return InformationAt(sampler(self.gram.values), sampler(self.memory.values))
 
@@ -77,7 +77,7 @@ class InformationAt:
     def solution(self, alpha: float, f0: float, start: Array) -> Array | None:
         """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z), shape (M, p, c); None where that is singular.
 
-        Without the spectrum, which many gains share.
+        The spectrum, which many gains share, is not needed for it.
         """
         p = len(start)
         weight = (self.memory * f0)[:, None, None]
@@ -92,7 +92,7 @@ class InformationAt:
     def quotient(self) -> tuple[Array, Array]:
         """G_z⁻¹ h_z (M, p, c), and to how many digits, λ_min/λ_max (M,).
 
-        In units of each parameter's own size: those they happen to have may hide most digits.
+        It is solved in units of each parameter's own size; other units may hide most digits.
         """
         values, p = self.values, self.values.shape[-2]
         size = np.sqrt(np.maximum(np.einsum("mii->mi", values[..., :p]), 0.0))

@@ -10,15 +10,15 @@ from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
 
-# Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not
-# needed there either: its weight in every law is ∫Δ².
+# Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not needed
+# there, because its weight in every law is ∫Δ².
 SINGULAR = 1e-14
 
 
 def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     """Mix [Ω | 𝒴] (p, p + c): the path that the scalar law takes, reported at the times t (M,).
 
-    Realisations are so many parameters more to the law: p·c of them, in the order of (p, c).
+    The law takes c realisations as p·c parameters, in the order of (p, c).
     """
     p = extended.values.shape[-2]
 

@@ -29,7 +29,7 @@ class PowerLaw:
     def solve(self, start: Array, gains: Array) -> Array:
         """η̂ (g, M, P) at the path's times, from ``start`` (P,) or (g, P), for gains (g, P or 1).
 
-        Every gain and parameter has steps of its own: errors come to zero at times of their own.
+        Every gain and parameter has steps of its own, because errors reach zero at different times.
 
         Raises:
             SolverError: steps become too short.
@@ -81,7 +81,7 @@ class PowerLaw:
         found = path.signals(places.ravel(), inside.ravel())
         delta, digits = (found[i].reshape(places.shape)[lane, 1:] for i in (0, 2))
         Y = found[1].reshape(*places.shape, -1)[lane, 1:, column]
-        # Where 𝐘/Δ is rounding nothing is known, and nothing moves.
+        # Where 𝐘/Δ is rounding nothing is known, and the estimate does not move.
         known = (digits > SINGULAR) & (delta != 0.0)
         rest = np.where(known, Y - delta * eta[:, None], 0.0)
         integral = (right - left)[:, None, None] * rule.integration * delta[:, None]

@@ -135,7 +135,7 @@ class ScalarLaw:
         self, filters: Sequence[Filter], quotients: Sequence[Array],
         decay: Array, of_new: Array, of_old: Array, had: BoolArray,
     ) -> tuple[ErrorRecursion, ...]:
-        """Of the filters' errors and of η̂ behind them, for each case of an update."""
+        """The systems of the filters' errors and of η̂ behind them, for each case of an update."""
         out = []
         before, self._inverse = self._inverse, [Q[-1:] for Q in quotients]
         for d, (own, Q) in enumerate(zip(filters, quotients, strict=True)):
@@ -170,7 +170,7 @@ class Filter(NamedTuple):
 
 
 def integrating(regression: SampledRegression, beta: float) -> Filter:
-    """That of h_z, with forgetting at the rate β."""
+    """The filter of h_z, with forgetting at the rate β."""
     p = regression.p
     into = transpose(regression.rows[..., :p])
     old, new = (share[:, None, None] for share in regression.shares)

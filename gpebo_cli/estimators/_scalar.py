@@ -3,7 +3,7 @@
 In the variable I = ∫Δ² and with η̄ = 𝐘/Δ the law is dη̂/dI = γ (η̄ − η̂). Without noise η̄ is
 constant and the law has the closed form η̂ = η̄ + e^{−γI} (η̂(0) − η̄): exact at any gain, one
 exponential per gain and time. With noise or forgetting η̄ varies, and where Δ changes sign it has
-poles that the law itself does not have; then the law is integrated as it stands, by the same
+poles that the law itself does not have. Then the law itself is integrated, by the same
 L-stable collocation as everything else, all gains as one batch.
 """
 
@@ -129,7 +129,7 @@ def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:
 
 
 def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
-    """η̄ linear in I between neighbouring points: what little it varies is second order.
+    """η̄ is linear in I between neighbouring points, and its small variation is of second order.
 
     Arguments and result, (g, M, p), are :func:`scalar_law`'s.
     """
@@ -144,7 +144,7 @@ def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     index = np.clip(np.searchsorted(path.mesh.rule.points, local, side="right") - 1, 0, s - 1)
     step = length[element, index]
     partial = np.clip(path.energy_at_t - energy[element, index], 0.0, step)
-    # At the next point itself there is nothing to go from there.
+    # At the next point itself the step has no length.
     there = (partial == step) & (index < s - 1)
     index, partial = index + there, np.where(there, 0.0, partial)
     share = np.divide(partial, step, out=np.zeros_like(partial), where=partial > 0)
@@ -155,7 +155,7 @@ def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
 
 
 def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
-    """The law as it stands, (g, M, p), a stretch of elements after the other."""
+    """The law itself is integrated, (g, M, p), one stretch of elements after the other."""
     mesh, rule, p = path.mesh, path.mesh.rule, path.quotient.shape[2]
     lanes = len(gains) * (rule.stages + 1) * rule.stages * p
     stretch = int(np.clip(_LANES // lanes, 16, _STRETCH))

@@ -27,7 +27,7 @@ _GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
 
 
 def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
-    """The estimator with numbers for gains that are ``auto``; one of another kind as it is."""
+    """The estimator with numbers for gains that are ``auto``; one of another kind unchanged."""
     if regression.resets or regression.dynamics is not None:
         return estimator
     return tuned_for(
@@ -45,14 +45,14 @@ def tuned_for(
 
 
 def raised(estimator: Estimator, requirement: Requirement) -> Estimator:
-    """The estimator with higher gains where nothing was said of them; itself where they do."""
+    """The estimator, with higher gains where none were given and the default is too low."""
     return estimator.raised(requirement) if isinstance(estimator, GainEstimator) else estimator
 
 
 def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Estimates:
     """``estimator.estimate`` from segment to segment, at the times t (M,), ascending.
 
-    At a reset η̂ goes on as T η̂ + τ and the extension as ``ExtensionState.after``. A time at which
+    At a reset η̂ becomes T η̂ + τ and the extension ``ExtensionState.after``. A time at which
     there is a reset belongs to what follows it.
 
     Raises:
@@ -74,7 +74,7 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
         if k > 0:
             reset = regression.resets[k - 1]
             known = tuple(state.after(reset) for state in parts[-1].reached)
-        # Besides the times that are asked for, the end, where the next one takes over.
+        # The end is added to the times that are asked for: there the next one takes over.
         times = np.append(own, segment.mesh.edges[-1])
         parts.append(resumable.resume(segment, times, known))
     return Chain(tuple(parts), regression.resets, tuple(int(k) for k in first))
@@ -82,21 +82,21 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
 
 @dataclass(frozen=True)
 class Nothing:
-    """Of a regression without parameters: constraints alone determine the states."""
+    """Estimates of a regression without parameters: constraints alone determine the states."""
 
     count: int  # of cases
     times: int
 
     @property
     def requirement(self) -> Requirement:
-        """Met."""
+        """Nothing is required."""
         return Requirement("none", True, {}, "there is nothing to estimate")
 
     def delta(self, t: Array) -> None:
         """Nothing is mixed at the times t (M,)."""
 
     def parameters(self, cases: slice) -> Array:
-        """Of some cases, (g, M, 0)."""
+        """Empty arrays for some cases, (g, M, 0)."""
         return np.zeros((len(range(self.count)[cases]), self.times, 0))
 
 
@@ -110,7 +110,7 @@ class Chain:
 
     @property
     def reached(self) -> tuple[ExtensionState, ...]:
-        """Of the last segment."""
+        """The extensions at the end of the last segment."""
         return self.parts[-1].reached
 
     def delta(self, t: Array) -> Array | None:

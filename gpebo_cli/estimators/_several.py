@@ -1,4 +1,4 @@
-"""A plain field of an estimator as an axis: one estimator for each value, all as one."""
+"""A plain field of an estimator as an axis: one estimator for each value, run as one."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Several:
 
     @property
     def cases(self) -> tuple[Mapping[str, float], ...]:
-        """Those of the first one, of the second one, and so on."""
+        """The cases of the first one, then of the second one, and so on."""
         pairs = zip(self.chosen, self.members, strict=True)
         return tuple({**own, **case} for own, member in pairs for case in member.cases)
 
     def tuned(self, requirement: Callable[[Estimator], Requirement]) -> Several:
-        """Each with numbers for gains that are ``auto``, by the ``requirement`` for γ = 1."""
+        """All with numbers for gains that are ``auto``, by the ``requirement`` for γ = 1."""
         return Several(self.chosen, tuple(
             m.tuned(requirement) if isinstance(m, GainEstimator) else m for m in self.members
         ))
@@ -59,7 +59,7 @@ class SeveralEstimates:
 
     @property
     def requirement(self) -> Requirement:
-        """The first one that is not met, else that of the first."""
+        """The first requirement that is not met, else that of the first estimator."""
         every = [part.requirement for part in self.parts]
         return next((one for one in every if not one.holds), every[0])
 

@@ -39,9 +39,9 @@ class VectorLaw:
             η̂' = Γ Mᵀ ν,      0 = b − N η̂ − ν.
 
         Eliminating it puts γ MᵀN into the matrix, whose rounding errors then drive the slow
-        directions: at γ = 1e14 nothing would be left of them. In this form the limit γ → ∞ is an
+        directions: at γ = 1e14 they would be lost. In this form the limit γ → ∞ is an
         ordinary differential-algebraic equation. Where b jumps (a sample, a step of the input), ν
-        does, and starts anew; η̂ does not.
+        does, too, and starts anew; η̂ does not jump.
         """
         mesh, p = self.M.mesh, len(start)
         k = self.b.values.shape[2]

@@ -29,11 +29,11 @@ from gpebo_cli.schema import nearest, shown
 
 @dataclass(frozen=True, kw_only=True)
 class Annihilator(Instrumental):
-    """The same means as of ``instrumental``; rows without bias, squared up.
+    """The means of ``instrumental``, of which only rows without bias are used.
 
     Attributes:
         perturbed: the parameters whose columns of ψ share the disturbance of Y.
-        gamma, delay, settle, initial: as of ``instrumental``.
+        gamma, delay, settle, initial: as for ``instrumental``.
     """
 
     perturbed: list[str] = field(default_factory=list)

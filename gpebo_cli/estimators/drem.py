@@ -43,11 +43,11 @@ class Drem(FilteredEstimator):
         return transpose(psi)
 
     def size(self, regression: LinearRegression) -> float:
-        """Of ψᵀψ."""
+        """The size of ψᵀψ, which no filter exceeds."""
         return largest(regression.outer.values)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveDrem:
-        """The same at samples."""
+        """The estimator at samples."""
         return RecursiveDrem(self, parameters)
 
     def estimate_moving(

@@ -1,4 +1,4 @@
-"""Finite-time DREM: the exact estimate after a known amount of excitation, not in the limit."""
+"""Finite-time DREM: the estimate is exact after a known amount of excitation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gpebo_cli.schema import number
 class FiniteTime(ResumableEstimator):
     """DREM plus w_c = min(e^{−γ∫Δ²}, 1 − μ), η̂_f = (η̂ − w_c η̂(0))/(1 − w_c).
 
-    Exact, not asymptotic, once γ∫Δ² ≥ −ln(1 − μ).
+    The estimate is exact, and not only asymptotically, once γ∫Δ² ≥ −ln(1 − μ).
 
     Attributes:
         extension: ``kreisselmeier`` (as ``drem``) or ``least_squares`` (as ``ls_drem``).
@@ -53,7 +53,7 @@ class FiniteTime(ResumableEstimator):
         )
 
     def axes(self) -> dict[str, Sequence[float]]:
-        """Those of the inner estimator.
+        """The cases of the inner estimator.
 
         Raises:
             ConfigError: ``mu`` is not between 0 and 1.

@@ -47,7 +47,7 @@ class Instrumental(GainEstimator):
     settle: float = 1.0
 
     def means(self, regression: LinearRegression) -> Trajectory:
-        """Of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c).
+        """Means of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c).
 
         Raises:
             ConfigError: the delay or T₀ is not positive.

@@ -36,8 +36,8 @@ class LeastSquares(ResumableEstimator):
 
     Attributes:
         alpha: α > 0; a number, a list, or ``logspace(a, b, n)``.
-        f0: f₀ > 0, likewise.
-        beta: forgetting rate ≥ 0, likewise; 0 remembers everything.
+        f0: f₀ > 0, given in the same ways.
+        beta: forgetting rate ≥ 0, given in the same ways; 0 remembers everything.
         bound: M ≥ 1/f₀ of β (1 − ‖F‖/M), or None for constant forgetting.
         initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
@@ -64,13 +64,13 @@ class LeastSquares(ResumableEstimator):
 
     @property
     def covariance_bound(self) -> float | None:
-        """M, or None."""
+        """M as a number, or None without a bound."""
         return None if self.bound is None else number(self.bound, "estimator.bound")
 
     def known_at(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> list[tuple[InformationAt, ExtensionState]]:
-        """Of every case G_z, h_z and z at the times t (M,), and at the end."""
+        """Prepare G_z, h_z and z of every case at the times t (M,), and at the end."""
         bound = self.covariance_bound
         made: dict[tuple[float, ...], tuple[InformationAt, ExtensionState]] = {}
         out = []
@@ -110,7 +110,7 @@ class LeastSquares(ResumableEstimator):
         return tuple(map(of_case, self.cases, known or repeat(None)))
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLeastSquares:
-        """The same at samples.
+        """The estimator at samples.
 
         Raises:
             ConfigError: forgetting with a bound, which there is in continuous time only.

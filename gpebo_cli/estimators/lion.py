@@ -31,7 +31,7 @@ class Lion(FilteredEstimator):
         return np.broadcast_to(np.eye(rows)[np.arange(p) % rows], (len(psi), p, rows))
 
     def size(self, regression: LinearRegression) -> float:
-        """Of p rows of ψ."""
+        """The size of p rows of ψ, which no filter exceeds."""
         return float(np.sqrt(regression.p * largest(regression.outer.values)))
 
 

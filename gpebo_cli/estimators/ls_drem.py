@@ -92,7 +92,7 @@ class LsDrem(ResumableEstimator):
         return tuple(of_case(case, gain, before) for case, before in pairs for gain in gains)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLsDrem:
-        """The same at samples.
+        """The estimator at samples.
 
         Raises:
             ConfigError: forgetting with a bound, which there is in continuous time only.
@@ -190,7 +190,7 @@ def mix_least_squares(
         usable[part] = own.reshape(points.shape)
         quotient[part] = (s.vectors @ inverse).reshape(*points.shape, -1)  # 𝐘/Δ = G_z⁻¹ h_z
         delta[part] = np.prod(_shares(s, alpha, f0), axis=1).reshape(points.shape)
-    # Where the units of the parameters never leave a digit, in those of each parameter's own size.
+    # If no digit is left in the units that are given, each parameter's own size is the unit.
     in_own_units = not usable.any()
     for first in range(0, mesh.size if in_own_units else 0, _AT_ONCE):
         part = slice(first, first + _AT_ONCE)

@@ -1,4 +1,4 @@
-"""DREM with power laws: finite time with one power below 1, fixed time with one above 1 beside it.
+"""DREM with power laws: one below 1 gives a finite time, one above 1 beside it a fixed time.
 
     η̂_i' = Δ (γ ⌈r_i⌋^α + γ₂ ⌈r_i⌋^β),   r = 𝐘 − Δ η̂,   ⌈r⌋^α = sign(r) |r|^α,   0 < α < 1 < β
 
@@ -72,7 +72,7 @@ class Power(ResumableEstimator):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PowerEstimates(MixedEstimates):
-    """As of ``drem``, with the power law."""
+    """The errors of ``drem``, with the power law."""
 
     alpha: float
     beta: float

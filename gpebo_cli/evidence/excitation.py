@@ -171,7 +171,7 @@ def excitation(
 def estimable(
     known: Knowledge, t: Array, parameters: Sequence[str], states: Sequence[str], seen: BoolArray
 ) -> dict[str, float | None]:
-    """From when on each parameter and state can be known; None: not even at the end.
+    """From when on each parameter and state can be known; None where it cannot be.
 
     Args:
         known: at the times
@@ -315,7 +315,7 @@ def _window_sums(signal: Trajectory, start: Sampler, stop: Sampler, columns: int
     )
 
     def within(places: Sampler) -> Array:
-        """From the left ends of elements to places in them."""
+        """Integrals from the left ends of elements to places in them."""
         weights = np.zeros_like(places.weights)
         weights[:, 1:] = mesh.steps[places.element, None] * (places.weights[:, 1:] @ R)
         found: Array = Sampler(places.element, weights)(signal.values)

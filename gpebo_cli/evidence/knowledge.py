@@ -35,7 +35,7 @@ class Knowledge:
     level: Array  # (M, p) share below which each parameter is rounding
 
     def at(self, chosen: slice | IntArray) -> Knowledge:
-        """At some of the times, a slice or indices (M,)."""
+        """The spectra at some of the times, a slice or indices (M,)."""
         return Knowledge(
             self.sizes[chosen], self.eigenvalues[chosen], self.vectors[chosen], self.level[chosen]
         )
@@ -94,7 +94,7 @@ class Knowledge:
         return np.sort(np.array(chosen, dtype=np.intp))
 
     def states(self, gain: Array, units: Array | None = None) -> BoolArray:
-        """Which states x = offset + gain η are, shape (M, n).
+        """Which states x = offset + gain η are determined, shape (M, n).
 
         Args:
             gain: at ascending times, the last M of which are those (M or more, n, p); NaN for a
@@ -114,7 +114,7 @@ class Knowledge:
 
 
 def _row_norms(matrices: Array) -> Array:
-    """Of the rows of matrices (M, n, p), shape (M, n)."""
+    """Norms of the rows of matrices (M, n, p), shape (M, n)."""
     return np.asarray(np.sqrt(np.einsum("mij,mij->mi", matrices, matrices)))
 
 

@@ -1,7 +1,7 @@
 """How well a case did: one number per case from its errors over time.
 
-Of the norm e of an error: the settling time is the least T with e(t) ≤ e(0)/100 for all t ≥ T, the
-root mean square over time is √(∫e² dt / horizon).
+If e is the norm of an error, the settling time is the least T with e(t) ≤ e(0)/100 for all t ≥ T.
+The root mean square over time is √(∫e² dt / horizon).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Metrics:
 
     @property
     def settled(self) -> Array:
-        """When the last quantity has settled, (G,); NaN where nobody knows of any."""
+        """When the last quantity has settled, (G,); NaN where that is not known of any."""
         each = np.array([*self.seconds_to_settled.values(), 0.0 * self.final_error_states - np.inf])
         last = np.where(np.isnan(each), -np.inf, each).max(axis=0)
         return np.where(np.isfinite(last), last, np.nan)
@@ -97,7 +97,7 @@ def settling_times(t: Array, error: Array, size: Array) -> Array:
 def standing_since(t: Array, value: Array, final: Array, deviation: Array) -> Array:
     """From when on c values (g, M, c) are within ±2σ of the final ones, (g, c), in seconds.
 
-    What is below a deviation is chance: that an error happens to be small at the end, too.
+    What is below a deviation is chance, and so is a small error at the end.
 
     Args:
         t: times (M,).

@@ -61,7 +61,7 @@ def propagated(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, instants: Array,
     variances: Array, t: Array, L: Array | None, starts: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """As :func:`deviations`, from a factor L of cov [ζ; s; e] at the start, and L at the end.
+    """:func:`deviations` from a factor L of cov [ζ; s; e] at the start; also gives L at the end.
 
     Args:
         observer: as there, with all arguments but L.
@@ -115,10 +115,10 @@ def after_reset(
     L: Array, estimator: ErrorsAt, end: tuple[Array, Array], reset: Reset,
     known: ExtensionState | None,
 ) -> Array:
-    """L of [ζ; s; e] after a reset, where w goes on from what it was estimated to be.
+    """L of [ζ; s; e] after a reset, where w starts from its estimate.
 
-    η₊ = T η + τ + V ζ and ζ₊ = 0. What is left in 𝒴 becomes S δ𝒴 − Ω₊ V ζ, and an estimate, where
-    the estimator goes on from one, T δη̂ − V ζ.
+    η₊ = T η + τ + V ζ and ζ₊ = 0. The error of 𝒴 becomes S δ𝒴 − Ω₊ V ζ, and that of an
+    estimate from which the estimator starts T δη̂ − V ζ.
 
     Args:
         L: before.
@@ -220,7 +220,7 @@ def noise_level(
     duration = float(mesh.edges[-1] - mesh.edges[0])
     expected = duration * float((of_rows**2).sum(axis=1).mean()) - float((of_fit[-1] ** 2).sum())
     eta = root.T @ (root @ final[:, p])
-    # At the instants: whatever is assumed between samples, there the noise is all there.
+    # The noise is taken at the instants, where it does not depend on what the hold rule assumes.
     residual = regression.Y(instants) - regression.psi(instants) @ eta
     square = duration * float((residual**2).sum(axis=-1).mean())
     return float(np.sqrt(square / expected)) if expected > 0.0 else np.nan
@@ -290,7 +290,7 @@ def error_steps(mesh: Mesh, times: Array, hold: str, A: Array, B: Array) -> Arra
         times: of the samples.
         hold: what is assumed between them, zoh or linear.
         A: of ζ' = A ζ + B e at the points of the mesh, (elements or 1, s + 1 or 1, k, k).
-        B: likewise, (…, k, signals).
+        B: at the same points, (…, k, signals).
 
     Returns:
         (K, k, k + 2 signals)
@@ -355,7 +355,7 @@ def _factors(
     for k, end in enumerate(ends):
         if anew[k]:
             L[:zeta] = 0.0
-        if fresh[k]:  # another e, independent of all before
+        if fresh[k]:  # another e, independent of those before
             L[:size, :size] = np.asarray(np.linalg.qr(L[:size].T, mode="r")).T
             L[:size, size:] = 0.0
             L[size:] = 0.0
@@ -388,7 +388,7 @@ class SampledDeviations:
         self, observer: ErrorSteps, cases: Sequence[ErrorRecursion],
         regression: SampledRegression, gain: Array, roots: Array,
     ) -> tuple[Array, Array]:
-        """Of η̂ and x̂ of every case at K samples (G, K, p + n), and the factor for them (K,).
+        """Deviations of η̂ and x̂ of every case at K samples (G, K, p + n), and their factor (K,).
 
         Args:
             observer: errors of [u; y] to those of Y and of the state's offset.
@@ -481,7 +481,7 @@ def _plain_sums(regression: SampledRegression) -> ErrorRecursion:
 
 
 def _beside(a: ErrorRecursion, b: ErrorRecursion) -> ErrorRecursion:
-    """Two of the same errors of Y, one above the other."""
+    """Two systems of the same errors of Y as one, one above the other."""
     def diagonal(x: Array, y: Array) -> Array:
         out = np.zeros((len(x), x.shape[1] + y.shape[1], x.shape[2] + y.shape[2]))
         out[:, : x.shape[1], : x.shape[2]], out[:, x.shape[1] :, x.shape[2] :] = x, y

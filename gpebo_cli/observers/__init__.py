@@ -55,7 +55,7 @@ _NONE = "none"  # simulate only
 def build(settings: Mapping[str, object]) -> Observer | None:
     """The observer that ``settings["name"]`` asks for, with the remaining keys as its settings.
 
-    None for the name none: there is a simulation, and nobody observes it.
+    It is None for the name none: there is a simulation, and nobody observes it.
 
     Raises:
         ConfigError: unknown name or key, with the nearest known one.
@@ -73,7 +73,7 @@ def settings_of(settings: Mapping[str, object]) -> list[str]:
 
 
 def sampling(observer: Observer | None) -> Sampling | None:
-    """The samples at which an observer was asked to run; None: in continuous time."""
+    """The samples at which an observer was asked to run; None if it runs in continuous time."""
     return observer.sampling() if isinstance(observer, AtSamples) else None
 
 

@@ -1,4 +1,4 @@
-"""What every observer is, what it is given, and what every one of them is told.
+"""What every observer is, and what it is given.
 
 ξ_a(start) = V1 ξ_a0,    weights w of the outputs: √(w/max w) y = √(w/max w) C x
 """
@@ -33,7 +33,7 @@ class SignalNoise:
 
     @property
     def variances(self) -> Array:
-        """Of (ν_u, ν_y) at any time, (m + r,)."""
+        """Variances of (ν_u, ν_y) at any time, (m + r,)."""
         return np.concatenate([self.inputs, self.outputs]) ** 2
 
 
@@ -48,7 +48,7 @@ class Measurements:
 
     @property
     def mesh(self) -> Mesh:
-        """On which both signals are given."""
+        """The mesh on which both signals are given."""
         return self.inputs.mesh
 
     @property
@@ -90,16 +90,16 @@ class Sampling(NamedTuple):
 
 
 class Reached(Protocol):
-    """Where a recursion stands after its last sample."""
+    """What a recursion remembers after its last sample."""
 
     @property
     def t(self) -> float:
-        """Of that sample."""
+        """The time of that sample."""
         ...
 
     @property
     def growth(self) -> float | None:
-        """Largest entry of Φ so far; None: there is no Φ."""
+        """Largest entry of Φ so far; None where there is no Φ."""
         ...
 
     @property
@@ -113,7 +113,7 @@ class Recursion(Protocol):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Of the regression, p names."""
+        """Names of the regression's parameters, p of them."""
         ...
 
     def advance(
@@ -145,7 +145,7 @@ class AtSamples(Observer, Protocol):
     """An observer that can run at samples, as a controller does it."""
 
     def sampling(self) -> Sampling | None:
-        """At which samples it was asked to run; None: in continuous time."""
+        """The samples at which it was asked to run; None if it runs in continuous time."""
         ...
 
     def at_samples(

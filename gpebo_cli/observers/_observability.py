@@ -5,7 +5,7 @@
 is what the measurements of one window tell about the state at its start, in units of P⁻¹. Kalman's
 uniform complete observability is a lower (and upper) bound on M(t) over all t; excitation (IE) is
 M > 0 for one window, the whole horizon. Windows are summed from elements, each of which starts
-with Ψ = I: nothing grows over the horizon.
+with Ψ = I, so that nothing grows over the horizon.
 """
 
 from __future__ import annotations

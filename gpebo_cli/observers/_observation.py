@@ -61,7 +61,7 @@ class AffineStateMap:
 
     @property
     def times(self) -> Array:
-        """None."""
+        """No further times are needed."""
         return np.zeros(0)
 
     def at(self, t: Array) -> Reconstruction:
@@ -80,7 +80,7 @@ class AffineStateMap:
         return np.broadcast_to(gain, (len(states), *gain.shape))
 
     def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
-        """None, whatever x̂ (g, M, n)."""
+        """No columns, whatever x̂ (g, M, n) is."""
         return {}
 
 
@@ -122,7 +122,7 @@ class InitialError:
 
 
 def _is_constant(theta: Array) -> bool:
-    """Whether θ (M, q) is the same at all times; at a broadcast array nobody has to look."""
+    """Whether θ (M, q) is the same at all times; of a broadcast array that is known at once."""
     return theta.strides[0] == 0 or not theta.size or not (theta[1:] != theta[:-1]).any()
 
 

@@ -16,9 +16,9 @@ equation (Reid; Bittanti, Laub & Willems, The Riccati Equation, 1991):
     P = X₂X₁⁻¹,   ζ̂ = x₂ − P x₁,   start (X₁, X₂ | x₁, x₂) = (I, P₀ | 0, ζ̂₀).
 
 Half of its solutions grow as fast as the filter forgets, so X₁ and X₂ soon differ by rounding only
-in the directions that do not. At every edge of the mesh the same P and ζ̂ therefore start anew from
-(I, P | 0, ζ̂). One batched solve gives the Hamiltonian's transition of every element; what is
-chained are linear-fractional maps P₊ = (Ψ₂₁ + Ψ₂₂P)(Ψ₁₁ + Ψ₁₂P)⁻¹.
+in the directions that do not grow. At every edge of the mesh the same P and ζ̂ therefore start
+anew from (I, P | 0, ζ̂). One batched solve gives the Hamiltonian's transition of every element;
+what is chained are linear-fractional maps P₊ = (Ψ₂₁ + Ψ₂₂P)(Ψ₁₁ + Ψ₁₂P)⁻¹.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def quotient(X: Array) -> tuple[Array, Array]:
     n = X.shape[-2] // 2
     X1, X2 = X[..., :n, :n], X[..., n:, :n]
     P = transpose(np.asarray(np.linalg.solve(transpose(X1), transpose(X2)), dtype=np.float64))
-    # Not P x₁: where X₁ is large in some rows, only the pair's own quotient is free of it.
+    # P x₁ is not subtracted: where X₁ is large in some rows, only the pair's own quotient is exact.
     estimate = X[..., n:, n:] - X2 @ np.linalg.solve(X1, X[..., :n, n:])
     return 0.5 * (P + transpose(P)), estimate
 
@@ -112,7 +112,7 @@ class _Restart:
 def _in_front(lost: BoolArray, found: list[Kind]) -> list[Kind]:
     """The signals to resolve where elements that lose conditioning have to be cut first.
 
-    What comes after such an element is rounding, and would be cut without end: it is left alone
+    What comes after such an element is rounding, and would be cut without end. It is not cut
     until the front has passed, a few elements at a time.
 
     Args:

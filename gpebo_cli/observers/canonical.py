@@ -109,7 +109,7 @@ class Canonical:
 
     Attributes:
         xi_a0: where the extension starts: by state name, or a list; None: what the plant proposes.
-        output: the one that Proposition 4 rests on; None: the first that fits.
+        output: the one that Proposition 4 rests on; None for the first that fits.
         L_w: its gain: diagonal, remark4, or two expressions of t.
         r0: start of its state.
         weights: how much each output counts, by order or name (absent: 1). None: equally.
@@ -162,7 +162,7 @@ class Canonical:
             Y, psi = regress(values, *extras)
             products = outer_products(psi, Y)
             shape = values.shape[:2]
-            # Y may vanish identically (a perfect ξ_a): what it is made of is its size.
+            # Y may vanish identically (if ξ_a is perfect), so its size is that of its terms.
             size = 1e-3 * float(np.abs(outputs.values[:, :, suitable]).max(initial=0.0))
             level = float(np.abs(psi).max(initial=0.0))
             kinds = (
@@ -278,7 +278,7 @@ def unknown_input_matrices(
     from_y = M[..., :, 1] * G2[..., None] + L
     from_y[..., 1] -= dG2
     d1 = f_b[..., 1] / N[..., 1, 0]
-    # [I − G_w c⊤] d_w = (d1, −c1 d1/c2): d2, and with it f_b3, drops out.
+    # [I − G_w c⊤] d_w = (d1, −c1 d1/c2) does not contain d2, and therefore not f_b3.
     return M, from_y, np.stack([d1, -c1 * d1 / c2], axis=-1)
 
 
@@ -449,7 +449,7 @@ class CanonicalStateMap:
 
     @property
     def times(self) -> Array:
-        """Where the observer for z_b needs ẑ_a."""
+        """The times at which the observer for z_b needs ẑ_a."""
         return np.zeros(0) if self.zb is None else self.zb.mesh.points.ravel()
 
     def at(self, t: Array) -> Reconstruction:

@@ -87,7 +87,7 @@ def filter_model(
     q, k = o.from_unknowns.shape[2], basis.shape[1]
     signals = np.concatenate([v, y], axis=1)
     A = np.zeros((count, q + k, q + k))
-    # w = P w: rounding off the range of P(t), which turns, is damped, lest it grows on its own.
+    # w = P w. The range of P(t) turns; rounding outside of it is damped, or it would grow.
     off = np.eye(k) - basis.T @ o.projector @ basis
     damping = np.linalg.norm(o.dynamics, axis=(1, 2))[:, None, None] * off
     A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics - damping
@@ -145,7 +145,7 @@ class NoiseModel:
         weighted = s.from_noise * self.signals  # Γ S
         Q = weighted @ transpose(s.from_noise)
         if self.process.any():
-            # w stays in the range of P(t): so does what drives it.
+            # w stays in the range of P(t), and so does what drives it.
             inside = np.zeros_like(Q)
             inside[:, :q, :q] = np.eye(q)
             inside[:, q:, q:] = basis.T @ s.projector @ basis
@@ -190,10 +190,10 @@ class KalmanBucy:
     """Unknown parameters are constant states; it estimates by itself.
 
     Attributes:
-        form: of the equations, as for gpebo.
+        form: form of the equations, as for gpebo.
         xi_a0: first estimate of the differential states, as for gpebo; of unknowns: 0.
         P0: its variance: one number, a list, or by name (theta1, w_e1; absent: 10).
-        process: intensity of white noise that drives what is estimated, likewise (absent: 0).
+        process: intensity of white noise that drives what is estimated, given as P0 is (absent: 0).
         regularisation: where the noise leaves measurements exact: standard deviation of the noise
             assumed instead, relative to each one's own size, at the noise's sample time.
     """
@@ -210,7 +210,7 @@ class KalmanBucy:
         """Run the filter; the regression is that of the GPEBO observer, as evidence of excitation.
 
         Raises:
-            ModelError: as the GPEBO observer: rank of E not constant, Assumption 1 violated.
+            ModelError: the rank of E is not constant, or Assumption 1 is violated.
             ConfigError: settings that do not fit the plant.
             SolverError: the tolerance cannot be reached.
         """
@@ -396,7 +396,7 @@ class FilterStateMap:
 
     @property
     def times(self) -> Array:
-        """The points of the filter's mesh: what it reached in between is part of its errors."""
+        """The points of the filter's mesh, because its errors depend on what it reached there."""
         return np.unique(self.spread.filtered.mesh.points)
 
     def at(self, t: Array) -> Reconstruction:
@@ -413,14 +413,14 @@ class FilterStateMap:
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """The filter as an estimator with one case; the regression tells it nothing new."""
+    """The filter as an estimator with one case, which does not use the regression."""
 
     filtered: Filtered
     observability: Requirement
 
     @property
     def cases(self) -> tuple[Mapping[str, float], ...]:
-        """One, without gains."""
+        """One case, which has no gains."""
         return ({},)
 
     def estimate(self, regression: LinearRegression, t: Array) -> KalmanBucyEstimates:  # noqa: ARG002

@@ -1,4 +1,4 @@
-"""No observer at all: Y = ψη is given, as text over signals (config group ``regression``)."""
+"""There is no observer: Y = ψη is given, as text over signals (config group ``regression``)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Given:
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
     ) -> Observation:
-        """The regression of the system's text; no state is mapped to.
+        """The regression of the system's text; there is no state.
 
         Raises:
             ConfigError: the system is a plant, or an expression has no finite value at some time.
@@ -102,7 +102,7 @@ class FittedMap:
 
     @property
     def times(self) -> Array:
-        """None."""
+        """No further times are needed."""
         return np.zeros(0)
 
     def gains(self, t: Array, states: Array) -> Array:
@@ -120,7 +120,7 @@ class FittedMap:
         return fitted
 
     def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
-        """None, whatever θ̂ (g, M, q)."""
+        """No columns, whatever θ̂ (g, M, q) is."""
         return {}
 
 
@@ -133,7 +133,7 @@ class GivenAtSamples:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """η's names."""
+        """Names of the components of η."""
         return self.text.system.unknowns
 
     def advance(
@@ -164,7 +164,7 @@ class GivenAtSamples:
         )
 
     def assumptions(self, reached: TextState) -> tuple[Assumption, ...]:  # noqa: ARG002  protocol
-        """None is made."""
+        """No assumption is made."""
         return ()
 
     def truth(self, extension: Array) -> Truth:  # noqa: ARG002  protocol

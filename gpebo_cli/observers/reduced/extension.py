@@ -177,7 +177,7 @@ class ReducedSystem:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of e₀'s components, (d,)."""
+        """Names of e₀'s components, (d,)."""
         return self.begin.names
 
     @property
@@ -187,7 +187,7 @@ class ReducedSystem:
 
     @property
     def rank(self) -> int:
-        """n_a."""
+        """The number n_a of coordinates of the range of P."""
         return int(self.first.split.rank)
 
     @property
@@ -200,7 +200,7 @@ class ReducedSystem:
         return tuple(name.removeprefix("e0_") for name in names)
 
     def matrices(self, t: Array, inside: Array) -> ObserverMatrices:
-        """At the times t (N,), output injection included."""
+        """The matrices at the times t (N,), with output injection."""
         signals = self.signals.at(t, inside) if self.form.follows_signals else None
         o = observer_matrices(
             self.form, t, inside, self.solver.rank_tol, self.first, signals=signals
@@ -213,7 +213,7 @@ class ReducedSystem:
         return u, self.signals.outputs(t, inside)
 
     def start_at(self, time: float, inside: float) -> Start:
-        """Where the extension may start at a later time."""
+        """The start of an extension that begins at a later time."""
         t, t_in = np.array([time]), np.array([inside])
         return start_at(self.form, self.matrices(t, t_in), *self.driving(t, t_in))
 
@@ -354,7 +354,7 @@ def choose_form(
 
 
 def _reason(error: NotObservableError) -> str:
-    """What fails where, without whose it is and what to do."""
+    """What fails and where; the name of the plant and advice are left out."""
     return str(error).rpartition("; ")[0].partition(": ")[2]
 
 

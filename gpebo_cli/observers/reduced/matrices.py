@@ -108,7 +108,7 @@ class ObserverMatrices:
         )
 
     def injected(self, gain: Array) -> ObserverMatrices:
-        """The same w, driven by gain · (𝒜 w + g_y + G θ) too, for a gain (N, k, e + r).
+        """The equations of w with gain · (𝒜 w + g_y + G θ) added to w', for a gain (N, k, e + r).
 
         The gain must be N = N R with columns in range P: R (𝒜 w + g_y + G θ) = 0 is all that w
         has to fulfil, and w must stay in range P.
@@ -165,7 +165,7 @@ def observer_matrices(
     if like is not None:
         rows, scale = like.rows, like.output_scale
     else:
-        # By what is known at the start: what comes later must not change what was before.
+        # Only what is known at the start decides: later times must not change earlier results.
         rows = row_sizes(np.abs(model.E[0])) if normalise else np.ones(system.n)
         scale = np.ones(system.r)
     if output_scale is not None:
@@ -189,7 +189,7 @@ def _in_frame(
 ) -> ObserverMatrices | None:
     """What :func:`_by_steps` finds if the frame is that of E at all times, in one call.
 
-    None where it is not, and where singular values have to tell.
+    It is None where the frame is another one, and where singular values have to decide.
     """
     (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
      from_signals) = kernels.observer.in_frame(
@@ -247,7 +247,7 @@ def _by_steps(
     else:
         Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
     if hidden is not None:
-        Q1[:, Q1.shape[1] - r :] = 0.0  # y has no part in it, nor has its rounding
+        Q1[:, Q1.shape[1] - r :] = 0.0  # y is not in it, and neither is its rounding
     Lambda = exact_product(pinv, A)  # Λ = E⁺A + Ṗ
     if split.turn is not None:
         Lambda = Lambda + split.turn
@@ -285,8 +285,8 @@ def _seen_through(
 ) -> tuple[Array, Array, Array]:
     """The outputs with v = Q x put in from the constraints: C − C J M, D − C J M_v, H − C J M_θ.
 
-    J = V2 (M V2)⁺ with V2 (N, n, n_b) of the kernel of E. What is left of C vanishes on that
-    kernel, so no output takes part in the elimination: they are all left to the regression.
+    J = V2 (M V2)⁺ with V2 (N, n, n_b) of the kernel of E. C − C J M vanishes on that kernel, so no
+    output takes part in the elimination, and the regression has all of them.
     """
     through = C @ kernel @ np.linalg.pinv(hidden.states @ kernel)
     left = [

@@ -61,7 +61,7 @@ def untouched(
         kept, _ = initial_basis(
             frame.projector - given_up @ given_up.T, split.rank - given_up.shape[1], states
         )
-        # A state that is none of what is left must not look like a little of it.
+        # A state that is given up must not look as if a small part of it was kept.
         kept = without_rounding(kept[None], np.ones((1, 1, 1)))[0]
         kernel = np.hstack([frame.kernel, given_up])
         _, sigma, Vt = np.linalg.svd(algebraic @ kernel)

@@ -1,4 +1,4 @@
-"""What is left of the algebraic equations: Y = ψη, and x = offset + gain η."""
+"""The algebraic equations without v, Y = ψη, and the state, x = offset + gain η."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Assembled:
     def kinds(self) -> Iterator[tuple[Array, float]]:
         """Everything the mesh has to resolve, with the size below which it is rounding.
 
-        One after the other: of a long recording all together would be what takes the memory.
+        They come one after the other, because all signals of a long recording take much memory.
         """
         columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
         psi = self.psi / np.tile(columns, (self.psi.shape[1], 1))

@@ -44,7 +44,7 @@ def _stacked(upper: Array, lower: Array) -> Array:
 
 
 def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) -> Array:
-    """What errors of the signals add to Y, all columns in one solve on the mesh as it is.
+    """What errors of the signals add to Y, all columns in one solve on the mesh that is given.
 
     Args:
         mesh: of the regression; errors are smooth within its elements.
@@ -79,7 +79,7 @@ def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) 
 
 
 def noisy_matrices(reduced: ReducedSystem) -> bool:
-    """Whether noise is where the response to it does not go: in matrices, in slopes of inputs."""
+    """Whether noise is in matrices or in slopes of inputs, where the response is not computed."""
     system, noise = reduced.system, reduced.signals.noise
     if not reduced.form.follows_signals:
         return False

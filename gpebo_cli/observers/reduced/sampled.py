@@ -4,8 +4,7 @@ The state of the recursion is W = [ξ_a | ξ_b | Φ]; between samples, with the 
 
     W' = A_0 W + [b_0 | D_0 | 0],      Y_{k+1} = ψ_{k+1} η.
 
-Between two samples u and y are what the hold rule
-makes of them, and the dynamic extension is carried over by the same collocation as in continuous
+The dynamic extension is carried over by the same collocation as in continuous
 time; ψ and Y are then those of the new sample. What remains is the error of the hold: order 1 in
 the time between samples for zoh, order 2 for linear. Nothing grows with the number of samples.
 """
@@ -45,7 +44,7 @@ TOLERANCE = 1e-10  # where samples are far apart, steps are cut until this is re
 
 @dataclass(frozen=True, eq=False)
 class SampledState:
-    """Where the recursion stands: the last sample, and all it has to remember of the past."""
+    """The last sample, and everything that the recursion has to remember of the past."""
 
     t: float
     u: Array  # (m,)
@@ -85,7 +84,7 @@ class SampledObserver:
 
     @property
     def basis(self) -> Array:
-        """In whose coordinates the extension is integrated, (n, k)."""
+        """The basis in whose coordinates the extension is integrated, (n, k)."""
         return self.like.split.basis
 
     def assumptions(self, reached: SampledState) -> tuple[Assumption, ...]:
@@ -288,8 +287,8 @@ def _kernel_is_fixed(
 ) -> bool:
     """Whether kernel and range of E are at the times t (N,) what they are at the first sample.
 
-    The sample is [u; y] (m + r,). If so the extension needs n_a coordinates, else all n. A kernel
-    that starts to turn later on is refused then.
+    The sample is [u; y] (m + r,). If they are, the extension needs n_a coordinates, else all n.
+    A kernel that starts to turn later on is refused then.
     """
     frame = first.split.frame
     if frame is None or "E" in form.system.coefficients.constant:

@@ -33,7 +33,7 @@ class Split:
 
 @dataclass(frozen=True, eq=False)
 class Remaining:
-    """What is left of w where Assumption 1 fails, see :mod:`.partial`."""
+    """The part of w that is kept where Assumption 1 fails, see :mod:`.partial`."""
 
     kept: Array  # (n, k) orthonormal
     given_up: Array  # (n, c) orthonormal, the rest of range P
@@ -64,7 +64,7 @@ def entry_sizes(E: Array) -> Array:
 def axes_frame(entries: Array) -> Frame | None:
     """Coordinate axes where E has columns and rows that are exactly zero.
 
-    As in E = diag(E_a(t), 0); None where there are more of the ones than of the others.
+    E = diag(E_a(t), 0) is such a case; None where their numbers differ.
 
     Args:
         entries: the size of each entry of E over the times, (n, n).
@@ -162,7 +162,7 @@ def split_by_svd(
     Args:
         system: for messages.
         E: (N, n, n).
-        dE: its derivative, likewise.
+        dE: its derivative (N, n, n).
         t: (N,).
         rank_tol: singular values below this, relative, are zero.
         basis: (n, k) of another split, which is kept.

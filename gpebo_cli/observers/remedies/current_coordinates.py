@@ -1,7 +1,7 @@
-"""The state itself as the parameter: no Φ, for a plant whose A_0 does not forget.
+"""The state itself is the parameter, without Φ, for a plant whose A_0 does not forget.
 
 With V an orthonormal basis of range P, ζ = (θ, Vᵀw) moves by known dynamics and is measured by
-what is left of the algebraic equations:
+the algebraic equations without v:
 
     ζ' = 𝔸 ζ + 𝕓,      𝔸 = [[0, 0], [Vᵀ D_0, Vᵀ A_0 V]],  𝕓 = (0, Vᵀ b_0)
     Y = ψ ζ,           ψ = [R G, R𝒜 V],  Y = −R g_y

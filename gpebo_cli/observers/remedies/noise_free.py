@@ -38,7 +38,7 @@ class NoiseFree:
     """The observer on the plant linearised along a copy of its signals without noise."""
 
     def observe(self, reduced: ReducedSystem) -> Observation:
-        """The regression along the copy that least squares fits; without y in matrices, as ever.
+        """The regression along the copy that least squares fits; ``Plain``'s if no matrix has y.
 
         Raises:
             ModelError: rank of E not constant, Assumption 1 violated.

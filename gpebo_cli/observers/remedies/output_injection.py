@@ -4,8 +4,8 @@ The residual c w = y_c of the regression, c = R𝒜 and y_c = −R (g_y + G θ),
 
     w' = (A_0 − K_o c) w + (b_0 − K_o R g_y) + (D_0 − K_o R G) θ
 
-for any K_o(t) whose columns lie in range P. A_0, b_0 and D_0 change, nothing after them does, and
-w is still exactly ξ_a + ξ_b θ − Φ e₀. What K_o is decides how fast Φ decays, not what is true.
+for any K_o(t) whose columns lie in range P. Only A_0, b_0 and D_0 change, and w is still exactly
+ξ_a + ξ_b θ − Φ e₀. K_o decides how fast Φ decays, and does not change what is true.
 
 By default K_o is that of a Kalman–Bucy filter with unit weights,
 
@@ -14,7 +14,7 @@ By default K_o is that of a Kalman–Bucy filter with unit weights,
 with c₀ the root mean square of ‖c‖ over the horizon and κ twice that of the largest real part of
 A_0's eigenvalues where it is positive (at least four per horizon), so that neither the unit of
 time nor that of the outputs matters. Φ then decays about as fast as it would grow, or twice as
-fast; not faster, because with Φ the excitation of e₀ fades, too. S is the covariance
+fast. It is not made faster, because with Φ the excitation of e₀ fades, too. S is the covariance
 of that filter (``_riccati``). It need not be accurate: what counts is that it is one and the same
 smooth function.
 """

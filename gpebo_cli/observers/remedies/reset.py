@@ -1,16 +1,16 @@
 """Resets of the dynamic extension, for a plant whose A_0 does not forget.
 
 At times t_k the extension starts again, from [ξ_a₊ | 0 | V₊] with V₊ an orthonormal basis of
-range P(t_k), and the regression goes on about other parameters. From
+range P(t_k), and the regression has other parameters from then on. From
 w = ξ_a + ξ_b θ − Φ e₀ = ξ_a₊ − V₊ e₊,
 
     η₊ = T η + τ,    T = [[I, 0], [−V₊ᵀξ_b, V₊ᵀΦ]],    τ = (0, V₊ᵀ(ξ_a₊ − ξ_a)),
 
 which is exact whatever ξ_a₊ is. It is the least-squares estimate of w(t_k) by all that the
-regression has shown. If ξ_a went on instead it would grow as Φ does, and so would e₊: w would
+regression has shown. A ξ_a that is not replaced would grow as Φ does, and so would e₊: w would
 become the difference of large numbers, which is the loss that resets are for.
 
-Between resets Φ starts at size 1. Without times being given it is reset before it exceeds 100.
+Φ has size 1 after each reset. If no times are given, it is reset before it exceeds 100.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Resets:
     Attributes:
         interval: seconds; without it and without ``times``: before Φ exceeds 100.
         times: further ones, seconds.
-        keep: share of what is known that counts after a reset; 0: learn anew.
+        keep: share of what is known that counts after a reset; 0 forgets everything.
     """
 
     interval: float | None = field(
