@@ -28,7 +28,7 @@ if typing.TYPE_CHECKING:
 T = TypeVar("T")
 
 LARGEST = 1e50
-"""Of the numbers in plants, settings and samples: squares of products of them are still numbers."""
+"""Largest number in plants, settings and samples: squares of products are numbers, too."""
 _SHOWN = 60  # characters of a wrong value that a message repeats
 
 

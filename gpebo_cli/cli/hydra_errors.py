@@ -72,7 +72,7 @@ def _missing(error: MissingConfigException, arguments: Arguments) -> str:
 
 
 def _a_path(parts: tuple[str, str, str]) -> str:
-    """Of a choice that is the path of a file instead of its name."""
+    """The message for a choice that is the path of a file instead of its name."""
     group, _, path = parts
     name = os.path.basename(path).removesuffix(".yaml")
     folder = os.path.dirname(os.path.dirname(path)) or "."
@@ -116,7 +116,7 @@ def _no_match(key: str) -> str:
 
 
 def _unknown_key(key: str, cause: BaseException | None) -> str:
-    """Of a key that does not exist: its neighbours, which OmegaConf's error still knows."""
+    """The message for a key that does not exist; OmegaConf's error still knows its neighbours."""
     parent = getattr(cause, "parent_node", None)
     if not isinstance(parent, DictConfig):
         reason = getattr(cause, "msg", None) or "it cannot be set"

@@ -248,7 +248,7 @@ def _unquoted(value: str) -> str:
 
 
 def _digest(config: DictConfig) -> str:
-    """Of everything the jobs share: a resumed sweep must not mix two versions of a plant."""
+    """Digest of everything the jobs share: a resumed sweep must not mix two versions of a plant."""
     content = OmegaConf.to_container(config, resolve=False)
     assert isinstance(content, dict)  # noqa: S101  for the type checker: a DictConfig is one
     content.pop("hydra", None)

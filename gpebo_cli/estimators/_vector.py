@@ -82,7 +82,7 @@ class VectorLaw:
 
 
 def _residual_restarts(packed: Trajectory, p: int) -> dict[float, Callable[[Array], Array]]:
-    """At the edges where the signals [M ; N ; b] jump: (η̂, ν before) -> (η̂, ν after)."""
+    """What becomes of (η̂, ν) at the edges where the signals [M ; N ; b] jump."""
     before, after = packed.values[:-1, -1], packed.values[1:, 0]
     size = np.abs(packed.values).max(axis=(0, 1))
     jumps = (np.abs(after - before) > _ROUNDING * size).any(axis=(1, 2))

@@ -97,7 +97,7 @@ def assess(
     enough = min(WELL, 0.5 * float(smallest[margin >= 1.0].max(initial=0.0)))
 
     def reached(at: Array, matrices: Array) -> Array:
-        """At least 0 where ψ is exciting; to be read as a distance from that in logarithms."""
+        """A number that is at least 0 where ψ is exciting: a distance from that in logarithms."""
         if rho is not None:
             level = kernels.laws.eigenvalues(matrices)[:, 0] / rho
         elif enough:

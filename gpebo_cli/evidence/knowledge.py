@@ -42,7 +42,7 @@ class Knowledge:
 
     @staticmethod
     def joined(parts: Sequence[Knowledge]) -> Knowledge:
-        """At the times of one after those of the other."""
+        """The spectra of one, and after them those of the other."""
         return Knowledge(
             *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Knowledge))
         )

@@ -257,7 +257,7 @@ class Observed(Protocol):
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
-        """Of this observer, with their evidence."""
+        """The assumptions of this observer, with their evidence."""
         ...
 
     @property

@@ -4,7 +4,7 @@ At each time t the bounded estimate is the nearest one to η̂ in the metric of 
 
     min (η − η̂)ᵀ M (η − η̂)    s.t.    low ≤ offset(s) + gain(s) η ≤ high  for all s ≤ t,
 
-and likewise for the unknowns. M is z f₀I + αG_z of least squares, which makes it full-information
+and the same for the unknowns. M is z f₀I + αG_z of least squares, which makes it full-information
 estimation with bounds, and G of the other estimators. In z = M^½ (η − η̂) it is a problem of
 least distance, which SciPy's ``nnls`` solves by its active set (Lawson & Hanson, chapter 23). It
 begins with the unknowns' bounds; those of states are added where they are violated, between the

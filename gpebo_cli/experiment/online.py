@@ -191,7 +191,7 @@ class Online:
 
     @property
     def error_estimate(self) -> float:
-        """Of the integration between samples; the hold's own error is not in it."""
+        """Error estimate of the integration between samples; the hold's own error is not in it."""
         return self.reached.error_estimate
 
     @property

@@ -136,7 +136,7 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
 
 
 def check_stream(settings: Settings, system: DescriptorSystem) -> None:
-    """Refuse what would need to know how a recording goes on: its rows come one after the other.
+    """Refuse what would need later rows of a recording, whose rows come one after the other.
 
     Raises:
         ConfigError: names the key and what it may be.

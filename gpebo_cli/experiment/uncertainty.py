@@ -31,7 +31,7 @@ MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not 
 def sampled_deviations(
     noise: NoiseSettings, levels: NoiseLevels, source: Source | None
 ) -> SampledDeviations | None:
-    """Of an observer at samples; None: there is no noise.
+    """Deviations of an observer at samples; None if there is no noise.
 
     Args:
         noise: its settings.
@@ -82,7 +82,7 @@ def standard_deviations(
     observation: Observation, estimator: Estimator, source: Source, noise: NoiseSettings,
     levels: NoiseLevels, t: Array, states: Array,
 ) -> tuple[Array, Array] | str:
-    """Of parameters (G, M, p) and ``states`` (G, M, n) at the times t (M,), or why there are none.
+    """Deviations of parameters (G, M, p) and ``states`` (G, M, n) at t (M,), or why there are none.
 
     No reason is given, and none is needed, of a simulation without noise and where there is nothing
     to estimate. Rounding to steps q counts as noise of variance q²/12. Of a recording without
@@ -149,7 +149,7 @@ def _over_resets(
     errors: ErrorsAt, estimator: ResumableEstimator, regression: LinearRegression, gains: Array,
     instants: Array, variances: Array, t: Array,
 ) -> Iterator[tuple[Array, Array]]:
-    """Of every case, from segment to segment."""
+    """Deviations of every case, from segment to segment."""
     segments, resets = regression.segments, regression.resets
     cuts = np.searchsorted(t, [reset.time for reset in resets], side="left")
     parts = np.split(np.arange(len(t)), cuts)

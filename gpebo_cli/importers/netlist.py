@@ -71,7 +71,7 @@ class Netlist:
     elements: tuple[Element, ...]
     parameters: Mapping[str, float | str]
     initial: Mapping[str, float]  # by quantity, ``v(out)`` or ``i(l1)``
-    saved: tuple[str, ...]  # quantities, likewise
+    saved: tuple[str, ...]  # quantities that are saved
 
 
 @dataclass

@@ -102,7 +102,7 @@ def _across(matrix: Array, columns: Array) -> Array:
 
 
 def _down(rows: Array, matrix: Array) -> Array:
-    """The product of rows (d, n) with a matrix, likewise."""
+    """The product of rows (d, n) with a matrix, in the same way."""
     axes = _axes(rows.T)
     return rows @ matrix if axes is None else matrix[:, axes]
 
@@ -146,6 +146,6 @@ def regression_signals(
         state = np.zeros((len(z), len(basis), z.shape[2]))
         state[:, axes] = signed
     given = elimination.any(axis=(0, 2))
-    state[:, given] -= elimination[:, given] @ seen  # w − K (…): the state, signed likewise
+    state[:, given] -= elimination[:, given] @ seen  # w − K (…): the state, with the same sign
     # the gain is [X_w ξ_b + X_θ | −X_w Φ]
     return left[:, :, 0], left[:, :, 1:], state[:, :, 0], -state[:, :, 1:], sizes

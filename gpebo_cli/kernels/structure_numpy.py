@@ -274,9 +274,9 @@ def eliminated(
         time: see above.
         orders: see above.
         B: of f = B u + F θ, (orders, N or 1, n, m).
-        F: likewise, (orders, N or 1, n, q).
-        u: likewise, (orders, N or 1, m).
-        theta: likewise, (orders, N or 1, q).
+        F: coefficients of F, (orders, N or 1, n, q).
+        u: coefficients of u, (orders, N or 1, m).
+        theta: coefficients of θ, (orders, N or 1, q).
         pivot_rows: as in :func:`bounds`, with the three that follow.
         pivot_columns: likewise.
         rank: likewise.

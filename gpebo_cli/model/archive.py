@@ -25,7 +25,7 @@ ARCHIVE = "matrices"
 """The key of a plant that names such a file."""
 MATRICES = "EABFCDH"
 MAX_BYTES = 200_000_000
-"""Of a file of matrices, unpacked."""
+"""Largest size of a file of matrices, unpacked."""
 
 _MAX_PACKED = 20_000_000  # a longer list of contents takes memory before anything can be counted
 _COMPRESSED = 15

@@ -142,7 +142,7 @@ def _by_place(
 def _place(
     plant: str, where: str, label: str, side: Side, places: Mapping[str, int]
 ) -> int:
-    """Of a row or column by its name, or by its number from 0 on."""
+    """Number of a row or column by its name, or by its number from 0 on."""
     label = label.strip()
     if label in places:
         return places[label]

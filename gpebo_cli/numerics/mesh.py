@@ -259,7 +259,7 @@ class Trajectory:
         return self._integral(on=True)
 
     def _integral(self, *, on: bool) -> Trajectory:
-        """On from the elements before, or from each left end."""
+        """The values continue from the elements before, or from each left end."""
         rule, mesh, flat = self.mesh.rule, self.mesh, _flat(self.values)
         out = np.zeros(flat.shape)
         out[:, 1:] = mesh.steps[:, None, None] * np.matmul(rule.integration, flat[:, 1:])

@@ -34,7 +34,7 @@ Monitor = Callable[[Array, tuple[Array, ...]], Iterable[tuple[Array, float | Arr
 
 
 class Renewal(Protocol):
-    """At every edge, an equivalent value to go on with: a basis whose columns grow is changed."""
+    """An equivalent value at every edge to continue with: a basis whose columns grow is changed."""
 
     def state(self, reached: Array) -> Array:
         """What (n, columns) replaces the limit from the left."""

@@ -104,7 +104,7 @@ class Reached(Protocol):
 
     @property
     def error_estimate(self) -> float:
-        """Of what is integrated between samples, so far."""
+        """Error estimate of what is integrated between samples, so far."""
         ...
 
 

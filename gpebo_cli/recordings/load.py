@@ -32,7 +32,7 @@ class Recording:
 
     @property
     def derivatives(self) -> InputDerivatives | None:
-        """Of the inputs: only a cubic interpolant has any."""
+        """Derivatives of the inputs: only a cubic interpolant has any."""
         return InputDerivatives.of_signal(self.inputs) if self.hold == "cubic" else None
 
     def sampled(self, t: Array) -> Samples:

@@ -72,7 +72,7 @@ class ConstantForm:
 
     @property
     def units(self) -> Array:
-        """Of z (d,)."""
+        """Units of z (d,)."""
         return np.ones(self.d)
 
     @property
@@ -88,7 +88,7 @@ class ConstantForm:
         return np.asarray(self.inverse @ x)
 
     def at_first(self) -> ConstantForm:
-        """At the first of the times."""
+        """The form at the first of the times."""
         return replace(self, offset=self.offset[:1], f=self.f[:1])
 
     def states_from(self, z: Array) -> Array:

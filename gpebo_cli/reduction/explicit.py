@@ -69,7 +69,7 @@ class Explicit:
 
     @property
     def units(self) -> Array:
-        """Of x_I (d,)."""
+        """Units of x_I (d,)."""
         return self.state_units[self.states]
 
     @property
@@ -85,7 +85,7 @@ class Explicit:
         return shifted[self.states]
 
     def at_first(self) -> Explicit:
-        """At the first of the times."""
+        """The form at the first of the times."""
         return replace(
             self, entries=self.entries[:1], f=self.f[:1],
             others=tuple((i, {k: a[:1] for k, a in row.items()}, phi[:1])

@@ -282,7 +282,7 @@ class _Along:
         self._form, self._t, self._signals = form, t, signals
 
     def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:
-        """At the times t (N,), with the signals between those of theirs that are known."""
+        """The matrices at the times t (N,), with signals interpolated between the known ones."""
         inside = t if inside is None else inside
         seen = np.stack([np.interp(t, self._t, signal) for signal in self._signals.T], axis=1)
         along = self._form.along(t, inside, seen, order)

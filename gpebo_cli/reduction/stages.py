@@ -153,14 +153,14 @@ def _some(values: Array, every: int, axis: int = 0) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Of matrices of Taylor coefficients (orders, N or 1, ·, ·)."""
+    """Product of matrices of Taylor coefficients (orders, N or 1, ·, ·)."""
     return np.array([
         sum(a[j] @ b[k - j] for j in range(k + 1)) for k in range(min(len(a), len(b)))
     ])
 
 
 def _slope(a: Array, power: int = 1) -> Array:
-    """Of the derivative, one order less; or, squared, of its errors."""
+    """Coefficients of the derivative, one order less; or, squared, of its errors."""
     return np.asarray(a[1:] * np.arange(1.0, len(a)).reshape(-1, 1, 1, 1) ** power)
 
 

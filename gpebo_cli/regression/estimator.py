@@ -1,7 +1,7 @@
 """What an estimator is to the rest: settings that make estimates from a regression.
 
 ``Estimator`` and ``Estimates`` are the least there must be. What more an estimator can do it shows
-by a method: :class:`Resumable` goes on after a reset, :class:`Moving` follows parameters that
+by a method: :class:`Resumable` can continue after a reset, :class:`Moving` follows parameters that
 move, :class:`Recursive` works at samples.
 """
 

@@ -83,8 +83,9 @@ class LinearRegression:
     def gram(self) -> Trajectory:
         """[G | h] with G(t) = ∫ψᵀψ, h(t) = ∫ψᵀY from the start, shape (p, p + c).
 
-        After a reset it is about the new parameters: Gη = h goes on. For parameters that move it
-        is about the current ones and forgets at their rate ρ, a lower bound of what is known.
+        After a reset it is about the new parameters, so that Gη = h stays true. If parameters
+        move, it is about the current ones and forgets at their rate ρ: a lower bound of what is
+        known.
         """
         if self.dynamics is not None:
             ones = np.ones(self.p)

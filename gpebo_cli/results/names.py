@@ -31,4 +31,4 @@ METRICS = (
 """What is measured of every case, the fields of :class:`gpebo_cli.experiment.result.Metrics`."""
 
 FORMATS = ("png", "pdf", "svg")
-"""Of the files of figures."""
+"""Formats of the files of figures."""

@@ -87,7 +87,7 @@ def _divide(_: np.ufunc, low: Any, high: Any, least: Any, most: Any, __: bool) -
 
 
 def _even(function: Callable[[Any], Any], low: Any, high: Any) -> tuple[Array, Array]:
-    """Of a function that falls up to 0 and grows from there."""
+    """Bounds of a function that falls up to 0 and grows from there."""
     nearest = np.maximum(np.maximum(low, -np.asarray(high)), 0.0)
     return function(nearest), function(np.maximum(np.abs(low), np.abs(high)))
 
@@ -106,7 +106,7 @@ def _power(_: np.ufunc, low: Any, high: Any, least: Any, __: Any, ___: bool) -> 
 
 
 def _wave(function: np.ufunc, low: Any, high: Any, to: float) -> Any:
-    """Of sin(x + to); a crest counts also where rounding might have moved it into the cell."""
+    """Bounds of sin(x + to); a crest that rounding might have moved into the cell counts, too."""
     slack = 4e-16 * np.maximum(np.abs(low), np.abs(high)) + 1e-15
 
     def crest(at: float) -> Any:
