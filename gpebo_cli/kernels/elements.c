@@ -258,20 +258,20 @@ static Outcome chain(Call *call)
 }
 
 #define MOST_STAGES 16 /* of a rule; its nodes lie side by side: loops have this length */
-#define TOGETHER 4
-#define AT_ONCE 8 /* columns, so that what is swept over fits the cache */
+#define AT_ONCE 8 /* columns: their sums are in registers, and what is swept over in the cache */
 typedef double Nodes[MOST_STAGES];
-#define EACH_NODE for (int j = 0; j < MOST_STAGES; j++)
+/* Not unrolled before they are vectorised: else sums are kept in memory, at twice the time. */
+#define EACH_NODE _Pragma("omp simd") for (int j = 0; j < MOST_STAGES; j++)
 
 /* Everything about one element and some of the columns while sweeping. */
 typedef struct {
-    npy_intp s, d, columns;
-    const npy_intp *row, *column; /* of the entries of A */
-    const Nodes *R;               /* h Rᵀ */
-    const Nodes *A, *f;           /* entries; (d, columns) forcing */
-    Nodes *X;                     /* (d, columns) */
-    const double *left, *weight;  /* (d, columns) at the left end; (d,) */
-    double *size, *change;        /* (d,) */
+    npy_intp s, d, columns, forced; /* forced: 0 where f is zero, and only its first one is read */
+    const npy_intp *row, *column;   /* of the entries of A */
+    const Nodes *R;                 /* h Rᵀ */
+    const Nodes *A, *f;             /* entries; (d, columns) forcing */
+    Nodes *X;                       /* (d, columns) */
+    const double *left, *weight;    /* (d, columns) at the left end; (d,) */
+    double *size, *change;          /* (d,) */
 } Swept;
 
 /* What is not a number is left out: the caller looks for that. */
@@ -280,9 +280,9 @@ typedef struct {
 /* Row i of a sweep in `count` columns from c on; their sums are independent, and done together. */
 INLINE void sweep_row(const Swept *q, npy_intp i, npy_intp c, const npy_intp count)
 {
-    Nodes sum[TOGETHER], next[TOGETHER];
+    Nodes sum[AT_ONCE], next[AT_ONCE];
     for (npy_intp k = 0; k < count; k++)
-        EACH_NODE sum[k][j] = q->f[i * q->columns + c + k][j];
+        EACH_NODE sum[k][j] = q->f[(i * q->columns + c + k) * q->forced][j];
     for (npy_intp e = q->row[i]; e < q->row[i + 1]; e++) {
         const double *a = q->A[e];
         const Nodes *X = (const Nodes *)q->X + q->column[e] * q->columns + c;
@@ -318,13 +318,12 @@ EVERY_WIDTH static void sweep(const Swept *q, int back)
         const npy_intp i = back ? q->d - 1 - row : row;
         npy_intp c = 0;
         q->change[i] = 0.0;
-        for (; c + TOGETHER <= q->columns; c += TOGETHER)
-            sweep_row(q, i, c, TOGETHER);
-        if (q->columns - c == 3)
+        for (; c + AT_ONCE <= q->columns; c += AT_ONCE)
+            sweep_row(q, i, c, AT_ONCE);
+        for (; c + 3 <= q->columns; c += 3)
             sweep_row(q, i, c, 3);
-        else
-            for (; c < q->columns; c++)
-                sweep_row(q, i, c, 1);
+        for (; c < q->columns; c++)
+            sweep_row(q, i, c, 1);
     }
 }
 
@@ -371,6 +370,7 @@ static Outcome sweeps(Call *call)
         Swept q = {s,
                    d,
                    b,
+                   first < forced,
                    row,
                    column,
                    (const Nodes *)hR,
