@@ -13,11 +13,13 @@ transformations: no variance can become negative, whatever the rounding.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from gpebo_cli.evidence.knowledge import Knowledge
-from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -32,6 +34,9 @@ _MOST_PARTS = 8
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
 _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
+_GROUPS = 2000  # of samples, by which many of them are replaced at first
+_PER_ELAPSED = 16  # groups at least, since the start
+_AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
 _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
 
 
@@ -51,14 +56,61 @@ def deviations(
         t: ascending.
         starts: edges at which ζ begins anew, of several experiments; None: at the first one only.
     """
-    of_eta, of_x, _ = propagated(
-        observer, estimator, gain, edges, instants, variances, t, None, starts
-    )
-    return of_eta, of_x
+    most, before = len(instants) // _GROUPS, list[Array]()
+    while True:
+        groups = _grouped(instants, edges[-1], t, edges[:1] if starts is None else starts, most)
+        *found, _ = propagated(
+            observer, estimator, gain, edges, groups, variances, t, None, starts
+        )
+        if most <= 1 or (before and all(map(_agree, before, found))):
+            return found[0], found[1]
+        before, most = found, most // (4 if before else 2)
+
+
+def _agree(coarse: Array, fine: Array) -> bool:
+    largest = fine.max(axis=0, initial=0.0)
+    return bool((np.abs(coarse - fine) <= _AGREE * (fine + _AGREE * largest)).all())
+
+
+class Groups(NamedTuple):
+    """Samples in groups: one error for each, that moves integrals as all of its own together do."""
+
+    starts: Array  # (G,) the times of their first samples
+    shares: Array  # (G,) of a sample's deviation: √(Σ h²)/Σ h over the steps h in the group
+
+
+def _grouped(instants: Array, end: float, t: Array, starts: Array, most: int) -> Groups:
+    """Samples (N,) up to ``end`` in groups of up to ``most``, small ones soon after a start.
+
+    The sample at or before a time of ``t`` or ``starts`` is the first one of its group.
+    """
+    if most <= 1:
+        return each_alone(instants)
+    near = 1e-6 * float(np.diff(instants).min())
+
+    def at(times: Array) -> IntArray:
+        return np.searchsorted(instants, times + near, side="right").clip(1) - 1
+
+    fresh = at(starts)
+    bounds = np.unique(np.concatenate([[0], at(t), fresh, [len(instants)]]))
+    origins = fresh[np.searchsorted(fresh, bounds, side="right").clip(1) - 1]
+    first: list[int] = []
+    for (k, stop), origin in zip(pairwise(bounds.tolist()), origins.tolist(), strict=False):
+        while k < stop:
+            first.append(k)
+            k += max(1, min(most, (k - origin) // _PER_ELAPSED))  # noqa: PLW2901
+    steps = np.diff(instants, append=end)
+    whole, squares = (np.add.reduceat(steps**power, first) for power in (1, 2))
+    return Groups(instants[first], np.sqrt(squares) / whole)
+
+
+def each_alone(instants: Array) -> Groups:
+    """Samples (N,), each with its own error."""
+    return Groups(instants, np.ones(len(instants)))
 
 
 def propagated(
-    observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, instants: Array,
+    observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, groups: Groups,
     variances: Array, t: Array, L: Array | None, starts: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """:func:`deviations` from a factor L of cov [ζ; s; e] at the start; also gives L at the end.
@@ -68,16 +120,16 @@ def propagated(
         estimator: see there.
         gain: see there, (M, n, p).
         edges: see there.
-        instants: see there.
+        groups: of the samples.
         variances: see there.
         t: see there.
         L: at the first edge, (size, ·); None: everything is known there.
         starts: see there.
     """
     n, p = gain.shape[1:]
-    mesh, fresh = _mesh(edges, instants)
+    mesh, fresh, shares = _mesh(edges, groups)
     if L is not None:  # an error of the last sample is held on
-        fresh[0] = bool((np.abs(instants - edges[0]) < 1e-3 * mesh.steps[0]).any())
+        fresh[0] = bool((np.abs(groups.starts - edges[0]) < 1e-3 * mesh.steps[0]).any())
     sampler = mesh.sampler(t)
     of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
     stretch = _stretch(observer, estimator, mesh, n)
@@ -90,7 +142,8 @@ def propagated(
         size = maps.shape[2]
         zeta = observer(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]
         factors, L = _factors(
-            maps[:, -1], fresh[part] | anew[part], np.sqrt(variances), L, anew[part], zeta
+            maps[:, -1], fresh[part] | anew[part], shares[part, None] * np.sqrt(variances), L,
+            anew[part], zeta,
         )
         chosen = (sampler.element >= first) & (sampler.element < first + stretch)
         if not chosen.any():
@@ -106,7 +159,8 @@ def propagated(
         eta = e.C @ reached[:, zeta:]
         rows = o.C.shape[1] - n  # of Y; those of the offset stand below
         x = gain[chosen] @ eta
-        x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ factors[own, size:]
+        e_now = factors[own, size:] / shares[element, None, None]  # of one sample, not of many
+        x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ e_now
         of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
     return of_eta, of_x, np.zeros((0, 0)) if L is None else L
 
@@ -221,8 +275,11 @@ def noise_level(
     expected = duration * float((of_rows**2).sum(axis=1).mean()) - float((of_fit[-1] ** 2).sum())
     eta = root.T @ (root @ final[:, p])
     # The noise is taken at the instants, where it does not depend on what the hold rule assumes.
-    residual = regression.Y(instants) - regression.psi(instants) @ eta
-    square = duration * float((residual**2).sum(axis=-1).mean())
+    if regression.factor is not None:
+        square = regression.misfit(eta)
+    else:
+        residual = regression.Y(instants) - regression.psi(instants) @ eta
+        square = duration * float((residual**2).sum(axis=-1).mean())
     return float(np.sqrt(square / expected)) if expected > 0.0 else np.nan
 
 
@@ -232,8 +289,9 @@ def _stretch(observer: ErrorsAt, estimator: ErrorsAt, mesh: Mesh, n: int) -> int
     return max(1, _CHUNK // int(width) ** 2)
 
 
-def _mesh(edges: Array, instants: Array) -> tuple[Mesh, Array]:
-    """Elements between all edges and instants, and whether a sample is new at each one's start."""
+def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, Array]:
+    """Elements between all edges and groups, whether one is new at each one's start, its share."""
+    instants = groups.starts
     near = 1e-9 * float(np.diff(edges).min())
     own = instants[np.abs(edges[np.searchsorted(edges, instants).clip(0, len(edges) - 1)]
                           - instants) > near]
@@ -245,7 +303,8 @@ def _mesh(edges: Array, instants: Array) -> tuple[Mesh, Array]:
     fresh = np.zeros(mesh.size + 1, dtype=bool)
     fresh[at.clip(0, mesh.size)] = True
     fresh[0] = True
-    return mesh, fresh[:-1]
+    group = np.searchsorted(instants - near, mesh.edges[:-1], side="right") - 1
+    return mesh, fresh[:-1], groups.shares[group.clip(0)]
 
 
 def _element_maps(
@@ -337,19 +396,19 @@ def _joint(
 
 
 def _factors(
-    ends: Array, fresh: Array, deviations: Array, L: Array | None, anew: Array, zeta: int
+    ends: Array, fresh: BoolArray, deviations: Array, L: Array | None, anew: BoolArray, zeta: int
 ) -> tuple[Array, Array]:
     """L of [ζ; s; e] at the left end of every element (K, d + m + r, d + m + r), and at the end.
 
     Args:
         ends: what an element makes of it, (K, d, d + m + r).
         fresh: where another e begins, (K,).
-        deviations: of e, (m + r,).
+        deviations: of e, (K, m + r).
         L: at the start; None: everything is known there.
         anew: where ζ is zero, (K,).
         zeta: its size.
     """
-    size, signals = ends.shape[1], len(deviations)
+    size, signals = ends.shape[1], deviations.shape[1]
     L = np.zeros((size + signals, size + signals)) if L is None else L
     out = np.empty((len(ends), *L.shape))
     for k, end in enumerate(ends):
@@ -359,7 +418,7 @@ def _factors(
             L[:size, :size] = np.asarray(np.linalg.qr(L[:size].T, mode="r")).T
             L[:size, size:] = 0.0
             L[size:] = 0.0
-            L[size:, size:] = np.diag(deviations)
+            L[size:, size:] = np.diag(deviations[k])
         out[k] = L
         L[:size] = end @ L
     return out, L

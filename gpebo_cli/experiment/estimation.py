@@ -94,7 +94,7 @@ def continuous(
         known = signals if isinstance(signals, Source) else source
         seen = Measurements(
             signals.inputs, signals.outputs, signal_noise(settings.noise, levels),
-            known.derivatives,
+            known.derivatives, known.t if known.recording else None,
         )
         return observer.observe(system, seen, settings.solver)
 
@@ -399,6 +399,7 @@ def _reduced(observation: Observation, columns: IntArray) -> tuple[Observation, 
     regression = replace(
         whole, psi=Trajectory(whole.mesh, whole.psi.values[..., columns]),
         parameters=tuple(whole.parameters[j] for j in columns),
+        factor=None if whole.factor is None else whole.factor[:, [*columns, whole.p]],
         scale=np.broadcast_to(whole.scale, (whole.mesh.size, whole.p))[:, columns],
     )
     gain = Trajectory(state_map.gain.mesh, state_map.gain.values[..., columns])
@@ -555,14 +556,12 @@ def _fit(
         return None
     duration = float(regression.mesh.edges[-1] - regression.mesh.edges[0])
 
-    def rms(signal: Array) -> float:
-        square = Trajectory(regression.mesh, (signal**2).sum(axis=-1))
-        return float(np.sqrt(max(float(square.integral().final), 0.0) / duration))
+    def rms(eta: Array) -> float:
+        return float(np.sqrt(regression.misfit(eta) / duration))
 
-    Y, psi = regression.Y.values, regression.psi.values
     # What is not determined was zero, and matters neither to Y nor to what is.
     final = np.nan_to_num(estimation.parameters[:, -1])
-    fit = Fit(np.array([rms(Y - psi @ eta) for eta in final]), rms(Y))
+    fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)))
     if regression.resets or regression.dynamics is not None:
         return fit
     return _explained(fit, final[fit.best], observation.state_map, system, source)

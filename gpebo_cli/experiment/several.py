@@ -96,6 +96,7 @@ def joined_observation(
         for k, each in enumerate(observations) for name in each.regression.parameters[q:]
     ]
     regressions = [each.regression for each in observations]
+    factors = [each.factor for each in regressions if each.factor is not None]
     rows = max(each.psi.values.shape[2] for each in regressions)
     psi = _joined([
         Trajectory(each.mesh, wide(_filled(each.psi.values, rows), k))
@@ -141,6 +142,10 @@ def joined_observation(
                 Trajectory(each.mesh, _filled(each.Y.values, rows)) for each in regressions
             ], shifts),
             psi, (*regressions[0].parameters[:q], *names), np.maximum.accumulate(scale, axis=0),
+            factor=np.concatenate([
+                np.column_stack([wide(factor[:, :-1], k), factor[:, -1]])
+                for k, factor in enumerate(factors)
+            ]) if len(factors) == len(regressions) else None,
         ),
         state_map=AffineStateMap(
             _joined([each.offset for each in affine], shifts),

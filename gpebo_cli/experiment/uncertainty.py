@@ -11,6 +11,7 @@ from gpebo_cli.evidence.uncertainty import (
     SampledDeviations,
     after_reset,
     deviations,
+    each_alone,
     noise_level,
     propagated,
 )
@@ -163,8 +164,8 @@ def _over_resets(
         reached = estimator.resume(segment, mesh.edges[-1:], known).reached
         for g, system in enumerate(systems):
             *of, L = propagated(
-                errors, system, gains[g][own], mesh.edges, _within(instants, mesh), variances,
-                t[own], factors[g],
+                errors, system, gains[g][own], mesh.edges, each_alone(_within(instants, mesh)),
+                variances, t[own], factors[g],
             )
             found[g].append((of[0], of[1]))
             if reset is not None:

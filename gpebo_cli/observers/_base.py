@@ -45,6 +45,7 @@ class Measurements:
     outputs: Trajectory  # y (r,), on the same mesh
     noise: SignalNoise | None = None  # for an observer that weighs by it; None: there is none
     derivatives: InputDerivatives | None = None  # of the inputs; None: they are not known
+    wanted: Array | None = None  # (N,) times that results are for; None: all
 
     @property
     def mesh(self) -> Mesh:

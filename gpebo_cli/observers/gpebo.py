@@ -16,6 +16,7 @@ from gpebo_cli.evidence.knowledge import knowledge, smallest_and_margin
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import Measurements, Sampling
 from gpebo_cli.observers._observation import AffineStateMap, Observation
+from gpebo_cli.observers.reduced.condensed import condensed, thinned
 from gpebo_cli.observers.reduced.extension import reduced_system
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
@@ -87,6 +88,16 @@ class Gpebo:
             ConfigError: no outputs, or a setting that does not fit the plant.
             SolverError: the tolerance cannot be reached.
         """
+        keeps = isinstance(self.remedy, Plain | OutputInjection) and not self.bounds
+        few = thinned(system, signals, solver) if keeps else None
+        if few is None:
+            return self._observe(system, signals, solver)
+        return condensed(self._observe(system, few, solver), signals, few, solver)
+
+    def _observe(
+        self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
+    ) -> Observation:
+        """:meth:`observe` along the signals as they are given."""
         arguments = system, signals, solver
         if self.form != "auto" or self.regression == "paper" or not isinstance(self.remedy, Plain):
             return self._on(self.form, *arguments)

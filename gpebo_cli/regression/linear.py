@@ -39,6 +39,9 @@ class LinearRegression:
     floor: float = 0.0  # size below which parameters are rounding
     dynamics: Dynamics | None = None  # of parameters that move; then there are no resets
     parametrisation: Parametrisation | None = None  # η = S(θ)
+    # (·, p + 1) where Y is the projection of what was measured: |factor [−η; 1]|² is ∫‖Y − ψη‖² of
+    # that, as its samples have it.
+    factor: Array | None = None
 
     @classmethod
     def from_functions(
@@ -101,6 +104,14 @@ class LinearRegression:
             if reset is not None:
                 known = ExtensionState(pieces[-1][-1, -1], level).after(reset).values
         return Trajectory(self.mesh, np.concatenate(pieces))
+
+    def misfit(self, eta: Array) -> float:
+        """∫‖Y − ψη‖² for parameters η (p,)."""
+        if self.factor is not None:
+            return float(((self.factor @ np.append(-eta, 1.0)) ** 2).sum())
+        residual = self.Y.values - self.psi.values @ eta
+        square = Trajectory(self.mesh, (residual**2).sum(axis=-1)).integral()
+        return max(float(square.final), 0.0)
 
     def least_squares(self) -> Array:
         """η̂ (p,) that makes ∫‖Y − ψη̂‖² least; the smallest one where many do. Without resets."""

@@ -1,0 +1,193 @@
+"""A long recording: its many short elements become the few that ψ and the state's gain need.
+
+ψ does not follow the signals here, so long elements resolve it. Y, rough as measured, enters every
+estimator through integrals with ψ. Over each long element it is replaced by its projection on
+polynomials, Ỹ = Σ_j (2j + 1)/h P_j ∫ P_j Y dt, which leaves these integrals as they are: at the
+ends of long elements the estimates are those of Y itself. The offset is exact at all points.
+
+Y and offset are affine in the signals. Those of a thinned copy of the signals are at hand, and the
+difference, ζ' = A_0 ζ + B_e e of theory 12, is added window by window: what is held at a time does
+not depend on the number of samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import prod
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.collocation import solve
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers._base import Measurements
+from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.settings import SolverSettings
+
+_MANY = 8  # elements of the signals for each of those that they are thinned to
+_LARGE = 1000  # numbers in the system of errors, which then are not kept
+_AT_ONCE = 1 << 13  # elements of the signals, about
+_INSIDE = 1e-3  # of a step: on which side of an edge a point is
+_NEAR = 1e-9  # of a step: an edge that is nearer to a sample is that sample
+
+
+def thinned(
+    system: DescriptorSystem, signals: Measurements, solver: SolverSettings
+) -> Measurements | None:
+    """Straight lines between the signals at the wanted times, and where the plant's matrices jump.
+
+    None: there are hardly more samples than that, or Y is not affine in them.
+    """
+    wanted = signals.wanted
+    if wanted is None or signals.mesh.size < _MANY * len(wanted):
+        return None
+    if system.coefficients.signals or signals.derivatives is not None:
+        return None
+    start, stop = signals.span
+    edges = np.unique(np.concatenate([[start], wanted, [stop]]))
+    mesh = Mesh(
+        _edges(edges, system.coefficients.breakpoints(start, stop)), radau_rule(solver.stages)
+    )
+    at = signals.at(mesh.edges)
+    both = at[:-1, None] + mesh.rule.points[:, None] * np.diff(at, axis=0)[:, None]
+    u, y = (Trajectory(mesh, part) for part in np.split(both, [system.m], axis=2))
+    return replace(signals, inputs=u, outputs=y, wanted=None)
+
+
+def condensed(
+    found: Observation, signals: Measurements, few: Measurements, solver: SolverSettings
+) -> Observation:
+    """What is ``found`` along the thinned signals, along all of them.
+
+    Args:
+        found: its regression has no resets and is affine in the signals, and so is the state.
+        signals: as measured.
+        few: what was observed, of :func:`thinned`.
+        solver: tolerances.
+
+    Raises:
+        SolverError: the tolerance cannot be reached.
+    """
+    regression, state_map, errors = found.regression, found.state_map, found.errors
+    extension = found.truth.extension if isinstance(found.truth, InitialError) else None
+    if errors is None or not (
+        isinstance(state_map, AffineStateMap) and isinstance(extension, Trajectory)
+    ):
+        raise TypeError("an observation that says what errors of the signals do to it")
+    size = np.abs(extension.values[..., :1]).max(axis=(0, 1))  # of ξ_a, (k, 1)
+    mesh, (rows, p) = regression.mesh, regression.psi.values.shape[2:]
+    Y, offset = regression.Y.values.copy(), state_map.offset.values.copy()
+    edges = _edges(signals.mesh.edges, mesh.edges)
+    cuts = np.searchsorted(edges, mesh.edges - 0.5 * _NEAR * mesh.steps.min())
+    first, estimate, count = 0, found.error_estimate, 0
+    zeta = np.zeros((len(size), 1))
+    errors = _interpolated(errors, mesh, solver.tol)
+    factor = np.zeros((0, p + 1))
+    while first < mesh.size:
+        last = max(first + 1, int(np.searchsorted(cuts, cuts[first] + _AT_ONCE, side="right")) - 1)
+        window = Mesh(edges[cuts[first] : cuts[last] + 1], signals.mesh.rule)
+        seen = _part(signals, window)
+        added, zeta, error = _response(errors, seen, few, window, zeta, size, solver)
+        estimate = max(estimate, error)
+        part = slice(first, last)
+        Y[part] += _projected(Trajectory(added.mesh, added.values[:, :, :rows]), mesh, part)
+        points, near = mesh.points[part], _INSIDE * added.mesh.steps.min()
+        inside = points.clip(points[:, :1] + near, points[:, -1:] - near)  # of a short element
+        more = added(points.ravel(), inside.ravel())[:, rows:]
+        offset[part] += more.reshape(*points.shape, -1)
+        at = np.flatnonzero(np.isin(added.mesh.edges[:-1], seen.mesh.edges))
+        t, t_in = added.mesh.edges[at], added.mesh.inside[at, 0]
+        full = regression.Y(t, t_in) + added.values[at, 0, :rows]
+        own = np.concatenate([regression.psi(t, t_in), full[:, :, None]], axis=2)
+        factor = np.asarray(
+            np.linalg.qr(np.concatenate([factor, own.reshape(-1, p + 1)]), mode="r")
+        )
+        count, first = count + len(at), last
+    duration = float(mesh.edges[-1] - mesh.edges[0])
+    return replace(
+        found, error_estimate=estimate, respond=None,
+        regression=replace(
+            regression, Y=Trajectory(mesh, Y), factor=np.sqrt(duration / count) * factor
+        ),
+        state_map=replace(state_map, offset=Trajectory(mesh, offset)),
+    )
+
+
+def _edges(samples: Array, cuts: Array) -> Array:
+    """All samples, and those cuts that are no sample."""
+    k = np.searchsorted(samples, cuts).clip(1, len(samples) - 1)
+    near = np.minimum(np.abs(cuts - samples[k - 1]), np.abs(samples[k] - cuts))
+    return np.union1d(samples, cuts[near > _NEAR * (samples[k] - samples[k - 1])])
+
+
+def _response(
+    errors: ErrorsAt, signals: Trajectory, few: Measurements, window: Mesh, zeta: Array,
+    size: Array, solver: SolverSettings,
+) -> tuple[Trajectory, Array, float]:
+    """What [u; y] less the thinned ones add to Y and the offset, ζ (k, 1) at the end, an error.
+
+    ζ is resolved in terms of the ``size`` of what it is part of.
+    """
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
+        o = errors(t, inside)
+        e = (signals(t, inside) - few.at(t, inside))[:, :, None]
+        return LinearEquation(None, o.A, o.B @ e, (o.C, o.D @ e))
+
+    problem = LinearProblem(
+        coefficients, zeta, name="observer's response to the samples", floor=size
+    )
+    solution = solve(problem, window, tol=solver.tol, max_elements=solver.max_elements)
+    z, (C, direct) = solution.trajectory, solution.extras
+    added = (C @ z.values + direct)[..., 0]
+    return Trajectory(z.mesh, added), z.final, solution.error_estimate
+
+
+def _part(signals: Measurements, window: Mesh) -> Trajectory:
+    """[u; y] (m + r,) in a window."""
+    whole = signals.mesh
+    first = int(np.searchsorted(whole.edges, window.edges[0] + 0.5 * window.steps[0])) - 1
+    last = int(np.searchsorted(whole.edges, window.edges[-1] - 0.5 * window.steps[-1]))
+    part = slice(first, last)
+    values = np.concatenate([signals.inputs.values[part], signals.outputs.values[part]], axis=2)
+    return Trajectory(Mesh(whole.edges[first : last + 1], whole.rule), values)
+
+
+def _interpolated(errors: ErrorsAt, mesh: Mesh, tol: float) -> ErrorsAt:
+    """The same system from its values at the points of a mesh, if that resolves them."""
+    system = errors(mesh.points.ravel(), mesh.inside.ravel())
+    if all(len(part) == 1 for part in system) or sum(part[0].size for part in system) > _LARGE:
+        return errors
+    shapes = [part.shape[1:] for part in system]
+    values = np.concatenate([
+        np.broadcast_to(part, (mesh.points.size, *shape)).reshape(*mesh.points.shape, -1)
+        for part, shape in zip(system, shapes, strict=True)
+    ], axis=2)
+    if unresolved(values, mesh.rule).max() > tol:
+        return errors
+    known, ends = Trajectory(mesh, values), np.cumsum([prod(shape) for shape in shapes])
+
+    def at(t: Array, inside: Array) -> ErrorSystem:
+        parts = np.split(known(t, inside), ends[:-1], axis=1)
+        return ErrorSystem(*(
+            part.reshape(-1, *shape) for part, shape in zip(parts, shapes, strict=True)
+        ))
+
+    return at
+
+
+def _projected(signal: Trajectory, mesh: Mesh, part: slice) -> Array:
+    """Ỹ of a signal at the points of some elements of another mesh, (K, s + 1, rows)."""
+    fine, s = signal.mesh, mesh.rule.stages
+    whole = np.searchsorted(mesh.edges, fine.edges[:-1] + 0.5 * fine.steps) - 1
+    place = (fine.points[:, 1:] - mesh.edges[whole, None]) / mesh.steps[whole, None]
+    weights = fine.steps[:, None] * fine.rule.integration[-1]
+    by_degree = weights[..., None] * legendre.legvander(2.0 * place - 1.0, s - 1)
+    moments = np.swapaxes(by_degree, 1, 2) @ signal.values[:, 1:]
+    firsts = np.searchsorted(whole, np.arange(part.start, part.stop))
+    moments = np.add.reduceat(moments, firsts) / mesh.steps[part, None, None]
+    basis = legendre.legvander(2.0 * mesh.rule.points - 1.0, s - 1)
+    return np.asarray(basis * (2.0 * np.arange(s) + 1.0) @ moments)

@@ -1,0 +1,85 @@
+"""Recordings with many more samples than results: elements and errors in groups change nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gpebo_cli import run
+from gpebo_cli.evidence import uncertainty
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.observers import Measurements, build
+from gpebo_cli.recordings.hold import held, on_mesh, recording_mesh
+from gpebo_cli.settings import SolverSettings
+from tests.plants import shipped
+
+STEP = {  # its A jumps, between samples and away from wanted times
+    "name": "steps", "states": ["x1", "x2"], "inputs": {"u": 0}, "unknowns": {"a": 1},
+    "outputs": ["y", "z"], "E": [[1, 0], [0, 0]],
+    "A": [["-1 - step(t - 1.2345)", 1], [1, -2]], "B": [[1], [0]], "F": [["cos(t)"], [0]],
+    "C": [[1, 0], [0, 1]], "initial_state": {"x1": 1, "x2": 0},
+}
+FAST = {**STEP, "name": "fast", "A": [[-90, 80], [1, -2]], "B": [[0], [1]]}
+PLANTS = {"steps": STEP, "fast": FAST}
+
+
+def rough(system, hold, rows=700, horizon=4.0):
+    """Uneven samples of a rough signal, as an observer sees them."""
+    rng = np.random.default_rng(0)
+    t = np.sort(np.append(rng.uniform(0.0, horizon, rows - 2), [0.0, horizon]))
+    values = rng.standard_normal((rows, system.m + system.r)) + np.sin(t)[:, None]
+    mesh = recording_mesh(t, values, hold, (0.0, horizon), system.coefficients, 1e-10)
+    both = on_mesh(held(t, values, hold), mesh).values
+    signals = (Trajectory(mesh, part) for part in np.split(both, [system.m], axis=2))
+    return Measurements(*signals)
+
+
+@pytest.mark.parametrize("hold", ["linear", "zoh"])
+@pytest.mark.parametrize("name", ["circuit", "descriptor", "strangeness_free", "steps", "fast"])
+def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(name, hold):
+    """G, h, the misfit and x at the wanted times, of signals that no long element resolves."""
+    system = plant_from_mapping(PLANTS[name], name) if name in PLANTS else shipped(name)
+    signals, wanted = rough(system, hold), np.linspace(0.0, 4.0, 23)
+    whole, few = (
+        build({"name": "gpebo"}).observe(system, each, SolverSettings())
+        for each in (signals, replace(signals, wanted=wanted))
+    )
+    assert few.regression.mesh.size < whole.regression.mesh.size / 3
+    assert few.regression.parameters == whole.regression.parameters
+    before, after = whole.regression.gram(wanted), few.regression.gram(wanted)
+    np.testing.assert_allclose(after, before, atol=1e-8 * np.abs(before).max())
+    for part in ("offset", "gain"):
+        before, after = (getattr(each.state_map, part)(wanted) for each in (whole, few))
+        np.testing.assert_allclose(after, before, atol=1e-8 * np.abs(before).max())
+    at, eta = signals.mesh.edges[:-1], np.ones(whole.regression.p)
+    residual = whole.regression.Y(at) - whole.regression.psi(at) @ eta
+    rms = np.sqrt((residual**2).sum(axis=1).mean())
+    assert np.sqrt(few.regression.misfit(eta) / 4.0) == pytest.approx(rms, rel=1e-8)
+
+
+def test_samples_in_groups_have_the_deviations_of_each_alone(tmp_path, monkeypatch):
+    """Of two files, whose errors begin anew, with filters that are slower and faster than they."""
+    rng = np.random.default_rng(0)
+    files = []
+    for k, rows in enumerate((900, 850)):
+        t = np.linspace(0.0, 5.0, rows)
+        made = run("descriptor", observer="none", time={"horizon": 5.0, "samples": 501})
+        table = [t, np.interp(t, made.t, made["u"]), np.interp(t, made.t, made["y"])]
+        table[2] = table[2] + 0.05 * rng.standard_normal(rows)
+        files.append(tmp_path / f"{k}.csv")
+        np.savetxt(files[-1], np.transpose(table), delimiter=",", header="t,u,y", comments="")
+    found = []
+    for groups in (200, 10**9):
+        monkeypatch.setattr(uncertainty, "_GROUPS", groups)
+        result = run(
+            "descriptor", data={"file": list(map(str, files))}, time={"samples": 41},
+            estimator={"name": "drem", "gamma": 1e8},
+        )
+        found.append(result.details.estimation)
+    for part in ("parameters_std", "states_std"):
+        groups, alone = (getattr(each, part)[0] for each in found)
+        np.testing.assert_allclose(groups, alone, rtol=1e-2, atol=1e-2 * alone.max())
+        assert not np.array_equal(groups, alone)
