@@ -256,3 +256,26 @@ def test_check_tells_the_deviation_that_a_run_with_noise_has():
     stds = np.concatenate([result.states_std[0, -1], result.parameters_std[0, -1]])
     for name, std in zip(names, stds, strict=True):
         assert 0.02 * examined.deviations[name] == pytest.approx(std, rel=1e-3)
+
+
+def test_a_parameter_that_another_can_stand_for_does_not_look_like_a_wrong_model():
+    """Of a + b only the sum is known; the fit of the recording has it, and says so."""
+    plant = {
+        "name": "sum", "states": ["x"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "unknowns": {"a": 0.5, "b": 0.3}, "E": [[1]], "A": [[-1]], "B": [[1]], "F": [[1, 1]],
+        "C": [[1]], "initial_state": {"x": 1},
+    }
+    truth = run(plant, observer="none")
+    data = {"t": truth.t, "u": truth["u"], "y": truth["y"]}
+    result = run(plant, data=data, noise={"name": "gaussian", "outputs": 0.01})
+    assert np.isnan([result.parameters["a"], result.parameters["b"]]).all()
+    fit = result.details.fit
+    assert fit.residual[0] < 1e-3 * fit.size
+    assert "missing or wrong parameter" not in result.verdict
+
+
+def test_a_state_that_the_observer_leaves_out_is_not_called_estimable():
+    result = run("canonical", observer="canonical", time={"horizon": 5})
+    assert np.isnan(result.estimates["zb3"]).all()
+    assert result.details.estimable["zb3"] is None
+    assert result.details.estimable["zb2"] is not None

@@ -6,7 +6,7 @@ first stage that cannot be carried out and reports that stage as the failed assu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Protocol
@@ -108,7 +108,7 @@ def _of_observer(
     excitation = assess(observation.regression, t, settings.excitation, settings.solver.tol)
     times = estimable(
         excitation.known, t, observation.regression.parameters, system.states,
-        visible(observation, t, system.n)(excitation.known),
+        visible(observation, t, system.states)(excitation.known),
     )
     found += of_observation(observation, excitation, system)
     if both and isinstance(observer, Gpebo) and observer.form == "auto":
@@ -160,13 +160,16 @@ def _per_unit(
     return {name: found[name] for name, since in estimable.items() if since is not None}
 
 
-def visible(observation: Observation, t: Array, n: int) -> Callable[[Knowledge], BoolArray]:
+def visible(
+    observation: Observation, t: Array, states: Sequence[str]
+) -> Callable[[Knowledge], BoolArray]:
     """From what is known at the last M of the times t (N,) to which states are known, (M, n)."""
     state_map = observation.state_map
     if isinstance(state_map, AffineStateMap) and observation.names is None:
         return partial(Knowledge.states, gain=state_map.gain(t), units=state_map.units)
     # What it needs of the parameters is not known: all of them.
-    return lambda known: np.repeat(known.parameters.all(axis=1, keepdims=True), n, axis=1)
+    given = np.array([name not in observation.unseen for name in states], dtype=bool)
+    return lambda known: known.parameters.all(axis=1, keepdims=True) & given
 
 
 def _named(error: GpeboError) -> str:

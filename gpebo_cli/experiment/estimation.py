@@ -112,7 +112,7 @@ def continuous(
     with stage("excitation"):
         excitation = assess(regression, t, settings.excitation, settings.solver.tol)
     with stage("estimate") as share:
-        known, seen_at = excitation.final, visible(observation, t, system.n)
+        known, seen_at = excitation.final, visible(observation, t, system.states)
         seen, names = seen_at(known), (regression.parameters, system.states)
         unknown = _never(estimable(known, t[-1:], *names, seen))
         estimator = estimators.tuned(estimator, regression)
@@ -358,6 +358,7 @@ def _estimate(
         numbers[:, part] = found[: len(numbers)]
         share(part.stop / size)
     checks = state_map.checks(kept, estimated)
+    explaining = parameters[:, -1].copy()
     parameters[..., np.isnan(told[0])] = np.nan
     estimated[..., np.isnan(told[1])] = np.nan
     result = EstimationResult(
@@ -371,6 +372,7 @@ def _estimate(
         checks=checks,
         requirement=estimates.requirement,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
+        explaining=explaining,
     )
     return result, _metrics(numbers, observation.parameters, system)
 
@@ -552,15 +554,14 @@ def _fit(
 ) -> Fit | None:
     """Root mean squares over time of Y − ψη̂ with the final estimates, and of Y; the fitted ŷ."""
     regression = observation.regression
-    if estimation.names != regression.parameters:
+    final = estimation.explaining
+    if final is None or estimation.names != regression.parameters:
         return None
     duration = float(regression.mesh.edges[-1] - regression.mesh.edges[0])
 
     def rms(eta: Array) -> float:
         return float(np.sqrt(regression.misfit(eta) / duration))
 
-    # What is not determined was zero, and matters neither to Y nor to what is.
-    final = np.nan_to_num(estimation.parameters[:, -1])
     fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)))
     if regression.resets or regression.dynamics is not None:
         return fit

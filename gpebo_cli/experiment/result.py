@@ -156,6 +156,7 @@ class EstimationResult:
     parameters_std: Array | None = None  # (G, M, p) standard deviations; None: nobody knows
     states_std: Array | None = None  # (G, M, n)
     active: Mapping[int, tuple[ActiveBound, ...]] = field(default_factory=dict)  # bounds, by case
+    explaining: Array | None = None  # (G, p) at the end; one value of many where not determined
 
     @cached_property
     def gains(self) -> dict[str, Array]:

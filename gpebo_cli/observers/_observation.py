@@ -169,6 +169,7 @@ class Observation:
     note: str = ""  # what the last line of a run has to say of it, from "; " on
     starts: Array | None = None  # (k,) of several experiments one after the other; None: of one
     bounds: Mapping[str, Mapping[str, Sequence[float | None]]] | None = None  # ``observer.bounds``
+    unseen: tuple[str, ...] = ()  # states that the map leaves NaN, where it is not affine
 
     @property
     def parameters(self) -> tuple[str, ...]:

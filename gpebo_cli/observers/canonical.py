@@ -207,6 +207,7 @@ class Canonical:
                 *(zb.assumptions if zb is not None else ()),
             ),
             growth=float(np.abs(Phi).max(initial=0.0)),
+            unseen=system.states[n_a if zb is None else system.n - (zb.third is None) :],
             growth_rate=log_norm(Phi[-1, -1]) / float(mesh.edges[-1] - mesh.edges[0]),
         )
 
