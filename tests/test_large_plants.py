@@ -10,7 +10,11 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.numerics.mesh import SHARE
+from gpebo_cli.numerics import sweeps
+from gpebo_cli.numerics.collocation import solve
+from gpebo_cli.numerics.mesh import SHARE, initial_mesh
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced import extension
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import large, simulate
@@ -386,3 +390,33 @@ def test_blas_has_one_thread_where_matrices_are_of_a_middle_size(cells, one):
         assert threadpool_info() == before
     assert asked
     assert all((1 in found) == one for found in asked)
+
+
+def test_elements_that_stay_are_not_evaluated_again_though_new_ones_have_more_entries():
+    d, asked = 12, []
+
+    def coefficients(t, inside):
+        """A narrow coupling, and within it one that is zero at all points of the first mesh."""
+        asked.append(len(t))
+        narrow = np.maximum(1.0 - ((t - 3.0) / 0.04) ** 2, 1e-3)
+        A = np.zeros((len(t), d, d))
+        A[:, range(d), range(d)] = -1.0
+        A[:, range(1, d), range(d - 1)] = 1.0 + np.exp(-(((t - 3.0) / 0.2) ** 2))[:, None]
+        A[:, 0, d - 1] = np.where(narrow > 1e-3, np.exp(1.0 - 1.0 / narrow), 0.0)
+        return LinearEquation(None, A, np.ones((len(t), d, d)), (A[:, 0, :],))
+
+    mesh = initial_mesh(0.0, 6.0, [], 7, radau_rule(8))
+    problem = LinearProblem(coefficients, np.eye(d), name="pulse")
+    first = coefficients(mesh.points.ravel(), None).A[:, 0, d - 1]
+    asked.clear()
+    found = sweeps.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
+    last = found.trajectory.mesh
+    assert asked[0] == mesh.size * 9
+    assert max(asked[1:]) < last.size * 9
+    again = coefficients(last.points.ravel(), None).extras[0]
+    np.testing.assert_array_equal(found.extras[0].reshape(again.shape), again)
+    assert not first.any()
+    assert again[:, d - 1].any()
+    t = np.linspace(0.0, 6.0, 31)
+    expected = solve(problem, last, tol=1e-9, max_elements=500).trajectory(t)
+    np.testing.assert_allclose(found.trajectory(t), expected, atol=1e-8)

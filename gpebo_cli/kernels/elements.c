@@ -346,7 +346,7 @@ static Outcome sweeps(Call *call)
     const npy_intp forced = SIZE(f), most = SIZE(m), *row = call->index[2],
                    *column = call->index[3];
     const double *R = call->in[0], *h = call->in[1], *kicks = call->in[6];
-    const double tol = call->number[9], share = call->number[10];
+    const double *guess = call->in[7], tol = call->number[10], share = call->number[11];
     if (s > MOST_STAGES || (SIZE(P) != 1 && SIZE(P) != K * (s + 1)))
         return refused("stages, or points of all elements", SIZE(P));
     if (forced > all || (SIZE(Q) != 1 && SIZE(Q) != K * (s + 1)))
@@ -378,13 +378,13 @@ static Outcome sweeps(Call *call)
                    (const Nodes *)f,
                    X,
                    left,
-                   call->in[8],
+                   call->in[9],
                    size,
                    change};
         memset(size, 0, d * sizeof(double));
         for (npy_intp i = 0; i < d; i++)
             for (npy_intp c = 0; c < b; c++)
-                left[i * b + c] = call->in[7][i * all + first + c];
+                left[i * b + c] = call->in[8][i * all + first + c];
         for (npy_intp k = 0; k < K; k++) {
             double *out = call->out[0] + k * (s + 1) * d * all + first, found = INFINITY;
             const double *values = call->in[4] + k * (s + 1) * call->step[4];
@@ -405,6 +405,8 @@ static Outcome sweeps(Call *call)
                     A[e][j] = 0.0;
             for (npy_intp i = 0; i < d * b; i++) {
                 EACH_NODE X[i][j] = left[i];
+                for (npy_intp j = 0; guess != NULL && j < s; j++)
+                    X[i][j] = guess[((k * (s + 1) + j + 1) * d + i / b) * all + first + i % b];
                 size[i / b] = larger(fabs(left[i]), size[i / b]);
             }
             for (npy_intp m = 0; m < most && found > tol; m++) {
@@ -432,6 +434,6 @@ static Outcome sweeps(Call *call)
 const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
-    {"sweeps", "ss K @d+ @e P?e Q?df |Kdc dc d # # %m", "Ks+dc K", sweeps},
+    {"sweeps", "ss K @d+ @e P?e Q?df |Kdc |Ks+dc dc d # # %m", "Ks+dc K", sweeps},
     {NULL, NULL, NULL, NULL},
 };

@@ -145,7 +145,8 @@ def chain(
 
 def sweeps(
     R: Array, h: Array, rows: IntArray, indices: IntArray, entries: Array, f: Array,
-    kicks: Array | None, start: Array, weights: Array, tol: float, share: float, most: int,
+    kicks: Array | None, guess: Array | None, start: Array, weights: Array, tol: float,
+    share: float, most: int,
 ) -> tuple[Array, Array]:
     """Values at all points of X' = A X + f by fixed-point iteration, one element after the other.
 
@@ -160,6 +161,7 @@ def sweeps(
         entries: them at the K (s + 1) points of all elements, or at one (P or 1, e).
         f: of the first columns of X (P or 1, d, f).
         kicks: what is added to X at the end of each element (K, d, c), or None.
+        guess: what X nearly is at all points (K, s + 1, d, c), or None.
         start: at the first left end (d, c).
         weights: 1 over the unit of each row (d,).
         tol: see above.
@@ -180,7 +182,7 @@ def sweeps(
         points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
         A[:, all_rows, indices] = entries if len(entries) == 1 else entries[points]
         forcing[:, :, : f.shape[2]] = f if len(f) == 1 else f[points]
-        X = np.repeat(state[None], s, axis=0)
+        X = np.repeat(state[None], s, axis=0) if guess is None else guess[k, 1:]
         size = np.maximum(size, np.abs(state).max(axis=1, initial=0.0))
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(2 * most):  # each row uses the old ones: that is slower by half

@@ -99,7 +99,7 @@ def solve(
             maps = _element_maps(problem, mesh, None, known)
         else:
             fresh = kept < 0
-            maps = _merge(before[0], _element_maps(problem, mesh, fresh), kept, fresh)
+            maps = _merge(before[0], _element_maps(problem, mesh, fresh), kept)
         values, whole = _chain(maps, problem, mesh, restarts or {})
         tail = _tail_of_numbers(problem, mesh, values, maps, whole, tol)
         return (maps, values, whole), tail
@@ -171,27 +171,33 @@ def unresolved_signals(
     return unresolved_kinds(chain([own], further), rule)
 
 
-def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray, fresh: BoolArray) -> _ElementMaps:
-    K, count = len(old.particular), len(new.particular)
-    place = np.where(fresh, K - 1 + fresh.cumsum(), kept)
-
-    def merged(before: Array, after: Array) -> Array:
-        shape = before.shape[1:]
-        before, after = (
-            x if len(x) == size else np.broadcast_to(x, (size, *shape))
-            for x, size in ((before, K), (after, count))
-        )
-        return np.concatenate([before, after]).take(place, axis=0)
-
+def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray) -> _ElementMaps:
     return _ElementMaps(
-        merged(old.homogeneous, new.homogeneous),
-        merged(old.particular, new.particular),
-        merged(old.noise, new.noise),
-        tuple(
-            a if a.shape[:2] == (1, 1) else merged(a, b)
-            for a, b in zip(old.extras, new.extras, strict=True)
-        ),
+        merged(old.homogeneous, new.homogeneous, kept),
+        merged(old.particular, new.particular, kept),
+        merged(old.noise, new.noise, kept),
+        tuple(merged(a, b, kept) for a, b in zip(old.extras, new.extras, strict=True)),
     )
+
+
+def merged(before: Array, after: Array, kept: IntArray) -> Array:
+    """Of all elements of a mesh, from those of the mesh before and of the fresh ones.
+
+    Args:
+        before: of the elements before, or of the first for all of them.
+        after: of the fresh elements, likewise.
+        kept: for each element which one before it is, −1 for a fresh one.
+    """
+    if before.shape[:2] == after.shape[:2] == (1, 1):
+        return before
+    fresh = kept < 0
+    count, shape = int(kept.max()) + 1, before.shape[1:]
+    before, after = (
+        x if len(x) > 1 else np.broadcast_to(x, (size, *shape))
+        for x, size in ((before, count), (after, int(fresh.sum())))
+    )
+    place = np.where(fresh, len(before) - 1 + fresh.cumsum(), kept)
+    return np.concatenate([before, after]).take(place, axis=0)
 
 
 def _element_maps(

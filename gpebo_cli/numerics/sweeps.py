@@ -25,6 +25,7 @@ from gpebo_cli.numerics.collocation import (
     decoupled,
     decoupled_maps,
     equal_lengths,
+    merged,
     unresolved_signals,
 )
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
@@ -68,6 +69,16 @@ class Sparse(NamedTuple):
         out[np.repeat(np.arange(d), np.diff(self.rows)), self.columns] = self.entries[0]
         return out
 
+    def within(self, other: Sparse) -> Array:
+        """The entries at the places of another one, which has all of these."""
+        d = len(self.rows) - 1
+        own, theirs = (
+            np.repeat(np.arange(d), np.diff(x.rows)) * d + x.columns for x in (self, other)
+        )
+        out = np.zeros((len(self.entries), len(theirs)))
+        out[:, np.searchsorted(theirs, own)] = self.entries
+        return out
+
     def growth(self, enough: float) -> float:
         """How fast x' = A x may grow for the first of them, at most; or what is below ``enough``.
 
@@ -103,9 +114,14 @@ class Sparse(NamedTuple):
         return np.asarray(np.min(found, axis=0))
 
 
-def sparse(A: Array) -> Sparse | None:
-    """Matrices (N or 1, d, d) by their entries, None where most are not zero."""
+Equation = tuple[Sparse, Array, tuple[Array, ...]]
+
+
+def sparse(A: Array, more: Sparse | None = None) -> Sparse | None:
+    """Matrices (N or 1, d, d) by their entries, at ``more`` places, too; None if most are there."""
     there = (A != 0.0).any(axis=0)
+    if more is not None:
+        there |= more._replace(entries=np.ones((1, len(more.columns)))).full() != 0.0
     i, j = np.nonzero(there)
     if len(i) > _DENSE * there.size:
         return None
@@ -113,8 +129,8 @@ def sparse(A: Array) -> Sparse | None:
 
 
 def solve(
-    problem: LinearProblem, equation: Callable[[Mesh], tuple[Sparse, Array, tuple[Array, ...]]],
-    mesh: Mesh, *, units: Array, tol: float, max_elements: int,
+    problem: LinearProblem, equation: Callable[[Mesh, IntArray], Equation], mesh: Mesh, *,
+    units: Array, tol: float, max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None, stiff: bool = False,
 ) -> LinearSolution | None:
     """As :func:`gpebo_cli.numerics.collocation.solve`, or None where sweeps will not do.
@@ -122,7 +138,7 @@ def solve(
     Args:
         problem: what to solve, but for its coefficients.
         equation: A, f (P or 1, d, ·) of the first columns and what the monitor needs, at the
-            points of a mesh.
+            points of a mesh, of which some elements (K,) are those of the mesh before, else −1.
         mesh: where to start; its edges stay edges.
         units: of the components (d,).
         tol: see there.
@@ -133,7 +149,7 @@ def solve(
     Raises:
         SolverError: ``max_elements`` do not reach ``tol``; names the time.
     """
-    A, _, _ = equation(mesh)
+    A, _, _ = equation(mesh, np.full(mesh.size, -1))
     march: March = elements.sweeps
     if stiff:
         march = _Solved(A)
@@ -144,15 +160,16 @@ def solve(
         if parts.max(initial=1.0) > 1.0:
             mesh = mesh.split(np.maximum(parts, 1.0).astype(np.intp))[0]
 
-    def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
-        A, f, extras = equation(mesh)
+    def evaluate(mesh: Mesh, before: _Found | None, kept: IntArray) -> tuple[_Found, Array]:
+        A, f, extras = equation(mesh, kept)
         mapped = not stiff and len(A.entries) == 1 and problem.start.shape[1] > _MANY_COLUMNS
         mapped = mapped and _MANY_ALIKE * equal_lengths(mesh.steps)[0].max() < mesh.size
         values, change = _swept(
-            _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {}
+            _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {},
+            None if before is None else before.on(mesh),
         )
         made_of, moved = _terms(A, f, mesh, values)
-        found = _Found(A, values, change, made_of, moved, extras)
+        found = _Found(A, Trajectory(mesh, values), change, made_of, moved, extras)
         return found, unresolved_signals(
             problem, mesh.rule, values, extras, made_of.max(axis=0), tol
         )
@@ -165,7 +182,7 @@ def solve(
         return None
     errors, lost = _errors(march, problem, mesh, units, found)
     return LinearSolution(
-        Trajectory(mesh, found.values),
+        found.trajectory,
         max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), rounds, errors,
         None if lost == mesh.size else float(mesh.edges[lost + 1]), found.extras,
     )
@@ -179,18 +196,33 @@ def solve_dense(
 
     ``f`` may be of the first columns only. None also where too few entries are zero.
     """
-    given = mesh
+    last: list[tuple[Mesh, Sparse, Array, tuple[Array, ...]]] = []
 
-    def equation(mesh: Mesh) -> tuple[Sparse, Array, tuple[Array, ...]]:
-        if mesh is given and known is not None:
-            c = known
-        else:
-            c = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel())
-        A = sparse(c.A)
+    def equation(mesh: Mesh, kept: IntArray) -> Equation:
+        if last and last[0][0] is mesh:
+            return last[0][1:]
+        fresh, s = kept < 0, mesh.rule.stages
+        points, count = mesh.points[fresh].ravel(), int(fresh.sum())
+        c = known if known is not None and not last else problem.coefficients(
+            points, mesh.inside[fresh].ravel()
+        )
+        before = None if fresh.all() else last[0]
+        A = sparse(c.A, None if before is None else before[1])
         if A is None:
             raise _StiffError
-        extras = (at_points(e, mesh.size, mesh.rule.stages) for e in c.extras)
-        return A, c.f, tuple(extras)
+        f, extras = c.f, tuple(at_points(e, count, s) for e in c.extras)
+        if before is not None:
+            def whole(old: Array, new: Array) -> Array:
+                """Points one after the other (P or 1, ...), of all elements."""
+                K = before[0].size
+                found = merged(at_points(old, K, s), at_points(new, count, s), kept)
+                return found.reshape(-1, *found.shape[2:])
+
+            A = A._replace(entries=whole(before[1].within(A), A.entries))
+            f = whole(before[2], f)
+            extras = tuple(merged(a, b, kept) for a, b in zip(before[3], extras, strict=True))
+        last[:] = [(mesh, A, f, extras)]
+        return A, f, extras
 
     try:
         return solve(
@@ -209,16 +241,21 @@ class _Found(NamedTuple):
     """What was found on a mesh."""
 
     A: Sparse
-    values: Array  # (K, s + 1, d, c)
+    trajectory: Trajectory  # (d, c)
     change: Array  # (K,) the last in each element, relative
     made_of: Array  # (K, d, c) sizes of what right ends are the sum of
     moved: Array  # (K, d, c) what rounding of the equation's terms moves
     extras: tuple[Array, ...]
 
+    def on(self, mesh: Mesh) -> Array:
+        """The values at the points of another mesh (K, s + 1, d, c)."""
+        found = self.trajectory(mesh.points.ravel(), mesh.inside.ravel())
+        return found.reshape(*mesh.points.shape, *found.shape[1:])
+
 
 def _mapped(
     R: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array,
-    kicks: Array | None, start: Array, *_: object,
+    kicks: Array | None, _guess: Array | None, start: Array, *_: object,
 ) -> tuple[Array, Array]:
     """As ``elements.sweeps`` for one constant A and many columns, by maps of elements."""
     s, (d, c) = len(R), start.shape
@@ -250,7 +287,7 @@ class _Solved:
 
     def __call__(
         self, R: Array, h: Array, _rows: IntArray, _columns: IntArray, _entries: Array, f: Array,
-        kicks: Array | None, start: Array, *_: object,
+        kicks: Array | None, _guess: Array | None, start: Array, *_: object,
     ) -> tuple[Array, Array]:
         s, (d, columns) = len(R), start.shape
         from_left = np.linalg.inv(R).sum(axis=1)[:, None, None]
@@ -288,9 +325,11 @@ class _Solved:
 
 def _swept(
     march: March, A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, units: Array, tol: float,
-    restarts: Mapping[float, Callable[[Array], Array]],
+    restarts: Mapping[float, Callable[[Array], Array]], guess: Array | None,
 ) -> tuple[Array, Array]:
     """Values (K, s + 1, d, c), and the last change in each element (K,).
+
+    ``guess``: what they are nearly.
 
     Raises:
         _StiffError: sweeps do not converge.
@@ -306,7 +345,8 @@ def _swept(
         values, change = march(
             mesh.rule.integration, mesh.steps[first:last], A.rows, A.columns,
             A.entries if len(A.entries) == 1 else A.entries[part],
-            f if len(f) == 1 else f[part], None, state, 1.0 / units, enough, SHARE, _MOST_SWEEPS,
+            f if len(f) == 1 else f[part], None, None if guess is None else guess[first:last],
+            state, 1.0 / units, enough, SHARE, _MOST_SWEEPS,
         )
         if not (change <= 8.0 * enough).all() or not np.isfinite(values[-1]).all():
             raise _StiffError
@@ -342,7 +382,7 @@ def _errors(
 
     Of many columns the largest error at each place is carried on, for all of them.
     """
-    A, values, rule = found.A, found.values, mesh.rule
+    A, values, rule = found.A, found.trajectory.values, mesh.rule
     K, points, n, columns = values.shape
     sizes = np.abs(values).max(axis=1)
     size, flat = np.maximum(sizes, _TINY), values.reshape(K, points, n * columns)
@@ -362,7 +402,7 @@ def _errors(
     kicks = (signs[1:] * added[:, :, None]).reshape(K, n, -1)
     ends, _ = march(
         rule.integration, mesh.steps, A.rows, A.columns, A.entries, np.zeros((1, n, 0)), kicks,
-        (signs[0] * start[:, None]).reshape(n, -1), 1.0 / units, _ROUGH, SHARE, _MOST_SWEEPS,
+        None, (signs[0] * start[:, None]).reshape(n, -1), 1.0 / units, _ROUGH, SHARE, _MOST_SWEEPS,
     )
     squares = ((ends[:, -1] + kicks) ** 2).reshape(K, n, -1, added.shape[2])
     systematic = np.arange(2, K + 2)[:, None, None]

@@ -12,7 +12,6 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import orthonormal_complement, transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
-from gpebo_cli.regression.linear import outer_products
 
 _ROUNDING = 1e-3  # of a projection, in terms of what is resolved
 _NOISE = 1e-11  # of the terms of a gain: beyond what extensions are resolved to
@@ -47,9 +46,9 @@ class Assembled:
         yield psi, 1e-3
         yield self.offset, 0.0
         yield self.gain / (np.where(states > 0.0, states, 1.0)[:, None] * columns), 0.0
-        squares, right = _products(psi, self.Y)
-        yield squares, 1e-3
-        yield right, 1e-3 * self.Y_scale
+        # Of ψᵀψ the diagonal: a product of two columns that are resolved shows no more than theirs.
+        yield (psi**2).sum(axis=1), 1e-3
+        yield np.einsum("nrp,nr->np", psi, self.Y), 1e-3 * self.Y_scale
 
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
@@ -62,12 +61,6 @@ class Assembled:
                 return kept
         rows = self.Y.shape[1]
         return np.arange(rows - system.r, rows)  # eq. (regpsi)
-
-
-def _products(psi: Array, Y: Array) -> tuple[Array, Array]:
-    """ψᵀψ (N, p, p) and ψᵀY (N, p) of ψ (N, rows, p) and Y (N, rows)."""
-    both = outer_products(psi, Y)
-    return both[..., :-1], both[..., -1]
 
 
 def regression_signals(
