@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 from plants import CONF, seen, shipped
 from regressions import ETA, fading, regression
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import brentq
 
 from gpebo_cli import estimators
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.canonical import (
@@ -269,6 +273,57 @@ def test_D2_rank_equivalence_holds():
         stacked = np.block([[E, A], [np.zeros((r, n)), C], [np.zeros((n, n)), E]])
         agreed += one == (np.linalg.matrix_rank(stacked) == n_a + n)
     assert agreed == 4000
+
+
+def test_agent_2_of_the_distributed_observer_takes_longer_and_is_not_exact():
+    """Eqs. (22) to (25) of arXiv:2005.12940 in errors: Ω2, e = 𝒴2 − Ω2θ, ∫Δ2² and θ̂2 − θ."""
+    A21 = np.array([[0, -1.4142], [0.7071, 0.7071], [6.3640, 4.9497], [-2.8284, -2.8284]])
+    A22 = np.array([[-1, -2, 1, 1], [1, 1, 0, 0], [-1, 1, -2, 0], [0.5, -0.5, 0, -4]])
+    A = np.block([[-np.eye(2), np.zeros((2, 4))], [A21, A22]])
+    C, lam, gamma, mu = np.array([-1.4142, -1.4142, 5, 0, 0, 3]), 0.8, 20.0, 0.1
+    theta = np.array([a := 1.4142271248762552, -2 * a, -2, 3, -1, 2])
+    M = 2 * np.diag([2.1213**2, 0.7071**2])  # C11ᵀC11; Ω1 = M (e^{−t} − e^{−2t})
+
+    def error_1(t):  # of agent 1, from θ̂ = 0: θ (1 − ω1)/μ1 − θ until it is exact
+        if t >= t_c1:
+            return np.zeros(2)
+        return theta[:2] * ((1 - np.exp(-5 * energy_1(t))) / 0.05 - 1)
+
+    def energy_1(t):  # ∫Δ1²
+        x = np.exp(-np.array([t, 0.0]))
+        return np.linalg.det(M) ** 2 * np.diff(x**4 / 4 - 4 * x**5 / 5 + x**6 - 4 * x**7 / 7
+                                               + x**8 / 8)[0]
+
+    t_c1 = brentq(lambda t: 5 * energy_1(t) + np.log(0.95), 0.01, 1.0)
+    assert abs(t_c1 - 0.309) < 1e-3
+
+    def run(until, factor=lam):
+        def f(t, x):
+            Phi, omega, e, rest = expm(A * t), x[:16].reshape(4, 4), x[16:20], x[21:]
+            psi = C[2:] @ Phi[2:, 2:]
+            eps = (C[:2] @ Phi[:2, :2] + C[2:] @ Phi[2:, :2]) @ error_1(t)
+            delta, mixed, _ = determinant_and_adjugate_action(omega[None], e[None, :, None])
+            law = gamma * delta[0] * (mixed[0, :, 0] - delta[0] * rest)
+            return np.concatenate([
+                (factor * np.outer(psi, psi) - lam * omega).ravel(),
+                -lam * e - factor * psi * eps, delta**2, law,
+            ])
+
+        start, at = np.append(np.zeros(21), -theta[2:]), 0.0
+        for stop in (t_c1, until):
+            start = solve_ivp(
+                f, (at, stop), start, method="DOP853", rtol=1e-10, atol=1e-18
+            ).y[:, -1]
+            at = stop
+        Phi, omega_2 = expm(A * until), np.exp(-gamma * start[20])
+        return omega_2, Phi[2:, 2:] @ (start[21:] + omega_2 * theta[2:]) / (1 - omega_2)
+
+    for when, factor in ((1.979, lam), (1.691, 1.0)):
+        assert run(when - 2e-3, factor)[0] > 1 - mu > run(when + 2e-3, factor)[0]
+    omega_2, error = run(2.0)
+    assert omega_2 < 1 - mu
+    assert 0.12 < np.abs(error).max() < 0.14
+    assert 0.004 < np.abs(run(5.0)[1]).max() < 0.006
 
 
 def test_every_erratum_names_a_test_that_exists():

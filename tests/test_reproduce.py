@@ -24,7 +24,8 @@ def test_every_recipe_says_what_it_reproduces_and_from_where():
         assert len(path.read_text().splitlines()) <= 40
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "vanadium"])
+# One needs data, and two take long, which they do in `gpebo reproduce` of CI.
+@pytest.mark.parametrize("name", sorted({*NAMES} - {"vanadium", "transistor", "oregonator"}))
 def test_published_numbers_are_ours(name):
     found = list(reproduce.reproduced(name))
     assert found
@@ -39,7 +40,7 @@ def test_the_page_is_that_of_the_recipes():
     for name in NAMES:
         picture = f"img/atlas/{name}.png"
         assert f"({picture})" in page
-        assert (ROOT / "docs" / picture).stat().st_size < 20_000
+        assert (ROOT / "docs" / picture).stat().st_size < 40_000
 
 
 def test_a_page_and_its_pictures_are_written(tmp_path, monkeypatch, capsys):
@@ -47,7 +48,9 @@ def test_a_page_and_its_pictures_are_written(tmp_path, monkeypatch, capsys):
     assert reproduce.main(["fct_agent2", "gelda", "vanadium", "--page", "page/a.md"]) == 0
     page = (tmp_path / "page" / "a.md").read_text()
     assert "fct_agent2`: " in page
-    assert "| Erratum | Candidate." in page
+    assert "| Erratum | The text says 1.7 s." in page
+    assert "| 3.3685e-06 | needs their data |" in page
+    assert page.count("![") == 2
     for name in ("fct_agent2", "gelda"):
         picture = tmp_path / "page" / "img" / "atlas" / f"{name}.png"
         assert picture.read_bytes().startswith(b"\x89PNG")

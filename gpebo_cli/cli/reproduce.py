@@ -42,15 +42,15 @@ class Finding:
     reference: str
     quantity: str
     published: float
-    ours: float
+    ours: float | None  # None: not run, its data are not here
     tolerance: float
     where: str
     notes: Mapping[str, str] = field(default_factory=dict)  # what the recipe says besides
 
     @property
     def holds(self) -> bool:
-        """Whether they agree."""
-        return abs(self.ours - self.published) <= self.tolerance
+        """Whether they agree, as far as is known."""
+        return self.ours is None or abs(self.ours - self.published) <= self.tolerance
 
 
 def main(words: list[str]) -> int:
@@ -74,7 +74,8 @@ def main(words: list[str]) -> int:
     if page is not None:
         from gpebo_cli.results.files import write_text
 
-        write_text(Path(page), atlas(findings))
+        write_text(Path(page), atlas(findings, Path(page).parent))
+    findings = [finding for finding in findings if finding.ours is not None]
     off = [finding for finding in findings if not finding.holds]
     count = len({finding.recipe for finding in findings})
     if off or not options.quiet:
@@ -96,7 +97,7 @@ def _names(options: Options) -> list[str]:
 def reproduced(
     name: str, options: Options = PLAIN, pictures: Path | None = None
 ) -> Iterator[Finding]:
-    """Run a recipe of ``experiments/published`` and compare; nothing where its data are not here.
+    """Run a recipe of ``experiments/published`` and compare, where its data are here.
 
     Args:
         name: of the recipe.
@@ -116,23 +117,25 @@ def reproduced(
     where = f"experiment published/{name}"
     with session(Arguments()) as hydra:
         ((_, config),) = recipe_jobs(f"published/{name}", hydra.config_loader)
-    file = OmegaConf.select(config, "data.file")
+    file, result = OmegaConf.select(config, "data.file"), None
     if file is not None and not Path(file).exists():
         sys.stderr.write(f"{name}: not run, there is no {file} here; see {config.reference}\n")
-        return
-    try:
-        result = run_recipe_job(config, Arguments(), options)
-    except GpeboError as error:
-        raise type(error)(f"{where}: {error}") from error
-    if pictures is not None:
-        _draw(result, pictures / f"{name}.png")
+    else:
+        try:
+            result = run_recipe_job(config, Arguments(), options)
+        except GpeboError as error:
+            raise type(error)(f"{where}: {error}") from error
+        if pictures is not None:
+            _draw(result, pictures / f"{name}.png")
     notes = {key: str(config[key]).strip() for key in _NOTES if config.get(key)}
     title, reference = (str(OmegaConf.select(config, key) or "") for key in ("title", "reference"))
     entries = OmegaConf.to_container(config.expected)
     for entry in entries if isinstance(entries, list) else []:
         expected = read(Expected, entry, f"{where}: expected")
-        ours = quantity(result, expected.quantity, where)
         values = expected.value if isinstance(expected.value, list) else [expected.value]
+        ours: list[float] | list[None] = [None] * len(values)
+        if result is not None:
+            ours = quantity(result, expected.quantity, where)
         if not isinstance(expected.value, list):
             values *= len(ours)  # the same of every case
         if len(values) != len(ours):
@@ -197,7 +200,7 @@ def table(findings: Sequence[Finding]) -> list[str]:
     rows += [
         (f.recipe, f.quantity, f"{f.published:.7g}", f"{f.ours:.7g}", f"{f.tolerance:.1g}",
          "agrees" if f.holds else f"OFF by {abs(f.ours - f.published):.3g}")
-        for f in findings
+        for f in findings if f.ours is not None
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
@@ -206,8 +209,8 @@ def table(findings: Sequence[Finding]) -> list[str]:
     ]
 
 
-def atlas(findings: Sequence[Finding]) -> str:
-    """The page of published results."""
+def atlas(findings: Sequence[Finding], folder: Path) -> str:
+    """The page of published results, for a folder with pictures of those that were run."""
     lines = [
         "# Published results, reproduced", "",
         "Made by `gpebo reproduce --page docs/atlas.md`. Each recipe is a file of",
@@ -221,14 +224,16 @@ def atlas(findings: Sequence[Finding]) -> str:
         if f.recipe != previous:
             marked = " **erratum**" if "erratum" in f.notes else ""
             name = f"`{f.recipe}`: {f.title}; {f.reference}{marked}"
-            picture = f"![{f.title}]({(_PICTURES / f.recipe).as_posix()}.png)"
+            file = _PICTURES / f"{f.recipe}.png"
+            picture = f"![{f.title}]({file.as_posix()})" if (folder / file).exists() else ""
             notes += [
                 f"| `{f.recipe}` | {_NOTES[key]} | {text} |" for key, text in f.notes.items()
             ]
         previous = f.recipe
+        ours = "needs their data" if f.ours is None else f"{f.ours:.7g}"
         lines.append(
             f"| {name} | {picture} | {f.quantity} | {f.published:.7g} | "
-            f"{f.ours:.7g}{'' if f.holds else ' **off**'} | {f.tolerance:.1g} | {f.where} |"
+            f"{ours}{'' if f.holds else ' **off**'} | {f.tolerance:.1g} | {f.where} |"
         )
     return "\n".join([
         *lines, "", "## What stands in the publications", "", "| recipe | | |", "|---|---|---|",
