@@ -145,23 +145,38 @@ def run_system(plant):
     ), plant_from_mapping(plant))
 
 
-def main(count):
-    """Run as many systems and print those of which the program says something else."""
+def largest_error(result):
+    """Of what is called estimable at the end, states beside the size that they ever had."""
+    found, x = result.estimation, result.simulation.states
+    errors = np.concatenate([
+        found.parameters[0, -1] - found.true_parameters[-1],
+        (found.states[0, -1] - x[-1]) / np.maximum(1.0, np.abs(x).max(axis=0)),
+    ])
+    names = [*found.names, *result.system.states]
+    told = [e for e, name in zip(errors, names, strict=True) if result.estimable[name] is not None]
+    return float(np.abs(told).max(initial=0.0))
+
+
+def main(first, last):
+    """Run systems and print those of which the program says something else, or wrong numbers."""
     from gpebo_cli.errors import GpeboError
 
     wrong = 0
-    for seed in range(count):
+    for seed in range(first, last):
         plant, expected = random_system(seed)
         try:
-            told = run_system(plant).estimable
+            result = run_system(plant)
+            told = result.estimable
             other = [name for name in expected if (told[name] is not None) != expected[name]]
+            if not largest_error(result) < 1e-6:
+                other.append(f"error {largest_error(result):.1e}")
         except GpeboError as error:
             other = [str(error)]
         if other:
             wrong += 1
             sys.stdout.write(f"seed {seed}, index {seed % 5}: {', '.join(other)}\n")
-    sys.stdout.write(f"{count - wrong} of {count} agree\n")
+    sys.stdout.write(f"{last - first - wrong} of {last - first} agree\n")
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(*map(int, (["0", *sys.argv[1:]])[-2:]))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from plants import shipped
-from random_systems import random_system, run_system
+from random_systems import largest_error, random_system, run_system
 from test_cli import gpebo
 
 from gpebo_cli import run
@@ -23,8 +23,9 @@ from gpebo_cli.results.figures import describe
 from gpebo_cli.settings import Settings, TimeSettings
 
 
-# The last ones: an A_0 that hides something, and states that no parameter has part in.
-@pytest.mark.parametrize("seed", [*range(20), 98, 123, 143, 158, 170])
+# The last ones: an A_0 that hides something or leaves no digits, columns that are rounding, and
+# states that no parameter has part in.
+@pytest.mark.parametrize("seed", [*range(20), 98, 123, 143, 158, 170, 1028, 1074, 1172, 1193])
 def test_what_is_estimable_is_what_the_observability_matrix_says(seed):
     """Index 0 to 4, kernels that rotate; ``python -m tests.random_systems 200`` tries more."""
     plant, expected = random_system(seed)
@@ -34,6 +35,22 @@ def test_what_is_estimable_is_what_the_observability_matrix_says(seed):
     told = dict(zip(plant["states"], result.estimation.states[0, -1], strict=True))
     if any(expected[name] for name in told):
         assert all(np.isnan(told[name]) != expected[name] for name in told)
+    assert largest_error(result) < 1e-6
+
+
+def test_unknowns_that_only_their_sum_is_told_of_do_not_spoil_the_rest():
+    """Recovery and death of an epidemic, and the recovered, whom nobody counts."""
+    plant = {
+        "name": "sird", "states": ["S", "I", "R"], "outputs": ["seen"],
+        "unknowns": {"gamma": 0.2, "mu": 0.03}, "E": np.eye(3).tolist(),
+        "A": [["-0.6*seen", 0, 0], ["0.6*seen", 0, 0], [0, 0, 0]],
+        "F": [[0, 0], ["-seen", "-seen"], ["seen", 0]], "C": [[0, 1, 0]],
+        "initial_state": [0.95, 0.05, 0],
+    }
+    result = run(plant, time={"horizon": 20})
+    told = result.details.estimable
+    assert {name for name in told if told[name] is None} == {"gamma", "mu", "R", "e0_R"}
+    assert all(np.abs(result.errors[name][0, -1]) < 1e-9 for name in ("S", "I"))
 
 
 def test_units_of_parameters_do_not_matter():

@@ -64,10 +64,16 @@ class Knowledge:
         return np.asarray(1.0 / np.einsum("mjk,mk->mj", self.vectors**2, 1.0 / spectrum))
 
     @cached_property
+    def clarity(self) -> Array:
+        """The eigenvalues over the levels of their vectors, (M, p): below 1 they are rounding."""
+        return np.asarray(
+            self.eigenvalues / np.einsum("mjk,mj->mk", self.vectors**2, self.level)
+        )
+
+    @cached_property
     def _kernel(self) -> tuple[Array, Array]:
         """V with zeros for the eigenvalues that are not zero, and how far it may be off (M,)."""
-        level = np.einsum("mjk,mj->mk", self.vectors**2, self.level)
-        unknown = self.eigenvalues < level
+        unknown = self.clarity < 1.0
         next_one = np.where(unknown, 1.0, self.eigenvalues).min(axis=1, initial=1.0)
         return self.vectors * unknown[:, None, :], _SEEN + _MIXED / next_one
 
@@ -84,12 +90,12 @@ class Knowledge:
         The others, set to zero, change nothing that is determined: along the kernel of N the
         regression is the same.
         """
-        V, spectrum, level = self.vectors[-1], self.eigenvalues[-1], self.level[-1].max(initial=0.0)
+        V, spectrum, level = self.vectors[-1], self.eigenvalues[-1], self.level[-1]
         normalised = (V * np.maximum(spectrum, 0.0)) @ V.T
         chosen = np.flatnonzero(self.parameters[-1]).tolist()
         for j in np.flatnonzero(~self.parameters[-1]).tolist():
             more = [*chosen, j]
-            if np.linalg.eigvalsh(normalised[np.ix_(more, more)])[0] >= level:
+            if np.linalg.eigvalsh(normalised[np.ix_(more, more)])[0] >= level[more].max():
                 chosen = more
         return np.sort(np.array(chosen, dtype=np.intp))
 

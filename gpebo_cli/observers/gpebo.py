@@ -26,6 +26,8 @@ from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import SolverSettings
 
 _GROWN = 2.0  # the largest entry of Φ, from which on A_0 counts as unstable
+_BLOWN = 1e3  # from which on ψ, made of small differences of large terms, tells less than data do
+_CLEAR = 1e4  # times what is rounding: an eigenvalue of N that tells with some digits
 _SOUND = 1e-8  # relative singular values that are surely not zero
 _NOTE = "; observer on the strangeness-free form, {}"
 
@@ -37,7 +39,7 @@ class Gpebo:
     Attributes:
         form: the equations as given, or with all hidden constraints beside them, which takes any
             index and needs no output to see the algebraic states; auto: as given where that does,
-            unless the data determine more on the other form.
+            unless the data determine more on the other form, or with more digits.
         regression: the whole residual, or its last r rows as the paper has it.
         xi_a0: where the dynamic extension starts: by state name, or a list of n_a numbers; None:
             what the plant proposes, else zero.
@@ -102,20 +104,20 @@ class Gpebo:
         if self.form != "auto" or self.regression == "paper" or not isinstance(self.remedy, Plain):
             return self._on(self.form, *arguments)
         found: Observation | SolverError
-        known, everything = -1, system.q + system.n
+        known = everything = (True, system.q + system.n)
         try:
             found = self._on("auto", *arguments)
             if not found.note and not _same_on_both_forms(found, system, signals):
-                known = _determined(found, system, solver)
-            else:
-                known = everything
+                known = _told(found, system, solver)
             why = "which determines more than the equations as given"
+            if not known[0]:
+                why = "which tells with more digits what the equations as given tell, or more"
         except SolverError as error:
-            found, why = error, "for as given its signals are not resolved"
+            found, why, known = error, "for as given its signals are not resolved", (False, -1)
         if known < everything:
             try:
                 other = self._on("strangeness_free", *arguments, _NOTE.format(why))
-                if _determined(other, system, solver) > known:
+                if _told(other, system, solver) > known:
                     return other
             except GpeboError:  # the form does not exist, or not for these signals
                 pass
@@ -179,13 +181,20 @@ class Gpebo:
 def _same_on_both_forms(
     found: Observation, system: DescriptorSystem, signals: Measurements
 ) -> bool:
-    """Whether the equations as given hide nothing: no hidden constraints, and Φ does not grow."""
-    if found.growth is None or found.growth > _GROWN or system.coefficients.signals:
-        return False
-    mesh = signals.mesh
-    c = system.coefficients.taylor(mesh.points[0, :1], 0, mesh.inside[0, :1])
+    """Whether the equations as given hide nothing: no hidden constraints, and Φ does not grow.
+
+    Nor is there another form of differential equations alone.
+    """
+    t, inside = signals.mesh.points[0, :1], signals.mesh.inside[0, :1]
+    follows = system.coefficients.signals
+    along = signals.at(t, inside)[None] if follows else None
+    c = system.coefficients.taylor(t, 0, inside, along)
     U, sigma, V = np.linalg.svd(c.E[0, 0])
     rank = int((sigma > _SOUND * sigma[0]).sum())
+    if rank == system.n:
+        return True
+    if found.growth is None or found.growth > _GROWN or follows:
+        return False
     algebraic = U[:, rank:].T @ c.A[0, 0]  # of index 1 where it is regular on the kernel of E
     size = np.linalg.norm(algebraic, axis=1, keepdims=True)
     if not (size > 0.0).all():
@@ -194,19 +203,23 @@ def _same_on_both_forms(
     return bool(left.min(initial=1.0) > _SOUND)
 
 
-def _determined(found: Observation, system: DescriptorSystem, solver: SolverSettings) -> int:
-    """How many of the unknowns and states the data determine at the end."""
+def _told(
+    found: Observation, system: DescriptorSystem, solver: SolverSettings
+) -> tuple[bool, int]:
+    """Whether it is told with some digits, and how many unknowns and states are at the end."""
     regression, state_map = found.regression, found.state_map
     if not isinstance(state_map, AffineStateMap):
-        return 0
+        return False, 0
     start, stop = regression.mesh.edges[[0, -1]]
     scale = np.broadcast_to(regression.scale, (regression.mesh.size, regression.p))
     asked = regression.gram.final[None], scale[-1:], np.array([stop - start]), solver.tol
-    if smallest_and_margin(*asked)[1][0] >= 1.0:
-        return system.q + system.n
+    steady = found.growth is None or found.growth < _BLOWN
+    if smallest_and_margin(*asked)[1][0] >= _CLEAR:
+        return steady, system.q + system.n
     known = knowledge(*asked)
+    sound = steady and bool(known.clarity[known.clarity >= 1.0].min(initial=np.inf) > _CLEAR)
     seen = known.states(state_map.gain(np.linspace(start, stop, 11)), state_map.units)[-1]
-    return int(known.parameters[0, : system.q].sum() + seen.sum())
+    return sound, int(known.parameters[0, : system.q].sum() + seen.sum())
 
 
 OBSERVER = Gpebo

@@ -10,7 +10,12 @@ import numpy as np
 
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.linalg import orthonormal_complement, transpose, without_rounding
+from gpebo_cli.numerics.linalg import (
+    exact_product,
+    orthonormal_complement,
+    transpose,
+    without_rounding,
+)
 
 _TURNED = 8 * float(np.finfo(float).eps)  # of E outside the frame, relative: rounding
 _PROJECTOR_TURNED = 1e-13
@@ -183,9 +188,9 @@ def split_by_svd(
         )
     n_a = int(ranks[0])
     U1, V1, V2 = U[:, :, :n_a], transpose(Vt)[:, :, :n_a], transpose(Vt)[:, :, n_a:]
-    pinv_E = (V1 / sigma[:, None, :n_a]) @ transpose(U1)  # E⁺
+    pinv_E = without_rounding((V1 / sigma[:, None, :n_a]) @ transpose(U1))  # E⁺
     P = V1 @ transpose(V1)
-    S = pinv_E @ dE @ (V2 @ transpose(V2))  # E⁺ Ė Q
+    S = exact_product(pinv_E, exact_product(dE, without_rounding(V2 @ transpose(V2))))  # E⁺ Ė Q
     turned = float(np.abs(P - P[0]).max(initial=0.0)) >= _PROJECTOR_TURNED
     if basis is None:
         basis = np.eye(system.n) if turned else initial_basis(P[0], n_a, system.states)[0]
