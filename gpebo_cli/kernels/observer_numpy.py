@@ -129,9 +129,10 @@ def regression_signals(
     """
     signs = np.ones(z.shape[2])
     signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ
-    signed = z * signs
-    terms = algebraic @ signed  # [𝒜 ξ_a + g_y | −𝒜 ξ_b − G | 𝒜 Φ]
-    whole = np.abs(algebraic) @ np.abs(z)
+    used = algebraic.any(axis=(0, 1))  # of many coordinates few are seen
+    some, algebraic = z[:, used] * signs, algebraic[:, :, used]
+    terms = algebraic @ some  # [𝒜 ξ_a + g_y | −𝒜 ξ_b − G | 𝒜 Φ]
+    whole = np.abs(algebraic) @ np.abs(some)
     whole[:, :, 0] += np.abs(g_y)
     whole[:, :, 1 : 1 + q] += np.abs(G)
     sizes = whole.max(axis=(0, 1), initial=0.0)
@@ -140,12 +141,16 @@ def regression_signals(
     seen = np.swapaxes(range_, 1, 2) @ terms
     left = terms - range_ @ seen  # R (…)
     axes = _axes(basis)
+    # The state w − K (…) is the offset and minus the gain [X_w ξ_b + X_θ | −X_w Φ], signed likewise
     if axes is None:
-        state = basis @ signed
+        gain = basis @ (z[:, :, 1:] * -signs[1:])
+        offset = z[:, :, 0] @ basis.T
     else:
-        state = np.zeros((len(z), len(basis), z.shape[2]))
-        state[:, axes] = signed
+        offset = np.zeros((len(z), len(basis)))
+        gain = np.zeros((len(z), len(basis), z.shape[2] - 1))
+        offset[:, axes], gain[:, axes] = z[:, :, 0], z[:, :, 1:] * -signs[1:]
     given = elimination.any(axis=(0, 2))
-    state[:, given] -= elimination[:, given] @ seen  # w − K (…): the state, with the same sign
-    # the gain is [X_w ξ_b + X_θ | −X_w Φ]
-    return left[:, :, 0], left[:, :, 1:], state[:, :, 0], -state[:, :, 1:], sizes
+    through = elimination[:, given] @ seen
+    offset[:, given] -= through[:, :, 0]
+    gain[:, given] += through[:, :, 1:]
+    return left[:, :, 0], left[:, :, 1:], offset, gain, sizes
