@@ -7,7 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
+from gpebo_cli.numerics.linalg import (
+    affine_scan,
+    determinant_and_adjugate_action,
+    largest_over_time,
+)
 
 
 def adjugate(omega: np.ndarray) -> np.ndarray:
@@ -55,3 +59,14 @@ def test_affine_scan_is_the_recurrence(width):
 
 def test_affine_scan_of_nothing_is_the_start():
     assert affine_scan(np.zeros((0, 2)), np.zeros((0, 2)), np.ones(2)).tolist() == [[1.0, 1.0]]
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (1, 2), (525, 4, 3), (64, 0), (300, 1), (70, 20, 20)])
+def test_the_largest_sizes_over_time_are_those_of_the_times_one_by_one(shape):
+    values = np.random.default_rng(0).normal(size=shape)
+    expected = np.array([np.abs(one) for one in values]).reshape(shape).max(axis=0, initial=0.0)
+    assert np.array_equal(largest_over_time(values), expected)
+    assert np.array_equal(largest_over_time(values[None].swapaxes(0, 1), 2), expected)
+    if values.size:
+        values[-1] = np.nan
+        assert np.isnan(largest_over_time(values)).all()

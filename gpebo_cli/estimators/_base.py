@@ -114,7 +114,7 @@ class GainEstimator(ABC):
                 least = requirement(replace(self, **once)).gain
                 default = own.metadata["gain"].default
                 chosen[own.name] = _AMPLE * least if 0.0 < least < np.inf else default
-        return replace(self, **chosen)
+        return replace(self, **chosen) if chosen else self
 
     def raised(self, requirement: Requirement) -> Self:
         """The estimator itself, or one with ten times the least gain that would do.

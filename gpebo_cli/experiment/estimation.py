@@ -41,6 +41,7 @@ from gpebo_cli.experiment.uncertainty import (
     standard_deviations,
 )
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, StateMap
 from gpebo_cli.observers._observation import AffineStateMap
@@ -422,8 +423,11 @@ def _natural_sizes(regression: LinearRegression, p: int) -> Array:
 def _sizes(truth: Array, natural: Array, x: Array) -> tuple[Array, Array]:
     """Sizes of the parameters (p,) and states (n,): by these, errors of all kinds are compared."""
     with np.errstate(invalid="ignore"):
-        of_eta = np.fmax(np.fmax.reduce(np.abs(truth), axis=0), _LEAST * natural)
-        return of_eta, np.fmax.reduce(np.abs(x), axis=0)
+        of_eta, of_x = largest_over_time(truth), largest_over_time(x)
+        for size, values in ((of_eta, truth), (of_x, x)):
+            unknown = np.isnan(size)
+            size[unknown] = np.fmax.reduce(np.abs(values[:, unknown]), axis=0)
+        return np.fmax(of_eta, _LEAST * natural), of_x
 
 
 def _judged(source: Source, p: int) -> BoolArray:

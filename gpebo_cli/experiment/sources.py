@@ -14,6 +14,7 @@ from gpebo_cli.experiment.result import RecordingResult, SimulationResult, State
 from gpebo_cli.experiment.verdict import simulation_verdict
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Sampling, build, sampling
 from gpebo_cli.recordings.load import Recording, load
@@ -220,7 +221,7 @@ def _sample_simulation(
     signals, structure = simulation.signals, simulation.structure
     sampler = signals.mesh.sampler(t)
     start = float(signals.mesh.edges[0])
-    size = np.abs(signals.states.values).max(axis=(0, 1), initial=0.0)
+    size = largest_over_time(signals.states.values, 2)
     units = structure.scaling.columns if len(structure.scaling.columns) else np.ones(system.n)
     size = np.maximum(size, _NEVER * units * (size / units).max(initial=0.0))
     jumps = [

@@ -29,7 +29,7 @@ from gpebo_cli.kernels import elements
 from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import estimated_errors, least_sizes
-from gpebo_cli.numerics.linalg import inverse_or_none, largest_within
+from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, unresolved_kinds
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
@@ -146,11 +146,11 @@ def _tail_of_numbers(
             last = np.abs(maps.homogeneous[part, -1])
             made_of = last @ np.abs(values[part, 0]) + np.abs(maps.particular[part, -1])
         else:
-            made_of = np.abs(values[part]).max(axis=0)  # in two steps: that is faster by far
+            made_of = values[part].reshape(-1, *values.shape[2:])
         tail[part] = unresolved_signals(
             problem, mesh.rule, values[part],
             tuple(e if e.shape[:2] == (1, 1) else e[part] for e in maps.extras),
-            made_of.max(axis=0), tol,
+            largest_over_time(made_of), tol,
         )
     return tail
 

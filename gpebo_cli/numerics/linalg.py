@@ -6,12 +6,15 @@ singular value: a one-column product of size 1e-17 has rank 0, not 1.
 
 from __future__ import annotations
 
+from math import prod
+
 import numpy as np
 
 from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray
 
 _TINY = float(np.finfo(float).tiny)
+_ROW = 256  # numbers
 _CANCELLED = 1e-13  # of the terms of an entry: what is left is rounding
 
 
@@ -25,8 +28,8 @@ def without_rounding(found: Array, terms: Array | None = None) -> Array:
         found: overwritten.
         terms: size of what each entry is the sum of, (N or 1, i, j); None: that of the largest.
     """
-    size = np.abs(found).max(axis=0)
-    whole = size.max(initial=0.0) if terms is None else terms.max(axis=0)
+    size = largest_over_time(found)
+    whole = size.max(initial=0.0) if terms is None else largest_over_time(terms)
     found[:, size <= _CANCELLED * whole] = 0.0
     return found
 
@@ -41,12 +44,28 @@ def largest_within(values: Array) -> Array:
     return np.asarray(np.abs(np.swapaxes(values, 0, 1), order="C").max(axis=0))
 
 
+def largest_over_time(values: Array, axes: int = 1) -> Array:
+    """Largest sizes (…) of values (N, …), or of (K, points, …) with two axes of time; 0 of none.
+
+    Reductions are fast along long rows only, so that many times make one row at first.
+    """
+    shape = values.shape[axes:]
+    sizes = np.abs(values, order="C").reshape(prod(values.shape[:axes]), prod(shape))
+    count, width = sizes.shape
+    together = _ROW // max(1, width)
+    if width and count > together > 1:
+        whole = count - count % together
+        rows = sizes[:whole].reshape(-1, together * width).max(axis=0).reshape(together, width)
+        sizes = rows if whole == count else np.concatenate([rows, sizes[whole:]])
+    return np.asarray(sizes.max(axis=0, initial=0.0).reshape(shape))
+
+
 def exact_product(left: Array, right: Array) -> Array:
     """left @ right (N, i, k), for matrices (N or 1, i, j) and (N or 1, j, k), without rounding.
 
     What is not zero in a row of ``left`` counts as being of that row's size.
     """
-    size = np.abs(left).max(axis=(0, 2), initial=0.0)[:, None]
+    size = largest_over_time(left).max(axis=1, initial=0.0)[:, None]
     return without_rounding(left @ right, size * ((left != 0.0) @ np.abs(right)))
 
 

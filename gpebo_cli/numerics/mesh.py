@@ -13,7 +13,7 @@ from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import elements, signals
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.linalg import largest_within
+from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.radau import RadauRule
 
 # Functions that jump are decided this far (relative to the element) inside its ends, so that both
@@ -366,7 +366,7 @@ def signal_scale(values: Array, floor: float = 0.0) -> Array:
     A component more than three orders below the largest one, or below ``floor``, is measured
     against that: rounding in the large ones reaches it.
     """
-    size = np.abs(values).max(axis=(0, 1))
+    size = largest_over_time(values, 2)
     return np.asarray(np.maximum(size, max(SHARE * float(size.max(initial=0.0)), floor, _TINY)))
 
 

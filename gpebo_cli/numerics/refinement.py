@@ -100,16 +100,17 @@ def wanted_parts(tail: Array, poor: BoolArray, tol: float, stages: int) -> IntAr
 def _check_budget(
     mesh: Mesh, tail: Array, parts: IntArray, max_elements: int, name: str
 ) -> None:
+    # Next to t = 0 floating point resolves any transient; elsewhere 64 units in the last place.
+    cut = (parts > 1).nonzero()[0]
+    short = (mesh.steps[cut] < 64 * EPS * np.abs(mesh.edges[cut + 1])).any()
     worst = int(np.argmax(tail))
     t = mesh.edges[worst]
-    # Next to t = 0 floating point resolves any transient; elsewhere 64 units in the last place.
-    resolution = 64 * EPS * np.abs(mesh.edges[1:])
     if parts.sum() > max_elements:
         raise SolverError(
             f"the {name} is not resolved with {max_elements} elements; worst near "
             f"t = {t:.6g} (tail {tail[worst]:.1e}); raise solver.max_elements or solver.tol"
         )
-    if (mesh.steps < resolution)[parts > 1].any():
+    if short:
         raise SolverError(
             f"the {name} cannot be resolved near t = {t:.6g}: elements reached the "
             f"resolution of floating point (tail {tail[worst]:.1e}); is there a jump or a "

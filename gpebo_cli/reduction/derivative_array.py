@@ -18,6 +18,7 @@ import numpy as np
 
 from gpebo_cli.kernels.structure_numpy import forcing as kernel_forcing
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, distinct
+from gpebo_cli.numerics.linalg import largest_over_time
 
 _KEPT = 40  # states, up to which what the pattern of E and A alone decides is kept
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
@@ -52,7 +53,7 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     state or the time by a number changes its factor alone. Terms of E count ``mass`` times.
     """
     n = c.E.shape[2]
-    sizes = np.array([np.abs(distinct(matrix)[0]).max(axis=0) for matrix in (c.E, c.A)])
+    sizes = np.array([largest_over_time(distinct(matrix)[0]) for matrix in (c.E, c.A)])
     there = sizes > 0.0
     while True:
         balancing = _balancing if n <= _KEPT else _balancing.__wrapped__

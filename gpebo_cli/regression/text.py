@@ -24,6 +24,7 @@ from gpebo_cli.model.expressions import Expression, Tape, breakpoints_of_tape, n
 from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.syntax import signal
 from gpebo_cli.model.plant import plant_from_mapping, read_parameters
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import resolve
@@ -171,7 +172,7 @@ class TextRegression:
 def _jumps(signals: Trajectory) -> Array:
     """Edges at which some signal jumps by more than rounding."""
     left, right = signals.values[:-1, -1], signals.values[1:, 0]
-    size = np.abs(signals.values).max(axis=(0, 1), initial=0.0)
+    size = largest_over_time(signals.values, 2)
     found = (np.abs(right - left) > 1e-9 * size).any(axis=1)
     return np.asarray(signals.mesh.edges[1:-1][found])
 

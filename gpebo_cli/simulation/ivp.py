@@ -17,6 +17,7 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels.structure_numpy import derivative_array, scaled
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.collocation import LinearSolution, at_points, unresolved_signals
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearProblem
 from gpebo_cli.reduction.derivative_array import forcing
@@ -98,7 +99,7 @@ def solve(
         values = _sample(problem, mesh, max(tol, 1e-13), restarts or {})
         extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
         extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in extras)
-        sizes = np.abs(values).max(axis=(0, 1))
+        sizes = largest_over_time(values, 2)
         plain = replace(problem, apart=False)
         tail = unresolved_signals(plain, mesh.rule, values, extras, sizes, tol)
         poor = tail > 1e3 * tol  # its dense output is of lower order than its steps

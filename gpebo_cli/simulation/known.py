@@ -76,11 +76,19 @@ def known_joined(
     system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients], mesh: Mesh,
     c: Coefficients, cuts: Array, tol: float, longest: float,
 ) -> tuple[Mesh, Coefficients]:
-    """Elements joined where known functions are resolved all the same; the cuts (B,) stay."""
+    """Elements joined where known functions are resolved all the same; the cuts (B,) stay.
+
+    The mesh is kept with the matrices of a text, as :func:`gpebo_cli.reduction.structure.analyse`
+    keeps what it finds.
+    """
     if 2.0 * float(mesh.steps.min()) > longest:
         return mesh, c
-    values, counts = _known_kinds(system, c, mesh)
-    joined = mesh.joined(values, counts, tol, cuts, longest)
+    kept: dict[object, Mesh] = getattr(system.coefficients, "kept", {})
+    asked = mesh.edges.tobytes(), mesh.rule, len(c.E), cuts.tobytes(), tol, longest
+    if asked not in kept:
+        values, counts = _known_kinds(system, c, mesh)
+        kept[asked] = mesh.joined(values, counts, tol, cuts, longest)
+    joined = mesh if kept[asked].size == mesh.size else kept[asked]
     return joined, c if joined is mesh else evaluated(joined)
 
 

@@ -18,7 +18,7 @@ from gpebo_cli.model.descriptor import (
 )
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes
-from gpebo_cli.numerics.linalg import inverse_or_none
+from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
 from gpebo_cli.numerics.mesh import (
     FIRST_ELEMENTS,
     SHARE,
@@ -128,9 +128,9 @@ def _simulate_linear(
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
         y = _outputs(C, values[..., 0], *direct)
-        size = np.abs(values[..., 0]).max(axis=0).max(axis=0)
+        size = largest_over_time(values[..., 0], 2)
         least = least_sizes(problem, size[:, None], solver.tol)[:, 0]
-        least = np.abs(C).max(axis=0).max(axis=0) @ least
+        least = largest_over_time(C, 2) @ least
         return [(u, SHARE * terms(size)), (y, least)]
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
@@ -243,10 +243,11 @@ def _amplification(form: StrangenessFree, units: Array, step: float) -> Array:
     else:
         T = form.basis[some]
     found = form.amplification.copy()
-    sizes = np.abs(T) / units[:, None] * (np.abs(E1) @ units)[:, None]
+    T, E1 = np.abs(T), np.abs(E1)
+    sizes = T / units[:, None] * (E1 @ units)[:, None]
     rounding = np.where(sizes > NOTHING * sizes.max(initial=0.0), 1.0, 1.0 / EPS)
-    found[:, :-1] += ((np.abs(T) * rounding) @ np.abs(E1)).max(axis=0)
-    within = np.minimum(step * (np.abs(T) @ np.abs(A1)).max(axis=0), 1.0)
+    found[:, :-1] += ((T * rounding) @ E1).max(axis=0)
+    within = np.minimum(step * (T @ np.abs(A1)).max(axis=0), 1.0)
     once = within @ found
     return np.asarray(found + once + within @ once)
 
@@ -293,14 +294,13 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
     An input whose share of every equation is rounding of the others' is rounding itself.
     """
     if not c.B.shape[3]:
-        return lambda _size: c.u[0, 0]
-    A, B = (np.abs(distinct(matrix)[0]).max(axis=0) for matrix in (c.A, c.B))
+        return lambda _size: np.zeros(0)
+    A, B = (largest_over_time(distinct(matrix)[0]) for matrix in (c.A, c.B))
+    seen = [(A[column > 0.0], column[column > 0.0]) for column in B.T]
 
     def terms(size: Array) -> Array:
-        none = np.full_like(B, np.inf)
-        least = np.divide((A @ size)[:, None], B, out=none, where=B > 0.0)
-        least = least.min(axis=0, initial=np.inf)
-        return np.where(np.isfinite(least), least, 0.0)
+        least = [float((a @ size / b).min()) if len(b) else 0.0 for a, b in seen]
+        return np.array([one if isfinite(one) else 0.0 for one in least])
 
     return terms
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import orthonormal_complement, transpose
+from gpebo_cli.numerics.linalg import largest_over_time, orthonormal_complement, transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 
@@ -37,30 +38,36 @@ class Assembled:
         They come one after the other, because all signals of a long recording take much memory.
         """
         columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
-        psi = self.psi / np.tile(columns, (self.psi.shape[1], 1))
-        states = (np.abs(self.gain).max(axis=0) / columns).max(axis=1, initial=0.0)
+        rows, Y, psi = self._rows, self.Y, self.psi
+        if len(rows) < Y.shape[1]:
+            Y, psi = Y[:, rows], psi[:, rows]
+        psi = psi / np.tile(columns, (psi.shape[1], 1))
+        states = (largest_over_time(self.gain) / columns).max(axis=1, initial=0.0)
         if self.Y_scale > 0.0:  # a state that no parameter has part in is no signal to resolve
-            own = np.abs(self.offset).max(axis=0, initial=0.0) / self.Y_scale
+            own = largest_over_time(self.offset) / self.Y_scale
             states = np.maximum(states, 1e-3 * own)
-        yield self.Y, 1e-3 * self.Y_scale
+        yield Y, 1e-3 * self.Y_scale
         yield psi, 1e-3
         yield self.offset, 0.0
         yield self.gain / (np.where(states > 0.0, states, 1.0)[:, None] * columns), 0.0
         # Of ψᵀψ the diagonal: a product of two columns that are resolved shows no more than theirs.
         yield (psi**2).sum(axis=1), 1e-3
-        yield np.einsum("nrp,nr->np", psi, self.Y), 1e-3 * self.Y_scale
+        yield np.einsum("nrp,nr->np", psi, Y), 1e-3 * self.Y_scale
 
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
-        if regression != "paper":
-            in_psi, in_Y = np.abs(self.psi).max(axis=0), np.abs(self.Y).max(axis=0)
-            large = (in_psi > _VANISHING * self.column_scale).any(axis=1)
-            large |= in_Y > _VANISHING * self.Y_scale
-            kept: IntArray = large.nonzero()[0]
-            if len(kept):
-                return kept
+        if regression != "paper" and len(self._rows):
+            return self._rows
         rows = self.Y.shape[1]
         return np.arange(rows - system.r, rows)  # eq. (regpsi)
+
+    @cached_property
+    def _rows(self) -> IntArray:
+        """Rows of the residual that are more than rounding of their terms."""
+        in_psi, in_Y = largest_over_time(self.psi), largest_over_time(self.Y)
+        large = (in_psi > _VANISHING * self.column_scale).any(axis=1)
+        kept: IntArray = (large | (in_Y > _VANISHING * self.Y_scale)).nonzero()[0]
+        return kept
 
 
 def regression_signals(

@@ -12,6 +12,7 @@ from gpebo_cli.errors import ModelError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import (
     exact_product,
+    largest_over_time,
     orthonormal_complement,
     transpose,
     without_rounding,
@@ -63,7 +64,7 @@ class Frame:
 
 def entry_sizes(E: Array) -> Array:
     """Largest size of each entry of E (N, n, n) over the times, (n, n)."""
-    return np.asarray(np.abs(E).max(axis=0))
+    return largest_over_time(E)
 
 
 def axes_frame(entries: Array) -> Frame | None:
