@@ -48,6 +48,8 @@ PAYLOADS = {
     "dotted": "hydra.callbacks.x._target_: os.mkdir",
     "another case": "Hydra: {callbacks: {x: CALL}}",
     "value": "title: CALL",
+    "sweep of an interpolation":
+        r"hydra: {mode: MULTIRUN, sweeper: {params: {title: '$\{oc.env\:SECRET\}'}}}",
     "deep": "time: {horizon: CALL}",
     "interpolation": "title: '${oc.env:SECRET}'",
     "escaped interpolation": 'title: "\\x24{oc.env:SECRET}"',
@@ -175,6 +177,7 @@ def test_a_recipe_may_sweep_and_nothing_else(tmp_path):
 @pytest.mark.parametrize("override", [
     f"+hydra.callbacks.x={CALL}", "hydra.launcher._target_=os.mkdir",
     "+plant.parameters={_target_: os.mkdir}", "hydra.searchpath=[file:///tmp]",
+    "title=${oc.env:SECRET}", r"title=$\{oc.env\:SECRET\}", "title=[{a: '${plant.name}'}]",
 ])
 def test_the_second_line_holds_without_the_first(tmp_path, override):
     """What is composed is checked, too, whoever wrote it."""

@@ -31,7 +31,6 @@ from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.types import RunMode
 from hydra.version import setbase
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from gpebo_cli.cli.arguments import Arguments, quoted
 from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS, explain
@@ -237,25 +236,21 @@ def show(hydra: Hydra, arguments: Arguments) -> bool:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration without Hydra's section as plain data, interpolations resolved.
+    """The configuration without Hydra's section as plain data.
 
-    In the plant there are none: it is text that may come from a stranger, and an interpolation in
-    it could read environment variables or other parts of the configuration.
+    There are no interpolations in it: a stranger's sweep can give values that Hydra's grammar turns
+    into one, and it could read environment variables or other parts of the configuration.
 
     Raises:
-        ConfigError: an interpolation in the plant, or a value that is still missing (``???``).
+        ConfigError: an interpolation, or a value that is still missing (``???``).
     """
-    config = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    plant = config.get("plant")
-    if not isinstance(plant, DictConfig):
+    content = cast("dict[str, Any]", OmegaConf.to_container(config, resolve=False))
+    content.pop("hydra", None)
+    if not isinstance(content.get("plant"), dict):
         raise ConfigError("plant.name is missing; choose a file with plant=NAME")
-    for where, value in _leaves(OmegaConf.to_container(plant, resolve=False), "plant"):
+    for where, value in _leaves(content, ""):
         if "${" in f"{where}{value}":
-            raise ConfigError(f"{where}: ${{…}} is not allowed in a plant; write the value")
-    try:
-        missing = sorted(OmegaConf.missing_keys(config))
-        if missing:
-            raise ConfigError(f"{missing[0]} has no value yet (???); give it one")
-        return cast("dict[str, Any]", OmegaConf.to_container(config, resolve=True))
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"{error.full_key or 'configuration'}: {error.msg}") from error
+            raise ConfigError(f"{where}: ${{…}} is not allowed; write the value")
+        if value == "???":
+            raise ConfigError(f"{where} has no value yet (???); give it one")
+    return content

@@ -201,9 +201,12 @@ def _hydra(path: str, section: object) -> dict[str, Any]:
                 f"--config-dir; allowed: mode, {', '.join(f'sweeper.{k}' for k in _SWEEPER_KEYS)}"
             )
         params = sweeper.get("params") or {}
-        for name in params if isinstance(params, dict) else [params]:
-            if not (isinstance(name, str) and _SWEPT.fullmatch(name)):
-                raise ConfigError(f"{path}: hydra.sweeper.params: {shown(name)} cannot be swept")
+        for name, values in params.items() if isinstance(params, dict) else [(params, "")]:
+            # A backslash can hide ``${`` in what Hydra's grammar reads.
+            if not (isinstance(name, str) and _SWEPT.fullmatch(name)) or "\\" in str(values):
+                raise ConfigError(
+                    f"{path}: hydra.sweeper.params: {shown(f'{name}={values}')} cannot be swept"
+                )
         allowed[key] = value
     return allowed
 
