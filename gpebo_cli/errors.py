@@ -7,6 +7,8 @@ returns :attr:`GpeboError.exit_code`; anything else that escapes is a bug.
 
 from __future__ import annotations
 
+_MOST = 2.0  # GB
+
 
 class GpeboError(Exception):
     """A run or a check that failed for a reason its user can act on (exit code 1)."""
@@ -26,3 +28,20 @@ class ModelError(GpeboError):
 
 class SolverError(GpeboError):
     """The solver cannot reach the tolerance it was asked for."""
+
+
+def check_memory(what: str, numbers: float) -> None:
+    """Refuse what would hold more than a run may: a machine that swaps stands still.
+
+    Args:
+        what: asks for it; the setting and its value.
+        numbers: of 8 bytes each that it would hold, estimated.
+
+    Raises:
+        ConfigError: names the setting, what it would need, and the limit.
+    """
+    size = 8e-9 * numbers
+    if size > _MOST:
+        raise ConfigError(
+            f"{what} would take some {size:.3g} GB of memory; a run may take {_MOST:g} GB"
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import subprocess
 import sys
@@ -422,3 +423,23 @@ def test_an_estimator_of_another_package(tmp_path):
 def test_the_span_that_a_default_decides_is_written_down():
     result = run("circuit", observer="none", time={"samples": 11})
     assert result.config["time"] == {"start": 0.0, "horizon": 20.0, "samples": 11}
+
+
+NOISY = {"name": "gaussian", "outputs": 0.1, "sample_time": 1.0, "seeds": 3}
+
+
+@pytest.mark.parametrize(("settings", "what"), [
+    ({"estimator": "gradient", "gamma": [1, 10, 100]}, "3 cases"),
+    ({"observer": {"sample_time": 0.1}}, "201 samples with 1 cases"),
+    ({"observer": "kalman_bucy", "noise": NOISY},
+     "3 noise.seeds with 1 cases"),
+    ({"noise": NOISY}, "3 noise.seeds with 1 cases"),
+])
+def test_what_would_take_minutes_is_refused_when_that_is_known(monkeypatch, settings, what):
+    """With a clock that is 100 s later at every look, and one thing at a time."""
+    experiment = "gpebo_cli.experiment"
+    monkeypatch.setattr(f"{experiment}.pace.process_time", itertools.count(0, 100).__next__)
+    for name in ("estimation._BATCH", "estimation._SAMPLES_AT_ONCE", "seeds._NUMBERS"):
+        monkeypatch.setattr(f"{experiment}.{name}", 1)
+    with pytest.raises(GpeboError, match=f"^{what} would take some .* s of computing time"):
+        run("window", **settings)

@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gpebo_cli.errors import SolverError
+from gpebo_cli.errors import SolverError, check_memory
 from gpebo_cli.estimators._extension import low_pass
 from gpebo_cli.estimators._mixing import SINGULAR
 from gpebo_cli.model.descriptor import Array
@@ -27,6 +27,7 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 
 _PICARD_ROUNDS = 200
+_HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
 
@@ -134,6 +135,16 @@ class Spectrum:
             return np.full(len(self.memory), beta)
         smallest = alpha * self.eigenvalues[:, 0] + self.memory * f0
         return np.asarray(beta * (1.0 - 1.0 / (smallest * bound)))
+
+
+def check_held(regression: LinearRegression, count: int) -> None:
+    """Refuse so many :func:`information` at once, where they would hold too much memory.
+
+    Raises:
+        ConfigError: says how much, and how much they may.
+    """
+    what = f"{count} combinations of alpha, f0 and beta, each with matrices of its own,"
+    check_memory(what, _HELD * regression.outer.values.size * count)
 
 
 def information(

@@ -11,7 +11,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._following import SolvedEstimates
-from gpebo_cli.estimators._information import InformationAt, Spectrum, information
+from gpebo_cli.estimators._information import InformationAt, Spectrum, check_held, information
 from gpebo_cli.estimators._recursive import InformationRoot, integrating, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
@@ -74,10 +74,13 @@ class LeastSquares(ResumableEstimator):
         bound = self.covariance_bound
         made: dict[tuple[float, ...], tuple[InformationAt, ExtensionState]] = {}
         out = []
-        for i, case in enumerate(self.cases):
-            key: tuple[float, ...] = (case["beta"],)
-            if bound is not None and case["beta"] > 0:
-                key = (case["alpha"], case["f0"], case["beta"])
+        bounded = bound is not None and max(self.axes()["beta"]) > 0.0
+        keys = [
+            (case["alpha"], case["f0"], case["beta"]) if bounded else (case["beta"],)
+            for case in self.cases
+        ]
+        check_held(regression, len(set(keys)))
+        for i, (case, key) in enumerate(zip(self.cases, keys, strict=True)):
             if key not in made:
                 info = information(
                     regression, case["alpha"], case["f0"], case["beta"], bound,

@@ -13,7 +13,7 @@ from itertools import repeat
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._information import Information, Spectrum, information
+from gpebo_cli.estimators._information import Information, Spectrum, check_held, information
 from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement, scalar_errors
 from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import ScalarLaw, integrating, quotient_of
@@ -104,6 +104,7 @@ class LsDrem(ResumableEstimator):
     ) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,)."""
         part = self.least_squares
+        check_held(regression, len(part.cases))
         infos = tuple(
             information(
                 regression, case["alpha"], case["f0"], case["beta"], part.covariance_bound,

@@ -29,8 +29,10 @@ from gpebo_cli.evidence.metrics import (
 )
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
+from gpebo_cli.experiment.memory import check_samples
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
+from gpebo_cli.experiment.pace import Pace
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
@@ -187,6 +189,7 @@ def at_samples(
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
     with stage("observe and estimate") as share:
         t = sample_times(samples.step, start, stop)
+        check_samples(len(estimator.cases), len(t), system)
         u, y = source.inputs(t), source.outputs(t)
         first = np.append(u[0], y[0])
 
@@ -199,11 +202,12 @@ def at_samples(
                 settings, system, samples.hold, start, first, by, wanted, source.derivatives
             )
             made = []
+            pace = Pace(len(t), f"samples with {len(estimator.cases)} cases", share)
             for i in range(0, len(t), _SAMPLES_AT_ONCE):
                 part = slice(i, i + _SAMPLES_AT_ONCE)
                 found = online.feed(t[part], u[part], y[part])
                 made += [found] if last else []
-                share(min(part.stop / len(t), 1.0))
+                pace(min(part.stop, len(t)))
             return online, made
 
         estimator = estimators.tuned_for(
@@ -348,6 +352,7 @@ def _estimate(
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
     numbers = np.empty((len(METRICS) + each * (p + n), size))
     batch = max(1, _BATCH // (len(grid) * (2 * p + n)))
+    pace = Pace(size, "cases", share)
     for first in range(0, size, batch):
         part = slice(first, min(first + batch, size))
         eta = estimates.parameters(part)
@@ -357,7 +362,7 @@ def _estimate(
             eta = whole
         found, parameters[part], estimated[part] = evaluate(eta)
         numbers[:, part] = found[: len(numbers)]
-        share(part.stop / size)
+        pace(part.stop)
     checks = state_map.checks(kept, estimated)
     explaining = parameters[:, -1].copy()
     parameters[..., np.isnan(told[0])] = np.nan

@@ -6,17 +6,16 @@ from math import prod
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, check_memory
 from gpebo_cli.experiment.noise import NoiseLevels
 from gpebo_cli.experiment.sources import kept_samples
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.settings import Settings
 
-_MOST = 2.0  # GB
 _HELD = 4  # arrays of every kind that are alive at once; measured
 
 
-def check_memory(
+def check(
     settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cases: int
 ) -> None:
     """Refuse a run that would need more memory than one run may.
@@ -30,25 +29,33 @@ def check_memory(
     Raises:
         ConfigError: names the setting, what it would need, and the limit.
     """
-    for what, size in _needs(settings, system, levels, cases, system.n).items():
-        if size <= _MOST:
-            continue
-        start = settings.time.start
-        start = start if np.isfinite(start) else 0.0  # of a recording: its own
-        source, at = system.coefficients.of_time, np.array([start])
-        E = source.taylor(at, 0).E[0, 0] if system.n else np.zeros(0)
-        rank = int(np.linalg.matrix_rank(E)) if E.size and np.isfinite(E).all() else system.n
-        size = _needs(settings, system, levels, cases, rank)[what]  # noqa: PLW2901
-        if size > _MOST:
-            raise ConfigError(
-                f"{what} would take some {size:.3g} GB of memory; a run may take {_MOST:g} GB"
-            )
+    for what, numbers in _needs(settings, system, levels, cases, system.n).items():
+        try:
+            check_memory(what, numbers)
+        except ConfigError:
+            # The rank of E, which takes a while to find, makes it less.
+            start = settings.time.start
+            start = start if np.isfinite(start) else 0.0  # of a recording: its own
+            source, at = system.coefficients.of_time, np.array([start])
+            E = source.taylor(at, 0).E[0, 0] if system.n else np.zeros(0)
+            rank = int(np.linalg.matrix_rank(E)) if E.size and np.isfinite(E).all() else system.n
+            check_memory(what, _needs(settings, system, levels, cases, rank)[what])
+
+
+def check_samples(cases: int, samples: int, system: DescriptorSystem) -> None:
+    """The same of estimates at samples.
+
+    Raises:
+        ConfigError: they would need more.
+    """
+    numbers = 2 * _HELD * cases * samples * (system.q + 2 * system.n)
+    check_memory(f"{cases} cases at {samples} samples", numbers)
 
 
 def _needs(
     settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cases: int, rank: int
 ) -> dict[str, float]:
-    """Gigabytes by the setting that asks for them, where E has so large a rank."""
+    """Numbers held by the setting that asks for them, where E has so large a rank."""
     time, n, signals = settings.time, system.n, system.m + system.r
     p = system.q + rank
     regression = (p + 1) * (n + p) if cases else n
@@ -62,4 +69,4 @@ def _needs(
         needs[f"noise.sample_time = {settings.noise.sample_time:g} s"] = (
             elements, settings.solver.stages + 1, n**2 + regression + signals * (p + 1),
         )
-    return {what: 8e-9 * _HELD * prod(numbers) for what, numbers in needs.items()}
+    return {what: _HELD * prod(numbers) for what, numbers in needs.items()}

@@ -15,10 +15,9 @@ from typing import Any, Self
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment import several, sources
+from gpebo_cli.experiment import memory, several, sources
 from gpebo_cli.experiment.assumptions import of_observation, warnings
 from gpebo_cli.experiment.estimation import Share, at_samples, continuous
-from gpebo_cli.experiment.memory import check_memory
 from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
@@ -116,7 +115,7 @@ def _experiment(
     if observer is not None and estimator is None:
         estimator = estimators.build(settings.estimator)
     check_seeds(settings.noise, levels, settings.time.horizon)
-    check_memory(settings, system, levels, 0 if estimator is None else len(estimator.cases))
+    memory.check(settings, system, levels, 0 if estimator is None else len(estimator.cases))
     stage = _Clock(progress)
     recorded, samples = settings.data.name == "csv", sampling(observer)
     with stage("read" if recorded else "simulate"):

@@ -25,6 +25,7 @@ from gpebo_cli.experiment.noise import (
     on_mesh,
     sampled_mesh,
 )
+from gpebo_cli.experiment.pace import Pace
 from gpebo_cli.experiment.result import NoiseStatistics
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
@@ -89,9 +90,11 @@ def over_seeds(
     Raises:
         ModelError: an assumption of the observer fails along some noise.
         SolverError: a tolerance cannot be reached.
+        ConfigError: all seeds would take longer than a run may.
     """
     horizon = observation.regression.mesh.edges[-1:]
     seeds = range(settings.seed, settings.seed + settings.seeds)
+    pace = Pace(len(seeds), f"noise.seeds with {len(estimator.cases)} cases", share)
     if observation.respond is None:
         found = []
         for done, seed in enumerate(seeds, 1):
@@ -99,13 +102,13 @@ def over_seeds(
             eta = estimate(own.estimator or estimator, own.regression, horizon)
             truth = own.truth(horizon, theta, signals.states)[0]
             found.append(eta.parameters(slice(None))[:, 0] - truth)
-            share(done / len(seeds))
+            pace(done)
         error = np.stack(found, axis=-1)
     else:
         added, found = _added(observation, observation.respond, signals, settings, levels), []
         for many in added:
             found.append(estimator.estimate(many, horizon).parameters(slice(None))[:, 0])
-            share(sum(part.shape[-1] for part in found) / len(seeds))
+            pace(sum(part.shape[-1] for part in found))
         error = np.concatenate(found, axis=-1)
         error -= observation.truth(horizon, theta, signals.states)[0][:, None]
     return NoiseStatistics(
