@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gpebo_cli.cli.app import entry
+from gpebo_cli.cli.start import entry
 
 if __name__ == "__main__":
     entry()

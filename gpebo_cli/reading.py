@@ -25,7 +25,13 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise ConfigError(f"{path} is not a regular file")
-    return os.fdopen(descriptor, "rb")
+    stream = os.fdopen(descriptor, "rb")
+    try:
+        stream.peek(1)
+    except OSError as error:  # of /proc, for instance
+        stream.close()
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+    return stream
 
 
 def read_text(path: str | os.PathLike[str], limit: int) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -57,3 +58,11 @@ def test_without_a_signal_nothing_happens_and_all_is_as_before():
         assert signal.getsignal(signal.SIGINT) is not handler
     assert signal.getsignal(signal.SIGINT) is handler
     assert sys.unraisablehook is hook
+
+
+def test_a_signal_before_anything_is_loaded_is_answered():
+    words = "from gpebo_cli.cli import start; import signal; signal.raise_signal(signal.SIGINT)"
+    done = subprocess.run(
+        [sys.executable, "-c", words], check=False, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (130, "gpebo: error: interrupted\n")

@@ -241,6 +241,13 @@ def test_links_lead_nowhere_but_inside(tmp_path):
     assert not marker.exists()
 
 
+@pytest.mark.skipif(not os.path.exists("/proc/self/mem"), reason="needs /proc")
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    done = gpebo("run", "data.file=/proc/self/mem", "figures=none", cwd=tmp_path)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "/proc/self/mem cannot be read" in done.err
+
+
 BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n"
     for a, b in zip("abcdefgh", "bcdefghi", strict=True)

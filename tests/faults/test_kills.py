@@ -30,7 +30,7 @@ COMMANDS = {
     "compare": ["compare", "WHOLE", "--output", "out"],
 }
 # A signal before our first line is the interpreter's, so the file says when that was reached.
-BEGIN = "from gpebo_cli.cli.app import entry; open('begun', 'w').close(); entry()"
+BEGIN = "from gpebo_cli.cli.start import entry; open('begun', 'w').close(); entry()"
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 
