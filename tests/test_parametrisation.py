@@ -234,6 +234,34 @@ def test_monotony_is_verified_on_the_whole_box(entries, T, message):
     assert found.mu > 0.1 * least
 
 
+def test_places_of_the_box_without_a_value_are_named():
+    p = regression_from_mapping({**TEXT, "S": ["sqrt(a - 0.5)", "b", "1", "2"]}).parametrisation
+    made = replace(given()[0], parametrisation=p)
+    with pytest.raises(ConfigError, match=r"S\[0\] .* has no finite value at a = 0\.\d+, b = "):
+        estimators.build(MONOTONE).estimate(made, np.array([1.0]))
+    with pytest.raises(ConfigError, match=r"unknowns\.a = 7 is not within its box"):
+        regression_from_mapping({**TEXT, "unknowns": {"a": 7, "b": 0.5}})
+
+
+@pytest.mark.parametrize("estimator", [
+    {"name": "least_squares", "f0": [1e-9, 1.0]}, MONOTONE,
+], ids=lambda e: e["name"])
+def test_seeds_say_how_well_the_unknowns_are_estimated(estimator):
+    """Bias and deviation of θ̂ over seeds are those of runs with one seed each."""
+    noise = {"name": "gaussian", "outputs": 0.05, "sample_time": 0.1}
+    given = {"regression": TEXT, "estimator": estimator, "time": {"horizon": 3}}
+    found = run(**given, noise={**noise, "seeds": 2}).details.noise
+    single = np.array([
+        [run_i.estimates[name][:, -1] for name in ("a", "b")]
+        for run_i in (run(**given, noise={**noise, "seed": i}) for i in range(2))
+    ])
+    assert found.names[-2:] == ("a", "b")
+    np.testing.assert_allclose(found.truth[-2:], [2.0, 0.5])
+    expected = single.mean(axis=0).T - [2.0, 0.5]
+    np.testing.assert_allclose(found.bias[:, -2:], expected, atol=1e-8)
+    np.testing.assert_allclose(found.deviation[:, -2:], single.std(axis=0, ddof=1).T, atol=1e-8)
+
+
 def test_the_monotone_gradient_is_for_parametrisations():
     with pytest.raises(ConfigError, match="is for a regression with S and box"):
         run("circuit", estimator="monotone", time={"horizon": 1})

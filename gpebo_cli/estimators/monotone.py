@@ -90,12 +90,12 @@ class Monotone(GainEstimator):
         S, T = made.S, made.T
 
         def of_case(gamma: float) -> ErrorsAt:
-            path = made.solution(gamma, 0)
+            path = made.solution(gamma)
 
             def at(t: Array, inside: Array) -> ErrorSystem:
                 omega = extended(t, inside)[..., :k]
                 delta, adjugate, _ = determinant_and_adjugate_action(omega)
-                slope, weighted = S.jacobian(path(t)), gamma * delta[:, None, None] * T
+                slope, weighted = S.jacobian(path(t)[:, 0]), gamma * delta[:, None, None] * T
                 law = delta[:, None, None] * (weighted @ slope)
                 into = rates[:, None] * transpose(regression.psi(t, inside))
                 return filtered_errors(rates, into, law, weighted @ adjugate, slope)
@@ -117,37 +117,36 @@ class MonotoneEstimates:
     gains: Array  # (g,)
     realisations: tuple[int, ...]
 
-    def solution(self, gamma: float, column: int) -> Callable[[Array], Array]:
-        """θ̂ (N, q) at times (N,), of one realisation of Y.
+    def solution(self, gamma: float) -> Callable[[Array], Array]:
+        """θ̂ (N, c, q) at times (N,), for c realisations of Y.
 
         Raises:
             SolverError: the law cannot be integrated.
         """
-        path, k = self.path, self.T.shape[1]
+        path, (q, k), count = self.path, self.T.shape, int(np.prod(self.realisations))
 
         def rates(t: float, theta: Array) -> Array:
             delta, Y, _ = path.signals(np.array([t]), np.array([t]))
-            rest = Y.reshape(k, -1)[:, column] - delta[0] * self.S.values(theta[None])[0]
-            return np.asarray(gamma * delta[0] * (self.T @ rest))
+            rest = Y.reshape(k, count).T - delta[0] * self.S.values(theta.reshape(count, q))
+            return np.asarray(gamma * delta[0] * (rest @ self.T.T)).ravel()
 
         edges, size = path.mesh.edges, np.abs(self.S.high - self.S.low)
-        found = solve_ivp(
-            rates, (edges[0], edges[-1]), self.start, method="LSODA", dense_output=True,
-            rtol=_TOLERANCE, atol=_TOLERANCE * size, max_step=float(path.mesh.steps.max()),
+        found = solve_ivp(  # no realisation acts on another: the Jacobian is banded
+            rates, (edges[0], edges[-1]), np.tile(self.start, count), method="LSODA",
+            rtol=_TOLERANCE, atol=np.tile(_TOLERANCE * size, count), dense_output=True,
+            max_step=float(path.mesh.steps.max()), lband=q - 1, uband=q - 1,
         )
         if not found.success or found.sol is None:
             raise SolverError(f"the monotone law cannot be integrated: {found.message}")
         sol = found.sol
-        return lambda t: np.asarray(sol(t).T)
+        return lambda t: np.asarray(sol(t).T).reshape(len(t), count, q)
 
     def parameters(self, cases: slice) -> Array:
         """η̂ = S(θ̂) of some cases, (g, M, k), or (g, M, k, c) for c realisations."""
-        t, count = self.path.t, int(np.prod(self.realisations))
-        eta = np.array([
-            [self.S.values(self.solution(float(gamma), c)(t)) for c in range(count)]
-            for gamma in self.gains[cases]
-        ])
-        return np.moveaxis(eta, 1, 3).reshape(*eta.shape[:1], *eta.shape[2:], *self.realisations)
+        theta = np.array([self.solution(float(gamma))(self.path.t) for gamma in self.gains[cases]])
+        eta = self.S.values(theta.reshape(-1, theta.shape[-1])).reshape(*theta.shape[:3], -1)
+        shape = (*theta.shape[:2], eta.shape[-1], *self.realisations)
+        return np.asarray(np.moveaxis(eta, 2, 3).reshape(shape))
 
     def delta(self, t: Array) -> Array:
         """Δ at the times t (M,), (1, M)."""

@@ -100,26 +100,50 @@ def over_seeds(
         for done, seed in enumerate(seeds, 1):
             own = observe(measure(signals, replace(settings, seed=seed), levels))
             eta = estimate(own.estimator or estimator, own.regression, horizon)
-            truth = own.truth(horizon, theta, signals.states)[0]
-            found.append(eta.parameters(slice(None))[:, 0] - truth)
+            values = eta.parameters(slice(None))[:, 0, :, None]
+            truth = _truth(own, horizon, theta, signals)
+            found.append(_with_unknowns(values, own.regression, horizon)[..., 0] - truth)
             pace(done)
         error = np.stack(found, axis=-1)
     else:
         added, found = _added(observation, observation.respond, signals, settings, levels), []
         for many in added:
-            found.append(estimator.estimate(many, horizon).parameters(slice(None))[:, 0])
+            values = estimator.estimate(many, horizon).parameters(slice(None))[:, 0]
+            found.append(_with_unknowns(values, observation.regression, horizon))
             pace(sum(part.shape[-1] for part in found))
         error = np.concatenate(found, axis=-1)
-        error -= observation.truth(horizon, theta, signals.states)[0][:, None]
+        error -= _truth(observation, horizon, theta, signals)[:, None]
+    S = observation.regression.parametrisation
     return NoiseStatistics(
         seeds=settings.seeds,
         t=float(horizon[0]),
-        names=observation.parameters,
-        truth=observation.truth(horizon, theta, signals.states)[0],
+        names=(*observation.parameters, *(() if S is None else S.names)),
+        truth=_truth(observation, horizon, theta, signals),
         bias=error.mean(axis=-1),
         deviation=error.std(axis=-1, ddof=1),
         rms=np.sqrt(np.mean(error**2, axis=-1)),
     )
+
+
+def _with_unknowns(eta: Array, regression: LinearRegression, horizon: Array) -> Array:
+    """η̂ (g, p, c) at the horizon, and the θ̂ that fit it where η = S(θ), (g, p + q, c)."""
+    S = regression.parametrisation
+    if S is None:
+        return eta
+    each = np.moveaxis(eta, 1, 2)
+    weight = regression.gram(horizon)[..., : eta.shape[1]]
+    flat = each.reshape(-1, eta.shape[1])
+    theta = S.fitted(flat, np.repeat(weight, len(flat), axis=0))
+    whole = np.concatenate([each, theta.reshape(*each.shape[:2], -1)], axis=2)
+    return np.asarray(np.moveaxis(whole, 2, 1))
+
+
+def _truth(observation: Observation, horizon: Array, theta: Array, signals: Signals) -> Array:
+    """True η, and true θ where η = S(θ), which are then the states."""
+    truth = np.asarray(observation.truth(horizon, theta, signals.states)[0])
+    if observation.regression.parametrisation is None:
+        return truth
+    return np.concatenate([truth, signals.states(horizon)[0]])
 
 
 def _added(

@@ -46,14 +46,26 @@ class Parametrisation:
         Raises:
             ConfigError: an entry of S without a finite value there.
         """
-        return np.asarray(self.tape.taylor(np.zeros(len(theta)), 0, None, theta[None])[0])
+        return self._taylor(0, theta[None])
 
     def jacobian(self, theta: Array) -> Array:
         """∂S/∂θ (N, k, q) at θ (N, q): along each axis the first Taylor coefficient, exactly."""
         along = np.eye(theta.shape[1])[:, None] + np.zeros_like(theta)
-        t = np.zeros(len(theta))
-        columns = [self.tape.taylor(t, 1, None, np.stack([theta, v]))[1] for v in along]
-        return np.stack(columns, axis=2)
+        return np.stack([self._taylor(1, np.stack([theta, v])) for v in along], axis=2)
+
+    def _taylor(self, order: int, along: Array) -> Array:
+        """The last coefficient of S (N, k) along those of θ (order + 1, N, q)."""
+        try:
+            return np.asarray(self.tape.taylor(np.zeros(along.shape[1]), order, None, along)[order])
+        except ConfigError as error:
+            if along.shape[1] > 1:  # which of them is it?
+                for n in range(along.shape[1]):
+                    self._taylor(order, along[:, n : n + 1])
+            what = str(error).removesuffix(" at t = 0")
+            raise ConfigError(f"{what} at {self._place(along[0, 0])}, in the box") from None
+
+    def _place(self, theta: Array) -> str:
+        return ", ".join(f"{n} = {x:.4g}" for n, x in zip(self.names, theta, strict=True))
 
     def slopes(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Bounds of ∂S/∂θ (N, k, q) over boxes from ``low`` to ``high`` (N, q), by intervals."""
@@ -82,7 +94,8 @@ class Parametrisation:
         low, high, least, axis = self.low[None], self.high[None], np.inf, 0
         while True:
             ends = np.stack(self.slopes(low, high))
-            middle, radius = T @ ends.mean(axis=0), np.abs(T) @ (0.5 * np.ptp(ends, axis=0))
+            with np.errstate(invalid="ignore"):  # ends may be infinite
+                middle, radius = T @ ends.mean(axis=0), np.abs(T) @ (0.5 * np.ptp(ends, axis=0))
             known = np.isfinite(radius).all(axis=(1, 2))
             symmetric = np.where(known[:, None, None], middle + np.swapaxes(middle, 1, 2), 0.0)
             spread = (radius + np.swapaxes(radius, 1, 2)).sum(axis=2).max(axis=1)
@@ -96,8 +109,7 @@ class Parametrisation:
             slope = T @ self.jacobian(theta)
             poor = np.linalg.eigvalsh(slope + np.swapaxes(slope, 1, 2))[:, 0] <= 0.0
             if poor.any() or len(low) > _CELLS:
-                at = theta[np.argmax(poor)]
-                text = ", ".join(f"{n} = {x:.4g}" for n, x in zip(self.names, at, strict=True))
+                text = self._place(theta[np.argmax(poor)])
                 what = "is not positive" if poor.any() else "cannot be shown to be positive"
                 raise ConfigError(
                     f"estimator.T: T∇S + (T∇S)ᵀ {what} at {text}; give another T or a smaller box"
