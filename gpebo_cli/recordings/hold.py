@@ -152,7 +152,9 @@ def _parts(source: CoefficientSource, signal: Held, mesh: Mesh, tol: float) -> f
     the observer makes products of everything with everything.
     """
     chosen = np.unique(np.linspace(0, mesh.size - 1, _PROBED).round().astype(np.intp))
-    t, inside = mesh.points[chosen], mesh.inside[chosen]
+    left, step = mesh.edges[chosen, None], mesh.steps[chosen, None]
+    t, margin = left + step * mesh.rule.points, 1e-3 * step  # all points of all: too much memory
+    inside = t.clip(left + margin, left + step - margin)
     samples = signal(t.ravel(), inside.ravel())
     c = source.taylor(t.ravel(), 1, inside.ravel(), samples[None] if source.signals else None)
     matrices = (c.A, c.B, c.F, c.C, c.phi, c.D, c.H)
