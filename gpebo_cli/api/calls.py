@@ -47,6 +47,7 @@ def run(
     data: Choice | os.PathLike[str] | DataFrame | None = None,
     time: Mapping[str, object] | None = None,
     excitation: Mapping[str, object] | None = None,
+    uncertainty: bool = True,
     config_dir: Folder | None = None,
     progress: Callable[[str], None] | None = None,
     **gains: object,
@@ -72,6 +73,7 @@ def run(
             ``time_unit``, …); by default the plant is simulated.
         time: ``start`` and ``horizon`` in seconds, ``samples`` of the output grid.
         excitation: ``rho`` and ``window`` (seconds) of the evidence.
+        uncertainty: whether estimates of noisy signals get standard deviations.
         config_dir: a folder of yours, with ``plant/NAME.yaml``, ``estimator/NAME.yaml``, …
         progress: called with the name of each stage as it begins; of a long one again, with an
             attribute ``share`` of 0 to 1, as it gets on.
@@ -100,6 +102,7 @@ def run(
     sections: dict[str, object] = {
         "observer": observer, "estimator": None if own else estimator, "solver": solver,
         "noise": noise, "data": _recording(data), "time": time, "excitation": excitation,
+        "uncertainty": uncertainty,
     }
     config, system, settings = _configure(plant, sections, {} if own else gains, config_dir)
     if own is not None:
@@ -243,6 +246,7 @@ def _configure(
                 f"{name}: expected a mapping such as {_EXAMPLES[name]}, got {shown(given)}"
             )
         config[name] = {**config[name], **plain(given or {})}
+    config["uncertainty"] = sections.get("uncertainty", True)
     if isinstance(plant, DescriptorSystem):
         config["plant"], system = {}, plant
     else:

@@ -54,6 +54,7 @@ from gpebo_cli.simulation.signals import Signals
 _SAMPLES_AT_ONCE = 2048
 _LAGS = 20  # of the residual's autocorrelation
 _PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
+_SILENT = 1e-9  # of an output: a residual below that is rounding
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that counts as this large
 _BATCH = 1 << 21  # numbers held at once while cases are evaluated: beyond it calls cost little
 
@@ -574,38 +575,55 @@ def _fit(
     fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)))
     if regression.resets or regression.dynamics is not None:
         return fit
-    return _explained(fit, final[fit.best], observation.state_map, system, source)
+    return _explained(
+        fit, final[fit.best], observation.state_map, system, source,
+        every=regression.factor is None and not source.pieces,
+    )
 
 
 def _explained(
-    fit: Fit, eta: Array, state_map: StateMap, system: DescriptorSystem, source: Source
+    fit: Fit, eta: Array, state_map: StateMap, system: DescriptorSystem, source: Source, *,
+    every: bool,
 ) -> Fit:
-    """With ŷ = C x̂ + D u + H θ̂ of the final estimates η̂ (p,), and how white y − ŷ is."""
+    """With ŷ = C x̂ + D u + H θ̂ of the final estimates η̂ (p,), and how white y − ŷ is.
+
+    That is looked at at ``every`` sample, or at the output times if x̂ is known there only.
+    """
     t, recording = source.t, source.recording
     if recording is None or len(state_map.times):
         return fit
-    x = state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
+
+    def outputs(t: Array, own_t: Array, u: Array, y: Array) -> Array:
+        x = state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
+        c = system.coefficients.taylor(own_t, 0, signals=np.hstack([u, y])[None])
+        terms = (c.C, x), (c.D, u), (c.H, np.tile(eta[: system.q], (len(t), 1)))
+        return np.asarray(sum(
+            np.matmul(matrix[0], signal[..., None])[..., 0] for matrix, signal in terms
+        ))
+
     u, y = recording.inputs, recording.outputs
-    own_t = t if source.own_t is None else source.own_t
-    c = system.coefficients.taylor(own_t, 0, signals=np.hstack([u, y])[None])
-    fitted = sum(
-        np.matmul(matrix[0], signal[..., None])[..., 0]
-        for matrix, signal in ((c.C, x), (c.D, u), (c.H, np.tile(eta[: system.q], (len(t), 1))))
-    )
+    fitted = outputs(t, t if source.own_t is None else source.own_t, u, y)
+    fit = replace(fit, outputs=fitted)
+    samples = source.inputs.mesh.edges
+    if every and len(samples) > len(t):
+        u, y = source.inputs(samples), source.outputs(samples)
+        t, fitted = samples, outputs(samples, samples, u, y)
     # Two samples apart: between samples the signals are interpolated and no noise is white.
     apart = 2.0 * (recording.last - recording.first) / max(recording.rows - 1, 1)
-    stride = max(1, int(np.ceil(apart / (t[1] - t[0]))))
+    step = float(t[-1] - t[0]) / (len(t) - 1)
+    stride = 1 if t is samples else max(1, int(np.ceil(apart / step)))
     residual = (y - fitted)[::stride]
     residual = residual - residual.mean(axis=0)
     power = (residual**2).sum(axis=0)
-    count, seen = len(residual), power > 0.0
+    # What an output is used up for leaves rounding, which is no noise.
+    count, seen = len(residual), power > _SILENT**2 * (y[::stride] ** 2).sum(axis=0)
     lags = range(1, min(_LAGS, count // 4) + 1)
     if not seen.any() or not lags:
-        return replace(fit, outputs=fitted)
+        return fit
     correlation = np.array([
         ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
     ])
     return replace(
-        fit, outputs=fitted, correlation=correlation, lag=stride * float(t[1] - t[0]),
+        fit, correlation=correlation, lag=stride * step, noisy_matrices=system.depends_on_outputs,
         band=1.96 / np.sqrt(count * seen.sum()),
     )

@@ -20,6 +20,7 @@ from gpebo_cli.findings import Assumption, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.settings import Settings
 
+_TOGETHER = 1.7  # bands of a sum of correlations, which one white noise in a thousand leaves
 _OUTSIDE = 0.15  # share of correlations outside a band that white noise leaves with 5 % of them
 
 
@@ -188,6 +189,7 @@ class Fit:
     correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
     lag: float = np.nan  # seconds
     band: float = np.nan  # 95 % of the correlations of white noise are within
+    noisy_matrices: bool = False  # they follow measured outputs, whose noise is then no error of Y
     ratio: float | None = None  # of the residual to what the sensors' noise makes of it, √χ²/dof
 
     @property
@@ -195,7 +197,9 @@ class Fit:
         """Whether the residual looks like white noise; None: it was not looked at."""
         if self.correlation is None:
             return None
-        return bool((np.abs(self.correlation) > self.band).mean() <= _OUTSIDE)
+        rho, band = self.correlation, self.band
+        together = abs(rho.sum()) / np.sqrt(len(rho))  # small ones of one sign: a slow misfit
+        return bool((np.abs(rho) > band).mean() <= _OUTSIDE and together <= _TOGETHER * band)
 
     @property
     def best(self) -> int:

@@ -103,7 +103,10 @@ def standard_deviations(
     if not isinstance(estimator, Affine) or not goes_on:
         return "the estimator does not say what errors of Y do to it"
     if len(estimator.cases) > MOST_CASES:
-        return f"more than {MOST_CASES} cases"
+        return (
+            f"each of {len(estimator.cases)} cases would take a pass of its own, which up to "
+            f"{MOST_CASES} do"
+        )
     edges = regression.mesh.edges
     instants = (
         source.inputs.mesh.edges[:-1] if source.recording

@@ -14,6 +14,7 @@ from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
+_FEW = 4.0  # the same where integrals of noise are all that is left: few independent numbers
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
 _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that says so
 
@@ -69,13 +70,15 @@ def verdict(
 
 def _explains(fit: Fit, case: int) -> str:
     """What the residual says of the model."""
-    if fit.correlation is None:
-        return ""
-    if fit.residual[case] <= _EXACT * fit.size:
-        return ": the estimates explain the data"
-    noise = ""
+    noise, why = "", "a missing or wrong parameter, a drifting sensor, or a delay"
     if fit.ratio is not None:
         noise = f", {fit.ratio:.2f} times what the sensors' noise makes"
+    if fit.correlation is None:  # all outputs are used up for states
+        if fit.ratio is None:
+            return ""
+        return noise + (f", which suggests {why}" if fit.ratio > _FEW else "")
+    if fit.residual[case] <= _EXACT * fit.size:
+        return ": the estimates explain the data"
     if fit.white and (fit.ratio is None or fit.ratio < _MORE):
         return f": the estimates explain the data up to white noise{noise}"
     if fit.white:
@@ -84,8 +87,8 @@ def _explains(fit: Fit, case: int) -> str:
         )
     return (
         f": the residual{noise and noise + ','} is not white (its correlation is "
-        f"{np.abs(fit.correlation).max():.2f}), "
-        "which suggests a missing or wrong parameter, a drifting sensor, or a delay"
+        f"{np.abs(fit.correlation).max():.2f}), which "
+        f"{'noise in the matrices does; or it ' if fit.noisy_matrices else ''}suggests {why}"
     )
 
 
