@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -194,13 +194,16 @@ def at_samples(
         u, y = source.inputs(t), source.outputs(t)
         first = np.append(u[0], y[0])
 
-        def fed(by: estimators.Estimator, *, last: bool) -> tuple[Online, list[OnlineEstimates]]:
+        def fed(
+            by: estimators.Estimator, columns: IntArray | None, *, last: bool
+        ) -> tuple[Online, list[OnlineEstimates]]:
             wanted = (
                 sampled_deviations(settings.noise, levels, source)
                 if settings.uncertainty and last else None
             )
             online = Online(
-                settings, system, samples.hold, start, first, by, wanted, source.derivatives
+                settings, system, samples.hold, start, first, by, wanted, source.derivatives,
+                columns,
             )
             made = []
             pace = Pace(len(t), f"samples with {len(estimator.cases)} cases", share)
@@ -211,14 +214,23 @@ def at_samples(
                 pace(min(part.stop, len(t)))
             return online, made
 
-        estimator = estimators.tuned_for(
-            estimator, lambda one: fed(one, last=False)[0].requirement
-        )
-        online, made_of = fed(estimator, last=True)
-        raised = estimators.raised(estimator, online.requirement)
-        if raised is not estimator:
-            online, made_of = fed(raised, last=True)
-        made = joined(made_of)
+        def estimated(columns: IntArray | None) -> tuple[Online, OnlineEstimates]:
+            by = estimators.tuned_for(
+                estimator, lambda one: fed(one, columns, last=False)[0].requirement
+            )
+            online, made = fed(by, columns, last=True)
+            raised = estimators.raised(by, online.requirement)
+            if raised is not by:
+                online, made = fed(raised, columns, last=True)
+            return online, joined(made)
+
+        online, made = estimated(None)
+        by, columns = online, made.known.independent
+        if 0 < len(columns) < len(online.parameters) and not online.fits:
+            # As many numbers in its settings as parameters: all are estimated.
+            with suppress(ConfigError):
+                by, few = estimated(columns)
+                made = made.with_some(few, columns)
         truth = online.truth(made.extension)(t, source.theta(t), source.states)
         x = source.states(t)
         parameters = made.parameters * _told(made.known.parameters[-1])
@@ -228,14 +240,14 @@ def at_samples(
             t, parameters - truth, states - x, sizes, _judged(source, truth.shape[1])
         )
     chosen = kept_samples(1, len(t), settings.time.samples)
-    kept = chosen[kept_samples(len(online.cases), len(chosen), settings.output.max_rows)]
+    kept = chosen[kept_samples(len(by.cases), len(chosen), settings.output.max_rows)]
     std: Array | None = None
     p = parameters.shape[2]
     if made.std is not None and made.level is not None:
         std = made.std[:, kept] * made.level[-1]
         std[np.isnan(np.concatenate([parameters, states], axis=2)[:, kept])] = np.nan
     estimation = EstimationResult(
-        cases=online.cases,
+        cases=by.cases,
         t=t[kept],
         names=online.parameters,
         parameters=parameters[:, kept],
@@ -243,7 +255,7 @@ def at_samples(
         states=states[:, kept],
         delta=None if made.delta is None else made.delta[:, kept],
         checks={},
-        requirement=online.requirement,
+        requirement=by.requirement,
         parameters_std=None if std is None else std[..., :p],
         states_std=None if std is None else std[..., p:],
     )
@@ -263,7 +275,7 @@ def at_samples(
         ),
         excitation, estimation,
         _standing(estimation, metrics, None, np.arange(len(online.parameters)), system),
-        online.fit() if source.recording else None,
+        by.fit() if source.recording else None,
         times, _never(times),
         note=online.note
         + (_held(samples, metrics) if levels.silent and not source.recording else ""),

@@ -6,7 +6,7 @@ What is kept between two calls has a fixed size.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,19 @@ class OnlineEstimates:
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
     std: Array | None = None  # (G, K, p + n) deviations, to be multiplied by
     level: Array | None = None  # (K,) that of the noise so far, 1 where it is known
+
+    def with_some(self, few: OnlineEstimates, columns: IntArray) -> OnlineEstimates:
+        """The same with the estimates of some of the parameters (k,), the others being zero."""
+        wide = np.zeros_like(self.parameters)
+        wide[..., columns] = few.parameters
+        std = few.std
+        if std is not None:
+            k, p = len(columns), wide.shape[2]
+            std = np.zeros((*std.shape[:2], p + std.shape[2] - k))
+            std[..., [*columns, *range(p, std.shape[2])]] = few.std
+        return replace(
+            self, parameters=wide, states=few.states, delta=few.delta, std=std, level=few.level
+        )
 
 
 def joined(parts: Sequence[OnlineEstimates]) -> OnlineEstimates:
@@ -80,6 +93,7 @@ class Online:
         estimator: estimators.Estimator | None = None,
         deviations: SampledDeviations | None = None,
         derivatives: InputDerivatives | None = None,
+        columns: IntArray | None = None,
     ) -> None:
         """Prepare for samples of which the first is at ``start``.
 
@@ -92,6 +106,7 @@ class Online:
             estimator: used instead of the one that the settings name.
             deviations: of what is estimated; None: nobody asks for them.
             derivatives: of the inputs, as far as they are known.
+            columns: parameters to estimate (k,), the others being zero; None: all.
 
         Raises:
             ConfigError: the observer or the estimator works in continuous time only.
@@ -104,7 +119,8 @@ class Online:
         if estimator is None:
             estimator = estimators.build(settings.estimator)
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases
-        self.parameters = self._observer.parameters
+        self._columns, names = columns, self._observer.parameters
+        self.parameters = names if columns is None else tuple(names[j] for j in columns)
         self._recursion = estimators.able(
             estimator, estimators.Recursive,
             "observer.sample_time needs an estimator that works at samples",
@@ -132,6 +148,9 @@ class Online:
             SolverError: a step between samples cannot be resolved.
         """
         self._state, block = self._observer.advance(self._state, t, u, y)
+        self.fits = block.fit is not None
+        if self._columns is not None:
+            block = block.about(self._columns)
         made = self._recursion.update(block.regression)
         roots, _ = self._gram.update(block.regression)
         self._root, self.count = roots[-1, 0], self.count + len(t)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps
 from gpebo_cli.regression.estimator import Estimator
@@ -193,3 +193,12 @@ class SampledBlock:
     errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset
     units: Array | None = None  # (n,) as of ``AffineStateMap``
     fit: Fit | None = None  # where the state is not affine in η: instead of offset and gain
+
+    def about(self, columns: IntArray) -> SampledBlock:
+        """The same about some of the parameters (k,), the others being zero."""
+        whole = self.regression
+        rows = whole.rows[..., [*columns, whole.p]]
+        return replace(
+            self, regression=replace(whole, rows=rows), gain=self.gain[..., columns],
+            scale=self.scale[:, columns],
+        )
