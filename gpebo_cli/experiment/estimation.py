@@ -48,6 +48,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, StateMap
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals
 
@@ -192,7 +193,6 @@ def at_samples(
         t = sample_times(samples.step, start, stop)
         check_samples(len(estimator.cases), len(t), system)
         u, y = source.inputs(t), source.outputs(t)
-        first = np.append(u[0], y[0])
 
         def fed(
             by: estimators.Estimator, columns: IntArray | None, *, last: bool
@@ -202,8 +202,8 @@ def at_samples(
                 if settings.uncertainty and last else None
             )
             online = Online(
-                settings, system, samples.hold, start, first, by, wanted, source.derivatives,
-                columns,
+                settings, system, samples.hold, start, np.append(u[0], y[0]), by, wanted,
+                source.derivatives, columns,
             )
             made = []
             pace = Pace(len(t), f"samples with {len(estimator.cases)} cases", share)
@@ -263,16 +263,13 @@ def at_samples(
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
         level = sampled_window_level(made.regression, window)[chosen]
         excitation = online.excitation(made, chosen, level, window)
-    rows = made.regression.rows[1:][chosen]
     metrics = _metrics(numbers, online.parameters, system)
     times = estimable(
         excitation.known, excitation.t, online.parameters, system.states, made.seen[chosen]
     )
     return Estimated(
         online,
-        RegressionResult(
-            t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
-        ),
+        _shown(made.regression, chosen, online),
         excitation, estimation,
         _standing(estimation, metrics, None, np.arange(len(online.parameters)), system),
         by.fit() if source.recording else None,
@@ -284,6 +281,14 @@ def at_samples(
 
 def _never(times: Mapping[str, float | None]) -> list[str]:
     return [name for name, since in times.items() if since is None]
+
+
+def _shown(regression: SampledRegression, chosen: IntArray, online: Online) -> RegressionResult:
+    """The regression at some of the samples, for the tables."""
+    rows, p = regression.rows[1:][chosen], regression.p
+    return RegressionResult(
+        regression.t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
+    )
 
 
 def _held(samples: Sampling, metrics: Metrics) -> str:
