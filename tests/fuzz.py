@@ -1,4 +1,4 @@
-"""Random plants, words, recordings and streams: ``python -m tests.fuzz --seconds 60``.
+"""Random plants, regressions, recordings, models, run folders: `python -m tests.fuzz --seconds 60`.
 
 Everything runs in this process. Whatever is given, there is a result or one line; no traceback, no
 answer that takes longer than 20 s, no more than 2 GB.
@@ -94,7 +94,8 @@ def plant(r):
         content["E"][i][i] = pick(r, [1, 1, 0, one(r)])
         content["A"][i][i] = pick(r, [-1, 1, one(r)])
     while r.random() < 0.3:
-        key = pick(r, [*content, "D", "H", "phi", "units", "observer_defaults", "titel"])
+        key = pick(r, [*content, "D", "H", "phi", "units", "labels",
+                        "observer_defaults", "titel"])
         grid = matrix(r.randint(0, 3), r.randint(0, 3))
         content[key] = pick(r, [pick(r, STRANGE), entry(r), grid])
     return content
@@ -110,6 +111,74 @@ def run_plant(r, folder):
         run(content, **chosen, time={"horizon": pick(r, [0.1, 1, 5]), "samples": 11})
     except GpeboError as error:
         yield from one_line(str(error) + "\n")
+
+
+def run_regression(r, folder):
+    """A regression that would run, with a few things about it changed."""
+    from gpebo_cli import GpeboError, run
+
+    p, rows = r.randint(1, 3), r.randint(1, 2)
+    one = entry if r.random() < 0.3 else plain_entry
+    names = [f"a{i}" for i in range(p)]
+    content = {
+        "name": "mine", "parameters": {"k": "1 + t/10"}, "unknowns": dict.fromkeys(names, 1.5),
+        "signals": {"u": "sin(t)", "y": entry(r)},
+        "Y": [pick(r, ["u", "y", one(r)]) for _ in range(rows)],
+        "psi": [[pick(r, ["u", one(r)]) for _ in range(p)] for _ in range(rows)],
+    }
+    while r.random() < 0.3:
+        content[pick(r, [*content, "S", "box", "theta"])] = pick(r, [pick(r, STRANGE), entry(r)])
+    estimator = pick(r, CHOICES["estimator"][:-1])
+    yield content, estimator
+    try:
+        run(regression=content, estimator=estimator, time={"horizon": 1, "samples": 11})
+    except GpeboError as error:
+        yield from one_line(str(error) + "\n")
+
+
+MODELS = {
+    "a.cir": "a circuit\nV1 in 0 SIN(0 1 1k)\nR1 in out 1k\nC1 out 0 1u IC=0\nL1 out 0 1m\n",
+    "a.yaml": "coordinates: [q]\nM: [[1]]\nD: [[0.1]]\nK: [[2]]\nforces: [[1]]\ninputs: [F]\n",
+    "a.m": "A = [-1 0; 0 -2];\nB = [1; 1];\nC = [1 1];\n",
+    "a.mo": "model a\nend a;\n",
+}
+SNIPPETS = ["\n", " ", "1e400", "-", "(", ")", "{", "R2 in in 0\n", ".subckt a b\n", "X1 in a\n",
+            "\x00", "K1 L1 L1 2\n", "E1 out 0 in 0 1e30\n", ".param a={a}\n", "M: [[0]]\n", "[",
+            "]", "é", ";"]
+
+
+def altered(r, text):
+    while r.random() < 0.7:
+        i = r.randrange(len(text) + 1)
+        j = min(len(text), i + r.choice([0, 0, 1, 5, 20]))
+        text = text[:i] + pick(r, SNIPPETS) + text[j:]
+    return text
+
+
+def run_import(r, folder):
+    """A model of another program, with a few things about its text changed; and its plant."""
+    name = pick(r, list(MODELS))
+    text = altered(r, MODELS[name])
+    (folder / name).write_text(text)
+    yield name, text
+    made = gpebo("new", "plant", "mine", "--from", name, cwd=folder)
+    yield from judged(made)
+    if made.code == 0:
+        words = ["--config-dir", ".", "plant=mine", "time.horizon=1e-3", *_SHORT]
+        yield from judged(gpebo("run", *words, cwd=folder))
+
+
+def run_folder(r, folder):
+    """The folder of a run, with a file changed; what shows and repeats it."""
+    words = ["run", "time.horizon=0.1", *_SHORT, "hydra.run.dir=out"]
+    gpebo(*words, cwd=folder)
+    path = pick(r, sorted((folder / "out").glob("*.*")))
+    text = altered(r, path.read_text())
+    path.write_text(text)
+    words = pick(r, [["compare", "out"], ["report", "out"],
+                     ["run", "--config-dir", "out", "--config-name", "config", *_SHORT]])
+    yield path.name, text, words
+    yield from judged(gpebo(*words, cwd=folder))
 
 
 def run_words(r, folder):
@@ -199,10 +268,14 @@ def one_line(text):
         yield text
 
 
+KINDS = [run_plant, run_plant, run_words, run_words, run_recording, run_recording, run_regression,
+         run_import, run_folder]
+
+
 def case(seed: int, folder: Path) -> str:
     """What is wrong with the case of this seed, or nothing."""
     r = random.Random(seed)  # noqa: S311
-    steps = pick(r, [run_plant, run_words, run_recording])(r, folder)
+    steps = pick(r, KINDS)(r, folder)
     given = next(steps)
     begin = time.process_time()
     try:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
-from gpebo_cli.errors import ConfigError
+from gpebo_cli import run
+from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.model.descriptor import MATRIX_NAMES, CoefficientSource, DescriptorSystem
 from gpebo_cli.model.plant import KEYS, plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -425,3 +428,13 @@ def test_entries_beyond_all_numbers_are_an_error_and_no_endless_decomposition() 
     system = plant_from_mapping(mine(E=[["exp(20*t)", 0], [0, 1]]))
     with pytest.raises(ConfigError, match=r"E\[0\]\[0\] is .*at t = 7\.5; numbers go up to 1e\+50"):
         simulate(system, TimeSettings(horizon=20.0), SolverSettings())
+
+
+@pytest.mark.parametrize("value", [1e-300, 1e45, 1e200, "1e-300*sin(t)", "exp(300*t)"])
+@pytest.mark.parametrize("key", ["E", "A"])
+def test_numbers_of_any_size_are_a_result_or_one_reason(key: str, value: object) -> None:
+    changed = mine(**{key: [[value, 0], [0, 1]]})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with suppress(GpeboError):
+            run(changed, observer="none", time={"horizon": 1, "samples": 3})

@@ -54,6 +54,7 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
     return examine(settings, system, both=True).assumptions
 
 
+@np.errstate(all="ignore")  # as in a run
 def examine(
     settings: Settings, system: DescriptorSystem, seen: Measurements | None = None, *,
     both: bool = False,

@@ -13,6 +13,8 @@ from functools import cache
 from time import perf_counter
 from typing import Any, Self
 
+import numpy as np
+
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment import memory, several, sources
@@ -85,7 +87,8 @@ def run_experiment(
         ModelError: the plant cannot be simulated, or Assumption 1 fails.
         SolverError: a tolerance cannot be reached.
     """
-    with _threads(system.n):
+    # What is not finite is found where it matters, with its reason and its time.
+    with _threads(system.n), np.errstate(all="ignore"):
         return _experiment(settings, system, progress, estimator)
 
 

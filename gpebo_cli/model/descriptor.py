@@ -198,16 +198,24 @@ def check_sizes(system: DescriptorSystem, t: Array) -> None:
              "theta": ("unknowns", system.unknowns)}
     for name, values in entries.items():
         flat = distinct(values)[0].ravel()
-        if flat.dot(flat) <= LARGEST:  # then no entry is larger: no need to look at each
+        with np.errstate(over="ignore"):
+            none_large = flat.dot(flat) <= LARGEST  # no need to look at each
+        if none_large and name != "E":
             continue
         sizes = np.abs(distinct(values)[0])
-        too_large = np.argwhere(np.isfinite(sizes) & (sizes > LARGEST))
-        for at, *place in too_large[:1].tolist():
+        wrong = np.isfinite(sizes) & (sizes > LARGEST)
+        if name == "E":  # by which rates are divided
+            wrong |= (sizes > 0.0) & (sizes < 1.0 / LARGEST)
+        for at, *place in np.argwhere(wrong)[:1].tolist():
             where = name + "".join(f"[{k}]" for k in place)
             if name in named:
                 where = f"{named[name][0]}.{named[name][1][place[0]]}"
             when = "" if name == "initial_state" else f" at t = {t[at]:.6g}"
+            value = values[0][(at, *place)]
+            limit = f"go up to {LARGEST:g}, products of larger ones overflow"
+            if abs(value) < 1.0:
+                limit = f"of E go down to {1.0 / LARGEST:g}, quotients by smaller ones overflow"
             raise ConfigError(
-                f"plant {system.name}: {where} is {values[0][(at, *place)]:.3g}{when}; "
-                f"numbers go up to {LARGEST:g}, products of larger ones overflow; use other units"
+                f"plant {system.name}: {where} is {value:.3g}{when}; numbers {limit}; use other "
+                "units"
             )
