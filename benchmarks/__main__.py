@@ -38,7 +38,13 @@ Measured = tuple[list[Row], dict[str, Any]]
 def _growth() -> Measured:
     axes = growth.table()
     growth.plot(axes, PLOT)
-    return [], {"axes": axes, "ladders": ladders.table()}
+    return [], {"axes": axes, "ladders": _ladders()}
+
+
+def _ladders() -> list[dict[str, Any]]:
+    rows = ladders.table()
+    ladders.plot(rows, PLOT.with_name("ladders.png"))
+    return rows
 
 
 MEASURE: dict[str, Callable[[], Measured]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from math import log
 from typing import Any
 
 Data = dict[str, Any]
@@ -319,17 +320,34 @@ def _ladders(rows: list[Data]) -> list[str]:
             f"{row['peer_error']:.0e}, {row['our_error']:.0e}", f"{row['memory']:.0f} ×",
             *(duration(row[key]) if whole else "" for key in ("whole_peer", "whole_ours")),
             f"{row['whole_peer_error']:.0e}, {row['whole_our_error']:.0e}" if whole else "",
+            f"{row['whole_memory']:.1f} ×" if whole else "",
         ))
+    slopes = [
+        (f"{what}, {'varying' if varying else 'constant'}",
+         *(f"n^{_slope(rows, key + who, varying=varying)}" for who in ("peer", "ours")))
+        for what, key in (("simulation", ""), ("experiment", "whole_")) for varying in (False, True)
+    ]
     return [
         ("RLC ladders over 20 s at 1e-9, CPU time, beside what one would write instead: the plant "
-        "reduced by hand and SciPy's integrators (sparse Jacobians for Radau and BDF); for the "
-        "experiment x, ξ_a, Φ and the Gram matrix in one DOP853, and the normal equations. Errors "
-        "of the state at the end, theirs and ours (with 1,001 states: theirs beside ours); memory "
-        "is the most that is held, over the states' own size. Stiff: resistances over six "
-        "decades."),
+        "reduced by hand and SciPy's integrators, DOP853 or the faster one of Radau and BDF with "
+        "sparse Jacobians; for the experiment x, ξ_a, Φ and the Gram matrix in one DOP853, and the "
+        "normal equations. Errors of the state at the end, theirs and ours (with 1,001 states: "
+        "theirs beside ours); memory is the most that is held, over the states' own size, of "
+        "experiments over that of Φ and G. Index 2 and 3: a source holds the first capacitor's "
+        "voltage or the first coil's current. Stiff: resistances over six decades."),
         table(["ladder", "states", "script", "gpebo", "errors", "memory", "script, experiment",
-               "gpebo, experiment", "errors of e₀"], lines),
+               "gpebo, experiment", "errors of e₀", "memory"], lines),
+        "Exponents of time between 11 and 101 states, index 1:",
+        table(["", "script", "gpebo"], slopes),
+        "![CPU time of ladders over the number of states](img/ladders.png)",
     ]
+
+
+def _slope(rows: list[Data], key: str, *, varying: bool) -> str:
+    """Of log(time) over log(n) from 11 to 101 states."""
+    times = {row["n"]: row[key] for row in rows
+             if row["kind"] == "index 1" and row["varying"] == varying and key in row}
+    return f"{log(times[101] / times[11]) / log(101 / 11):.2f}"
 
 
 def _floor(part: Data, _: list[Row]) -> list[str]:
