@@ -1,5 +1,8 @@
 """Large sparse plants: elimination and sweeps against derivative array and dense collocation."""
 
+import os
+import subprocess
+import sys
 import tracemalloc
 
 import numpy as np
@@ -390,6 +393,27 @@ def test_blas_has_one_thread_where_matrices_are_of_a_middle_size(cells, one):
         assert threadpool_info() == before
     assert asked
     assert all((1 in found) == one for found in asked)
+
+
+def test_a_blas_that_is_loaded_between_two_runs_has_one_thread_too():
+    code = """
+from gpebo_cli import run
+from threadpoolctl import threadpool_info
+def look(_stage):
+    asked.append(sorted(p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"))
+plant = {"name": "lags", "states": [f"x{i}" for i in range(9)], "initial_state": [1] * 9,
+         "E": {f"x{i},x{i}": 1 for i in range(9)}, "A": {f"x{i},x{i}": -1 for i in range(9)}}
+for imported in ("math", "scipy.linalg"):
+    asked = []
+    __import__(imported)
+    run(plant, observer="none", progress=look, time={"horizon": 1.0})
+    print(asked[0])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "OPENBLAS_NUM_THREADS": "2"}, text=True,
+        check=True, capture_output=True,
+    )
+    assert done.stdout.splitlines() == ["[1]", "[1, 1]"]
 
 
 def test_elements_that_stay_are_not_evaluated_again_though_new_ones_have_more_entries():

@@ -6,6 +6,7 @@ estimation at samples as its rows come.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -30,6 +31,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
 
+_WITH_BLAS = ("scipy.linalg", "torch", "casadi", "jaxlib")
 _SMALL, _LARGE = 8, 200  # states, between which one thread is as fast as several
 
 
@@ -96,12 +98,19 @@ def _threads(n: int) -> AbstractContextManager[object]:
     """One thread of BLAS where more of them would mostly wait for each other, for n states."""
     if not _SMALL < n <= _LARGE:
         return nullcontext()
-    limited: AbstractContextManager[object] = _pools().limit(limits=1, user_api="blas")
+    limited: AbstractContextManager[object] = _pools(_libraries()).limit(
+        limits=1, user_api="blas"
+    )
     return limited
 
 
+def _libraries() -> int:
+    """How many packages are imported that bring a BLAS of their own; SciPy does so when needed."""
+    return sum(name in sys.modules for name in _WITH_BLAS)
+
+
 @cache
-def _pools() -> Any:
+def _pools(_loaded: int) -> Any:
     from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
     return ThreadpoolController()

@@ -35,8 +35,9 @@ def verdict(
         level = f"λ_min(G) = {excitation.lambda_min:.3g}, ρ = {excitation.rho:.2g}"
     if excitation.is_ie:
         first = f"interval-exciting from t = {excitation.t_c:.4g} s on ({level})"
-        if excitation.determined is not None:
-            first += f", parameters well determined from t = {excitation.determined:.4g} s on"
+        determined = excitation.determined
+        if determined is not None:
+            first += f", parameters well determined from t = {determined:.4g} s on"
     else:
         first = f"NOT interval-exciting: {level}; not excited: {excitation.weakest_direction}"
     parts = [first]
