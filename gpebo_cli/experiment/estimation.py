@@ -125,17 +125,12 @@ def continuous(
         def times() -> dict[str, float | None]:
             return estimable(excitation.known, t, *names, seen_at(excitation.known))
 
-        def estimated(by: estimators.Estimator) -> tuple[EstimationResult, Metrics]:
-            return _estimate(
-                settings, system, by, observation, source, known, seen[-1], share
-            )
-
         try:
-            estimation, metrics = estimated(observation.estimator or estimator)
-            if observation.estimator is None:
-                raised = estimators.raised(estimator, estimation.requirement)
-                if raised is not estimator:
-                    estimator, (estimation, metrics) = raised, estimated(raised)
+            used, estimation, metrics = _estimate(
+                settings, system, observation.estimator or estimator, observation, source, known,
+                seen[-1], share,
+            )
+            estimator = estimator if observation.estimator else used
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
     note = observation.note
@@ -332,11 +327,12 @@ def _standing(
 def _estimate(
     settings: Settings, system: DescriptorSystem, estimator: estimators.Estimator,
     observation: Observation, source: Source, known: Knowledge, seen: BoolArray, share: Share,
-) -> tuple[EstimationResult, Metrics]:
+) -> tuple[estimators.Estimator, EstimationResult, Metrics]:
     """Run every case on the mesh and the samples that are kept; measure on both.
 
-    What is not determined at the end is NaN. If the estimator is not the observer's own and has
-    nothing to carry over resets, the parameters that others can stand for are left out.
+    The first result is the estimator with the gains that were used. What is not determined at the
+    end is NaN. If the estimator is not the observer's own and has nothing to carry over resets, the
+    parameters that others can stand for are left out.
     """
     regression, state_map = observation.regression, observation.state_map
     cases, t = estimator.cases, source.t
@@ -353,12 +349,24 @@ def _estimate(
     size, p, n = len(cases), truth.shape[1], x.shape[1]
     each = size <= _PER_QUANTITY
     determined = np.ones(p, dtype=bool)
-    if observation.names is None and observation.estimator is None:
+    about_own = observation.names is None and observation.estimator is None
+
+    def made(by: estimators.Estimator) -> tuple[estimators.Estimates, IntArray]:
+        if about_own:
+            return _estimates(by, observation, grid, known.independent)
+        return estimators.estimate(by, regression, grid), np.arange(p)
+
+    if about_own:
         determined = known.parameters[-1]
-        estimates, columns = _estimates(estimator, observation, grid, known.independent)
     else:
         seen = np.ones(n, dtype=bool)
-        estimates, columns = estimators.estimate(estimator, regression, grid), np.arange(p)
+    estimates, columns = made(estimator)
+    requirement = estimates.requirement
+    if observation.estimator is None:
+        raised = estimators.raised(estimator, requirement)
+        if raised is not estimator:
+            estimator, (estimates, columns) = raised, made(raised)
+            requirement = estimates.requirement
     if observation.bounds:
         estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
     told = _told(determined), _told(seen)
@@ -386,7 +394,7 @@ def _estimate(
     parameters[..., np.isnan(told[0])] = np.nan
     estimated[..., np.isnan(told[1])] = np.nan
     result = EstimationResult(
-        cases=cases,
+        cases=estimator.cases,
         t=kept,
         names=observation.parameters,
         parameters=parameters,
@@ -394,11 +402,11 @@ def _estimate(
         states=estimated,
         delta=estimates.delta(kept),
         checks=checks,
-        requirement=estimates.requirement,
+        requirement=requirement,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
         explaining=explaining,
     )
-    return result, _metrics(numbers, observation.parameters, system)
+    return estimator, result, _metrics(numbers, observation.parameters, system)
 
 
 def _estimates(

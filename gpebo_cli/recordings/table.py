@@ -212,8 +212,9 @@ def read_header(
             same = [other for other in unused if other.casefold() == name.casefold()]
             hint = f"; did you mean {same[0]}?" if same else nearest(name, unused)
             needed = ", ".join(called[signal] for signal in signals)
+            kind = "plant" if system.regression is None else "regression"
             raise ConfigError(
-                f"{source}, line 1: there is no column {name}; plant {system.name} needs "
+                f"{source}, line 1: there is no column {name}; {kind} {system.name} needs "
                 f"{needed}, the header has {shown(', '.join(names))}{hint}; data.columns says what "
                 "a signal is called"
             )
