@@ -25,6 +25,7 @@ from gpebo_cli.observers.canonical import (
     unknown_input_matrices,
 )
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -56,7 +57,7 @@ def test_last_rows_are_lossless_if_and_only_if_A22_is_invertible(singular):
         "E": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]], "A": A,
         "C": [["0.3", "1", "0.2", "1"]], "initial_state": [1, 0, 0, 0],
     })
-    o = observer_matrices(EquationForm(system), T, T, 1e-10)
+    o = observer_matrices(EquationForm(system, Units.plain(system)), T, T, 1e-10)
     full = o.residual @ o.algebraic[:, :, :2]
     last = full[:, -1:]
     def rank(x):
@@ -193,7 +194,7 @@ def test_D3_reduced_matrix():
         "C": [[1, 2, 0, 0]], "initial_state": [0] * 4,
     })
     t = np.zeros(1)
-    found = observer_matrices(EquationForm(system), t, t, 1e-10).dynamics[0]
+    found = observer_matrices(EquationForm(system, Units.plain(system)), t, t, 1e-10).dynamics[0]
     expected = A[:2, :2] - A[:2, 2:] @ np.linalg.inv(A[2:, 2:]) @ A[2:, :2]
     np.testing.assert_allclose(found, expected, atol=1e-12)
     with pytest.raises(ValueError, match="mismatch"):

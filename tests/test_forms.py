@@ -16,7 +16,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, observe
-from gpebo_cli.reduction.form import InputDerivatives, strangeness_free
+from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -369,7 +369,8 @@ def test_hidden_constraints_hold_on_the_solution():
     signals = simulate(system, TimeSettings(horizon=5.0), SOLVER).signals
     t = np.linspace(0.0, 5.0, 57)
     inputs = InputDerivatives.of_plant(system, np.ones(2, dtype=bool))
-    form = strangeness_free(system, t, t, None, inputs, max_mu=6, rank_tol=1e-10)
+    given = EquationForm.given(system, inputs)
+    form = strangeness_free(given, t, t, None, max_mu=6, rank_tol=1e-10)
     assert form.structure is not None
     assert form.structure.mu == 2
     assert form.derivatives == ()

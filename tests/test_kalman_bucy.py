@@ -26,6 +26,7 @@ from gpebo_cli.observers import SignalNoise, observe
 from gpebo_cli.observers._riccati import run_filter
 from gpebo_cli.observers.kalman_bucy import filter_model, noise_model
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.settings import (
     NoiseSettings,
@@ -55,8 +56,8 @@ def assumption(result: RunResult, name: str):
 
 
 def in_basis(system: DescriptorSystem, t: Array, inside: Array, u: Array, y: Array, like=None):
-    o = observer_matrices(EquationForm(system), t, inside, 1e-10, like)
-    return filter_model(o, u, y, EquationForm(system)), o.split.basis, o
+    o = observer_matrices(EquationForm(system, Units.plain(system)), t, inside, 1e-10, like)
+    return filter_model(o, u, y, EquationForm(system, Units.plain(system))), o.split.basis, o
 
 
 @pytest.mark.parametrize("name", ["circuit", "descriptor", "rotating"])
@@ -71,7 +72,7 @@ def test_model_holds_on_the_true_state_whatever_the_noise(name):
     s, basis, o = in_basis(system, t, t, u, y)
 
     def zeta(at: Array) -> Array:
-        P = observer_matrices(EquationForm(system), at, at, 1e-10).projector
+        P = observer_matrices(EquationForm(system, Units.plain(system)), at, at, 1e-10).projector
         w = (P @ signals.states(at)[..., None])[..., 0] @ basis
         return np.concatenate([np.broadcast_to(system.theta, (len(at), system.q)), w], axis=1)
 

@@ -11,6 +11,7 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -140,7 +141,7 @@ def test_equal_to_the_papers_block_formulas(varying, q):
     n_a, n_b, r = 3, 2, 2
     system = random_block_system(rng, n_a, n_b, r, q, varying)
     t = np.linspace(0, 3, 11)
-    ours = observer_matrices(EquationForm(system), t, t, 1e-10)
+    ours = observer_matrices(EquationForm(system, Units.plain(system)), t, t, 1e-10)
     c = system.coefficients.taylor(t, 0)
     for k in range(len(t)):
         E, A, B, F, C = c.E[0, k], c.A[0, k], c.B[0, k], c.F[0, k], c.C[0, k]
@@ -166,7 +167,7 @@ def test_equal_to_the_papers_block_formulas(varying, q):
 def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
     system = plant_from_mapping(ROTATING)
     t = np.linspace(0, 5, 23)
-    o = observer_matrices(EquationForm(system), t, t, 1e-10)
+    o = observer_matrices(EquationForm(system, Units.plain(system)), t, t, 1e-10)
     R, P = o.residual, o.projector
     np.testing.assert_allclose(R @ R, R, atol=1e-13)
     np.testing.assert_allclose(R @ o.algebraic @ (np.eye(4) - P), 0, atol=1e-13)
@@ -175,7 +176,7 @@ def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
 def test_rotating_kernel_with_unknown_parameter():
     simulation, observation, truth = run(plant_from_mapping(ROTATING))
     assert simulation.structure.index == 2
-    assert observation.truth.initial_basis.shape == (4, 2)
+    assert observation.truth.initial_dual.shape == (2, 4)
     assert_identity(simulation, observation, truth)
     gram = observation.regression.gram.final
     estimate = np.linalg.solve(gram[:, :-1], gram[:, -1])
@@ -197,7 +198,9 @@ def test_assumption_1_violated_names_the_time_and_the_singular_value():
     signals = simulate(shipped("circuit"), TimeSettings(), SOLVER).signals
     blind = shipped("circuit", C=[[0, 0, 1, 0, 0, 0]])
     with pytest.raises(ModelError, match=r"Assumption 1 .* t = .* singular value"):
-        observer_matrices(EquationForm(blind), signals.mesh.edges, signals.mesh.edges, 1e-10)
+        observer_matrices(
+            EquationForm.given(blind), signals.mesh.edges, signals.mesh.edges, 1e-10
+        )
     found = observe(blind, seen(signals), SOLVER, form="given")
     (failed,) = [a for a in found.assumptions if not a.holds]
     assert failed.name == "Assumption 1"
@@ -211,7 +214,7 @@ def test_rank_of_E_that_changes_is_an_error_of_the_observer():
     )
     t = np.array([1.0, 5.0])
     with pytest.raises(ModelError, match="rank of E changes from 2 at t = 1 to 3 at t = 5"):
-        observer_matrices(EquationForm(system), t, t, 1e-10)
+        observer_matrices(EquationForm(system, Units.plain(system)), t, t, 1e-10)
 
 
 @pytest.mark.parametrize(

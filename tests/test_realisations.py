@@ -20,6 +20,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.settings import (
     NoiseSettings,
@@ -182,8 +183,9 @@ def test_weighted_elimination_is_weighted_least_squares():
     )
     t = np.array([0.7])
     w = np.array([1.0, 1.0, 1.0, 1.0, 0.3, 0.05])
-    weighted = observer_matrices(EquationForm(system), t, t, 1e-10, output_scale=np.sqrt(w[3:]))
-    plain = observer_matrices(EquationForm(system), t, t, 1e-10)
+    form = EquationForm(system, Units.plain(system))
+    weighted = observer_matrices(form, t, t, 1e-10, output_scale=np.sqrt(w[3:]))
+    plain = observer_matrices(form, t, t, 1e-10)
     A, column = plain.algebraic[0], plain.algebraic[0][:, 2:]  # x3 is the kernel of E
     w = w[-len(A) :]  # of the plant's equations those that are algebraic, then the outputs
     W = np.diag(w)

@@ -91,7 +91,7 @@ def observed(name, horizon=20.0, **observer):
 
 def test_the_plant_is_the_one_that_needs_a_remedy():
     system = plant_from_mapping(UNBOUNDED)
-    o = observer_matrices(EquationForm(system), np.zeros(1), np.zeros(1), 1e-10)
+    o = observer_matrices(EquationForm.given(system), np.zeros(1), np.zeros(1), 1e-10)
     eigenvalues = np.sort_complex(np.linalg.eigvals(o.dynamics[0]))
     np.testing.assert_allclose(eigenvalues, [0.33, 0.64 - 1.01j, 0.64 + 1.01j], atol=1e-12)
 
@@ -123,7 +123,9 @@ CASES = [
 def test_every_remedy_keeps_the_state(remedy, estimator):
     result = run(UNBOUNDED, estimator=estimator, remedy=remedy)
     late = result.estimation.t >= 39.0
-    assert relative_error(result)[late].max() < 1e-9
+    # Of a gradient law nothing is exact: by then it has come so far.
+    limit = 1e-6 if estimator["name"] == "gradient" else 1e-9
+    assert relative_error(result)[late].max() < limit
     assert not result.warnings
 
 

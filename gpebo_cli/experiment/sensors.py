@@ -123,7 +123,7 @@ class _Rows:
         self._elapsed = np.array([stop - start])
         self._parameters = (*system.unknowns, *reduced.names)
         self._gain = on_mesh(mesh, final.gain)(np.linspace(start, stop, _TIMES))
-        self._units = reduced.form.scales
+        self._units = reduced.form.units.states
         self._common = self._known(range(n)).sizes[0]
 
     def _known(self, chosen: Sequence[int]) -> Knowledge:
@@ -138,7 +138,7 @@ class _Rows:
         root = V[:, seen] / np.sqrt(spectrum[seen]) / sizes[:, None]
         which = np.concatenate([known.parameters[0], known.states(self._gain, self._units)[-1]])
         of_x = np.linalg.norm(self._gain[-1] @ root, axis=1)
-        own = of_x if self._units is None else of_x / self._units
+        own = of_x / self._units
         of_x[own <= _EXACT * own.max(initial=0.0)] = 0.0  # known without any output
         deviations = np.concatenate([np.linalg.norm(root, axis=1), of_x])
         names = (*self._parameters, *self._system.states)

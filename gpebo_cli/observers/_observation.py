@@ -94,7 +94,7 @@ class Truth(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class InitialError:
-    """η = (θ, e₀) with e₀ = ξ_a0 − V1ᵀ P x(start) = ξ_a0 − V1ᵀ x(start).
+    """η = (θ, e₀) with e₀ = ξ_a0 − V1⁺P x(start).
 
     If θ varies, no constant e₀ makes w = ξ_a + ξ_b θ − Φ e₀ true, but this one does, and with it
     Y = ψη still holds at every time:
@@ -102,22 +102,24 @@ class InitialError:
         e₀(t) = Φ⁺ (ξ_a + ξ_b θ(t) − w),      e₀' = Φ⁺ ξ_b θ'.
     """
 
-    initial_basis: Array  # (n, n_a) V1, orthonormal basis of range P(start)
+    initial_dual: Array  # (n_a, n) V1⁺P, V1 a basis of range P(start)
     xi_a0: Array  # (n_a,)
-    basis: Array  # (n, k) in whose coordinates the extension is integrated, k = n_a or n
+    dual: Array  # (k, n) that gives the coordinates of the extension, k = n_a or n
     extension: Callable[[Array], Array]  # times (M,) -> [ξ_a | ξ_b | Φ], (M, k, 1 + p)
+    units: Array | None = None  # (k,) of those, in which P is an orthogonal projector; None: ones
 
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """η at the times t (M,), shape (M, p)."""
         if _is_constant(theta) or np.isnan(theta).any():
             start = states.values[0, 0]
             # A state that nobody knows (NaN) does not spoil components it has no part in.
-            parts = np.where(self.initial_basis == 0.0, 0.0, self.initial_basis * start[:, None])
-            e0 = self.xi_a0 - parts.sum(axis=0)
+            parts = np.where(self.initial_dual == 0.0, 0.0, self.initial_dual * start)
+            e0 = self.xi_a0 - parts.sum(axis=1)
             eta = np.empty((len(t), theta.shape[1] + len(e0)))
             eta[:, : theta.shape[1]], eta[:, theta.shape[1] :] = theta, e0
             return eta
-        e0 = error_of_extension(self.extension(t), theta, states(t) @ self.basis)
+        z = states(t) @ self.dual.T
+        e0 = error_of_extension(self.extension(t), theta, z, self.units)
         return np.concatenate([theta, e0], axis=1)
 
 
@@ -126,9 +128,14 @@ def _is_constant(theta: Array) -> bool:
     return theta.strides[0] == 0 or not theta.size or not (theta[1:] != theta[:-1]).any()
 
 
-def error_of_extension(W: Array, theta: Array, x: Array) -> Array:
-    """e₀ = Φ⁺ (ξ_a + ξ_b θ − x) of [ξ_a | ξ_b | Φ] (M, k, 1 + p), θ (M, q) and x (M, k)."""
+def error_of_extension(W: Array, theta: Array, x: Array, units: Array | None) -> Array:
+    """e₀ = Φ⁺ (ξ_a + ξ_b θ − x) of [ξ_a | ξ_b | Φ] (M, k, 1 + p), θ (M, q) and x (M, k).
+
+    The coordinates have units (k,).
+    """
     q = theta.shape[1]
+    if units is not None:
+        W, x = W / units[:, None], x / units
     xi_a, xi_b, Phi = W[..., 0], W[..., 1 : 1 + q], W[..., 1 + q :]
     # Φᵀ x = Φᵀ w, because the columns of Φ lie in the range of the projector P.
     distance = xi_a + np.einsum("mij,mj->mi", xi_b, theta) - x

@@ -194,7 +194,7 @@ class Canonical:
                 n_b=n_b,
             ),
             truth=InitialError(
-                np.eye(system.n)[:, :n_a], xi_a0, np.eye(system.n)[:, :n_a], solution.trajectory
+                np.eye(n_a, system.n), xi_a0, np.eye(n_a, system.n), solution.trajectory
             ),
             error_estimate=solution.error_estimate,
             assumptions=(

@@ -40,6 +40,7 @@ from gpebo_cli.observers._observation import AffineStateMap, Observation, Recons
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
 from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
+from gpebo_cli.observers.reduced.split import Split
 from gpebo_cli.observers.remedies.current_coordinates import CurrentState
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.reduction.form import EquationForm
@@ -83,12 +84,12 @@ def filter_model(
         y: (N, r).
         form: of the equations.
     """
-    count, r, basis = len(v), y.shape[1], o.split.basis
+    count, r, basis, dual = len(v), y.shape[1], o.split.basis, o.split.dual
     q, k = o.from_unknowns.shape[2], basis.shape[1]
     signals = np.concatenate([v, y], axis=1)
     A = np.zeros((count, q + k, q + k))
     # w = P w. The range of P(t) turns; rounding outside of it is damped, or it would grow.
-    off = np.eye(k) - basis.T @ o.projector @ basis
+    off = np.eye(k) - dual @ o.projector @ basis
     damping = np.linalg.norm(o.dynamics, axis=(1, 2))[:, None, None] * off
     A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics - damping
     inward = np.zeros((count, q + k, signals.shape[1]))
@@ -138,8 +139,8 @@ class NoiseModel:
     process: Array  # (n,)
     rows: Array  # (e + r,) zero: V needs none
 
-    def state_space(self, s: FilterModel, q: int, basis: Array) -> StateSpace:
-        """The model with its covariances, one column of signals, from the basis (n, n_w) of w."""
+    def state_space(self, s: FilterModel, q: int, split: Split) -> StateSpace:
+        """The model with its covariances, one column of signals, w in the basis of a split."""
         Zt = transpose(s.rows)
         D = Zt @ s.in_measurement
         weighted = s.from_noise * self.signals  # Γ S
@@ -148,7 +149,7 @@ class NoiseModel:
             # w stays in the range of P(t), and so does what drives it.
             inside = np.zeros_like(Q)
             inside[:, :q, :q] = np.eye(q)
-            inside[:, q:, q:] = basis.T @ s.projector @ basis
+            inside[:, q:, q:] = split.dual @ s.projector @ split.basis
             Q = Q + (inside * self.process) @ transpose(inside)
         return StateSpace(
             A=s.A,
@@ -218,7 +219,7 @@ class KalmanBucy:
             system, signals, solver, xi_a0=self.xi_a0, form=self.form
         )
         evidence = Plain().observe(known)
-        mesh, q, basis = known.mesh, system.q, known.basis
+        mesh, q, split = known.mesh, system.q, known.first.split
         noise = signals.noise or SignalNoise(
             np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time
         )
@@ -233,7 +234,7 @@ class KalmanBucy:
                 f"plant {system.name} has neither unknowns nor differential states: there is "
                 "nothing for observer=kalman_bucy to filter; observer=gpebo takes it"
             )
-        w0 = basis.T @ known.xi_a
+        w0 = split.dual @ known.xi_a
         start = np.concatenate([np.zeros(q), w0])
         P0 = _initial_covariance(self.P0, names, known)
         process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
@@ -241,12 +242,12 @@ class KalmanBucy:
         model_noise = noise_model(known_of, noise, process, self.regularisation)
         # What w is beside the part of x that is known may be rounding of that, added up.
         turns = 1.0 + float(np.abs(known_of.A).max() * (mesh.edges[-1] - mesh.edges[0]))
-        beside = turns * np.abs(basis.T) @ np.abs(known_of.offset).max(axis=0)
+        beside = turns * np.abs(split.dual) @ np.abs(known_of.offset).max(axis=0)
         floor = _ROUNDING / solver.tol * np.concatenate([np.zeros(q), beside])
 
         def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
             s = reduced(t, inside)
-            return model_noise.state_space(s, q, basis), (s.offset, s.gain, s.direct, s.projector)
+            return model_noise.state_space(s, q, split), (s.offset, s.gain, s.direct, s.projector)
 
         def monitor(estimate: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
             offset, gain, *_ = extras
@@ -261,7 +262,7 @@ class KalmanBucy:
         offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
 
         def information(t: Array, inside: Array) -> tuple[Array, Array]:
-            m = model_noise.state_space(reduced(t, inside), q, basis)
+            m = model_noise.state_space(reduced(t, inside), q, split)
             return m.A, transpose(m.c) @ np.linalg.solve(m.V, m.c)
 
         windows = window_gramians(
@@ -308,10 +309,10 @@ def _note(model: NoiseModel, regularisation: float) -> str:
 def _initial_covariance(P0: ByName, names: tuple[str, ...], known: ReducedSystem) -> Array:
     """P(start) (n, n) of what is possible: w = offset + from_unknowns θ + V z."""
     variances = per_name(P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
-    q, basis = known.system.q, known.basis
+    q, dual = known.system.q, known.first.split.dual
     inside = np.zeros((len(names), len(names)))
-    inside[:q, :q], inside[q:, :q] = np.eye(q), basis.T @ known.begin.from_unknowns
-    inside[q:, q:] = basis.T @ known.initial_basis @ known.initial_basis.T @ basis
+    inside[:q, :q], inside[q:, :q] = np.eye(q), dual @ known.begin.from_unknowns
+    inside[q:, q:] = dual @ known.initial_basis @ known.begin.dual @ known.basis
     return np.asarray((inside * variances) @ inside.T)
 
 
@@ -320,10 +321,10 @@ def _uniform_observability(
 ) -> Requirement:
     """λ_min of M over all windows, in units of P(0)⁻¹, in the directions that ζ has."""
     P = projector(windows.starts)
-    n, q, basis = len(P0), known.system.q, known.basis
+    n, q, split = len(P0), known.system.q, known.first.split
     inside = np.zeros((len(P), n, n))
     inside[:, :q, :q] = np.eye(q)
-    inside[:, q:, q:] = basis.T @ P @ basis
+    inside[:, q:, q:] = split.dual @ P @ split.basis
     scale = np.sqrt(np.diag(P0))
     scale = np.where(scale > 0, scale, scale.max(initial=0.0) or 1.0)
     M = scale[:, None] * (inside @ windows.gramians @ inside) * scale

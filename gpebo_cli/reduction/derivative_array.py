@@ -13,15 +13,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpebo_cli.kernels.structure_numpy import forcing as kernel_forcing
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, distinct
+from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem, distinct
 from gpebo_cli.numerics.linalg import largest_over_time
 
 _KEPT = 40  # states, up to which what the pattern of E and A alone decides is kept
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
+_ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
+_BESIDE_TIES = 0.1234  # decades: where factors are rounded, halves and thirds are not at an edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +44,24 @@ class Scaling:
     weights: Array  # (n,)
 
 
+class Units(NamedTuple):
+    """Powers of ten in which what an observer sees is of comparable size, from its start alone.
+
+    x = states * x̃, y = outputs * ỹ, θ = unknowns * θ̃; equations are divided by ``equations``.
+    All are 1 where everything is within a decade of each other.
+    """
+
+    states: Array  # (n,)
+    equations: Array  # (n,)
+    outputs: Array  # (r,) the first one, of those that states connect, is 1
+    unknowns: Array  # (q,)
+
+    @classmethod
+    def plain(cls, system: DescriptorSystem) -> Units:
+        """Everything as it was written."""
+        return cls(*map(np.ones, (system.n, system.n, system.r, system.q)))
+
+
 def forcing(c: Coefficients) -> Array:
     """Taylor coefficients of f = B u + F θ + φ, shape (K + 1, N, n)."""
     return np.asarray(c.phi + kernel_forcing(c.B, c.F, c.u, c.theta, len(c.E)))
@@ -54,23 +76,7 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     """
     n = c.E.shape[2]
     sizes = np.array([largest_over_time(distinct(matrix)[0]) for matrix in (c.E, c.A)])
-    there = sizes > 0.0
-    while True:
-        balancing = _balancing if n <= _KEPT else _balancing.__wrapped__
-        terms, least_squares, counts = balancing(there.tobytes(), n, mass)
-        logs = np.log(sizes[there])
-        factors = -(least_squares @ ((logs * counts) @ terms))
-        entries = np.exp(terms @ factors + logs)
-        if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
-            break
-        scaled_sizes = np.zeros_like(sizes)
-        scaled_sizes[there] = entries
-        rest = scaled_sizes > _NOTHING * np.sqrt(
-            scaled_sizes.max(axis=(0, 2))[:, None] * scaled_sizes.max(axis=(0, 1))
-        )
-        if (rest == there).all():
-            break
-        there = rest  # once more without what turned out to be rounding
+    factors, _ = _factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)
     r = factors[:n]
     # A factor of all rows is left open, and means nothing.
     weights = 10.0 ** np.rint((r - r[0]) / np.log(10.0)) if n else np.zeros(0)
@@ -78,16 +84,84 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     return Scaling(powers[:n], powers[n:-1], float(powers[-1]), np.asarray(weights))
 
 
+def units_at(c: Coefficients) -> Units:
+    """The units in which the entries of E/τ, A, F, C and H at one time are of comparable size.
+
+    As in :func:`balance`, with outputs as further rows and unknowns as further columns. An entry
+    that is zero counts by its first derivative that is not, and small ones, once it is seen which
+    are, count little: a little damping tells nothing of a unit. A factor of all rows that hang
+    together is left open: an output is as it was written.
+    """
+    (n, q), r = c.F.shape[2:], c.C.shape[2]
+    entries = np.zeros((len(c.E), 2, n + r, n + q))
+    entries[:, 0, :n, :n], entries[:, 1, :n, :n], entries[:, 1, :n, n:] = (
+        np.abs(matrix[:, 0]) for matrix in (c.E, c.A, c.F)
+    )
+    entries[:, 1, n:, :n], entries[:, 1, n:, n:] = np.abs(c.C[:, 0]), np.abs(c.H[:, 0])
+    order = (entries > 0.0).argmax(axis=0)
+    sizes = np.take_along_axis(entries, order[None], axis=0)[0]
+    order = order.astype(np.int8)
+    factors, there = _factors(sizes, order, 1.0)
+    terms, _, _ = _balancing(there.tobytes(), order.tobytes(), sizes.shape, 1.0)
+    logs = np.log(sizes[there])
+    for _ in range(_ROUNDS):
+        counts = np.clip(np.exp(2.0 * (terms @ factors + logs)), _LITTLE, 1.0)
+        inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
+        factors = -inverse @ ((logs * counts) @ terms)
+    factors /= np.log(10.0)
+    linked = there.any(axis=0)
+    shared = linked.astype(np.float64)
+    near: Array = np.eye(n + r) + np.matmul(shared, shared.T)
+    for _ in range((n + r).bit_length()):  # rows that hang together by their columns
+        near = np.sign(near @ near)
+    order = np.roll(np.arange(n + r), r)  # outputs first
+    open_factor = factors[order[near[:, order].argmax(axis=1)]]
+    of_row = open_factor - factors[: n + r]
+    of_column = factors[n + r : -1] + open_factor[linked.argmax(axis=0)]
+    equations, outputs = np.split(10.0 ** np.rint(of_row + _BESIDE_TIES), [n])
+    states, unknowns = np.split(10.0 ** np.rint(of_column + _BESIDE_TIES), [n])
+    return Units(states, equations, outputs, unknowns)
+
+
+def _factors(sizes: Array, order: NDArray[np.int8], mass: float) -> tuple[Array, BoolArray]:
+    """Logarithms of the factors (a + b + 1,) for entries of these sizes and orders (2, a, b).
+
+    And which of them count: not those that turn out to be rounding.
+    """
+    there = sizes > 0.0
+    while True:
+        few = sum(sizes.shape[1:]) <= 2 * _KEPT
+        balancing = _balancing if few else _balancing.__wrapped__
+        terms, least_squares, counts = balancing(
+            there.tobytes(), order.tobytes(), sizes.shape, mass
+        )
+        logs = np.log(sizes[there])
+        factors = -(least_squares @ ((logs * counts) @ terms))
+        entries = np.exp(terms @ factors + logs)
+        if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
+            return factors, there
+        scaled_sizes = np.zeros_like(sizes)
+        scaled_sizes[there] = entries
+        rest = scaled_sizes > _NOTHING * np.sqrt(
+            scaled_sizes.max(axis=(0, 2))[:, None] * scaled_sizes.max(axis=(0, 1))
+        )
+        if (rest == there).all():
+            return factors, there
+        there = rest  # once more without what turned out to be rounding
+
+
 @lru_cache(maxsize=64)
-def _balancing(there: bytes, n: int, mass: float) -> tuple[Array, Array, Array]:
+def _balancing(
+    there: bytes, order: bytes, shape: tuple[int, int, int], mass: float
+) -> tuple[Array, Array, Array]:
     """What r, c and τ contribute to the logarithm of each entry that is there; (terms⊤terms)⁺.
 
     And how much each entry counts.
     """
-    kind, i, j = np.frombuffer(there, dtype=np.bool_).reshape(2, n, n).nonzero()
-    every, terms = np.arange(len(i)), np.zeros((len(i), 2 * n + 1))
-    terms[every, i] = terms[every, n + j] = 1.0
-    terms[:, -1] = kind - 1.0
+    kind, i, j = np.frombuffer(there, dtype=np.bool_).reshape(shape).nonzero()
+    every, terms = np.arange(len(i)), np.zeros((len(i), shape[1] + shape[2] + 1))
+    terms[every, i] = terms[every, shape[1] + j] = 1.0
+    terms[:, -1] = kind - 1.0 + np.frombuffer(order, np.int8).reshape(shape)[kind, i, j]
     counts = np.where(kind, 1.0, mass)
     inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
     return terms, np.asarray(inverse), counts

@@ -27,9 +27,11 @@ from gpebo_cli.model.descriptor import (
     CoefficientSource,
     DescriptorSystem,
 )
+from gpebo_cli.model.functions import FunctionCoefficients
 from gpebo_cli.model.matrix import listed
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.reduction.derivative_array import Units, units_at
 from gpebo_cli.reduction.strangeness_free import (
     MAX_GROWTH,
     by_singular_vectors,
@@ -38,6 +40,7 @@ from gpebo_cli.reduction.strangeness_free import (
 from gpebo_cli.reduction.structure import RESIDUAL, Structure, analyse
 
 _AHEAD = np.linspace(0.0, 1.0, 17)  # seconds
+_SEEN = 2  # derivatives at the start by which an entry that is zero there is known
 _MOVED = 1e-8  # of hidden constraints: what derivatives of an output may change by rounding
 _ABSENT = 1e-10  # of the largest coefficient of an input: a derivative with less is not there
 
@@ -97,10 +100,31 @@ class EquationForm:
     """A plant in the form that an observer takes."""
 
     system: DescriptorSystem
+    units: Units
     structure: Structure | None = None  # of the strangeness-free form; None: as given
     # Derivatives that hidden constraints contain: (order, input); of each from ``inputs``.
     derivatives: tuple[tuple[int, int], ...] = ()
     inputs: InputDerivatives | None = None
+
+    @classmethod
+    def given(
+        cls, system: DescriptorSystem, inputs: InputDerivatives | None = None,
+        at: tuple[Array, Array, Array | None] | None = None,
+    ) -> EquationForm:
+        """As given, in the units of the plant at its start: what comes later changes no unit.
+
+        Args:
+            system: the model.
+            inputs: derivatives of the inputs, as far as they are known.
+            at: the time of the start (1,), where functions that jump are decided, and [u; y]
+                (1, m + r) there for matrices that follow them; None: at 0, without signals.
+        """
+        t, inside, signals = at or (np.zeros(1), np.zeros(1), None)
+        plain = cls(system, Units.plain(system), inputs=inputs)
+        along = plain.along(t, inside, signals, 0)
+        # Functions from Python need have no derivatives.
+        order = 0 if isinstance(system.coefficients, FunctionCoefficients) else _SEEN
+        return replace(plain, units=units_at(system.coefficients.taylor(t, order, inside, along)))
 
     @property
     def follows_signals(self) -> bool:
@@ -118,11 +142,6 @@ class EquationForm:
         if self.inputs is None or self.inputs.exact:
             return ()
         return tuple(sorted({j for _, j in self.derivatives}))
-
-    @property
-    def scales(self) -> Array | None:
-        """Sizes of the states (n,), in units of which M is a projector; None: as given."""
-        return None if self.structure is None else self.structure.scaling.columns
 
     def driving(self, t: Array, inside: Array, u: Array) -> Array:
         """v (N, ·) at the times t (N,), from the measured inputs u (N, m)."""
@@ -171,7 +190,9 @@ class EquationForm:
             D = np.concatenate([D, np.zeros((len(D), system.r, extra + phi.shape[2]))], axis=2)
         hidden = None
         if self.structure is not None:
-            hidden = self._kept(hidden_constraints(system, self.structure, t, c))
+            hidden = self._kept(
+                hidden_constraints(system, self.structure, self.units.states, t, c)
+            )
         return Equations(
             value("E"), value("A"), B, value("F"), value("C"), D, value("H"), hidden
         )
@@ -211,13 +232,14 @@ class EquationForm:
 
 
 def hidden_constraints(
-    system: DescriptorSystem, structure: Structure, t: Array, c: Coefficients
+    system: DescriptorSystem, structure: Structure, units: Array, t: Array, c: Coefficients
 ) -> HiddenConstraints:
     """M, M_v and M_θ at the times t (N,), with v = [u, u', …, u^(μ)/μ!, 1].
 
     Args:
         system: the model.
         structure: of it.
+        units: of the states (n,), in which M is an orthogonal projector.
         t: times.
         c: the model there, to the order μ.
 
@@ -242,6 +264,7 @@ def hidden_constraints(
     else:
         A2, f2 = _by_array(system, structure, E, A, g * weights[:, None, :, None], t)
     terms = np.abs(g * weights[:, None, :, None]).max(axis=(0, 2))[:, None, :]
+    A2 = A2 * (units / s.columns)
     # Rows of equal size first: they are of any size, and the factors below are then of order one.
     size = np.maximum(np.abs(A2).max(axis=2, keepdims=True), np.finfo(float).tiny)
     f2 = without_rounding(f2 / size, terms)
@@ -249,7 +272,7 @@ def hidden_constraints(
     inward = exact_product(Q @ transpose(np.linalg.inv(R)), f2)  # Â2⁺ [f̂_v | f̂_θ]
     driving = (mu + 1) * system.m + 1
     return HiddenConstraints(
-        without_rounding(Q @ transpose(Q)) / s.columns,
+        without_rounding(Q @ transpose(Q)) / units,
         inward[:, :, :driving], inward[:, :, driving:],
     )
 
@@ -293,17 +316,16 @@ class _Along:
 
 
 def strangeness_free(
-    system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
-    inputs: InputDerivatives | None, *, max_mu: int, rank_tol: float,
+    given: EquationForm, t: Array, inside: Array, signals: Array | None, *, max_mu: int,
+    rank_tol: float,
 ) -> EquationForm:
     """The strangeness-free form, for a horizon that the times t (N,) span.
 
     Args:
-        system: the model.
+        given: the model as given.
         t: times by which to judge which derivatives of inputs there are.
         inside: where functions that jump are decided.
         signals: [u; y] there (N, m + r), for matrices that follow them.
-        inputs: derivatives of the inputs, as far as they are known.
         max_mu: largest strangeness index.
         rank_tol: singular values below this, relative, are zero.
 
@@ -311,19 +333,19 @@ def strangeness_free(
         ModelError: not uniquely solvable, or the index is too high.
         ConfigError: a derivative is needed of an input, or of an output, of which it is not known.
     """
+    system, inputs = given.system, given.inputs
     source = system.coefficients
     if len(t) == 1:  # of samples that are still to come nothing is known but the plant
         t = inside = t + _AHEAD
         signals = None if signals is None else np.repeat(signals, len(t), axis=0)
     known = system
     if system.depends_on_outputs and signals is not None:
-        along = cast("CoefficientSource", _Along(EquationForm(system, inputs=inputs), t, signals))
+        along = cast("CoefficientSource", _Along(given, t, signals))
         known = replace(system, coefficients=along)
     structure = analyse(known, float(t[0]), float(t[-1]), max_mu=max_mu, rank_tol=rank_tol)
-    whole = EquationForm(
-        system, structure, tuple((k, j) for k in range(1, structure.mu + 1)
-                                 for j in range(system.m)), inputs,
-    )
+    whole = replace(given, structure=structure, derivatives=tuple(
+        (k, j) for k in range(1, structure.mu + 1) for j in range(system.m)
+    ))
     followed = frozenset[str]().union(*source.signals.values())
     for j, name in enumerate(system.inputs):
         if name in followed and structure.mu and (inputs is None or not inputs.known[j]):

@@ -14,7 +14,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.linalg import exact_product
-from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import (
     ByName,
@@ -38,7 +38,8 @@ from gpebo_cli.observers.reduced.regression import (
     resolved,
     term_sizes,
 )
-from gpebo_cli.observers.reduced.split import initial_basis
+from gpebo_cli.observers.reduced.split import comparable, initial_basis, units_along
+from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import SolverSettings
@@ -56,7 +57,8 @@ class Start(NamedTuple):
     zero. Hidden constraints leave d of n_a dimensions.
     """
 
-    basis: Array  # (n, d) V, orthonormal
+    basis: Array  # (n, d) V, with
+    dual: Array  # (d, n)
     names: tuple[str, ...]  # of e's components
     offset: Array  # (n,)
     from_unknowns: Array  # (n, q)
@@ -77,25 +79,29 @@ def start_at(
         y: there (1, r).
     """
     rank, states = o.split.rank, form.system.states
-    V1, names = initial_basis(o.split.projector[0], rank, states)
+    units = form.units.states
+    own = o.split.projector[0] * units / units[:, None]  # P in comparable units
     n, q = form.system.n, form.system.q
     if form.structure is None or form.structure.d == rank:
-        return Start(V1, names, np.zeros(n), np.zeros((n, q)))
+        return Start(*initial_basis(own, rank, states, units), np.zeros(n), np.zeros((n, q)))
+    V1 = initial_basis(own, rank, states, np.ones(n))[0]
     exact = slice(0, o.algebraic.shape[1] - o.outputs)
     seen = o.equations(np.concatenate([driving, y], axis=1)[:, :, None])
     R = o.residual[0][exact]
-    U, sigma, Vt = np.linalg.svd(R @ o.algebraic[0] @ V1)
+    U, sigma, Vt = np.linalg.svd(R @ o.algebraic[0] @ (units[:, None] * V1))
     d = form.structure.d
     known = (Vt[: rank - d].T / sigma[: rank - d]) @ U[:, : rank - d].T @ R
     free = V1 @ Vt[rank - d :].T
-    basis, names = initial_basis(free @ free.T, d, states)
-    inward = V1 @ known
-    return Start(basis, names, -inward @ seen.g_y[0], exact_product(inward[None], -seen.G)[0])
+    inward = units[:, None] * V1 @ known
+    return Start(
+        *initial_basis(free @ free.T, d, states, units),
+        -inward @ seen.g_y[0], exact_product(inward[None], -seen.G)[0],
+    )
 
 
 def begin_at(
     xi_a0: Mapping[str, float] | list[float] | None, system: DescriptorSystem,
-    o: ObserverMatrices, begin: Start,
+    units: Array, o: ObserverMatrices, begin: Start,
 ) -> Array:
     """``observer.xi_a0``, of the differential states, in the coordinates of the start, (d,).
 
@@ -106,8 +112,8 @@ def begin_at(
     if frame is not None:  # with what may have been given up
         P = frame.projector
     rank = int(np.rint(np.trace(P)))
-    V1, names = initial_basis(P, rank, system.states)
-    return np.asarray(begin.basis.T @ V1 @ initial_extension(xi_a0, system, names))
+    V1, _, names = initial_basis(P * units / units[:, None], rank, system.states, units)
+    return np.asarray(begin.dual @ V1 @ initial_extension(xi_a0, system, names))
 
 
 def with_unknown(
@@ -140,10 +146,10 @@ def with_unknown(
     chosen = np.array([name in unknown for name in names], dtype=bool)
     said = set(given) if isinstance(given, Mapping) else set(names if given is not None else ())
     own = np.array([name in said for name in names], dtype=bool)
-    start = np.where(own, xi_a0, begin.basis.T @ system.initial_state)
+    start = np.where(own, xi_a0, begin.dual @ system.initial_state)
     known = begin.basis[:, ~chosen] @ start[~chosen]
     return begin._replace(
-        basis=begin.basis[:, chosen], offset=begin.offset + known,
+        basis=begin.basis[:, chosen], dual=begin.dual[chosen], offset=begin.offset + known,
         names=tuple(name for name, used in zip(begin.names, chosen, strict=True) if used),
     ), xi_a0[chosen]
 
@@ -162,7 +168,6 @@ class ReducedSystem:
     regression: str  # projected: all rows of the residual, paper: the last r
     note: str = ""  # which form is used, where that was not said, and why
     lost: BoolArray | None = None  # (n,) states that a failure of Assumption 1 touches
-    units: Array | None = None  # (n,) of the states then
     injection: Injection | None = None
 
     @property
@@ -186,6 +191,11 @@ class ReducedSystem:
         return self.first.split.basis
 
     @property
+    def units(self) -> Array:
+        """Of w's coordinates, (k,)."""
+        return units_along(self.basis, self.form.units.states)
+
+    @property
     def rank(self) -> int:
         """The number n_a of coordinates of the range of P."""
         return int(self.first.split.rank)
@@ -196,7 +206,9 @@ class ReducedSystem:
         states = self.system.states
         if self.basis.shape[1] > self.rank:
             return states
-        _, names = initial_basis(self.first.split.projector[0], self.rank, states)
+        units = self.form.units.states
+        own = self.first.split.projector[0] * units / units[:, None]
+        _, _, names = initial_basis(own, self.rank, states, units)
         return tuple(name.removeprefix("e0_") for name in names)
 
     def matrices(self, t: Array, inside: Array) -> ObserverMatrices:
@@ -225,7 +237,7 @@ class ReducedSystem:
         begin = self.begin if begin is None else begin
         xi_a = self.xi_a if xi_a is None else xi_a
         whole = np.concatenate([xi_a[:, None], begin.from_unknowns, begin.basis], axis=1)
-        return np.asarray(self.basis.T @ whole)
+        return np.asarray(self.first.split.dual @ whole)
 
     @property
     def xi_a(self) -> Array:
@@ -244,6 +256,7 @@ def reduced_system(
     form: str = "auto",
     unknown: Sequence[str] | None = None,
     in_part: bool = False,
+    units: Units | None = None,
 ) -> ReducedSystem:
     """The reduced system on measured signals.
 
@@ -257,6 +270,7 @@ def reduced_system(
         form: given, strangeness_free, or auto: as given where Assumption 1 holds.
         unknown: ``observer.unknown_initial``, None for all.
         in_part: where Assumption 1 fails on the form chosen, without what that touches.
+        units: in which everything counts; None: those of the plant at the start.
 
     Raises:
         ModelError: rank of E not constant, or Assumption 1 violated.
@@ -265,28 +279,28 @@ def reduced_system(
     mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
     at = signals.at(t, inside) if system.coefficients.signals else None
-    lost = units = None
+    lost = None
     try:
         used, first, note = choose_form(
-            system, t, inside, at, signals.derivatives, solver, form, weights
+            system, t, inside, at, signals.derivatives, solver, form, weights, units
         )
     except NotObservableError as error:
-        used = EquationForm(system, inputs=signals.derivatives)
+        used = as_given(system, t, inside, at, signals.derivatives)
         left = untouched(used, t, inside, at, solver.rank_tol) if in_part else None
         if left is None:
             raise
-        frame, lost, units = left
+        frame, lost = left
         first = observer_matrices(
-            used, t, inside, solver.rank_tol, normalise=True,
-            output_scale=output_scale(weights, system), signals=at, frame=frame,
+            used, t, inside, solver.rank_tol, output_scale=output_scale(weights, system),
+            signals=at, frame=frame,
         )
         note = f"; {_reason(error)}: what it touches is not estimated"
     whole = ReducedSystem(
         used, signals, solver, mesh, first,
         start_at(used, *_beginning(used, first, signals)), np.zeros(0), regression, note,
-        lost, units,
+        lost,
     )
-    begin, start = whole.begin, begin_at(xi_a0, system, first, whole.begin)
+    begin, start = whole.begin, begin_at(xi_a0, system, used.units.states, first, whole.begin)
     if unknown is not None:
         begin, start = with_unknown(begin, start, unknown, xi_a0, system)
     return replace(whole, begin=begin, xi_a0=start)
@@ -304,7 +318,7 @@ def _beginning(
 def choose_form(
     system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
     derivatives: InputDerivatives | None, solver: SolverSettings, form: str,
-    weights: ByName | None,
+    weights: ByName | None, units: Units | None = None,
 ) -> tuple[EquationForm, ObserverMatrices, str]:
     """The form of the equations, its matrices at the times t (N,), and why it is this one.
 
@@ -317,6 +331,7 @@ def choose_form(
         solver: tolerances.
         form: given, strangeness_free or auto.
         weights: of the outputs, ``observer.weights``.
+        units: as for :func:`reduced_system`.
 
     Raises:
         ModelError: rank of E not constant, Assumption 1 violated, not uniquely solvable.
@@ -330,13 +345,12 @@ def choose_form(
 
     def matrices(chosen: EquationForm) -> ObserverMatrices:
         return observer_matrices(
-            chosen, t, inside, solver.rank_tol, normalise=True, output_scale=scale,
-            signals=signals,
+            chosen, t, inside, solver.rank_tol, output_scale=scale, signals=signals
         )
 
-    note = ""
+    note, given = "", as_given(system, t, inside, signals, derivatives)
+    given = given if units is None else replace(given, units=units)
     if form != "strangeness_free":
-        given = EquationForm(system, inputs=derivatives)
         try:
             return given, matrices(given), note
         except NotObservableError as error:
@@ -344,13 +358,22 @@ def choose_form(
                 raise
             note = f"; observer on the strangeness-free form, for as given {_reason(error)}"
     hidden = strangeness_free(
-        system, t, inside, signals, derivatives,
+        given, t, inside, signals,
         max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol,
     )
     for j in hidden.interpolated:
         name = system.inputs[j]
         note += f"; derivatives of {name} are its interpolant's, which amplify its noise"
     return hidden, matrices(hidden), note
+
+
+def as_given(
+    system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
+    derivatives: InputDerivatives | None,
+) -> EquationForm:
+    """The form as given in the units of the first of the times t (N,)."""
+    at = t[:1], inside[:1], None if signals is None else signals[:1]
+    return EquationForm.given(system, derivatives, at)
 
 
 def _reason(error: NotObservableError) -> str:
@@ -365,6 +388,7 @@ class Extension:
     solution: LinearSolution  # [ξ_a | ξ_b | Φ] (k, 1 + q + n_a)
     assembled: Assembled
     scale: Array  # (K, p) size of the terms of each column of ψ so far, element by element
+    units: Array  # (k,) of the coordinates
 
     @property
     def mesh(self) -> Mesh:
@@ -372,12 +396,15 @@ class Extension:
         return self.solution.trajectory.mesh
 
     def growth(self, q: int) -> float:
-        """Largest entry of Φ."""
-        return largest_entry(self.solution.trajectory.values, 1 + q)
+        """Largest entry of Φ in comparable units, in which its columns start at size 1."""
+        return largest_entry(self._Phi(q))
 
     def logarithm(self, q: int) -> float:
         """ln ‖Φ(end)‖₂, which is 0 at the start."""
-        return log_norm(self.solution.trajectory.final[:, 1 + q :])
+        return log_norm(self._Phi(q)[-1, -1])
+
+    def _Phi(self, q: int) -> Array:
+        return comparable(self.solution.trajectory.values[..., 1 + q :], self.units)
 
 
 def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
@@ -393,12 +420,22 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         reduced.first.dynamics
     ) is not None
 
+    # What is integrated is in comparable units, as written where these are.
+    of_rows, of_columns = reduced.units, np.ones(columns)
+    of_columns[1 : 1 + q] = reduced.form.units.unknowns
+    of_columns[1 + q :] = units_along(start[:, 1 + q :], of_rows)
+    units = of_rows[:, None] / of_columns
+    plain = bool((units == 1.0).all())
+
     def equations(o: ObserverMatrices, v: Array, y: Array) -> LinearEquation:
         f, g_y = _driven(o, v, y, 1 + q if large else columns)
         seen = AlgebraicEquations(
             o.on_basis, g_y, o.G, o.range, o.elimination, o.injectivity
         )
-        return LinearEquation(None, o.dynamics, f, seen)
+        if plain:
+            return LinearEquation(None, o.dynamics, f, seen)
+        A = o.dynamics * of_rows / of_rows[:, None]
+        return LinearEquation(None, A, f / units[:, : f.shape[2]], seen)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         return equations(reduced.matrices(t, inside), *reduced.driving(t, inside))
@@ -413,14 +450,15 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
                 "unstable; use observer.remedy=output_injection, reset or current_coordinates, or "
                 "a shorter time.horizon"
             )
-        z, *seen = map(_over_time, (values, *extras))
+        z, *seen = map(_over_time, (values if plain else values * units, *extras))
         assembled = regression_signals(z, q, basis, AlgebraicEquations(*seen))
         latest[:] = [assembled]
         return (
             (signal.reshape(*values.shape[:2], -1), floor) for signal, floor in assembled.kinds()
         )
 
-    problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
+    name = f"observer of plant {system.name}"
+    problem = LinearProblem(coefficients, start / units, monitor, name)
     if solver.name == "ivp":
         solution = ivp.solve(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
     else:
@@ -434,13 +472,13 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         ) if large else None
         if swept is not None:
-            return _assembled(reduced, swept, latest[0], as_found=True)
+            return _assembled(reduced, _in_units(swept, units), latest[0], as_found=True)
         if large:
             large, known = False, None
         solution = solve(
             problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
         )
-    return _assembled(reduced, solution, latest[0])
+    return _assembled(reduced, _in_units(solution, units), latest[0])
 
 
 def _assembled(
@@ -470,13 +508,22 @@ def _assembled(
         here = replace(found, Y=found.Y[some], psi=found.psi[some], offset=found.offset[some],
                        gain=found.gain[some])
         for known, more in zip(
-            states, resolved(here, terms, system, reduced.form.scales), strict=True
+            states, resolved(here, terms, reduced.form), strict=True
         ):
             known.append(more)
     if not as_found:
         offset, gain = map(np.concatenate, states)
         found = replace(found, offset=offset, gain=gain)
-    return Extension(solution, found, np.maximum.accumulate(np.concatenate(scale), axis=0))
+    sizes = np.maximum.accumulate(np.concatenate(scale), axis=0)
+    return Extension(solution, found, sizes, reduced.units)
+
+
+def _in_units(solution: LinearSolution, units: Array) -> LinearSolution:
+    """A solution whose components are multiplied by their units (k, columns)."""
+    found = solution.trajectory
+    if (units == 1.0).all():
+        return solution
+    return replace(solution, trajectory=Trajectory(found.mesh, found.values * units))
 
 
 def _driven(o: ObserverMatrices, v: Array, y: Array, columns: int) -> tuple[Array, Array]:

@@ -67,7 +67,9 @@ def invariant_observer(
     basis: Array = o.split.basis
     names = system.states
     if basis.shape[1] == o.split.rank:
-        names = initial_basis(o.split.projector[0], o.split.rank, system.states)[1]
+        units = used.units.states
+        own = o.split.projector[0] * units / units[:, None]
+        names = initial_basis(own, o.split.rank, system.states, units)[2]
     return Invariant(
         o.dynamics[0],
         np.concatenate([o.from_signals[0], o.from_unknowns[0]], axis=1),

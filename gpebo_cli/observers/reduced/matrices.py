@@ -30,10 +30,8 @@ from gpebo_cli.observers.reduced.split import (
     split_in_frame,
     within_frame,
 )
+from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
-
-_BALANCING = 6  # rounds of scaling rows and columns
-_ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
 class NotObservableError(ModelError):
@@ -60,8 +58,7 @@ class ObserverMatrices:
     """
 
     split: Split
-    rows: Array  # (n,) constants by which the equations were divided
-    output_scale: Array  # (r,) √w, by which rows of C and y were multiplied
+    output_scale: Array  # (r,) √w over the unit, by which rows of C and y were multiplied
     dynamics: Array  # (N, k, k) BᵀA_0 B
     from_unknowns: Array  # (N, k, q) BᵀD_0
     from_signals: Array  # (N, k, · + r) Bᵀb_0 = from_signals [v; y], v as the form has it
@@ -82,7 +79,7 @@ class ObserverMatrices:
     @property
     def at_first(self) -> ObserverMatrices:
         """Those at the first time alone, split aside."""
-        constant = {"split", "rows", "output_scale"}
+        constant = {"split", "output_scale"}
         own = (f.name for f in fields(self) if f.name not in constant)
         return replace(self, **{name: getattr(self, name)[:1] for name in own})
 
@@ -125,35 +122,20 @@ class ObserverMatrices:
 Injection = Callable[[ObserverMatrices, Array, Array], Array]
 
 
-def row_sizes(entries: Array) -> Array:
-    """Size of each row of E, shape (n,), one for rows that are zero but for rounding.
-
-    Dividing equations by constants changes nothing, but an equation in picofarads would else look
-    like a rank deficiency of E. Powers of two: no rounding.
-
-    Args:
-        entries: the size of each entry of E, (n, n).
-    """
-    size = entries.max(axis=1, initial=0.0)
-    known = size > _ROUNDING * size.max(initial=0.0)
-    return np.asarray(np.exp2(np.rint(np.log2(np.where(known, size, 1.0)))))
-
-
 def observer_matrices(
     form: EquationForm, t: Array, inside: Array, rank_tol: float,
-    like: ObserverMatrices | None = None, *, normalise: bool = False,
+    like: ObserverMatrices | None = None, *,
     output_scale: Array | None = None, signals: Array | None = None, frame: Frame | None = None,
 ) -> ObserverMatrices:
     """Evaluate the observer's matrices at the times t (N,).
 
     Args:
-        form: of the plant.
+        form: of the plant, in whose units equations and outputs count.
         t: times, those of the start first.
         inside: where functions that jump are decided.
         rank_tol: singular values below this, relative, are zero.
-        like: those of other times, whose basis and scaling of the equations are kept.
-        normalise: divide the equations by their sizes first, see :func:`row_sizes`.
-        output_scale: √w (r,) of the outputs' weights; default: that of ``like``, else ones.
+        like: those of other times, whose basis and weights are kept.
+        output_scale: √w (r,) of the outputs' weights; default: those of ``like``, else ones.
         signals: [u; y] at these times (N, m + r), for a plant whose matrices follow them.
         frame: in place of that of ``like``.
 
@@ -162,24 +144,21 @@ def observer_matrices(
             singular value.
     """
     system, model = form.system, form.equations(t, inside, signals)
-    if like is not None:
-        rows, scale = like.rows, like.output_scale
+    units = form.units
+    if like is not None and output_scale is None:
+        scale = like.output_scale
     else:
-        # Only what is known at the start decides: later times must not change earlier results.
-        rows = row_sizes(np.abs(model.E[0])) if normalise else np.ones(system.n)
-        scale = np.ones(system.r)
-    if output_scale is not None:
-        scale = output_scale
+        scale = (np.ones(system.r) if output_scale is None else output_scale) / units.outputs
     plain = model.hidden is None and {"D", "H"} <= system.coefficients.zero
     known = like.split.frame if frame is None and like is not None else frame
     frame = axes_frame(entry_sizes(model.E)) if like is None and frame is None else known
     found = None
     if plain and frame is not None and frame.remaining is None:
-        found = _in_frame(model, rows, scale, frame, rank_tol)
+        found = _in_frame(model, units.equations, scale, frame, rank_tol)
     if found is not None:
         return found
     return _by_steps(
-        system, model, rows, scale, t, rank_tol, like, known,
+        system, model, units, scale, t, rank_tol, like, known,
         lambda: form.mass(t, inside, signals, 1)[: len(model.E)],
     )
 
@@ -203,28 +182,31 @@ def _in_frame(
     ):
         return None
     return ObserverMatrices(
-        within_frame(frame, pinv), rows, scale, dynamics, from_unknowns, from_signals, algebraic,
+        within_frame(frame, pinv), scale, dynamics, from_unknowns, from_signals, algebraic,
         on_basis, g_signals, G, Q1, H, injectivity,
     )
 
 
 def _by_steps(
-    system: DescriptorSystem, model: Equations, rows: Array, scale: Array, t: Array,
+    system: DescriptorSystem, model: Equations, units: Units, scale: Array, t: Array,
     rank_tol: float, like: ObserverMatrices | None, frame: Frame | None, slope: Callable[[], Array],
 ) -> ObserverMatrices:
     """The observer's matrices from those of the plant at the times t (N,) and Ė (N or 1, n, n)."""
     q, r = system.q, system.r
     E, A, B, F, C, D, H, hidden = model
+    rows = units.equations[:, None]
     if (rows != 1.0).any():
-        E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
+        E, A, B, F = (matrix / rows for matrix in (E, A, B, F))
     C, D, H = (scale[:, None] * matrix for matrix in (C, D, H))
     if frame is not None:
-        split = split_in_frame(E, frame, rank_tol)
+        split = split_in_frame(E, frame, units.states, rank_tol)
     else:
-        split = constant_split(E, system.states, rank_tol) if like is None else None
+        split = None
+        if like is None:
+            split = constant_split(E, system.states, units.states, rank_tol)
     if split is None:
-        known = None if like is None else like.split.basis
-        split = split_by_svd(system, E, slope() / rows[:, None], t, rank_tol, known)
+        known = None if like is None else like.split
+        split = split_by_svd(system, E, slope() / rows, t, units.states, rank_tol, known)
 
     L, pinv, basis = split.equations, split.pinv, split.basis
     # 0 = 𝒜 x + g_y + G θ: equations without derivatives, hidden constraints, outputs.
@@ -242,10 +224,10 @@ def _by_steps(
     g_signals = joined(of_inputs, of_y, axis=2)
     if frame is not None and frame.remaining is not None:
         Q1, K, injectivity = _eliminate_in_part(
-            system, algebraic, split.kernel, t, rank_tol, frame.remaining.rank
+            system, algebraic, split.kernel, units.states, t, rank_tol, frame.remaining.rank
         )
     else:
-        Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, t, rank_tol)
+        Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, units.states, t, rank_tol)
     if hidden is not None:
         Q1[:, Q1.shape[1] - r :] = 0.0  # y is not in it, and neither is its rounding
     Lambda = exact_product(pinv, A)  # Λ = E⁺A + Ṗ
@@ -265,7 +247,6 @@ def _by_steps(
     dynamics = whole[:, :, :k]
     return ObserverMatrices(
         split=split,
-        rows=rows,
         output_scale=scale,
         dynamics=dynamics[:1] if len(E) == len(A) == len(C) == 1 and hidden is None else dynamics,
         from_unknowns=whole[:, :, k : k + q],
@@ -297,15 +278,17 @@ def _seen_through(
 
 
 def _eliminate(
-    system: DescriptorSystem, algebraic: Array, kernel: Array, t: Array, rank_tol: float
+    system: DescriptorSystem, algebraic: Array, kernel: Array, units: Array, t: Array,
+    rank_tol: float,
 ) -> tuple[Array, Array, Array]:
     """Q1 and H of K = (𝒜 Q)⁺ = H Q1ᵀ, and a bound of the singular value behind Assumption 1.
 
-    With Q = V2 V2ᵀ and 𝒜 V2 = Q1 R1, (𝒜 Q)⁺ = V2 R1⁻¹ Q1ᵀ. σ_min(R1) is at least 1/‖R1⁻¹‖_F;
-    it is computed itself, in units of the rows and columns, only where that bound leaves a doubt.
+    With V2 of the kernel and 𝒜 V2 = Q1 R1, (𝒜 Q)⁺ = V2 R1⁻¹ Q1ᵀ. σ_min(R1) is at least 1/‖R1⁻¹‖_F;
+    it is computed itself only where that bound leaves a doubt. The states have units (n,).
     """
+    kernel = kernel / np.linalg.norm(kernel / units[:, None], axis=1, keepdims=True)
     on_kernel = algebraic @ kernel
-    size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), TINY)
+    size = np.maximum(np.linalg.norm(algebraic * units, axis=(1, 2)), TINY)
     n_b = kernel.shape[2]
     if n_b == 0:
         return on_kernel, kernel[:1], np.full(len(size), np.inf)
@@ -317,7 +300,7 @@ def _eliminate(
         inverse, bound = R1, np.zeros(len(R1))
     doubtful = np.flatnonzero(~(bound > rank_tol))
     if len(doubtful):
-        sigma = np.linalg.svd(_balanced(on_kernel[doubtful]), compute_uv=False)
+        sigma = np.linalg.svd(on_kernel[doubtful], compute_uv=False)
         smallest = sigma[:, -1] / np.maximum(sigma[:, 0], TINY)
         bound[doubtful] = smallest
         if (smallest <= rank_tol).any():
@@ -331,20 +314,13 @@ def _eliminate(
     return Q1, kernel @ inverse, bound
 
 
-def _balanced(matrices: Array) -> Array:
-    """Rows and columns of matrices (N, a, b) brought to comparable size, whatever their units."""
-    for _ in range(_BALANCING):
-        for axis in (2, 1):
-            size = np.sqrt(np.abs(matrices).max(axis=axis, keepdims=True, initial=0.0))
-            matrices = matrices / np.where(size > 0.0, size, 1.0)
-    return matrices
-
-
 def _eliminate_in_part(
-    system: DescriptorSystem, algebraic: Array, kernel: Array, t: Array, rank_tol: float, rank: int
+    system: DescriptorSystem, algebraic: Array, kernel: Array, units: Array, t: Array,
+    rank_tol: float, rank: int,
 ) -> tuple[Array, Array, Array]:
     """:func:`_eliminate` by the pseudoinverse of a rank that has to be the same at all times."""
-    size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), TINY)
+    kernel = kernel / np.linalg.norm(kernel / units[:, None], axis=1, keepdims=True)
+    size = np.maximum(np.linalg.norm(algebraic * units, axis=(1, 2)), TINY)
     U, sigma, Vt = np.linalg.svd(algebraic @ kernel)
     ranks = (sigma > rank_tol * size[:, None]).sum(axis=1)
     if (ranks != rank).any():

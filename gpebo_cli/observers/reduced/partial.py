@@ -16,7 +16,6 @@ import numpy as np
 from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
-from gpebo_cli.observers.reduced.matrices import row_sizes
 from gpebo_cli.observers.reduced.split import (
     TINY,
     Frame,
@@ -25,7 +24,6 @@ from gpebo_cli.observers.reduced.split import (
     initial_basis,
     within_frame,
 )
-from gpebo_cli.reduction.derivative_array import balance
 from gpebo_cli.reduction.form import EquationForm
 
 _DRIVEN = 1e-9  # of the largest entry of Λ V2 N: less is rounding
@@ -34,8 +32,8 @@ _DIP = 1e-3  # of the largest of a singular value over time: where less, it may 
 
 def untouched(
     form: EquationForm, t: Array, inside: Array, signals: Array | None, rank_tol: float
-) -> tuple[Frame, BoolArray, Array] | None:
-    """The frame of E without what is given up, which states are lost, and all states' units, (n,).
+) -> tuple[Frame, BoolArray] | None:
+    """The frame of E without what is given up, and which states are lost (n,).
 
     Args:
         form: as given.
@@ -48,28 +46,28 @@ def untouched(
         None where no state is left, where the kernel of E turns, or where a rank changes or may.
     """
     model, states = form.equations(t, inside, signals), form.system.states
-    rows = row_sizes(np.abs(model.E[0]))[:, None]
-    E, A = model.E / rows, model.A / rows
-    split = constant_split(E, states, rank_tol)
+    units, plain = form.units, np.ones(len(states))
+    own = units.states / units.equations[:, None]
+    E, A = model.E * own, model.A * own
+    split = constant_split(E, states, plain, rank_tol)
     if split is None or split.frame is None:
         return None
     frame = split.frame
-    algebraic = joined(exact_product(split.equations, A), model.C, axis=1)
+    C = model.C * units.states / units.outputs[:, None]
+    algebraic = joined(exact_product(split.equations, A), C, axis=1)
     size = np.maximum(np.linalg.norm(algebraic, axis=(1, 2)), TINY)
     given_up = np.zeros((len(states), 0))
     while given_up.shape[1] < split.rank:
-        kept, _ = initial_basis(
-            frame.projector - given_up @ given_up.T, split.rank - given_up.shape[1], states
-        )
-        # A state that is given up must not look as if a small part of it was kept.
-        kept = without_rounding(kept[None], np.ones((1, 1, 1)))[0]
+        rank = split.rank - given_up.shape[1]
+        left_over = frame.projector - given_up @ given_up.T
+        kept, dual, _ = initial_basis(left_over, rank, states, plain)
         kernel = np.hstack([frame.kernel, given_up])
         _, sigma, Vt = np.linalg.svd(algebraic @ kernel)
         ranks = (sigma > rank_tol * size[:, None]).sum(axis=1)
         weakest = sigma[:, max(ranks[0] - 1, 0)]
         if (ranks != ranks[0]).any() or weakest.min() < _DIP * weakest.max():
             return None
-        left = replace(frame, remaining=Remaining(kept, given_up, int(ranks[0])))
+        left = replace(frame, remaining=Remaining(kept, dual, given_up, int(ranks[0])))
         free = kernel @ transpose(Vt[:, ranks[0] :])
         drive = within_frame(left, split.pinv).pinv @ A
         into = drive @ free
@@ -79,8 +77,23 @@ def untouched(
             lost = (np.linalg.norm(free, axis=2) > _DRIVEN).any(axis=0)
             if lost.all():
                 return None
-            along = form.along(t, inside, signals, 0)
-            units = balance(form.system.coefficients.taylor(t, 0, inside, along)).columns
-            return left, lost, units
+            return _as_written(left, left_over, states, units.states), lost
         given_up = np.hstack([given_up, kept @ U[:, driven]])
     return None
+
+
+def _as_written(frame: Frame, left_over: Array, states: tuple[str, ...], units: Array) -> Frame:
+    """A frame of states in comparable units, with the projector on what is left, in their own."""
+    remaining = frame.remaining
+    assert remaining is not None  # noqa: S101  that is what it was made for
+    domain, dual, _ = initial_basis(frame.projector, frame.domain.shape[1], states, units)
+    kept, of_kept, _ = initial_basis(left_over, remaining.kept.shape[1], states, units)
+    own = units[:, None]
+    # A state that is given up must not look as if a small part of it was kept.
+    kept = own * without_rounding((kept / own)[None], np.ones((1, 1, 1)))[0]
+    return replace(
+        frame, domain=domain, dual=dual, kernel=own * frame.kernel,
+        remaining=replace(
+            remaining, kept=kept, dual=of_kept, given_up=own * remaining.given_up
+        ),
+    )

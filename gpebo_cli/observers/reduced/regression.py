@@ -13,6 +13,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time, orthonormal_complement, transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
+from gpebo_cli.reduction.form import EquationForm
 
 _ROUNDING = 1e-3  # of a projection, in terms of what is resolved
 _NOISE = 1e-11  # of the terms of a gain: beyond what extensions are resolved to
@@ -93,7 +94,7 @@ def regression_signals(
 
 
 def resolved(
-    found: Assembled, terms: Array, system: DescriptorSystem, scales: Array | None
+    found: Assembled, terms: Array, form: EquationForm
 ) -> tuple[Array, Array]:
     """The state's offset (N, n) and gain (N, n, p), on hidden constraints and without noise.
 
@@ -104,12 +105,12 @@ def resolved(
     Args:
         found: what :func:`regression_signals` gave.
         terms: sizes of those of the gain, (N, n, p).
-        system: the plant.
-        scales: sizes of the states (n,) by which M was made a projector; None: there is no M.
+        form: of the equations.
     """
-    offset, gain = found.offset, found.gain
-    if scales is not None:
-        rows = slice(-(system.n + system.r), -system.r)
+    n, r, offset, gain = form.system.n, form.system.r, found.offset, found.gain
+    if form.structure is not None:
+        scales = form.units.states  # M is a projector in these
+        rows = slice(-(n + r), -r)
         offset = offset - scales * found.Y[:, rows]
         gain = gain + scales[:, None] * found.psi[:, rows]
     return offset, np.where(np.abs(gain) <= _NOISE * terms, 0.0, gain)

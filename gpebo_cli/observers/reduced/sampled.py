@@ -25,12 +25,12 @@ from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import ByName
-from gpebo_cli.observers._observation import InitialError, SampledBlock
+from gpebo_cli.observers._observation import InitialError, SampledBlock, largest_entry
 from gpebo_cli.observers.reduced.extension import begin_at, choose_form, form_used, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import regression_signals, resolved, term_sizes
 from gpebo_cli.observers.reduced.response import error_system
-from gpebo_cli.observers.reduced.split import split_in_frame
+from gpebo_cli.observers.reduced.split import comparable, split_in_frame, units_along
 from gpebo_cli.recordings.hold import edges, held
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives
 from gpebo_cli.regression.errors import ErrorSteps
@@ -67,7 +67,7 @@ class SampledObserver:
     regression: str  # projected or paper
     like: ObserverMatrices  # those at the first sample, whose basis is kept
     start: Array  # (k, 1 + q + n_a)
-    initial_basis: Array  # (n, n_a) V1
+    initial_dual: Array  # (n_a, n) V1⁺P
     xi_a0: Array  # (n_a,)
     parameters: tuple[str, ...]
     note: str  # which form of the equations is used, where that was not said, and why
@@ -87,6 +87,11 @@ class SampledObserver:
         """The basis in whose coordinates the extension is integrated, (n, k)."""
         return self.like.split.basis
 
+    @property
+    def units(self) -> Array:
+        """Of those coordinates, (k,)."""
+        return units_along(self.basis, self.form.units.states)
+
     def assumptions(self, reached: SampledState) -> tuple[Assumption, ...]:
         """What the observer needed so far, with its evidence."""
         return (
@@ -103,7 +108,9 @@ class SampledObserver:
 
     def truth(self, extension: Array) -> InitialError:
         """What the parameters are, from [ξ_a | ξ_b | Φ] (K, k, 1 + p) at the times to be asked."""
-        return InitialError(self.initial_basis, self.xi_a0, self.basis, lambda _t: extension)
+        return InitialError(
+            self.initial_dual, self.xi_a0, self.like.split.dual, lambda _t: extension, self.units
+        )
 
     def advance(
         self, state: SampledState | None, t: Array, u: Array, y: Array
@@ -191,7 +198,8 @@ class SampledObserver:
         if self.regression == "paper":
             rows = rows[:, -system.r :]
         previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
-        growth = float(np.abs(z[..., 1 + system.q :]).max(initial=0.0))
+        Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
+        growth = largest_entry(Phi[1:])
         smallest = float(o.injectivity.min())
         terms, scale = term_sizes(z, system.q, self.basis, equations)
         if before is not None:
@@ -212,9 +220,9 @@ class SampledObserver:
             errors = ErrorSteps(step, *(
                 np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
             ))
-        offset, gain = resolved(assembled, terms, system, self.form.scales)
+        offset, gain = resolved(assembled, terms, self.form)
         return state, SampledBlock(
-            regression, offset, gain, z, scale, errors, self.form.scales
+            regression, offset, gain, z, scale, errors, self.form.units.states
         )
 
 
@@ -268,16 +276,17 @@ def sampled_observer(
     t = np.array([start])
     used, first, note = choose_form(system, t, t, sample[None], derivatives, solver, form, weights)
     if not _kernel_is_fixed(used, first, t + _PROBED, sample, solver.rank_tol):
-        split = replace(first.split, basis=np.eye(system.n), frame=None)
+        eye = np.eye(system.n)
+        split = replace(first.split, basis=eye, dual=eye, frame=None)
         first = replace(first, split=split, on_basis=first.algebraic)
     m = system.m
     begin = start_at(used, first, used.driving(t, t, sample[None, :m]), sample[None, m:])
-    xi = begin_at(xi_a0, system, first, begin)
+    xi = begin_at(xi_a0, system, used.units.states, first, begin)
     xi_a = begin.offset + begin.basis @ xi
     whole = np.concatenate([xi_a[:, None], begin.from_unknowns, begin.basis], axis=1)
     return SampledObserver(
         form=used, solver=solver, hold=hold, regression=regression, like=first,
-        start=first.split.basis.T @ whole, initial_basis=begin.basis, xi_a0=xi,
+        start=first.split.dual @ whole, initial_dual=begin.dual, xi_a0=xi,
         parameters=(*system.unknowns, *begin.names), note=note,
     )
 
@@ -294,5 +303,5 @@ def _kernel_is_fixed(
     if frame is None or "E" in form.system.coefficients.constant:
         return frame is not None
     signals = np.repeat(sample[None], len(t), axis=0) if form.follows_signals else None
-    E = form.mass(t, t, signals) / first.rows[:, None]
-    return split_in_frame(E, frame, rank_tol) is not None
+    E = form.mass(t, t, signals) / form.units.equations[:, None]
+    return split_in_frame(E, frame, form.units.states, rank_tol) is not None

@@ -1,4 +1,9 @@
-"""E⁺ and the subspaces of E(t), constant in time where they can be."""
+"""E⁺ and the subspaces of E(t), constant in time where they can be.
+
+E⁺ and with it P = E⁺E are those of states in units of comparable size, D: E⁺ = D (E D)⁺. So P is an
+orthogonal projector in D⁻¹x, and depends on no unit. A basis B (n, k) of range P comes with its
+dual (k, n), dual B = I and dual P = dual. Coordinate axes are their own dual.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +33,12 @@ class Split:
     """E⁺ and the subspaces of E at N times; a leading axis of 1 means constant in time."""
 
     rank: int  # n_a
-    basis: Array  # (n, k) orthonormal B with w = B z: range P where that is constant, else I
-    pinv: Array  # (N, k, n) BᵀE⁺
-    turn: Array | None  # (N, k, n) BᵀṖ, None for zero
+    basis: Array  # (n, k) B with w = B z: range P where that is constant, else I
+    dual: Array  # (k, n), z = dual w
+    pinv: Array  # (N, k, n) dual E⁺
+    turn: Array | None  # (N, k, n) dual Ṗ, None for zero
     equations: Array  # (N, e, n) L: Π itself, or the e = n_b equations without derivatives
-    kernel: Array  # (N, n, n_b) orthonormal
+    kernel: Array  # (N, n, n_b) orthonormal in comparable units
     projector: Array  # (N, n, n) P
     frame: Frame | None  # None where kernel or range turn
 
@@ -41,8 +47,9 @@ class Split:
 class Remaining:
     """The part of w that is kept where Assumption 1 fails, see :mod:`.partial`."""
 
-    kept: Array  # (n, k) orthonormal
-    given_up: Array  # (n, c) orthonormal, the rest of range P
+    kept: Array  # (n, k) with
+    dual: Array  # (k, n)
+    given_up: Array  # (n, c), the rest of range P
     rank: int  # of 𝒜 on the kernel and on what is given up
 
 
@@ -50,7 +57,8 @@ class Remaining:
 class Frame:
     """Kernel and range of an E(t) in which neither depends on time."""
 
-    domain: Array  # (n, n_a) orthonormal, of range P
+    domain: Array  # (n, n_a) of range P, with
+    dual: Array  # (n_a, n)
     range: Array  # (n, n_a) orthonormal, of range E
     kernel: Array  # (n, n_b)
     equations: Array  # (e, n)
@@ -59,7 +67,7 @@ class Frame:
     @cached_property
     def projector(self) -> Array:
         """P, (n, n)."""
-        return np.asarray(self.domain @ self.domain.T)
+        return np.asarray(self.domain @ self.dual)
 
 
 def entry_sizes(E: Array) -> Array:
@@ -80,39 +88,44 @@ def axes_frame(entries: Array) -> Frame | None:
     if np.count_nonzero(rows) != np.count_nonzero(columns):
         return None
     axes = np.eye(len(entries))
-    return Frame(axes[:, columns], axes[:, rows], axes[:, ~columns], axes[~rows])
+    domain = axes[:, columns]
+    return Frame(domain, domain.T, axes[:, rows], axes[:, ~columns], axes[~rows])
 
 
-def constant_split(E: Array, states: tuple[str, ...], rank_tol: float) -> Split | None:
+def constant_split(
+    E: Array, states: tuple[str, ...], units: Array, rank_tol: float
+) -> Split | None:
     """E⁺ at the times (N, n, n), if kernel and range of E are the same at all of them.
 
     Coordinate axes where columns and rows are exactly zero; else from the singular vectors at the
-    first time.
+    first time. The states have units (n,).
     """
     frame = axes_frame(entry_sizes(E))
     if frame is not None:
-        split = split_in_frame(E, frame, rank_tol)
+        split = split_in_frame(E, frame, units, rank_tol)
         if split is not None:
             return split
-    U, sigma, Vt = np.linalg.svd(E[0])
-    rank = int((sigma > rank_tol * np.linalg.norm(E, axis=(1, 2)).max()).sum())
-    U1, V2 = U[:, :rank], Vt[rank:].T
-    domain, _ = initial_basis(Vt[:rank].T @ Vt[:rank], rank, states)
+    U, sigma, Vt = np.linalg.svd(E[0] * units)
+    rank = int((sigma > rank_tol * np.linalg.norm(E * units, axis=(1, 2)).max()).sum())
+    U1, V2 = U[:, :rank], units[:, None] * Vt[rank:].T
+    domain, dual, _ = initial_basis(Vt[:rank].T @ Vt[:rank], rank, states, units)
     equations = without_rounding(orthonormal_complement(U1)[None])[0]
-    return split_in_frame(E, Frame(domain, U1, V2, equations), rank_tol)
+    return split_in_frame(E, Frame(domain, dual, U1, V2, equations), units, rank_tol)
 
 
-def split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
+def split_in_frame(E: Array, frame: Frame, units: Array, rank_tol: float) -> Split | None:
     """E⁺ = B (UᵀE B)⁻¹ Uᵀ of E (N, n, n), or None.
 
     None where kernel, range or rank are not those of the frame at one of the times.
     """
     B, U = frame.domain, frame.range
+    kernel, common = frame.kernel, E * units
     size, outside = (
-        float(np.abs(part).max(initial=0.0)) for part in (E, E @ frame.kernel)
+        float(np.abs(part).max(initial=0.0)) for part in (common, E @ kernel)
     )
-    outside = max(outside, float(np.abs(frame.equations @ E).max(initial=0.0)))
-    inner = U.T @ E @ B
+    outside = max(outside, float(np.abs(frame.equations @ common).max(initial=0.0)))
+    own = np.linalg.norm(B / units[:, None], axis=0)  # of columns that are not yet comparable
+    inner = U.T @ E @ (B / own)
     try:
         inverse = np.asarray(np.linalg.inv(inner), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -122,7 +135,7 @@ def split_in_frame(E: Array, frame: Frame, rank_tol: float) -> Split | None:
     ]
     if not fits(outside, size, B.shape[1], norms[0], norms[1], rank_tol):
         return None
-    return within_frame(frame, inverse @ U.T)
+    return within_frame(frame, inverse / own[:, None] @ U.T)
 
 
 def fits(
@@ -144,24 +157,25 @@ def fits(
 
 
 def within_frame(frame: Frame, pinv: Array) -> Split:
-    """The split in a frame, with BᵀE⁺ (N, n_a, n)."""
+    """The split in a frame, with dual E⁺ (N, n_a, n)."""
     left = frame.remaining
     if left is not None:
         return Split(
-            rank=left.kept.shape[1], basis=left.kept, pinv=left.kept.T @ frame.domain @ pinv,
-            turn=None, equations=frame.equations[None],
+            rank=left.kept.shape[1], basis=left.kept, dual=left.dual,
+            pinv=left.dual @ frame.domain @ pinv, turn=None, equations=frame.equations[None],
             kernel=np.hstack([frame.kernel, left.given_up])[None],
-            projector=(left.kept @ left.kept.T)[None], frame=frame,
+            projector=(left.kept @ left.dual)[None], frame=frame,
         )
     return Split(
-        rank=frame.domain.shape[1], basis=frame.domain, pinv=pinv, turn=None,
+        rank=frame.domain.shape[1], basis=frame.domain, dual=frame.dual, pinv=pinv, turn=None,
         equations=frame.equations[None], kernel=frame.kernel[None],
         projector=frame.projector[None], frame=frame,
     )
 
 
 def split_by_svd(
-    system: DescriptorSystem, E: Array, dE: Array, t: Array, rank_tol: float, basis: Array | None
+    system: DescriptorSystem, E: Array, dE: Array, t: Array, units: Array, rank_tol: float,
+    like: Split | None,
 ) -> Split:
     """The general case: singular vectors at every time, and Ṗ = S + Sᵀ with S = E⁺ Ė Q.
 
@@ -170,13 +184,14 @@ def split_by_svd(
         E: (N, n, n).
         dE: its derivative (N, n, n).
         t: (N,).
+        units: of the states (n,).
         rank_tol: singular values below this, relative, are zero.
-        basis: (n, k) of another split, which is kept.
+        like: another split, whose basis is kept.
 
     Raises:
         ModelError: the rank changes, or the kernel turns where that of the basis did not.
     """
-    U, sigma, Vt = np.linalg.svd(E)
+    U, sigma, Vt = np.linalg.svd(E * units)
     size = np.maximum(sigma.max(initial=0.0), TINY)
     ranks = (sigma > rank_tol * size).sum(axis=1)
     if (ranks != ranks[0]).any():
@@ -189,37 +204,66 @@ def split_by_svd(
         )
     n_a = int(ranks[0])
     U1, V1, V2 = U[:, :, :n_a], transpose(Vt)[:, :, :n_a], transpose(Vt)[:, :, n_a:]
-    pinv_E = without_rounding((V1 / sigma[:, None, :n_a]) @ transpose(U1))  # E⁺
+    # E⁺ in comparable units
+    pinv_E = without_rounding((V1 / sigma[:, None, :n_a]) @ transpose(U1))
     P = V1 @ transpose(V1)
-    S = exact_product(pinv_E, exact_product(dE, without_rounding(V2 @ transpose(V2))))  # E⁺ Ė Q
+    Q = without_rounding(V2 @ transpose(V2))
+    S = exact_product(pinv_E, exact_product(dE * units, Q))  # E⁺ Ė Q
     turned = float(np.abs(P - P[0]).max(initial=0.0)) >= _PROJECTOR_TURNED
-    if basis is None:
-        basis = np.eye(system.n) if turned else initial_basis(P[0], n_a, system.states)[0]
-    elif basis.shape[1] < system.n:
-        off = np.abs(P - basis @ basis.T).max(axis=(1, 2))
+    own = units[:, None]
+    if like is not None:
+        basis, dual = like.basis, like.dual
+    elif turned:
+        basis = dual = np.eye(system.n)
+    else:
+        basis, dual, _ = initial_basis(P[0], n_a, system.states, units)
+    if like is not None and basis.shape[1] < system.n:
+        off = np.abs(P - (basis @ dual) * units / own).max(axis=(1, 2))
         if off.max() >= 10 * _PROJECTOR_TURNED:
             raise ModelError(
                 f"plant {system.name}: the kernel of E turns near t = {t[int(np.argmax(off))]:.6g} "
                 "and nowhere else; start a run there, or make E smooth"
             )
     return Split(
-        rank=n_a, basis=basis, pinv=without_rounding(basis.T @ pinv_E),
-        turn=basis.T @ (S + transpose(S)), equations=without_rounding(orthonormal_complement(U1)),
-        kernel=V2, projector=P, frame=None,
+        rank=n_a, basis=basis, dual=dual, pinv=without_rounding(dual @ (own * pinv_E)),
+        turn=(dual * units) @ (S + transpose(S)) / units,
+        equations=without_rounding(orthonormal_complement(U1)),
+        kernel=own * V2, projector=own * P / units, frame=None,
     )
 
 
-def initial_basis(P: Array, rank: int, states: tuple[str, ...]) -> tuple[Array, tuple[str, ...]]:
-    """V1 (n, n_a), orthonormal basis of range P(start), and the names of e₀'s components.
+def units_along(basis: Array, units: Array) -> Array:
+    """Units (k,) of coordinates along a basis (n, k) of states with units (n,)."""
+    return np.asarray(1.0 / np.linalg.norm(basis / units[:, None], axis=0))
 
-    Coordinate axes where they span the range (E diagonal, or zero columns): e0_<state>. Else an
-    orthonormal basis made from the columns of P in the order of the states: e0_1, e0_2, …
+
+def comparable(Phi: Array, units: Array) -> Array:
+    """Φ (…, k, d) of coordinates with units (k,), with columns that start at size 1."""
+    own = Phi / units[:, None]
+    start = own[(0,) * (own.ndim - 2)]
+    return np.asarray(own / np.linalg.norm(start, axis=0))
+
+
+def initial_basis(
+    P: Array, rank: int, states: tuple[str, ...], units: Array
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """V1 (n, n_a), basis of range P(start), its dual and the names of e₀'s components.
+
+    Coordinate axes where they span the range (E diagonal, or zero columns): e0_<state>. Else a
+    basis that is orthonormal in comparable units, from the columns of P in the order of the states:
+    e0_1, e0_2, …
+
+    Args:
+        P: orthogonal projector in comparable units.
+        rank: n_a.
+        states: their names.
+        units: theirs (n,).
     """
     on_axes = P.diagonal() > 0.5
     exact = np.diag(on_axes.astype(np.float64))
     axes = on_axes.nonzero()[0]
     if len(axes) == rank and np.abs(P - exact).max(initial=0.0) < 1e-13:
-        return exact[:, axes], tuple([f"e0_{states[i]}" for i in axes.tolist()])
+        return exact[:, axes], exact[axes], tuple([f"e0_{states[i]}" for i in axes.tolist()])
     columns: list[Array] = []
     for column in P.T:  # Gram–Schmidt, twice: deterministic, unlike singular vectors
         v = column.copy()
@@ -229,4 +273,5 @@ def initial_basis(P: Array, rank: int, states: tuple[str, ...]) -> tuple[Array, 
         norm = float(np.linalg.norm(v))
         if norm > 1e-6 and len(columns) < rank:
             columns.append(v / norm)
-    return np.array(columns).T.reshape(len(P), -1), tuple(f"e0_{i + 1}" for i in range(rank))
+    V = np.array(columns).T.reshape(len(P), -1)
+    return units[:, None] * V, V.T / units, tuple(f"e0_{i + 1}" for i in range(rank))

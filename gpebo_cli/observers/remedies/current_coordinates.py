@@ -35,10 +35,10 @@ class CurrentState:
 
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """ζ at the times t (M,), shape (M, q + d)."""
-        basis, x = self.reduced.basis, states(t)
-        if basis.shape[1] > self.reduced.rank:
+        dual, x = self.reduced.first.split.dual, states(t)
+        if len(dual) > self.reduced.rank:
             x = np.einsum("mij,mj->mi", self.reduced.matrices(t, t).projector, x)
-        return np.concatenate([theta, x @ basis], axis=1)
+        return np.concatenate([theta, x @ dual.T], axis=1)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class CurrentCoordinates:
                 dynamics=Dynamics(on_mesh(mesh, A), on_mesh(mesh, b), -2.0 * fastest),
             ),
             state_map=AffineStateMap(
-                on_mesh(mesh, final.offset), on_mesh(mesh, final.gain), reduced.form.scales
+                on_mesh(mesh, final.offset), on_mesh(mesh, final.gain), reduced.form.units.states
             ),
             truth=CurrentState(reduced),
             error_estimate=error,

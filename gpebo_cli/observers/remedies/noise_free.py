@@ -76,8 +76,8 @@ def _round(reduced: ReducedSystem, found: Observation, eta: Array) -> Observatio
     copy = Linearised(system, Trajectory(state_map.offset.mesh, x), eta[: system.q])
     along = reduced_system(
         replace(system, coefficients=copy), reduced.signals, reduced.solver,
-        weights=(reduced.first.output_scale**2).tolist(), regression=reduced.regression,
-        form="given",
+        weights=((reduced.first.output_scale * reduced.form.units.outputs) ** 2).tolist(),
+        regression=reduced.regression, form="given", units=reduced.form.units,
     )
     return Plain().observe(replace(along, xi_a0=reduced.xi_a0))
 
@@ -90,10 +90,13 @@ def _unsettled(count: int, why: str) -> SolverError:
 
 
 def _change(found: Observation, before: Array, after: Array, tol: float) -> float:
-    """Root mean square of ψ(η̂₊ − η̂) in terms of that of the residual (Bates & Watts 1981)."""
+    """Root mean square of ψ(η̂₊ − η̂) in terms of that of the residual (Bates & Watts 1981).
+
+    Below what signals are resolved to, ``tol``, there is no change.
+    """
     Y, psi = found.regression.Y.values, found.regression.psi.values
     residual = Y - psi @ after
     floor = tol * float(np.abs(Y).max(initial=0.0) + np.abs(psi @ after).max(initial=0.0))
     return float(np.linalg.norm(psi @ (after - before)) / (
-        np.linalg.norm(residual) + floor * np.sqrt(residual.size)
+        np.linalg.norm(residual) + floor / _STILL * np.sqrt(residual.size)
     ))

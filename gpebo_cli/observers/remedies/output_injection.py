@@ -34,6 +34,7 @@ from gpebo_cli.observers._observation import Observation
 from gpebo_cli.observers._riccati import StateSpace, run_filter
 from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices
+from gpebo_cli.observers.reduced.split import units_along
 from gpebo_cli.observers.remedies.plain import Plain
 
 _TOLERANCE = 1e-6  # of S
@@ -92,7 +93,7 @@ def given_injection(system: DescriptorSystem, entries: list[list[float | str]]) 
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
         values = taylor(parsed, t, 0, inside)[0].reshape(-1, n, r)
-        return np.asarray(o.split.basis.T @ o.projector @ values @ o.residual[:, -r:])
+        return np.asarray(o.split.dual @ o.projector @ values @ o.residual[:, -r:])
 
     return gain
 
@@ -106,20 +107,21 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     Raises:
         SolverError: S cannot be resolved.
     """
-    mesh, basis = reduced.mesh, reduced.basis
-    o = reduced.first
+    mesh, basis, dual = reduced.mesh, reduced.basis, reduced.first.split.dual
+    o, variances = reduced.first, reduced.units**2
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     A_0 = np.broadcast_to(o.dynamics, (mesh.points.size, *o.dynamics.shape[1:]))
     n = basis.shape[1]
     unstable = np.maximum(np.linalg.eigvals(A_0).real.max(axis=1, initial=0.0), 0.0)
     kappa = max(2.0 * float(np.sqrt((unstable**2).mean())), _PER_HORIZON / horizon)
-    size = max(_rms(o.residual @ o.algebraic @ basis), np.finfo(float).tiny)
+    size = max(_rms(o.residual @ o.algebraic @ basis * reduced.units), np.finfo(float).tiny)
 
     def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
         o = reduced.matrices(t, inside)
         c = o.residual @ o.algebraic @ basis / size
         rows = c.shape[1]
-        Q = kappa**2 * (basis.T @ o.projector @ basis)
+        inside = dual @ o.projector @ basis
+        Q = kappa**2 * (inside * variances) @ transpose(inside)
         return StateSpace(
             A=np.broadcast_to(o.dynamics, (len(t), n, n)), b=np.zeros((len(t), n, 0)),
             c=np.broadcast_to(c, (len(t), rows, n)), z=np.zeros((len(t), rows, 0)),
@@ -127,7 +129,9 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
             V=np.broadcast_to(np.eye(rows), (len(t), rows, rows)),
         ), ()
 
-    S0 = kappa * (basis.T @ reduced.initial_basis) @ (reduced.initial_basis.T @ basis)
+    V = dual @ reduced.initial_basis
+    V = V * units_along(V, reduced.units)
+    S0 = kappa * V @ V.T
     S = run_filter(
         model, np.zeros((n, 0)), S0, mesh, tol=_TOLERANCE,
         max_elements=reduced.solver.max_elements,
@@ -135,7 +139,7 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     )
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
-        weight = basis.T @ o.projector @ basis @ S.at(t, inside)[0] / size**2
+        weight = dual @ o.projector @ basis @ S.at(t, inside)[0] / size**2
         return np.asarray(weight @ transpose(o.algebraic @ basis) @ o.residual)
 
     return gain, S.mesh

@@ -43,10 +43,11 @@ class Plain:
             ),
             state_map=AffineStateMap(
                 on_mesh(mesh, final.offset), on_mesh(mesh, final.gain),
-                reduced.form.scales if reduced.units is None else reduced.units,
+                reduced.form.units.states,
             ),
             truth=InitialError(
-                reduced.initial_basis, reduced.xi_a0, reduced.basis, extension.solution.trajectory
+                reduced.begin.dual, reduced.xi_a0, reduced.first.split.dual,
+                extension.solution.trajectory, reduced.units,
             ),
             error_estimate=extension.solution.error_estimate,
             assumptions=assumptions(reduced, mesh, final),

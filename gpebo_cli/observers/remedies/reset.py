@@ -1,6 +1,6 @@
 """Resets of the dynamic extension, for a plant whose A_0 does not forget.
 
-At times t_k the extension starts again, from [ξ_a₊ | 0 | V₊] with V₊ an orthonormal basis of
+At times t_k the extension starts again, from [ξ_a₊ | 0 | V₊] with V₊ a basis of
 range P(t_k), and the regression has other parameters from then on. From
 w = ξ_a + ξ_b θ − Φ e₀ = ξ_a₊ − V₊ e₊,
 
@@ -42,6 +42,7 @@ from gpebo_cli.observers.reduced.extension import (
 )
 from gpebo_cli.observers.reduced.regression import Assembled, on_mesh
 from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices
+from gpebo_cli.observers.reduced.split import comparable
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
@@ -101,40 +102,37 @@ class Resets:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """Where a segment begins: e = Vᵀ(ξ_a − w(time))."""
+    """Where a segment begins: e = V⁺(ξ_a − w(time))."""
 
     time: float
     begin: Start
     xi_a: Array  # (n,)
 
-    @property
-    def basis(self) -> Array:
-        """V (n, d)."""
-        return self.begin.basis
-
 
 @dataclass(frozen=True, eq=False)
 class SegmentErrors:
-    """η = (θ, e) with e = Vᵀ(ξ_a − x) at the start of the segment that a time belongs to.
+    """η = (θ, e) with e = V⁺P(ξ_a − x) at the start of the segment that a time belongs to.
 
     If θ varies within segments, e does too, see ``InitialError``.
     """
 
     starts: tuple[_Start, ...]
-    basis: Array  # (n, k)
+    dual: Array  # (k, n)
+    units: Array  # (k,)
     extension: Trajectory  # [ξ_a | ξ_b | Φ] of all segments, (k, 1 + p)
 
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """η at the times t (M,), shape (M, p)."""
         if (np.diff(theta, axis=0) != 0.0).any() and not np.isnan(theta).any():
-            e = error_of_extension(self.extension(t), theta, states(t) @ self.basis)
+            z = states(t) @ self.dual.T
+            e = error_of_extension(self.extension(t), theta, z, self.units)
             return np.concatenate([theta, e], axis=1)
         first = np.array([start.time for start in self.starts])
         x = states(first)
         x[0] = states.values[0, 0]
         # A state that nobody knows (NaN) does not spoil components it has no part in.
         errors = np.array([
-            np.where(s.basis == 0.0, 0.0, s.basis * (s.xi_a - own)[:, None]).sum(axis=0)
+            np.where(s.begin.dual == 0.0, 0.0, s.begin.dual * (s.xi_a - own)).sum(axis=1)
             for s, own in zip(self.starts, x, strict=True)
         ])
         segment = np.searchsorted(first[1:], t, side="right")
@@ -152,18 +150,18 @@ def _restart(
     reduced: ReducedSystem, extension: Extension, known: ExtensionState, time: float, begin: Start
 ) -> tuple[Reset, _Start]:
     """T and τ from [ξ_a | ξ_b | Φ] at the end, and where the next segment begins."""
-    q, basis = reduced.system.q, begin.basis
+    q, dual = reduced.system.q, begin.dual
     end = reduced.basis @ extension.solution.trajectory.final
     xi_a, xi_b, Phi = end[:, 0], end[:, 1 : 1 + q], end[:, 1 + q :]
     eta = np.linalg.pinv(known.values[:, :-1], rcond=_KNOWN, hermitian=True) @ known.values[:, -1]
     reached = xi_a + xi_b @ eta[:q] - Phi @ eta[q:]
-    after = begin.offset + basis @ (basis.T @ reached)
-    p = q + basis.shape[1]
+    after = begin.offset + begin.basis @ (dual @ reached)
+    p = q + len(dual)
     transform = np.eye(p)
-    transform[q:, :q], transform[q:, q:] = -basis.T @ xi_b, basis.T @ Phi
-    shift = np.concatenate([np.zeros(q), basis.T @ (after - xi_a)])
+    transform[q:, :q], transform[q:, q:] = -dual @ xi_b, dual @ Phi
+    shift = np.concatenate([np.zeros(q), dual @ (after - xi_a)])
     floor = _FLOOR * max(float(np.abs(part).max(initial=0.0)) for part in (eta[:q], after))
-    errors = np.concatenate([np.zeros((q, reduced.basis.shape[1])), basis.T @ reduced.basis])
+    errors = np.concatenate([np.zeros((q, reduced.basis.shape[1])), dual @ reduced.basis])
     return Reset(time, transform, shift, floor, errors=errors), _Start(time, begin, after)
 
 
@@ -200,10 +198,10 @@ def _joined(
             resets=tuple(resets),
         ),
         state_map=AffineStateMap(
-            on_mesh(mesh, whole.offset), on_mesh(mesh, whole.gain), reduced.form.scales
+            on_mesh(mesh, whole.offset), on_mesh(mesh, whole.gain), reduced.form.units.states
         ),
         truth=SegmentErrors(
-            tuple(starts), reduced.basis,
+            tuple(starts), reduced.first.split.dual, reduced.units,
             Trajectory(mesh, np.concatenate([e.solution.trajectory.values for e in extensions])),
         ),
         error_estimate=max(e.solution.error_estimate for e in extensions),
@@ -244,8 +242,8 @@ def reset_times(reduced: ReducedSystem, settings: Resets) -> Array:
 
 def growth_times(reduced: ReducedSystem) -> Array:
     """The last edges of the signals' mesh before ‖Φ‖ exceeds its limit, from reset to reset."""
-    mesh, basis = reduced.mesh, reduced.basis
-    d = basis.shape[1]
+    mesh, units = reduced.mesh, reduced.units
+    d = len(units)
     eye = np.eye(d)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
@@ -264,9 +262,10 @@ def growth_times(reduced: ReducedSystem) -> Array:
         )
     finer = solution.trajectory
     last = np.searchsorted(finer.mesh.edges, mesh.edges[1:]) - 1  # its last part, of each element
-    Phi = basis.T @ reduced.initial_basis
+    Phi = comparable(reduced.first.split.dual @ reduced.initial_basis, units)
     times = []
     for k, step in enumerate(finer.values[last, -1]):
+        step = step * units / units[:, None]  # noqa: PLW2901
         if k > 0 and log_norm(step @ Phi) > np.log(_GROWTH):
             times.append(float(mesh.edges[k]))
             Phi = np.linalg.svd(Phi, full_matrices=False)[0]  # orthonormal, of the same range
