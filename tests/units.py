@@ -60,7 +60,8 @@ def in_units(content, units):
         found[name] = {n: f"{f!r}*({text(v)})" if isinstance(v, str) else f * v
                        for (n, v), f in zip(given.items(), factors, strict=True)}
     size = dict(zip(content["states"], s, strict=True))
-    found["initial_state"] = {n: v * size[n] for n, v in content["initial_state"].items()}
+    found["initial_state"] = {n: f"{size[n]!r}*({text(v)})" if isinstance(v, str) else v * size[n]
+                              for n, v in content["initial_state"].items()}
     start = content.get("observer_defaults", {}).get("xi_a0")
     if start:
         found["observer_defaults"] = {"xi_a0": {n: v * size[n] for n, v in start.items()}}
