@@ -500,10 +500,11 @@ def _assembled(
             for e in (values, *solution.extras)
         )
         terms, sizes = term_sizes(z, system.q, reduced.basis, AlgebraicEquations(*seen))
-        scale.append(sizes.reshape(-1, 3, sizes.shape[1]).max(axis=1))
+        elements = len(sizes) // 3
+        scale.append(sizes.reshape(elements, 3, sizes.shape[1]).max(axis=1))
         if as_found:
             continue
-        terms = terms.reshape(-1, 3, *terms.shape[1:]).max(axis=1).repeat(points, axis=0)
+        terms = terms.reshape(elements, 3, *terms.shape[1:]).max(axis=1).repeat(points, axis=0)
         some = slice(first * points, part.stop * points)
         here = replace(found, Y=found.Y[some], psi=found.psi[some], offset=found.offset[some],
                        gain=found.gain[some])
