@@ -55,7 +55,7 @@ def _errors(rng, cases=11, times=70, p=3, n=4, constant=False, levels=True):
         rng.normal(size=(cases, times, p)), truth, np.array([2.0, 0.0, 1.0]),
         rng.normal(size=(of_time, n)), rng.normal(size=(of_time, n, p)), x,
         rng.uniform(0.5, 2.0, size=n),
-        rng.uniform(0.5, 9.0, size=(cases, p + n)) if levels else None,
+        rng.uniform(0.5, 9.0, size=(cases, p + n)) if levels else None, 0.3,
     )
 
 

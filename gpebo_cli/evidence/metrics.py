@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+from gpebo_cli.kernels.laws_numpy import last_above
 from gpebo_cli.model.descriptor import Array
 
 SETTLED = 0.01  # share of an error at the start, below which it has settled
@@ -59,18 +60,23 @@ def is_metric(name: str) -> bool:
 
 def measure_squares(
     t: Array, of_parameters: Array | None, last_parameters: Array, of_states: Array | None,
-    last_states: Array,
+    last_states: Array, last: Array | None = None,
 ) -> Metrics:
     """Metrics from squared norms (G, M) and from errors at the end, (G, p) and (G, n).
 
-    NaN where the norms are None. Norms are of quantities in units of their own size.
+    ``last`` (G, 2) are the times, as indices, at which norms were above their levels last, where
+    these are known. NaN where the norms are None. Norms are of quantities in units of their own
+    size.
     """
     out = np.full((5, len(last_parameters)), np.nan)
     if of_parameters is not None:
-        out[0] = settling_time(t, of_parameters, SETTLED**2)
+        known = None if last is None else last[:, 0]
+        out[0] = settling_time(t, of_parameters, SETTLED**2, last=known)
         out[2] = np.abs(last_parameters).max(axis=1, initial=0.0)
     if of_states is not None:
-        out[1], out[4] = settling_time(t, of_states, SETTLED**2), time_rms(t, of_states)
+        known = None if last is None else last[:, 1]
+        out[1] = settling_time(t, of_states, SETTLED**2, last=known)
+        out[4] = time_rms(t, of_states)
         out[3] = np.abs(last_states).max(axis=1)
     return Metrics(*out)
 
@@ -112,7 +118,8 @@ def standing_since(t: Array, value: Array, final: Array, deviation: Array) -> Ar
 
 
 def settling_time(
-    t: Array, error: Array, fraction: float = SETTLED, level: Array | None = None
+    t: Array, error: Array, fraction: float = SETTLED, level: Array | None = None,
+    last: Array | None = None,
 ) -> Array:
     """Time after which a nonnegative error stays below a fraction of its initial value.
 
@@ -124,16 +131,16 @@ def settling_time(
         error: (g, M).
         fraction: of the first value.
         level: instead of that (g,).
+        last: index of the last time at which it is above that (g,), −1 for none; None: not known.
 
     Returns:
         (g,), NaN if it is never reached; 0 if the error is zero from the start.
     """
     level = fraction * error[:, :1] if level is None else level[:, None]
-    above = error > level
-    last = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
+    if last is None:
+        last = last_above(error[:, :, None], level[:, None])[:, 0]
     rows = np.arange(len(last))
-    last = np.where(above[rows, last], last, -1)
-    k = np.clip(last, 0, max(len(t) - 2, 0))
+    k = np.clip(last, 0, max(len(t) - 2, 0)).astype(np.intp)
     following = np.minimum(k + 1, len(t) - 1)
     return settled(t, last, error[rows, k], error[rows, following], level[:, 0])
 

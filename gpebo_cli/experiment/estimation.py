@@ -20,6 +20,7 @@ from gpebo_cli.evidence.excitation import (
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import (
+    SETTLED,
     Metrics,
     levels,
     measure_squares,
@@ -497,13 +498,17 @@ def _numbers(
 
 
 def _of_all(
-    t: Array, squares: Sequence[Array], of_eta: Array, of_x: Array, judged: BoolArray
+    t: Array, squares: Sequence[Array], of_eta: Array, of_x: Array, judged: BoolArray,
+    last: Array | None = None,
 ) -> Array:
-    """The first five of them from squared norms (g, M) and errors at the end (g, p) and (g, n)."""
+    """The first five of them from squared norms (g, M) and errors at the end (g, p) and (g, n).
+
+    ``last`` as in :func:`measure_squares`.
+    """
     seen, known = judged & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
     metrics = measure_squares(
         t, squares[0] if seen.any() or not judged.any() else None, of_eta[:, seen],
-        squares[1] if known.any() else None, of_x[:, known],
+        squares[1] if known.any() else None, of_x[:, known], last,
     )
     return np.array([getattr(metrics, name) for name in METRICS])
 
@@ -567,10 +572,10 @@ def _evaluation(
         level = None
         if each:
             level = levels(np.concatenate(errors_at(eta, 0), axis=1), size)
-        *squares, last = kernels.laws.squared_errors(
-            eta, truth, in_eta, offset, gain, x, in_x, level
+        *squares, last, of_norms = kernels.laws.squared_errors(
+            eta, truth, in_eta, offset, gain, x, in_x, level, SETTLED**2
         )
-        numbers = _of_all(grid, squares, of_eta, of_x, judged)
+        numbers = _of_all(grid, squares, of_eta, of_x, judged, of_norms)
         if level is not None:
             k = np.clip(last, 0, max(len(grid) - 2, 0)).astype(np.intp)
             after = np.minimum(k + 1, len(grid) - 1)

@@ -220,9 +220,19 @@ EVERY_WIDTH static void errors_of_cases(const Call *call, const double *eta, npy
     }
 }
 
-/* η̂, η, weights (p,), offset, gain, x, weights (n,), levels (g, p + n) or None
+/* The last index at which a course (M,) is above a share of its beginning, −1 for none. */
+static double last_above(const double *course, npy_intp M, double share)
+{
+    npy_intp m = M - 1;
+    while (m >= 0 && !(course[m] > share * course[0]))
+        m--;
+    return (double)m;
+}
+
+/* η̂, η, weights (p,), offset, gain, x, weights (n,), levels (g, p + n) or None, a share
    -> Σ weight (η̂ − η)², Σ weight (x̂ − x)², and the last time, as an index, at which each error is
-   above its level, −1 for none; what has the weight zero may be NaN. */
+   above its level and each sum above a share of its beginning, −1 for none; what has the weight
+   zero may be NaN. */
 static Outcome squared_errors(Call *call)
 {
     const npy_intp M = SIZE(M), p = SIZE(p), g = SIZE(g), c = SIZE(c);
@@ -240,6 +250,8 @@ static Outcome squared_errors(Call *call)
         errors_of_cases(call, call->in[0] + first * M * p, used, lanes, &course,
                         call->out[0] + first * M, call->out[1] + first * M);
         lanes_store(call->out[2], course.last, 1, c, 0, c, first, used);
+        for (npy_intp k = 2 * first; k < 2 * (first + used); k++)
+            call->out[3][k] = last_above(call->out[k % 2] + k / 2 * M, M, call->number[8]);
     }
     return DONE;
 }
@@ -302,6 +314,6 @@ const Kernel law_kernels[] = {
     {"eigenvalues", "N?pw", "Np", eigenvalues},
     {"mixed", "Npw c=w-p", "N Npc N", mixed},
     {"stepped_law", "S Sp Sp Sp @M M M g?p gw", "gMp", stepped_law},
-    {"squared_errors", "gMp M?p p M?n M?np M?n n |gc c=p+n", "gM gM gc", squared_errors},
+    {"squared_errors", "gMp M?p p M?n M?np M?n n |gc # c=p+n", "gM gM gc g2", squared_errors},
     {NULL, NULL, NULL, NULL},
 };

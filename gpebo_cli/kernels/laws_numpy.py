@@ -70,11 +70,12 @@ def mean_decay(x: Array) -> Array:
 
 def squared_errors(
     eta: Array, truth: Array, in_eta: Array, offset: Array, gain: Array, x: Array, in_x: Array,
-    levels: Array | None,
-) -> tuple[Array, Array, Array]:
+    levels: Array | None, share: float,
+) -> tuple[Array, Array, Array, Array]:
     """Weighted squares of η̂ − η and of x̂ − x, x̂ = offset + gain η̂, both (g, M).
 
-    And when each error is above its level for the last time, as an index, −1 for never (g, p + n).
+    And when each error is above its level for the last time, as an index, −1 for never (g, p + n),
+    and each sum of squares above a share of its beginning (g, 2).
 
     Args:
         eta: η̂ (g, M, p).
@@ -85,6 +86,7 @@ def squared_errors(
         x: the true states (M or 1, n).
         in_x: their weights (n,).
         levels: of the errors (g, p + n); None: nobody asks when they are above them.
+        share: of the first sum of squares.
     """
     some, seen = in_eta != 0.0, in_x != 0.0
     in_all = [eta - truth, np.matmul(gain, eta[..., None])[..., 0] + (offset - x)]
@@ -92,7 +94,13 @@ def squared_errors(
     of_x = np.einsum("gmi,i->gm", in_all[1][..., seen] ** 2, in_x[seen])
     last = np.full((len(eta), len(in_eta) + len(in_x)), -1.0)
     if levels is not None:
-        above = np.abs(np.concatenate(in_all, axis=2)) > levels[:, None]
-        latest = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
-        last = np.where(above.any(axis=1), latest, last)
-    return of_eta, of_x, last
+        last = last_above(np.abs(np.concatenate(in_all, axis=2)), levels[:, None])
+    sums = np.stack([of_eta, of_x], axis=2)
+    return of_eta, of_x, last, last_above(sums, share * sums[:, :1])
+
+
+def last_above(courses: Array, levels: Array) -> Array:
+    """The last index at which courses (g, M, c) are above levels (g, 1, c), −1 for none."""
+    above = courses > levels
+    latest = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
+    return np.where(above.any(axis=1), latest, -1.0)
