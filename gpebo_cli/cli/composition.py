@@ -101,7 +101,10 @@ class Loader(ConfigLoaderImpl):
         try:
             config = super().load_configuration(*args, **kwargs)
         except (TypeError, ValueError) as error:  # +launcher=null or [1,2], for instance
-            raise ConfigError(f"the configuration cannot be composed: {error}") from error
+            raise ConfigError(
+                f"the configuration cannot be composed: {error}; a choice is one name, a list is "
+                "given as a whole, as in plant.outputs=[y]"
+            ) from error
         plain = OmegaConf.to_container(config, resolve=False)
         refuse_code(cast("dict[str, Any]", plain))
         return config

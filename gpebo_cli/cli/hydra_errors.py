@@ -129,7 +129,10 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
     missing = missing or str(getattr(cause, "key", ""))  # of a mapping that was given as a whole
     full = f"{path}.{missing}" if path else missing
     if not known:
-        return f"{full}: {path} is empty; give it as a whole, as in '{path}={{{missing}: VALUE}}'"
+        return (
+            f"{full}: {path} has no keys; give it as a whole, where it takes names as in "
+            f"'{path}={{{missing}: VALUE}}'"
+        )
     inside = path or "the configuration"
     deeper = [
         f"{section}.{missing}"
