@@ -262,7 +262,8 @@ class Trajectory:
         """The values continue from the elements before, or from each left end."""
         rule, mesh, flat = self.mesh.rule, self.mesh, _flat(self.values)
         out = np.zeros(flat.shape)
-        out[:, 1:] = mesh.steps[:, None, None] * np.matmul(rule.integration, flat[:, 1:])
+        np.matmul(rule.integration, flat[:, 1:], out=out[:, 1:])
+        out *= mesh.steps[:, None, None]
         if on:
             total = np.cumsum(out[:, -1], axis=0)
             out[1:] += total[:-1, None]
