@@ -282,7 +282,11 @@ class RowReader:
         if self._number.fullmatch(cell) is None:
             text = cell.strip(" \t").lower().lstrip("+-")
             what = "a finite number" if text in ("nan", "inf", "infinity") else "a number"
-            raise ConfigError(f"{where}: {shown(cell)} is not {what}")
+            gap = text in _MISSING and not first
+            raise ConfigError(
+                f"{where}: {shown(cell)} is not {what}"
+                + ("; data.missing says what to do with a gap" if gap else "")
+            )
         value = float(cell.replace(self._data.decimal, "."))
         if not math.isfinite(value):
             raise ConfigError(f"{where}: {shown(cell.strip())} is not a finite number")
