@@ -7,7 +7,9 @@ command line and from Python. A file that an attack would make is called ``MARKE
 from __future__ import annotations
 
 import os
+import pickle
 
+import numpy as np
 import pytest
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import given, settings
@@ -239,6 +241,46 @@ def test_links_lead_nowhere_but_inside(tmp_path):
         "run", "--config-dir", folder, "plant=inside", *SHORT, "hydra.run.dir=out", cwd=tmp_path
     ).code == 0
     assert not marker.exists()
+
+
+@pytest.mark.parametrize(("link", "target", "words"), [
+    ("x.yaml", "x.yaml", ["--config-name", "x"]),
+    ("experiment/x.yaml", "x.yaml", ["experiment=x"]),
+    ("experiment/lab", ".", ["experiment=lab/x"]),
+    ("estimator", ".", ["estimator=x"]),
+])
+def test_recipes_and_groups_are_not_found_by_links_either(tmp_path, link, target, words):
+    outside, folder = tmp_path / "outside", tmp_path / "evil"
+    for place in (outside, folder / "experiment"):
+        place.mkdir(parents=True)
+    (outside / "x.yaml").write_text("name: drem\n" if link == "estimator" else RECIPE)
+    (folder / link).symlink_to(outside / target)
+    done = gpebo("run", "--config-dir", folder, *words, *SHORT, cwd=tmp_path)
+    assert (done.code, done.err.count("\n")) == (2, 1), done.err
+    assert f"outside {folder}" in done.err
+
+
+class Call:
+    """What makes a folder when it is unpickled."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.marker),)
+
+
+def test_pickles_are_not_opened(tmp_path):
+    text = PLANT.replace("A: [[-1]]", "matrices: m.npz")
+    folder, marker = prepared(tmp_path, "plant/x.yaml", text)
+    np.savez(folder / "plant" / "m.npz", A=np.array([[Call(marker)]], dtype=object))
+    (folder / "a.npz").write_bytes((folder / "plant" / "m.npz").read_bytes())
+    (folder / "b.mat").write_bytes(pickle.dumps(Call(marker)))
+    for words in (["run", "--config-dir", folder, "plant=x", *SHORT],
+                  *(["new", "plant", "p", "--from", folder / name] for name in ("a.npz", "b.mat"))):
+        done = gpebo(*words, cwd=tmp_path)
+        assert (done.code, done.err.count("\n")) == (2, 1), done.err
+        assert not marker.exists()
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/mem"), reason="needs /proc")
