@@ -437,6 +437,19 @@ def test_runs_and_their_cases_are_compared_with_a_heat_map_of_two_gains(tmp_path
     assert values == sorted(values, reverse=True)
 
 
+def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
+    from gpebo_cli.results.comparison import metric_panels
+    from gpebo_cli.results.finished import METRICS, Case
+
+    def case(run, gain, error):
+        metrics = dict.fromkeys(METRICS, error)
+        return Case(run, Path(run), 0, {"plant": "p"}, {"gamma": gain}, metrics)
+
+    quiet = [case(f"quiet/{k}", 10.0**k, 1e-9) for k in range(3)]
+    (first, *_) = metric_panels([*quiet, case("noisy", 10.0, 1e-2)], "gamma")
+    assert [curve.y.tolist() for curve in first.curves] == [[1e-9] * 3]
+
+
 def test_error_curves_are_those_of_the_run(tmp_path):
     import numpy as np
 

@@ -251,12 +251,18 @@ def _is_axis(cases: Sequence[Case], name: str) -> bool:
 
 
 def _groups(cases: Sequence[Case], without: tuple[str, ...]) -> dict[str, list[Case]]:
-    """Cases that have ``without``, by all their other choices that vary, in words."""
+    """Cases that have ``without``, by all their other choices that vary, in words.
+
+    Where that leaves a choice twice, runs differ in what they do not tell: each folder is a group.
+    """
     relevant = [case for case in cases if all(name in _chosen(case) for name in without)]
     others = [name for name in varying(relevant) if name not in without]
+    twice = len({str(sorted(_chosen(case).items())) for case in relevant}) < len(relevant)
     groups: dict[str, list[Case]] = {}
     for case in relevant:
-        groups.setdefault(_words(case, others), []).append(case)
+        folder = [case.run.partition("/")[0]] if twice else []
+        label = ", ".join(filter(None, [*folder, _words(case, others)]))
+        groups.setdefault(label, []).append(case)
     return groups
 
 
