@@ -57,7 +57,7 @@ _SAMPLES_AT_ONCE = 2048
 _LAGS = 20  # of the residual's autocorrelation
 _PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
 _SILENT = 1e-9  # of an output: a residual below that is rounding
-_LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that counts as this large
+_LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
 _BATCH = 1 << 21  # numbers held at once while cases are evaluated: beyond it calls cost little
 
 Share = Callable[[float], None]  # told how much of a stage is done
@@ -459,7 +459,8 @@ def _sizes(truth: Array, natural: Array, x: Array) -> tuple[Array, Array]:
         for size, values in ((of_eta, truth), (of_x, x)):
             unknown = np.isnan(size)
             size[unknown] = np.fmax.reduce(np.abs(values[:, unknown]), axis=0)
-        return np.fmax(of_eta, _LEAST * natural), of_x
+        # A parameter that is zero has no size but that with which it would explain Y.
+        return np.where(of_eta > _LEAST * natural, of_eta, np.fmax(of_eta, natural)), of_x
 
 
 def _judged(source: Source, p: int) -> BoolArray:
