@@ -259,12 +259,21 @@ def test_a_quotient_that_is_rounding_moves_nothing():
 # What there is not ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name", ["gradient", "mre", "lion", "fct", "power", "exciting", "instrumental", "monotone"]
-)
+NOT_ALONG_RESETS = ["exciting", "instrumental", "annihilator", "monotone"]
+
+
+@pytest.mark.parametrize("name", ["gradient", "mre", "lion", "fct", "power", *NOT_ALONG_RESETS])
 def test_estimators_of_continuous_time_say_what_there_is(name):
     with pytest.raises(ConfigError, match="drem, least_squares, ls_drem"):
         estimators.able(estimators.build({"name": name}), estimators.Recursive, "samples")
+
+
+@pytest.mark.parametrize("name", NOT_ALONG_RESETS)
+def test_estimators_that_cannot_go_on_after_a_reset_say_which_can(name):
+    built = estimators.build({"name": name})
+    assert not isinstance(built, estimators.Resumable)
+    with pytest.raises(ConfigError, match=r"reset needs .* these can: drem, fct, .*, power"):
+        estimators.able(built, estimators.Resumable, "observer.remedy=reset needs one that can")
 
 
 def test_forgetting_with_a_bound_is_refused():
