@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.measure import Array, Prepare, Row, Solve, compare, decades, loosest
+from benchmarks.measure import Array, Prepare, Row, Solve, as_new, compare, decades, loosest
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
@@ -80,7 +80,7 @@ def ours(tol: float, gammas: list[float] | None = None) -> Solve:
     chosen = np.rint(_reference()[0] / HORIZON * (_GRID - 1)).astype(int)
 
     def solve() -> Array:
-        result = run_experiment(settings, plant())
+        result = run_experiment(settings, as_new(plant()))
         if result.estimation is None:
             raise TypeError("drem estimates")
         states = result.simulation.states[chosen, 1:3]

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.measure import at_most, say
+from benchmarks.measure import as_new, at_most, say
 
 ROOT = Path(__file__).parent.parent
 AXES: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -47,7 +47,7 @@ def experiment(
     system = plant(name)
 
     def run() -> object:
-        estimation = run_experiment(settings, system).estimation
+        estimation = run_experiment(settings, as_new(system)).estimation
         return None if estimation is None else np.asarray(estimation.parameters)
 
     return run
@@ -78,7 +78,8 @@ def chain(n: int, *, varying: bool) -> Callable[[], object]:
         "initial_state": [0] * n,
     }
     system = plant_from_mapping(mapping, "chain")
-    return lambda: simulate(system, TimeSettings(horizon=20.0), SolverSettings(tol=1e-9))
+    when, solver = TimeSettings(horizon=20.0), SolverSettings(tol=1e-9)
+    return lambda: simulate(as_new(system), when, solver)
 
 
 def work(axis: str, value: int) -> Callable[[], object]:

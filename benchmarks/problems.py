@@ -22,6 +22,7 @@ from benchmarks.measure import (
     Prepare,
     Row,
     Solve,
+    as_new,
     compare,
     decades,
     loosest,
@@ -109,7 +110,12 @@ def ours(problem: Problem) -> Prepare:
     system = plant_from_mapping(problem.mapping, problem.name)
     start, stop = problem.data["tspan"]
     when, t = TimeSettings(start, stop - start), problem.t
-    return lambda tol: lambda: simulate(system, when, SolverSettings(tol=tol)).signals.states(t)
+
+    def prepared(tol: float) -> Solve:
+        solver = SolverSettings(tol=tol)
+        return lambda: simulate(as_new(system), when, solver).signals.states(t)
+
+    return prepared
 
 
 # --- peers -----------------------------------------------------------------------------------
