@@ -29,7 +29,7 @@ from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.regression.samples import SampledRegression
 
 _STAGES = 4  # order 7: a deviation needs three digits, and elements end at the samples
-_ELEMENTS = 1000  # about so many at least
+_ELEMENTS = 500  # about so many at least
 _MOST_PARTS = 8
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
