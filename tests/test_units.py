@@ -117,3 +117,16 @@ def test_three_tanks_in_SI_units_pass_every_check():
     assert result.details.excitation.is_ie
     assert all(assumption.holds for assumption in result.details.assumptions)
     assert result.estimates["leak"].ravel()[-1] == pytest.approx(2e-5, rel=1e-6)
+
+
+@pytest.mark.parametrize("settings", [
+    {}, {"observer": "kalman_bucy"}, {"observer": {"name": "gpebo", "form": "strangeness_free"}},
+])
+def test_a_plant_without_derivatives_has_observers(settings):
+    """E = 0: nothing is integrated, and sizes of nothing are empty."""
+    result = run({
+        "name": "algebraic", "states": ["a", "b"], "unknowns": {"th": 2.0}, "outputs": ["y"],
+        "inputs": {"u": "sin(t)"}, "E": [[0, 0], [0, 0]], "A": [[1, "sin(t)/2"], [0.3, 2]],
+        "B": [[1], [0]], "F": [[0], ["cos(t)"]], "C": [[1, 0]], "initial_state": [0, -1],
+    }, time={"horizon": 20, "samples": 51}, **settings)
+    assert result.estimates["th"].ravel()[-1] == pytest.approx(2.0, rel=1e-6)

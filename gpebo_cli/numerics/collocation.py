@@ -145,8 +145,8 @@ def _tail_of_numbers(
         if problem.apart:
             last = np.abs(maps.homogeneous[part, -1])
             made_of = last @ np.abs(values[part, 0]) + np.abs(maps.particular[part, -1])
-        else:
-            made_of = values[part].reshape(-1, *values.shape[2:])
+        else:  # lengths are said: there may be no components
+            made_of = values[part].reshape(count * values.shape[1], *values.shape[2:])
         tail[part] = unresolved_signals(
             problem, mesh.rule, values[part],
             tuple(e if e.shape[:2] == (1, 1) else e[part] for e in maps.extras),

@@ -173,7 +173,7 @@ def _interpolated(errors: ErrorsAt, mesh: Mesh, tol: float) -> ErrorsAt:
     def at(t: Array, inside: Array) -> ErrorSystem:
         parts = np.split(known(t, inside), ends[:-1], axis=1)
         return ErrorSystem(*(
-            part.reshape(-1, *shape) for part, shape in zip(parts, shapes, strict=True)
+            part.reshape(len(t), *shape) for part, shape in zip(parts, shapes, strict=True)
         ))
 
     return at
