@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from plants import DATA, seen
 
 from gpebo_cli import run
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.functions import Names, system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
@@ -176,6 +177,32 @@ def test_a_divisor_that_passes_through_zero_is_named_with_its_time(hold, sample_
     entry = r"F\[1\]\[0\] = '-1/y' divides by something that passes through zero near t = 1\.0"
     with pytest.raises(ConfigError, match=entry):
         run(problem("boost")["plant"], data=data, observer={"sample_time": sample_time})
+
+
+@pytest.mark.parametrize("entry", ["1/y**2", "log(y)", "y**(-0.5)"])
+def test_an_output_that_touches_zero_is_named_with_its_time(entry, tmp_path):
+    """y = 1 + cos t, simulated, recorded and at samples."""
+    plant = {
+        "name": "touching", "states": ["x", "z"], "inputs": {"u": "-sin(t)"}, "outputs": ["y"],
+        "unknowns": {"k": 1}, "E": [[1, 0], [0, 1]], "A": [[0, 0], [0, -1]], "B": [[1], [0]],
+        "F": [[0], [entry]], "C": [[1, 0]], "initial_state": [2, 1],
+    }
+    if entry != "1/y**2":  # whose elements are cut for half a minute before it is refused
+        with pytest.raises(GpeboError, match=r"t = 3\.14"):
+            run(plant, time={"horizon": 4})
+    t = np.linspace(0.0, np.pi + 1.0, 51)
+    t[38] = np.pi
+    np.savetxt(tmp_path / "r.csv", np.column_stack([t, -np.sin(t), 1 + np.cos(t)]), "%.17g", ",",
+               header="t,u,y", comments="")  # fmt: skip
+    source = plant_from_mapping(plant).coefficients
+    near = np.array([3.0, np.pi - 1e-7, 3.3])  # never exactly zero
+    if "/" in entry:
+        with pytest.raises(ConfigError, match=r"passes through zero near t = 3\.14"):
+            source.taylor(near, 0, near, np.column_stack([-np.sin(near), 1 + np.cos(near)])[None])
+    for observer in ({}, {"sample_time": 0.1, "hold": "linear"}):
+        data = {"name": "csv", "file": str(tmp_path / "r.csv"), "hold": "zoh"}
+        with pytest.raises(GpeboError, match=re.escape(f"F[1][0] = '{entry}' has no finite value")):
+            run(plant, data=data, observer={"name": "gpebo", **observer})
 
 
 @pytest.mark.parametrize(

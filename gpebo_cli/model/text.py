@@ -28,6 +28,9 @@ from gpebo_cli.model.expressions import (
 # Shape of a matrix, and its entries by position, row after row; what is not there is 0.
 MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
 
+# Of its size before and after: a divisor that comes so near zero touches it.
+_TOUCHED = 1e-12
+
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
@@ -115,15 +118,21 @@ class TextCoefficients:
         return record(self.divisors)
 
     def _refuse_crossings(self, t: Array, inside: Array | None, signals: Array) -> None:
-        """Refuse a divisor whose sign differs at two times that follow each other."""
+        """Refuse a divisor that changes its sign between two times, or nearly vanishes at one."""
         ascending = np.argsort(t, kind="stable")
         values = self._divisors.taylor(t, 0, inside, signals[:1])[0][ascending]
-        crossed = np.argwhere(values[1:] * values[:-1] < 0.0)
+        size = np.abs(values)
+        before = np.maximum.accumulate(size)
+        after = np.maximum.accumulate(size[::-1])[::-1]
+        touched = size[:-1] <= _TOUCHED * np.minimum(before, after)[:-1]
+        crossed = np.argwhere((values[1:] * values[:-1] < 0.0) | (touched & (size[:-1] > 0.0)))
         if len(crossed):
             k, j = crossed[0]
             where, (before, after) = self.divisors[j], values[k : k + 2, j]
             first, then = t[ascending][k : k + 2]
-            at = first + (then - first) * before / (before - after)
+            at = first
+            if before * after < 0.0:
+                at += (then - first) * before / (before - after)
             raise ConfigError(
                 f"{where.where} = {shorten(where.text)} divides by something that passes through "
                 f"zero near t = {at:.6g}"
