@@ -49,6 +49,7 @@ class SolverSettings:
     tol: float = 1e-12
     stages: int = 14  # Radau IIA stages per element, order 2 * stages - 1
     max_elements: int = 200_000
+    max_seconds: float = 90.0  # of computing, of a loop over cases, seeds or samples
     max_strangeness_index: int = 6
     rank_tol: float = 1e-10  # singular values below rank_tol * (size of the factors) are zero
 

@@ -52,6 +52,7 @@ _RANGES = {
     "solver.tol": (1e-15, 0.1),
     "solver.stages": (2, 16),
     "solver.max_elements": (1, math.inf),
+    "solver.max_seconds": (1, math.inf),
     "solver.max_strangeness_index": (0, 20),
     "solver.rank_tol": (1e-15, 0.1),
     "output.max_rows": (2, math.inf),

@@ -60,9 +60,8 @@ _SILENT = 1e-9  # of an output: a residual below that is rounding
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
 _BATCH = 1 << 21  # numbers held at once while cases are evaluated: beyond it calls cost little
 
-Share = Callable[[float], None]  # told how much of a stage is done
 # name of a stage of the run -> what measures it
-Stage = Callable[[str], AbstractContextManager[Share]]
+Stage = Callable[[str], AbstractContextManager[Pace]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +116,7 @@ def continuous(
         )
     with stage("excitation"):
         excitation = assess(regression, t, settings.excitation, settings.solver.tol)
-    with stage("estimate") as share:
+    with stage("estimate") as pace:
         known, seen_at = excitation.final, visible(observation, t, system.states)
         seen, names = seen_at(known), (regression.parameters, system.states)
         unknown = _never(estimable(known, t[-1:], *names, seen))
@@ -129,7 +128,7 @@ def continuous(
         try:
             used, estimation, metrics = _estimate(
                 settings, system, observation.estimator or estimator, observation, source, known,
-                seen[-1], share,
+                seen[-1], pace,
             )
             estimator = estimator if observation.estimator else used
         except SolverError as error:
@@ -158,10 +157,10 @@ def continuous(
         fit = replace(fit, ratio=residual_ratio(observation, source, settings.noise, levels))
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
-        with stage("seeds") as share:
+        with stage("seeds") as pace:
             theta = source.theta(t[-1:])
             noise = over_seeds(
-                observation, observe, source.true, theta, estimator, settings.noise, levels, share
+                observation, observe, source.true, theta, estimator, settings.noise, levels, pace
             )
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
@@ -185,7 +184,7 @@ def at_samples(
     if source.pieces:
         raise ConfigError("data.file: several files need an observer in continuous time")
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
-    with stage("observe and estimate") as share:
+    with stage("observe and estimate") as pace:
         t = sample_times(samples.step, start, stop)
         check_samples(len(estimator.cases), len(t), system)
         u, y = source.inputs(t), source.outputs(t)
@@ -202,12 +201,12 @@ def at_samples(
                 source.derivatives, columns,
             )
             made = []
-            pace = Pace(len(t), f"samples with {len(estimator.cases)} cases", share)
+            done = pace(len(t), f"samples with {len(estimator.cases)} cases")
             for i in range(0, len(t), _SAMPLES_AT_ONCE):
                 part = slice(i, i + _SAMPLES_AT_ONCE)
                 found = online.feed(t[part], u[part], y[part])
                 made += [found] if last else []
-                pace(min(part.stop, len(t)))
+                done(min(part.stop, len(t)))
             return online, made
 
         def estimated(columns: IntArray | None) -> tuple[Online, OnlineEstimates]:
@@ -327,7 +326,7 @@ def _standing(
 
 def _estimate(
     settings: Settings, system: DescriptorSystem, estimator: estimators.Estimator,
-    observation: Observation, source: Source, known: Knowledge, seen: BoolArray, share: Share,
+    observation: Observation, source: Source, known: Knowledge, seen: BoolArray, pace: Pace,
 ) -> tuple[estimators.Estimator, EstimationResult, Metrics]:
     """Run every case on the mesh and the samples that are kept; measure on both.
 
@@ -379,7 +378,7 @@ def _estimate(
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
     numbers = np.empty((len(METRICS) + each * (p + n), size))
     batch = max(1, _BATCH // (len(grid) * (2 * p + n)))
-    pace = Pace(size, "cases", share)
+    done = pace(size, "cases")
     for first in range(0, size, batch):
         part = slice(first, min(first + batch, size))
         eta = estimates.parameters(part)
@@ -389,7 +388,7 @@ def _estimate(
             eta = whole
         found, parameters[part], estimated[part] = evaluate(eta)
         numbers[:, part] = found[: len(numbers)]
-        pace(part.stop)
+        done(part.stop)
     checks = state_map.checks(kept, estimated)
     explaining = parameters[:, -1].copy()
     parameters[..., np.isnan(told[0])] = np.nan

@@ -7,28 +7,35 @@ from time import process_time
 
 from gpebo_cli.errors import ConfigError
 
+Loop = Callable[[int], None]  # told how many rounds of a loop are done
+Pace = Callable[[int, str], Loop]  # how many rounds there are, and of what
+
 _LOOK = 1.0  # seconds after which a loop is known well enough
-_MOST = 90.0  # seconds
 
 
-class Pace:
-    """Told how many of so many are done, and tells ``share``; refuses what would take minutes."""
+def paced(count: int, what: str, limit: float, share: Callable[[float], None]) -> Loop:
+    """What a loop tells after each part of its rounds.
 
-    def __init__(self, count: int, what: str, share: Callable[[float], None]) -> None:
-        self._count, self._what, self._share = count, what, share
-        self._begin = process_time()
+    Args:
+        count: of rounds.
+        what: they are, for messages.
+        limit: of computing time in seconds.
+        share: told how much is done.
 
-    def __call__(self, done: int) -> None:
-        """So many are done.
+    Raises:
+        ConfigError: by what is returned; the whole loop would take longer than the limit.
+    """
+    begin = process_time()
 
-        Raises:
-            ConfigError: all of them would take longer than a run may.
-        """
-        spent = process_time() - self._begin
-        needed = spent * self._count / done
-        if done < self._count and spent > _LOOK and needed > _MOST:
+    def loop(done: int) -> None:
+        spent = process_time() - begin
+        needed = spent * count / done
+        if done < count and spent > _LOOK and needed > limit:
             raise ConfigError(
-                f"{self._count} {self._what} would take some {needed:.0f} s of computing time (the "
-                f"first {done} took {spent:.1f} s); a run may take {_MOST:g} s"
+                f"{count} {what} would take some {needed:.0f} s of computing time (the first "
+                f"{done} took {spent:.1f} s), and a run may take {limit:g} s; to wait for them: "
+                f"solver.max_seconds={float(f'{2 * needed:.1g}'):.0f}"
             )
-        self._share(done / self._count)
+        share(done / count)
+
+    return loop

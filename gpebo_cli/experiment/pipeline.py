@@ -20,9 +20,10 @@ from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment import memory, several, sources
 from gpebo_cli.experiment.assumptions import of_observation, warnings
-from gpebo_cli.experiment.estimation import Share, at_samples, continuous
+from gpebo_cli.experiment.estimation import at_samples, continuous
 from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.experiment.online import Online
+from gpebo_cli.experiment.pace import Pace, paced
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.uncertainty import sampled_deviations
@@ -54,10 +55,11 @@ class _Clock:
     """Seconds per stage; the only mutable thing in a run."""
 
     progress: Callable[[str], None]
+    limit: float  # of a loop in seconds
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def __call__(self, name: str) -> Iterator[Share]:
+    def __call__(self, name: str) -> Iterator[Pace]:
         since = perf_counter()
         self.progress(name)
 
@@ -65,7 +67,7 @@ class _Clock:
             if share < 1.0:
                 self.progress(Stage(name, share))
 
-        yield getting_on
+        yield lambda count, what: paced(count, what, self.limit, getting_on)
         self.seconds[name] = perf_counter() - since
 
 
@@ -128,7 +130,7 @@ def _experiment(
         estimator = estimators.build(settings.estimator)
     check_seeds(settings.noise, levels, settings.time.horizon)
     memory.check(settings, system, levels, 0 if estimator is None else len(estimator.cases))
-    stage = _Clock(progress)
+    stage = _Clock(progress, settings.solver.max_seconds)
     recorded, samples = settings.data.name == "csv", sampling(observer)
     with stage("read" if recorded else "simulate"):
         read = sources.recorded if recorded else sources.simulated

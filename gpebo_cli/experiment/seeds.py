@@ -73,7 +73,7 @@ def refuse_seeds(settings: NoiseSettings) -> None:
 def over_seeds(
     observation: Observation, observe: Callable[[Signals], Observation], signals: Signals,
     theta: Array, estimator: Estimator, settings: NoiseSettings, levels: NoiseLevels,
-    share: Callable[[float], None],
+    pace: Pace,
 ) -> NoiseStatistics:
     """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, …
 
@@ -85,7 +85,7 @@ def over_seeds(
         estimator: all of its cases are assessed.
         settings: of the noise.
         levels: of the noise.
-        share: told how much is done.
+        pace: of the loop over seeds.
 
     Raises:
         ModelError: an assumption of the observer fails along some noise.
@@ -94,23 +94,23 @@ def over_seeds(
     """
     horizon = observation.regression.mesh.edges[-1:]
     seeds = range(settings.seed, settings.seed + settings.seeds)
-    pace = Pace(len(seeds), f"noise.seeds with {len(estimator.cases)} cases", share)
+    done = pace(len(seeds), f"noise.seeds with {len(estimator.cases)} cases")
     if observation.respond is None:
         found = []
-        for done, seed in enumerate(seeds, 1):
+        for number, seed in enumerate(seeds, 1):
             own = observe(measure(signals, replace(settings, seed=seed), levels))
             eta = estimate(own.estimator or estimator, own.regression, horizon)
             values = eta.parameters(slice(None))[:, 0, :, None]
             truth = _truth(own, horizon, theta, signals)
             found.append(_with_unknowns(values, own.regression, horizon)[..., 0] - truth)
-            pace(done)
+            done(number)
         error = np.stack(found, axis=-1)
     else:
         added, found = _added(observation, observation.respond, signals, settings, levels), []
         for many in added:
             values = estimator.estimate(many, horizon).parameters(slice(None))[:, 0]
             found.append(_with_unknowns(values, observation.regression, horizon))
-            pace(sum(part.shape[-1] for part in found))
+            done(sum(part.shape[-1] for part in found))
         error = np.concatenate(found, axis=-1)
         error -= _truth(observation, horizon, theta, signals)[:, None]
     S = observation.regression.parametrisation
