@@ -119,7 +119,7 @@ def unbounded(path: Path) -> None:
                 plant={},
                 estimator={"name": "least_squares", "f0": 1e-8},
                 time=TimeSettings(horizon=40.0),
-                observer={"name": "gpebo", "remedy": remedy},
+                observer={"name": "gpebo", "form": "given", "remedy": remedy},
             ),
             system,
         )

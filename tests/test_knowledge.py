@@ -297,3 +297,5 @@ def test_a_state_that_the_observer_leaves_out_is_not_called_estimable():
     assert np.isnan(result.estimates["zb3"]).all()
     assert result.details.estimable["zb3"] is None
     assert result.details.estimable["zb2"] is not None
+    assert "left out by the observer: zb3" in result.verdict
+    assert "not determined" not in result.verdict

@@ -97,7 +97,8 @@ def test_the_plant_is_the_one_that_needs_a_remedy():
 
 
 def test_without_a_remedy_the_state_is_lost_and_a_warning_says_so():
-    result = run(UNBOUNDED)
+    assert relative_error(run(UNBOUNDED))[-1] < 1e-12  # in the form that auto takes
+    result = run(UNBOUNDED, form="given")
     assert relative_error(result)[-1] > 0.05
     (warning,) = result.warnings
     assert "1/s" in warning
@@ -427,7 +428,7 @@ def test_remedies_bear_noise_and_weights(remedy):
             Settings(
                 plant={}, estimator={"name": "least_squares"}, noise=noise,
                 time=TimeSettings(horizon=40.0, samples=201),
-                observer={"name": "gpebo", "remedy": kind, "weights": [2.0]},
+                observer={"name": "gpebo", "form": "given", "remedy": kind, "weights": [2.0]},
             ),
             plant_from_mapping(UNBOUNDED),
         )
@@ -492,7 +493,7 @@ def command(*words, cwd):
 def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
     words = [
         "run", "--config-dir", str(EXAMPLES), "plant=unbounded", "time.horizon=40", "figures=none",
-        "estimator=least_squares", "hydra.run.dir=out",
+        "estimator=least_squares", "observer.form=given", "hydra.run.dir=out",
     ]
     done = command(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

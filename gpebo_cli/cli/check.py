@@ -98,7 +98,10 @@ def main(words: list[str]) -> int:
 def _knowledge(examined: Examination) -> list[str]:
     """What can be known, from when on, and how well."""
     rows = [
-        [name, "cannot be known" if since is None else f"estimable from t = {since:.4g} s on"]
+        [name, (
+            f"estimable from t = {since:.4g} s on" if since is not None
+            else "left out by this observer" if name in examined.left_out else "cannot be known"
+        )]
         for name, since in examined.estimable.items()
     ]
     for row in rows:

@@ -44,6 +44,7 @@ class Examination:
     excitation: Excitation | None = None
     # At the end, of what is estimable, for noise of one unit at every output.
     deviations: Mapping[str, float] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()  # states that the observer does not estimate
 
 
 def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...]:
@@ -117,6 +118,7 @@ def _of_observer(
     return Examination(
         tuple(found), times, excitation,
         _per_unit(observation, excitation.known, settings, system, seen, times),
+        observation.unseen,
     )
 
 

@@ -77,6 +77,7 @@ class Estimated:
     # From when on each parameter and state can be known, None: never; or how that is found,
     estimable: Mapping[str, float | None] | Callable[[], Mapping[str, float | None]]
     unknown: Sequence[str]  # and of which it is never.
+    left_out: tuple[str, ...] = ()  # states that the observer does not estimate
     noise: NoiseStatistics | None = None
     by_observer: bool = False  # the observer estimates by itself
     note: str = ""  # what the last line of a run has to say of it, from "; " on
@@ -164,7 +165,8 @@ def continuous(
             )
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
-        fit, times, unknown, noise,
+        fit, times, [name for name in unknown if name not in observation.unseen],
+        observation.unseen, noise,
         observation.estimator is not None, note,
     )
 

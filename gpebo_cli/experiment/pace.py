@@ -27,7 +27,7 @@ def paced(count: int, what: str, limit: float, share: Callable[[float], None]) -
     """
     begin = process_time()
 
-    def loop(done: int) -> None:
+    def _loop(done: int) -> None:
         spent = process_time() - begin
         needed = spent * count / done
         if done < count and spent > _LOOK and needed > limit:
@@ -38,4 +38,4 @@ def paced(count: int, what: str, limit: float, share: Callable[[float], None]) -
             )
         share(done / count)
 
-    return loop
+    return _loop

@@ -155,12 +155,12 @@ def _experiment(
     warned = warnings(found.observed)
     told = verdict(
         found.excitation, found.estimation.cases, found.estimation.requirement, found.metrics,
-        found.fit, found.unknown, found.estimation.active,
+        found.fit, found.unknown, found.left_out, found.estimation.active,
     )
     return replace(
         result, regression=found.regression, excitation=found.excitation,
         estimation=found.estimation, metrics=found.metrics, noise=found.noise, fit=found.fit,
-        estimable=found.estimable,
+        estimable=found.estimable, left_out=found.left_out,
         assumptions=(
             *source.assumptions, *of_observation(found.observed, found.excitation, system)
         ),

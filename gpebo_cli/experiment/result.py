@@ -229,6 +229,7 @@ class RunResult:
     fit: Fit | None = None  # of a recording
     # From when on each parameter and state is determined by the data, None: never.
     estimable: OnDemand[Mapping[str, float | None]] = OnDemand(dict)
+    left_out: tuple[str, ...] = ()  # states that the observer does not estimate
     warnings: tuple[str, ...] = ()  # what does not stop a run and spoils its result, one line each
 
     __getstate__ = evaluated

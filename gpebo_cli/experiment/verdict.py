@@ -22,7 +22,7 @@ _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that sa
 def verdict(
     excitation: Excitation, cases: Sequence[Mapping[str, float]], requirement: Requirement,
     metrics: Metrics | None = None, fit: Fit | None = None,
-    unknown: Sequence[str] = (),
+    unknown: Sequence[str] = (), left_out: Sequence[str] = (),
     active: Mapping[int, Sequence[ActiveBound]] | None = None,
 ) -> str:
     """The last line: exciting or not and from when on, and how well the state is known.
@@ -40,9 +40,8 @@ def verdict(
             first += f", parameters well determined from t = {determined:.4g} s on"
     else:
         first = f"NOT interval-exciting: {level}; not excited: {excitation.weakest_direction}"
-    parts = [first]
-    if unknown:
-        parts.append(f"not determined by the data: {', '.join(unknown)}")
+    without = ("not determined by the data", unknown), ("left out by the observer", left_out)
+    parts = [first, *(f"{why}: {', '.join(names)}" for why, names in without if names)]
     best = None if metrics is None else _best_case(metrics)
     if metrics is not None and best is not None:
         if isfinite(metrics.settled[best]):  # under noise it is chance that an error is small now

@@ -184,9 +184,9 @@ def merged(before: Array, after: Array, kept: IntArray) -> Array:
     """Of all elements of a mesh, from those of the mesh before and of the fresh ones.
 
     Args:
-        before: of the elements before, or of the first for all of them.
-        after: of the fresh elements, likewise.
-        kept: for each element which one before it is, −1 for a fresh one.
+        before: of the elements before (K, s, ...), or (1, 1, ...) where all have the same.
+        after: of the fresh elements, in the same way.
+        kept: for each element which one before it is, −1 for a fresh one (K',).
     """
     if before.shape[:2] == after.shape[:2] == (1, 1):
         return before

@@ -39,9 +39,8 @@ class LinearRegression:
     floor: float = 0.0  # size below which parameters are rounding
     dynamics: Dynamics | None = None  # of parameters that move; then there are no resets
     parametrisation: Parametrisation | None = None  # η = S(θ)
-    # (·, p + 1) where Y is the projection of what was measured: |factor [−η; 1]|² is ∫‖Y − ψη‖² of
-    # that, as its samples have it.
-    factor: Array | None = None
+    # Where Y is the projection of what was measured, |factor [−η; 1]|² is ∫‖Y − ψη‖² of that.
+    factor: Array | None = None  # (k, p + 1)
 
     @classmethod
     def from_functions(

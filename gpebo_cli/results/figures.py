@@ -550,7 +550,9 @@ def _state_estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
         truth = _truth(result, name, signals.t, signals.states[:, i])
         if i in seen:
             panels.append(_estimate(result, name, estimation.states[:, :, i], truth))
-        elif not _known_by_data(result, name) and np.isfinite(truth.y).any():
+        elif not (_known_by_data(result, name) or name in result.left_out) and np.isfinite(
+            truth.y
+        ).any():
             panels.append(Panel(name, (truth,), _unit(result, name),
                                 typeset(name, result.system.labels), legend=True))
     return _with_legend(panels, _note(estimation))

@@ -116,7 +116,8 @@ def estimate_table(result: RunResult) -> list[str]:
         value, std, from_when = told["value"], told["std"], result.estimable.get(name)
         estimable = "no" if from_when is None else f"from {from_when:.4g} s"
         if not math.isfinite(value):
-            rows.append([name, "not determined", "", told["unit"] or "", "", estimable])
+            why = "left out" if name in result.left_out else "not determined"
+            rows.append([name, why, "", told["unit"] or "", "", estimable])
             continue
         away = np.abs(over_time[:, names.index(name)] - value) > 0.01 * abs(value)
         first = int(len(away) - np.argmax(away[::-1])) if away.any() else 0
