@@ -61,6 +61,7 @@ def tex(text: str) -> str:
     text = re.sub(r"√\(([^()]*)\)", r"\\sqrt{\1}", text)
     text = re.sub(r"√(\w)", r"\\sqrt{\1}", text)
     text = re.sub(r"\^\(([^()]*)\)", r"^{(\1)}", text)
+    text = re.sub(r"(?<![\w.{\\])([A-Za-z])(\d+)_([^\W_]+)", r"\1_{\2,\\mathrm{\3}}", text)
     text = re.sub(r"([_^])([^\W_]{2,})", r"\1{\\mathrm{\2}}", text)
     text = re.sub(r"_(\w)_\{", r"_{\1", text)
     text = re.sub(r"(?<![\w.{\\])([A-Za-z])(\d+)(?![\d.}])", r"\1_{\2}", text)

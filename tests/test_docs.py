@@ -122,10 +122,19 @@ def test_every_refusal_of_the_program_is_on_the_page_of_messages():
     ("w_{μ+1} = 0      (eq. 7, xa)", r"w_{μ+1} = 0 \quad  \text{(eq. 7, xa)} "),
     ("Γ = [R1 0; 0 1]", r"Γ = [R_{1}\ \ 0; 0\ \ 1]"),
     ("rank(𝒜Q) = n_b", r"\operatorname{rank} (𝒜Q) = n_b"),
+    ("e0_T = ξ_a(0)", r"e_{0,\mathrm{T}} = ξ_a(0)"),
 ])
 def test_formulas_become_tex(text, expected):
     assert tex.is_formula(text)
     assert " ".join(tex.tex(text).split()) == " ".join(expected.split())
+
+
+def test_no_formula_of_a_page_has_an_index_below_an_index():
+    """KaTeX sets none of these, and shows red text instead."""
+    for page in (ROOT / "docs").rglob("*.md"):
+        for text in filter(tex.is_formula, re.findall("`([^`\n]+)`", page.read_text())):
+            found = re.search(r"([_^])(\{[^{}]*\}|\w)\1", tex.tex(text))
+            assert not found, f"{page.name}: {text}"
 
 
 def test_commands_and_names_are_no_formulas():
