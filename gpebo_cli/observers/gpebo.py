@@ -13,7 +13,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, GpeboError, SolverError
 from gpebo_cli.evidence.knowledge import knowledge, smallest_and_margin
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.observers._base import Measurements, Sampling
 from gpebo_cli.observers._observation import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.condensed import condensed, thinned
@@ -29,6 +29,7 @@ _GROWN = 2.0  # the largest entry of Φ, from which on A_0 counts as unstable
 _BLOWN = 1e3  # from which on ψ, made of small differences of large terms, tells less than data do
 _CLEAR = 1e4  # times what is rounding: an eigenvalue of N that tells with some digits
 _SOUND = 1e-8  # relative singular values that are surely not zero
+_LONG = 10_000  # elements of a run that is not observed twice unasked: it takes gigabytes
 _NOTE = "; observer on the strangeness-free form, {}"
 
 
@@ -39,7 +40,8 @@ class Gpebo:
     Attributes:
         form: the equations as given, or with all hidden constraints beside them, which takes any
             index and needs no output to see the algebraic states; auto: as given where that does,
-            unless the data determine more on the other form, or with more digits.
+            unless the data determine more on the other form, or with more digits (looked at below
+            10,000 elements).
         regression: the whole residual, or its last r rows as the paper has it.
         xi_a0: where the dynamic extension starts: by state name, or a list of n_a numbers; None:
             what the plant proposes, else zero.
@@ -114,7 +116,7 @@ class Gpebo:
                 why = "which tells with more digits what the equations as given tell, or more"
         except SolverError as error:
             found, why, known = error, "for as given its signals are not resolved", (False, -1)
-        if known < everything:
+        if known < everything and signals.mesh.size < _LONG:
             try:
                 other = self._on("strangeness_free", *arguments, _NOTE.format(why))
                 if _told(other, system, solver) > known:
@@ -210,13 +212,21 @@ def _told(
     regression, state_map = found.regression, found.state_map
     if not isinstance(state_map, AffineStateMap):
         return False, 0
-    start, stop = regression.mesh.edges[[0, -1]]
+    gram, (start, stop) = regression.gram, regression.mesh.edges[[0, -1]]
     scale = np.broadcast_to(regression.scale, (regression.mesh.size, regression.p))
-    asked = regression.gram.final[None], scale[-1:], np.array([stop - start]), solver.tol
+
+    def asked(elements: IntArray) -> tuple[Array, Array, Array, float]:
+        ends = gram.mesh.edges[elements + 1]
+        terms = scale[np.searchsorted(regression.mesh.edges, ends) - 1]
+        return gram.values[elements, -1], terms, ends - start, solver.tol
+
     steady = found.growth is None or found.growth < _BLOWN
-    if smallest_and_margin(*asked)[1][0] >= _CLEAR:
-        return steady, system.q + system.n
-    known = knowledge(*asked)
+    last = gram.mesh.size - 1
+    # What was told is told for good, where later on it drowns in the rounding of a long run.
+    for some in (np.array([last]), last >> np.arange(1, last.bit_length() + 1)):
+        if smallest_and_margin(*asked(some))[1].max(initial=0.0) >= _CLEAR:
+            return steady, system.q + system.n
+    known = knowledge(*asked(np.array([last])))
     sound = steady and bool(known.clarity[known.clarity >= 1.0].min(initial=np.inf) > _CLEAR)
     seen = known.states(state_map.gain(np.linspace(start, stop, 11)), state_map.units)[-1]
     return sound, int(known.parameters[0, : system.q].sum() + seen.sum())
