@@ -9,7 +9,7 @@ import pytest
 import yaml
 from examples import gpebo
 
-from gpebo_cli import ConfigError, check, run
+from gpebo_cli import ConfigError, SolverError, check, run
 from gpebo_cli.regression.text import regression_from_mapping
 from gpebo_cli.regression.text_at_samples import advance
 
@@ -159,3 +159,14 @@ def test_arrays_by_name_and_what_can_be_checked():
     assert all(a.holds for a in check(regression=measured, data=arrays))
     constant = {**SINE, "signals": {"s": "1"}, "psi": [["s", 1]]}
     assert [a.name for a in check(regression=constant) if not a.holds] == ["Assumption 2"]
+
+
+@pytest.mark.parametrize("estimator", ["drem", "annihilator", "instrumental", "power"])
+def test_squares_that_no_number_holds_are_refused_with_their_time(estimator):
+    """ψ ends at e^700, which is a number, and its square is none."""
+    given = {
+        "name": "huge", "unknowns": {"a": 1.5}, "signals": {"u": "sin(t)"}, "Y": [0, "u"],
+        "psi": [["exp(700*t)"], [0]],
+    }
+    with pytest.raises(SolverError, match=r"^Ω.* is too large for a number near t = 0\.\d+; write"):
+        run(regression=given, estimator=estimator, time={"horizon": 1, "samples": 11})

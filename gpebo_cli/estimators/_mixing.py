@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli import kernels
+from gpebo_cli.errors import SolverError
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
@@ -19,8 +20,17 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     """Mix [Ω | 𝒴] (p, p + c): the path that the scalar law takes, reported at the times t (M,).
 
     The law takes c realisations as p·c parameters, in the order of (p, c).
+
+    Raises:
+        SolverError: Ω is beyond what a number can be; names the time.
     """
     p = extended.values.shape[-2]
+    finite = np.isfinite(extended.values).all(axis=(1, 2, 3))
+    if not finite.all():
+        raise SolverError(
+            "Ω, which is made of squares of ψ, is too large for a number near t = "
+            f"{extended.mesh.edges[int(np.argmin(finite))]:.4g}; write Y and ψ in larger units"
+        )
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         values = extended(t, inside)
