@@ -32,7 +32,6 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
 
-_WITH_BLAS = ("scipy.linalg", "torch", "casadi", "jaxlib")
 _SMALL, _LARGE = 8, 200  # states, between which one thread is as fast as several
 
 
@@ -100,19 +99,14 @@ def _threads(n: int) -> AbstractContextManager[object]:
     """One thread of BLAS where more of them would mostly wait for each other, for n states."""
     if not _SMALL < n <= _LARGE:
         return nullcontext()
-    limited: AbstractContextManager[object] = _pools(_libraries()).limit(
-        limits=1, user_api="blas"
-    )
+    # SciPy brings a BLAS of its own when it is needed; others are not called here.
+    pools = _pools("scipy.linalg" in sys.modules)
+    limited: AbstractContextManager[object] = pools.limit(limits=1, user_api="blas")
     return limited
 
 
-def _libraries() -> int:
-    """How many packages are imported that bring a BLAS of their own; SciPy does so when needed."""
-    return sum(name in sys.modules for name in _WITH_BLAS)
-
-
 @cache
-def _pools(_loaded: int) -> Any:
+def _pools(_with_scipy: bool) -> Any:
     from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
     return ThreadpoolController()
