@@ -19,6 +19,7 @@ from gpebo_cli.numerics.mesh import SHARE, initial_mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced import extension
+from gpebo_cli.reduction import derivative_array
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import large, simulate
 
@@ -444,3 +445,25 @@ def test_elements_that_stay_are_not_evaluated_again_though_new_ones_have_more_en
     t = np.linspace(0.0, 6.0, 31)
     expected = solve(problem, last, tol=1e-9, max_elements=500).trajectory(t)
     np.testing.assert_allclose(found.trajectory(t), expected, atol=1e-8)
+
+
+def test_units_of_many_states_are_those_that_singular_values_give(monkeypatch):
+    """A ladder in units of all sizes, by sparse factors as by dense ones."""
+    rng = np.random.default_rng(3)
+    for n in (3, 9, 30):
+        E = np.diag(rng.random(n) < 0.8).astype(float)
+        A = np.diag(rng.normal(size=n - 1), 1) - np.eye(n)
+        rows, columns = 10.0 ** rng.integers(-6, 7, (2, n))
+        C = (np.arange(n) < 2) * rng.normal(size=(1, n))
+        system = load_plant(from_matrices({
+            "E": rows[:, None] * E * columns, "A": rows[:, None] * A * columns, "C": C * columns,
+        }, "units").mapping())
+        found = []
+        for kept in (40, 0):
+            derivative_array._balancing.cache_clear()
+            monkeypatch.setattr(derivative_array, "_KEPT", kept)
+            c = system.coefficients.taylor(np.zeros(1), 2)
+            found.append(derivative_array.units_at(c))
+        for dense, sparse in zip(*found, strict=True):
+            np.testing.assert_array_equal(sparse, dense)
+        assert len(set(found[0].states)) > 1

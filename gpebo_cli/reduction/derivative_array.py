@@ -11,20 +11,29 @@ or M (x_1, …, x_{μ+1}) = N x_0 + g with M_ij = (j + 1) e_{i−j} − a_{i−j
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpebo_cli.kernels.structure_numpy import forcing as kernel_forcing
-from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem, distinct
+from gpebo_cli.model.descriptor import (
+    Array,
+    BoolArray,
+    Coefficients,
+    DescriptorSystem,
+    IntArray,
+    distinct,
+)
 from gpebo_cli.numerics.linalg import largest_over_time
 
 _KEPT = 40  # states, up to which what the pattern of E and A alone decides is kept
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 _ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
+_OPEN = 1e-11  # added to squares of sparse terms: directions that they leave open come to nothing
 _BESIDE_TIES = 0.1234  # decades: where factors are rounded, halves and thirds are not at an edge
 
 
@@ -102,20 +111,13 @@ def units_at(c: Coefficients) -> Units:
     sizes = np.take_along_axis(entries, order[None], axis=0)[0]
     order = order.astype(np.int8)
     factors, there = _factors(sizes, order, 1.0)
-    terms, _, _ = _balancing(there.tobytes(), order.tobytes(), sizes.shape, 1.0)
-    logs = np.log(sizes[there])
+    terms, logs = _terms(there, order), np.log(sizes[there])
     for _ in range(_ROUNDS):
         counts = np.clip(np.exp(2.0 * (terms @ factors + logs)), _LITTLE, 1.0)
-        inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
-        factors = -inverse @ ((logs * counts) @ terms)
+        factors = -_squares(terms, counts)((logs * counts) @ terms)
     factors /= np.log(10.0)
-    linked = there.any(axis=0)
-    shared = linked.astype(np.float64)
-    near: Array = np.eye(n + r) + np.matmul(shared, shared.T)
-    for _ in range((n + r).bit_length()):  # rows that hang together by their columns
-        near = np.sign(near @ near)
-    order = np.roll(np.arange(n + r), r)  # outputs first
-    open_factor = factors[order[near[:, order].argmax(axis=1)]]
+    linked = np.asarray(there.any(axis=0))
+    open_factor = factors[_first_of_each_part(linked, np.roll(np.arange(n + r), r))]
     of_row = open_factor - factors[: n + r]
     of_column = factors[n + r : -1] + open_factor[linked.argmax(axis=0)]
     equations, outputs = np.split(10.0 ** np.rint(of_row + _BESIDE_TIES), [n])
@@ -132,11 +134,9 @@ def _factors(sizes: Array, order: NDArray[np.int8], mass: float) -> tuple[Array,
     while True:
         few = sum(sizes.shape[1:]) <= 2 * _KEPT
         balancing = _balancing if few else _balancing.__wrapped__
-        terms, least_squares, counts = balancing(
-            there.tobytes(), order.tobytes(), sizes.shape, mass
-        )
+        terms, solve, counts = balancing(there.tobytes(), order.tobytes(), sizes.shape, mass)
         logs = np.log(sizes[there])
-        factors = -(least_squares @ ((logs * counts) @ terms))
+        factors = -solve((logs * counts) @ terms)
         entries = np.exp(terms @ factors + logs)
         if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
             return factors, there
@@ -153,18 +153,59 @@ def _factors(sizes: Array, order: NDArray[np.int8], mass: float) -> tuple[Array,
 @lru_cache(maxsize=64)
 def _balancing(
     there: bytes, order: bytes, shape: tuple[int, int, int], mass: float
-) -> tuple[Array, Array, Array]:
-    """What r, c and τ contribute to the logarithm of each entry that is there; (terms⊤terms)⁺.
+) -> tuple[Any, Callable[[Array], Array], Array]:
+    """:func:`_terms`, the solution of their least squares, and how much each entry counts."""
+    present = np.frombuffer(there, dtype=np.bool_).reshape(shape)
+    terms = _terms(present, np.frombuffer(order, np.int8).reshape(shape))
+    counts = np.where(present.nonzero()[0], 1.0, mass)
+    return terms, _squares(terms, counts), counts
 
-    And how much each entry counts.
+
+def _terms(there: BoolArray, order: NDArray[np.int8]) -> Any:
+    """What r, c and τ contribute to the logarithm of each entry that is there; sparse if many."""
+    (kind, i, j), (_, a, b) = there.nonzero(), there.shape
+    every, of_time = np.arange(len(i)), kind - 1.0 + order[kind, i, j]
+    if a + b > 2 * _KEPT:
+        from scipy.sparse import csr_array
+
+        values = np.concatenate([np.ones(2 * len(i)), of_time])
+        columns = np.concatenate([i, a + j, np.full(len(i), a + b)])
+        return csr_array((values, (np.tile(every, 3), columns)), shape=(len(i), a + b + 1))
+    terms = np.zeros((len(i), a + b + 1))
+    terms[every, i] = terms[every, a + j] = 1.0
+    terms[:, -1] = of_time
+    return terms
+
+
+def _squares(terms: Any, counts: Array) -> Callable[[Array], Array]:
+    """The solution of termsᵀ diag(counts) terms x = b with the least norm, of sparse ones nearly.
+
+    Singular values of a thousand states would take longer than a run.
     """
-    kind, i, j = np.frombuffer(there, dtype=np.bool_).reshape(shape).nonzero()
-    every, terms = np.arange(len(i)), np.zeros((len(i), shape[1] + shape[2] + 1))
-    terms[every, i] = terms[every, shape[1] + j] = 1.0
-    terms[:, -1] = kind - 1.0 + np.frombuffer(order, np.int8).reshape(shape)[kind, i, j]
-    counts = np.where(kind, 1.0, mass)
-    inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
-    return terms, np.asarray(inverse), counts
+    if isinstance(terms, np.ndarray):
+        inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
+        return lambda right: np.asarray(inverse @ right)
+    from scipy.sparse import diags_array, eye_array
+    from scipy.sparse.linalg import splu
+
+    matrix = terms.T @ diags_array(counts) @ terms + _OPEN * eye_array(terms.shape[1])
+    solve: Callable[[Array], Array] = splu(matrix.tocsc()).solve
+    return solve
+
+
+def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:
+    """For each row (a,) the first one, in this order, of those that columns link it to."""
+    place = np.empty(len(order), dtype=np.intp)
+    place[order] = np.arange(len(order))
+    i, j = linked.nonzero()
+    while True:
+        of_column = np.full(linked.shape[1], len(order))
+        np.minimum.at(of_column, j, place[i])
+        nearer = place.copy()
+        np.minimum.at(nearer, i, of_column[j])
+        if (nearer == place).all():
+            return order[place]
+        place = nearer
 
 
 def who(system: DescriptorSystem) -> str:
