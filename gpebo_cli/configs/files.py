@@ -7,6 +7,7 @@ configuration, chooses files of groups, gives values of known keys, and may swee
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -93,14 +94,7 @@ def shipped(inside: str) -> dict[str, Any]:
     Raises:
         ConfigError: there is none.
     """
-    return dict(_copied(_shipped(inside)))
-
-
-def _copied(value: Any) -> Any:
-    """Mappings and lists anew, as far down as there are any."""
-    if isinstance(value, dict):
-        return {key: _copied(inner) for key, inner in value.items()}
-    return [_copied(inner) for inner in value] if isinstance(value, list) else value
+    return copy.deepcopy(_shipped(inside))
 
 
 @cache
