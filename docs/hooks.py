@@ -77,14 +77,7 @@ def commands_page() -> str:
     texts = {
         "gpebo": usage.HELP,
         "gpebo run": usage.run_help(),
-        "gpebo check": usage.CHECK_HELP,
-        "gpebo compare": usage.COMPARE_HELP,
-        "gpebo report": usage.REPORT_HELP,
-        "gpebo figures": usage.FIGURES_HELP,
-        "gpebo reproduce": usage.REPRODUCE_HELP,
-        "gpebo list": usage.LIST_HELP,
-        "gpebo new": usage.NEW_HELP,
-        "gpebo completion": usage.COMPLETION_HELP,
+        **{f"gpebo {command}": text for command, text in usage.HELP_OF.items()},
     }
     parts = [f"## {name}\n\n```text\n{text.rstrip()}\n```\n" for name, text in texts.items()]
     return "\n".join(["# Commands\n\nWhat `--help` prints.\n", *parts])

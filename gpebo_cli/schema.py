@@ -46,6 +46,12 @@ def nearest(given: str, known: Iterable[str]) -> str:
     return f"; did you mean {folded[near[0]]}?" if near else ""
 
 
+def unknown(what: str, given: object, known: Iterable[str], there: str = "known:") -> ConfigError:
+    """The error for a name that is none: ``what`` is wrong, ``there`` are others, one is near."""
+    names = [str(name) for name in known]
+    return ConfigError(f"{what}; {there} {', '.join(names) or 'none'}{nearest(str(given), names)}")
+
+
 def shown(value: object) -> str:
     """A value as a message repeats it: on one line, printable, and not too long."""
     try:
@@ -75,10 +81,7 @@ def read(cls: type[T], mapping: object, where: str) -> T:
     by_key, known = _by_key(cls), keys(cls)
     for key in mapping:
         if key not in known:
-            raise ConfigError(
-                f"{where}.{key}: no such key; {where} has {', '.join(known)}"
-                + nearest(str(key), known)
-            )
+            raise unknown(f"{where}.{key}: no such key", key, known, f"{where} has")
     values: dict[str, Any] = {}
     for key, field in by_key.items():
         if "one_of" in field.metadata:

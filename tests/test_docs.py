@@ -27,12 +27,8 @@ import tutorials  # noqa: E402
 
 NOTEBOOK = ROOT / "docs" / "first_run.ipynb"
 MADE = ("notebook.md", "commands.md", "messages.md")  # with the site
-HELP = {
-    "": usage.HELP, "check": usage.CHECK_HELP, "compare": usage.COMPARE_HELP,
-    "report": usage.REPORT_HELP,
-    "figures": usage.FIGURES_HELP, "list": usage.LIST_HELP, "new": usage.NEW_HELP,
-    "reproduce": usage.REPRODUCE_HELP, "run": usage.run_help(),
-}
+HELP = {"": usage.HELP, **usage.HELP_OF, "run": usage.run_help()}
+del HELP["completion"]  # its words are for a shell's start-up file
 
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 

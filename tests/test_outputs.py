@@ -18,11 +18,12 @@ from factories import STATES, make_result, with_figures, without_observer
 
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
-from gpebo_cli.results import files
-from gpebo_cli.results.folder import TABLES, write_run
+from gpebo_cli.results import files, tables
+from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import GitState, Provenance, git_state, provenance
 from gpebo_cli.results.summary import plain, summary_text
 
+TABLES = [f"{name}.csv" for name in tables.TABLES]
 MADE_BY = Provenance({"gpebo": "0.1.0"}, GitState("c0ffee", False))
 
 

@@ -20,7 +20,9 @@ from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
 from gpebo_cli.cli.progress import Progress
 from gpebo_cli.cli.sweep import _overrides
-from gpebo_cli.cli.sweep_folder import (
+from gpebo_cli.cli.sweep_progress import Watch
+from gpebo_cli.errors import ConfigError
+from gpebo_cli.results.sweep_folder import (
     JobRecord,
     Plan,
     read_plan,
@@ -28,8 +30,6 @@ from gpebo_cli.cli.sweep_folder import (
     table,
     write_record,
 )
-from gpebo_cli.cli.sweep_progress import Watch
-from gpebo_cli.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 FAST = ["figures=none", "time.samples=51"]

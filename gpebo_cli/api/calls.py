@@ -21,7 +21,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.recordings.drive import located
 from gpebo_cli.regression.text import system_from_mapping
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import nearest, shown, unknown
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
 
 if TYPE_CHECKING:
@@ -223,10 +223,7 @@ def available(
     if group is None:
         return {name: available(name, config_dir) for name in GROUPS}
     if group not in GROUPS:
-        raise ConfigError(
-            f"available({shown(group)}): no such group; known: {', '.join(GROUPS)}"
-            + nearest(str(group), GROUPS)
-        )
+        raise unknown(f"available({shown(group)}): no such group", group, GROUPS)
     folders = [conf_folder(), *([] if config_dir is None else [os.fspath(config_dir)])]
     return sorted({name for folder in folders for name in choices(folder, group)})
 

@@ -26,7 +26,7 @@ from gpebo_cli.results.frames import frame
 from gpebo_cli.results.page import case_table as case_cells
 from gpebo_cli.results.report import case_rows, run_lines
 from gpebo_cli.results.style import draw_on
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import shown, unknown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,11 +55,8 @@ class NamedArrays(Mapping[str, Array]):
         if name in self._twice:
             raise UnknownNameError(f"{name} is both a parameter and a state; rename the state")
         if name not in self._values:
-            known = ", ".join(self._values) or "none"
-            raise UnknownNameError(
-                f"{self._what} has no {shown(name)}; known: {known}"
-                + nearest(str(name), self._values)
-            )
+            what = f"{self._what} has no {shown(name)}"
+            raise UnknownNameError(str(unknown(what, name, self._values)))
         return self._values[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -199,10 +196,7 @@ class Result:
         if name in hats:
             return self.estimates[name.removesuffix(_HAT)]
         known = ["t", *everything, *hats]
-        raise UnknownNameError(
-            f"this run has no signal {shown(name)}; known: {', '.join(known)}"
-            + nearest(str(name), known)
-        )
+        raise UnknownNameError(str(unknown(f"this run has no signal {shown(name)}", name, known)))
 
     def __str__(self) -> str:
         return "\n".join(run_lines(self.details))

@@ -119,10 +119,10 @@ def _dispatch(words: list[str]) -> int:
 
         sys.stdout.write(f"gpebo {__version__}\n")
         return 0
-    if command == "run" and not {"--help", "-h"}.isdisjoint(rest):
-        from gpebo_cli.cli.usage import run_help
+    if command in COMMANDS and not {"--help", "-h"}.isdisjoint(rest):
+        from gpebo_cli.cli.usage import HELP_OF, run_help
 
-        sys.stdout.write(run_help())
+        sys.stdout.write(run_help() if command == "run" else HELP_OF[command])
         return 0
     if command in COMMANDS:
         from importlib import import_module

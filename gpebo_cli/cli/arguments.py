@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from gpebo_cli.configs.locations import GROUPS, PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import nearest, shown, unknown
 
 _SWITCHES = {
     "--dry-run": "--dry-run",
@@ -113,6 +113,10 @@ class Arguments:
     def folders(self) -> list[str]:
         """Where configuration is looked for, in this order."""
         return [conf_folder(), *([] if self.config_dir is None else [self.config_dir])]
+
+    def known(self, group: str) -> list[str]:
+        """Names of the files of a group there."""
+        return [name for folder in self.folders for name in choices(folder, group)]
 
 
 def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> Arguments:
@@ -300,12 +304,8 @@ def checked_folder(given: str | None) -> str | None:
 
 def _config_name(given: str | None, config_dir: str | None) -> str:
     name = PRIMARY if given is None else given.removesuffix(".yaml")
-    folders = [conf_folder(), *([] if config_dir is None else [config_dir])]
-    if any(os.path.isfile(os.path.join(folder, f"{name}.yaml")) for folder in folders):
+    known = Arguments(config_dir=config_dir).known("")
+    if name in known:
         return name
-    known = [found for folder in folders for found in choices(folder, "")]
     where = "" if config_dir is None else f" in {config_dir}"
-    raise ConfigError(
-        f"--config-name {name}: there is no {name}.yaml{where}; known: {', '.join(known)}"
-        + nearest(name, known)
-    )
+    raise unknown(f"--config-name {name}: there is no {name}.yaml{where}", name, known)

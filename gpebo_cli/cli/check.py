@@ -56,11 +56,6 @@ def main(words: list[str]) -> int:
         ConfigError: the words or the configuration are wrong.
         GpeboError: the solver fails.
     """
-    if "--help" in words or "-h" in words:
-        from gpebo_cli.cli.usage import CHECK_HELP
-
-        sys.stdout.write(CHECK_HELP)
-        return 0
     as_json, sensors = "--json" in words, "sensors=all" in words
     wrong = [word for word in words if word.startswith("sensors=") and word != "sensors=all"]
     if wrong:

@@ -111,11 +111,6 @@ def main(words: list[str]) -> int:
     Raises:
         ConfigError: not one shell, or an unknown one.
     """
-    if not {"--help", "-h"}.isdisjoint(words):
-        from gpebo_cli.cli.usage import COMPLETION_HELP
-
-        sys.stdout.write(COMPLETION_HELP)
-        return 0
     if len(words) != 1 or words[0] not in SCRIPTS:
         given = shown(" ".join(words)) if words else "nothing"
         raise ConfigError(

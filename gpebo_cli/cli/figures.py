@@ -5,17 +5,16 @@ from __future__ import annotations
 import itertools
 import os
 import sys
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpebo_cli.cli.arguments import Arguments, checked_folder
-from gpebo_cli.cli.options import CONFIG_DIR, PLAIN, VOLUME, Options, parse, unknown
+from gpebo_cli.cli.options import CONFIG_DIR, PLAIN, VOLUME, Options, no_option, parse
 from gpebo_cli.configs import configuration
-from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
+from gpebo_cli.configs.locations import PRIMARY
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import shown, unknown
 
 if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
@@ -30,16 +29,6 @@ _FORMATS = "figures.formats"
 _FOLDERS = {"--output": "a folder", "--check": "a folder", "--update": "a folder"}
 
 
-@dataclass(frozen=True)
-class _Arguments:
-    """What ``gpebo figures`` was asked to do."""
-
-    names: list[str]
-    formats: list[str]
-    folders: Mapping[str, str]  # --output, --check, --update
-    config_dir: str | None  # absolute
-
-
 def main(words: list[str]) -> int:
     """Regenerate the figures; the exit code.
 
@@ -48,12 +37,11 @@ def main(words: list[str]) -> int:
         GpeboError: a run failed, a file cannot be written, or ``--check`` found a difference.
     """
     options = parse("figures", words, {**_FOLDERS, **CONFIG_DIR}, VOLUME)
-    if options.help:
-        from gpebo_cli.cli.usage import FIGURES_HELP
-
-        sys.stdout.write(FIGURES_HELP)
-        return 0
-    arguments = _arguments(options)
+    config_dir = checked_folder(options.config_dir)
+    names, formats = _asked(options, config_dir)
+    update, check = options.values.get("--update"), options.values.get("--check")
+    if check is not None and not os.path.isdir(check):
+        raise ConfigError(f"--check {check}: there is no such folder")
 
     # Only now, when the words are known to be good: half a second of imports.
     from gpebo_cli.results import gallery
@@ -62,17 +50,16 @@ def main(words: list[str]) -> int:
     from gpebo_cli.results.provenance import provenance
     from gpebo_cli.results.studies import STUDIES
 
-    folder = Path(arguments.folders.get("--output", _OUTPUT))
-    update, check = arguments.folders.get("--update"), arguments.folders.get("--check")
-    names = arguments.names or list(STUDIES)
+    folder = Path(options.values.get("--output", _OUTPUT))
+    names = names or list(STUDIES)
     if gallery.lacks_circuit(names):
         sys.stderr.write("Fig. 1 is left out: it needs schemdraw, pip install 'gpebo[figures]'\n")
     make_folder(folder)
     sections: list[Section] = []
     differences: list[str] = []
-    for recipe in run_recipes(names, options, arguments.config_dir):
+    for recipe in run_recipes(names, options, config_dir):
         figures = gallery.figures_of(recipe)
-        section = gallery.write_recipe(folder / recipe.name, recipe, figures, arguments.formats)
+        section = gallery.write_recipe(folder / recipe.name, recipe, figures, formats)
         sections.append(section)
         if not options.quiet:
             sys.stdout.write(f"{recipe.name}: {len(section.pictures)} figures\n")
@@ -92,33 +79,30 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def _arguments(options: Options) -> _Arguments:
+def _asked(options: Options, config_dir: str | None) -> tuple[list[str], list[str]]:
+    """Names of recipes, and formats."""
     names: list[str] = []
     formats = ["png"]
-    config_dir = checked_folder(options.config_dir)
+    known = Arguments(config_dir=config_dir).known("experiment")
     for word in options.words:
         key, equals, value = word.partition("=")
         if key == _FORMATS:
             formats = _formats(value)
         elif equals and key != "experiment":
-            raise unknown("figures", key, (*_FOLDERS, *CONFIG_DIR, _FORMATS, "--help"))
+            raise no_option("figures", key, (*_FOLDERS, *CONFIG_DIR, _FORMATS, "--help"))
         else:
-            names.append(_recipe(word, config_dir))
-    check = options.values.get("--check")
-    if check is not None and not os.path.isdir(check):
-        raise ConfigError(f"--check {check}: there is no such folder")
-    return _Arguments(list(dict.fromkeys(names)), formats, options.values, config_dir)
+            names.append(known_recipe("figures", word.removeprefix("experiment="), known))
+    return list(dict.fromkeys(names)), formats
 
 
-def _recipe(word: str, config_dir: str | None) -> str:
-    folders = [conf_folder(), *([] if config_dir is None else [config_dir])]
-    known = [name for folder in folders for name in choices(folder, "experiment")]
-    name = word.removeprefix("experiment=")
+def known_recipe(command: str, name: str, known: Sequence[str]) -> str:
+    """``name``, one of the known recipes.
+
+    Raises:
+        ConfigError: it is none of them.
+    """
     if name not in known:
-        raise ConfigError(
-            f"gpebo figures: there is no recipe {shown(name)}; known: {', '.join(known)}"
-            + nearest(name, known)
-        )
+        raise unknown(f"gpebo {command}: there is no recipe {shown(name)}", name, known)
     return name
 
 

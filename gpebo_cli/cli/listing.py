@@ -22,13 +22,18 @@ _HEAD = 1 << 16  # characters of a file in which its title is looked for
 
 
 def main(words: list[str]) -> int:
-    """Print names, titles and references of the kinds asked for, by default of all."""
-    kinds, folders = _parse(words)
-    if not kinds:
-        from gpebo_cli.cli.usage import LIST_HELP
+    """Print names, titles and references of the kinds asked for, by default of all.
 
-        sys.stdout.write(LIST_HELP)
-        return 0
+    Raises:
+        ConfigError: there is no such kind, option or folder.
+    """
+    options = parse("list", words, CONFIG_DIR)
+    folders = [conf_folder()]
+    if options.config_dir is not None:
+        if not os.path.isdir(options.config_dir):
+            raise ConfigError(f"--config-dir {options.config_dir}: there is no such folder")
+        folders.append(options.config_dir)
+    kinds = list(dict.fromkeys(map(_kind, options.words))) or list(KINDS)
     for position, kind in enumerate(kinds):
         if len(kinds) > 1:
             sys.stdout.write(f"{'' if position == 0 else chr(10)}{kind}\n")
@@ -36,30 +41,13 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def _parse(words: list[str]) -> tuple[list[str], list[str]]:
-    """Kinds (none if help is wanted) and the folders to look in."""
-    options = parse("list", words, CONFIG_DIR)
-    folders = [conf_folder()]
-    if options.config_dir is not None:
-        if not os.path.isdir(options.config_dir):
-            raise ConfigError(f"--config-dir {options.config_dir}: there is no such folder")
-        folders.append(options.config_dir)
-    if options.help:
-        return [], folders
-    kinds = [_kind(word) for word in options.words]
-    return list(dict.fromkeys(kinds)) or list(KINDS), folders
-
-
 def _kind(word: str) -> str:
     for kind, group in KINDS.items():
         if word in (kind, group):
             return kind
-    from gpebo_cli.schema import nearest, shown
+    from gpebo_cli.schema import shown, unknown
 
-    raise ConfigError(
-        f"gpebo list {shown(word)}: nothing of that kind; known: {', '.join(KINDS)}"
-        + nearest(word, KINDS)
-    )
+    raise unknown(f"gpebo list {shown(word)}: nothing of that kind", word, KINDS)
 
 
 def _lines(group: str, folders: list[str], indent: str) -> list[str]:

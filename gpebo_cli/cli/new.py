@@ -49,11 +49,6 @@ def main(words: list[str]) -> int:
         ConfigError: no such kind, a name that cannot be one, or a file that exists.
         GpeboError: the file cannot be written.
     """
-    if not {"--help", "-h"}.isdisjoint(words):
-        from gpebo_cli.cli.usage import NEW_HELP
-
-        sys.stdout.write(NEW_HELP)
-        return 0
     kind, name, options = _parse(words)
     folder = os.path.expanduser(options.config_dir or ".")
     if kind == RECORDING:

@@ -15,7 +15,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.recordings.guess import Guess, guess
 from gpebo_cli.regression.text import system_from_mapping
 from gpebo_cli.results.files import make_folder, write_text
-from gpebo_cli.schema import nearest
+from gpebo_cli.schema import unknown
 
 _WORDS = {"\t": "tab", " ": "space"}
 
@@ -29,10 +29,7 @@ def write(file: str, plant: str, folder: str) -> int:
     """
     names = {name: home for home in (folder, conf_folder()) for name in choices(home, "plant")}
     if plant not in names:
-        raise ConfigError(
-            f"--plant {plant}: there is no such plant; known: {', '.join(sorted(names))}"
-            + nearest(plant, names)
-        )
+        raise unknown(f"--plant {plant}: there is no such plant", plant, sorted(names))
     file_of_plant = os.path.join(names[plant], "plant", f"{plant}.yaml")
     system = system_from_mapping(files.load(names[plant], f"plant/{plant}"), file_of_plant)
     found = guess(file, system)

@@ -46,11 +46,6 @@ class Options:
         """Whether stages are wanted, too."""
         return not {"--verbose", "-v"}.isdisjoint(self.switches)
 
-    @property
-    def help(self) -> bool:
-        """Whether the command's help is wanted."""
-        return not {"--help", "-h"}.isdisjoint(self.switches)
-
 
 PLAIN = Options({}, frozenset(), ())
 """No words."""
@@ -66,7 +61,7 @@ def parse(
         words: what follows it.
         values: options that have a value, ``--option VALUE`` or ``--option=VALUE``, and what the
             value is: "a folder".
-        switches: options that have none; ``--help`` and ``-h`` are always among them.
+        switches: options that have none.
 
     Raises:
         ConfigError: an unknown option, or one without its value.
@@ -82,16 +77,16 @@ def parse(
             if not value or value.startswith("--"):
                 raise ConfigError(f"{key} needs {values[key]}; see gpebo {command} --help")
             given[key] = value
-        elif word in (*switches, "--help", "-h"):
+        elif word in switches:
             switched.add(word)
         elif word.startswith("-"):
-            raise unknown(command, key, (*values, *switches, "--help"))
+            raise no_option(command, key, (*values, *switches, "--help"))
         else:
             others.append(word)
     return Options(given, frozenset(switched), tuple(others))
 
 
-def unknown(command: str, key: str, known: Sequence[str]) -> ConfigError:
+def no_option(command: str, key: str, known: Sequence[str]) -> ConfigError:
     """The error for an option that the command does not have."""
     from gpebo_cli.schema import nearest, shown
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from gpebo_cli.cli.compare import find
 from gpebo_cli.cli.options import parse
 from gpebo_cli.errors import ConfigError
 
@@ -18,37 +17,18 @@ def main(words: list[str]) -> int:
         GpeboError: a file cannot be read or written.
     """
     arguments = parse("report", words, {"--output": "a file"})
-    if arguments.help:
-        from gpebo_cli.cli.usage import REPORT_HELP
-
-        sys.stdout.write(REPORT_HELP)
-        return 0
     if not arguments.words:
         raise ConfigError("gpebo report needs folders of runs or sweeps; see gpebo report --help")
     path = Path(arguments.values.get("--output", "report.html"))
     if path.is_dir():
         raise ConfigError(f"--output {path}: that is a folder; give the name of a file")
-    found = [one for name in arguments.words for one in find(name)]
-
-    from gpebo_cli.results.document import Job, Part, document
+    from gpebo_cli.results.document import document
     from gpebo_cli.results.files import make_folder, write_text
-    from gpebo_cli.results.finished import read_run
+    from gpebo_cli.results.finished import find
     from gpebo_cli.results.provenance import provenance
 
-    parts = [
-        Part(
-            one.label,
-            [(name, folder) for name, folder, _ in one.runs],
-            [
-                Job(str(r.job), " ".join(f"{k}={v}" for k, v in r.overrides.items()), r.status,
-                    r.error)
-                for r in one.records
-            ],
-            [case for run in one.runs for case in read_run(*run)] if one.records else [],
-        )
-        for one in found
-    ]
+    found = [one for name in arguments.words for one in find(name)]
     make_folder(path.parent)
-    write_text(path, document(parts, provenance()))
+    write_text(path, document(found, provenance()))
     sys.stdout.write(f"{path}\n")
     return 0

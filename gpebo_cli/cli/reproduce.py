@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gpebo_cli.cli.figures import known_recipe, recipe_jobs, run_recipe_job
 from gpebo_cli.cli.options import PLAIN, VOLUME, Options, parse
 from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.schema import nearest, read, shown
+from gpebo_cli.schema import read, shown
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import RunResult
@@ -61,14 +62,11 @@ def main(words: list[str]) -> int:
         GpeboError: a run failed, or the page cannot be written.
     """
     options = parse("reproduce", words, _PAGE, VOLUME)
-    if options.help:
-        from gpebo_cli.cli.usage import REPRODUCE_HELP
-
-        sys.stdout.write(REPRODUCE_HELP)
-        return 0
     page = options.values.get("--page")
     pictures = None if page is None else Path(page).parent / _PICTURES
-    findings = [f for name in _names(options) for f in reproduced(name, options, pictures)]
+    known = choices(conf_folder(), FOLDER)
+    names = [known_recipe("reproduce", name, known) for name in options.words] or known
+    findings = [f for name in names for f in reproduced(name, options, pictures)]
     if not options.quiet:
         sys.stdout.writelines(f"{line}\n" for line in table(findings))
     if page is not None:
@@ -81,17 +79,6 @@ def main(words: list[str]) -> int:
     if off or not options.quiet:
         sys.stdout.write(f"{count} recipes, {len(findings)} numbers, {len(off)} off\n")
     return 1 if off else 0
-
-
-def _names(options: Options) -> list[str]:
-    known = choices(conf_folder(), FOLDER)
-    for name in options.words:
-        if name not in known:
-            raise ConfigError(
-                f"gpebo reproduce: there is no recipe {shown(name)}; known: {', '.join(known)}"
-                + nearest(name, known)
-            )
-    return list(options.words) or known
 
 
 def reproduced(
@@ -112,7 +99,6 @@ def reproduced(
 
     from gpebo_cli.cli.arguments import Arguments
     from gpebo_cli.cli.composition import session
-    from gpebo_cli.cli.figures import recipe_jobs, run_recipe_job
 
     where = f"experiment published/{name}"
     with session(Arguments()) as hydra:
@@ -196,17 +182,15 @@ def quantity(result: RunResult, name: str, where: str) -> list[float]:
 
 def table(findings: Sequence[Finding]) -> list[str]:
     """One line for each number."""
+    from gpebo_cli.results.report import columns
+
     rows = [("recipe", "quantity", "published", "ours", "tolerance", "")]
     rows += [
         (f.recipe, f.quantity, f"{f.published:.7g}", f"{f.ours:.7g}", f"{f.tolerance:.1g}",
          "agrees" if f.holds else f"OFF by {abs(f.ours - f.published):.3g}")
         for f in findings if f.ours is not None
     ]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    return [line.rstrip() for line in columns(rows, str.ljust)]
 
 
 def atlas(findings: Sequence[Finding], folder: Path) -> str:

@@ -24,7 +24,14 @@ from gpebo_cli.cli import interrupts, workers
 from gpebo_cli.cli.arguments import Arguments, quoted
 from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS
 from gpebo_cli.cli.job import read_job, run_job
-from gpebo_cli.cli.sweep_folder import (
+from gpebo_cli.cli.sweep_progress import Watch
+from gpebo_cli.configs.locations import GROUPS
+from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.evidence.metrics import is_metric
+from gpebo_cli.results.files import make_folder, write_text
+from gpebo_cli.results.names import METRICS
+from gpebo_cli.results.report import case_rows, columns
+from gpebo_cli.results.sweep_folder import (
     STOP,
     TABLE,
     JobRecord,
@@ -36,13 +43,6 @@ from gpebo_cli.cli.sweep_folder import (
     write_record,
     write_table,
 )
-from gpebo_cli.cli.sweep_progress import Watch
-from gpebo_cli.configs.locations import GROUPS
-from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.evidence.metrics import is_metric
-from gpebo_cli.results.files import make_folder, write_text
-from gpebo_cli.results.names import METRICS
-from gpebo_cli.results.report import case_rows, columns
 from gpebo_cli.schema import shown
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from gpebo_cli.cli.progress import display
-from gpebo_cli.cli.sweep_folder import RESULT, JobRecord, Plan, job_folder, read_record
+from gpebo_cli.results.sweep_folder import RESULT, JobRecord, Plan, job_folder, read_record
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

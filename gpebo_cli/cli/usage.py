@@ -38,31 +38,30 @@ examples:
 exit codes: 0 done, 1 the run failed, 2 wrong usage or configuration, 130 interrupted
 """
 
-FIGURES_HELP = """\
-usage: gpebo figures [NAME …] [OPTIONS]
+HELP_OF = {
+    "check": """\
+usage: gpebo check [OVERRIDES] [OPTIONS]
 
-Runs recipes, by default those of the paper, and writes their figures to outputs/paper, a CSV
-file with what is drawn beside each, and a page with all of them, index.html. The same code on the
-same machine writes the same tables, byte for byte.
+Checks every assumption that a run with these OVERRIDES (those of gpebo run) would rest on:
+solvability and index, a consistent start, the rank of E, impulse observability, excitation, and
+those of the canonical form. What fails comes with what to do about it. Nothing is estimated or
+written. Exit code 1 if something that is needed does not hold. Below the assumptions stands, for
+each parameter and state, from when on the outputs determine it.
 
 options:
-  figures.formats=[png,pdf,svg]  formats besides PNG, which is always written
-  --config-dir DIR    a folder of yours with experiment/NAME.yaml, whose recipes can be named, too
-  --output DIR        where to write
-  --check DIR         compare with the tables in DIR; exit code 1 if a curve differs
-  --update DIR        write the tables that --check compares with
-  -q, -v              nothing but errors; how long each stage takes
+  sensors=all         tries every state as a further output: what becomes estimable, the best first
+  --json              for a program instead of a person
+  --config-dir DIR    a folder of yours with plant/NAME.yaml
   -h, --help          this text
 
 examples:
-  gpebo figures paper_circuit                        # without a name, all of them
-  gpebo figures literal_regressor 'figures.formats=[png,pdf]' --update tables
-  gpebo figures literal_regressor --check tables
-  gpebo new recipe mine
-  gpebo figures mine --config-dir .
-"""
-
-COMPARE_HELP = """\
+  gpebo check plant=circuit
+  gpebo check plant=circuit observer.regression=paper
+  gpebo check plant=canonical observer=canonical --json
+  gpebo new plant tank
+  gpebo check --config-dir . plant=tank
+""",
+    "compare": """\
 usage: gpebo compare DIR … [OPTIONS]
 
 One table over finished runs and sweeps, the best first, and figures: error curves overlaid,
@@ -85,9 +84,8 @@ examples:
   gpebo compare both
   gpebo compare both --columns run,gamma,e0_il_hat,seconds_to_1pct_il --no-figures
   gpebo compare both/0 both/1 --sort final_error_states --csv best.csv --no-figures
-"""
-
-REPORT_HELP = """\
+""",
+    "report": """\
 usage: gpebo report DIR … [--output FILE]
 
 One HTML page over finished runs and sweeps, with everything in it: verdicts, assumptions and their
@@ -102,32 +100,31 @@ examples:
   gpebo run plant=circuit hydra.run.dir=circuit
   gpebo report circuit
   gpebo report circuit --output page.html
-"""
+""",
+    "figures": """\
+usage: gpebo figures [NAME …] [OPTIONS]
 
-CHECK_HELP = """\
-usage: gpebo check [OVERRIDES] [OPTIONS]
-
-Checks every assumption that a run with these OVERRIDES (those of gpebo run) would rest on:
-solvability and index, a consistent start, the rank of E, impulse observability, excitation, and
-those of the canonical form. What fails comes with what to do about it. Nothing is estimated or
-written. Exit code 1 if something that is needed does not hold. Below the assumptions stands, for
-each parameter and state, from when on the outputs determine it.
+Runs recipes, by default those of the paper, and writes their figures to outputs/paper, a CSV
+file with what is drawn beside each, and a page with all of them, index.html. The same code on the
+same machine writes the same tables, byte for byte.
 
 options:
-  sensors=all         tries every state as a further output: what becomes estimable, the best first
-  --json              for a program instead of a person
-  --config-dir DIR    a folder of yours with plant/NAME.yaml
+  figures.formats=[png,pdf,svg]  formats besides PNG, which is always written
+  --config-dir DIR    a folder of yours with experiment/NAME.yaml, whose recipes can be named, too
+  --output DIR        where to write
+  --check DIR         compare with the tables in DIR; exit code 1 if a curve differs
+  --update DIR        write the tables that --check compares with
+  -q, -v              nothing but errors; how long each stage takes
   -h, --help          this text
 
 examples:
-  gpebo check plant=circuit
-  gpebo check plant=circuit observer.regression=paper
-  gpebo check plant=canonical observer=canonical --json
-  gpebo new plant tank
-  gpebo check --config-dir . plant=tank
-"""
-
-REPRODUCE_HELP = """\
+  gpebo figures paper_circuit                        # without a name, all of them
+  gpebo figures literal_regressor 'figures.formats=[png,pdf]' --update tables
+  gpebo figures literal_regressor --check tables
+  gpebo new recipe mine
+  gpebo figures mine --config-dir .
+""",
+    "reproduce": """\
 usage: gpebo reproduce [NAME …] [--page FILE]
 
 Runs the recipes of experiments/published, by default all of them, and prints every published
@@ -140,9 +137,19 @@ examples:
   gpebo reproduce gear_petzold
   gpebo reproduce fct_agent1 circuit
   gpebo reproduce brenan --page atlas.md
-"""
+""",
+    "list": """\
+usage: gpebo list [KIND …] [--config-dir DIR]
 
-NEW_HELP = """\
+What can be chosen in gpebo run, one line each: its name and what it is. KIND is plants,
+observers, estimators or experiments; without one, all are listed. With --config-dir, yours too.
+
+examples:
+  gpebo list
+  gpebo list plants
+  gpebo list plants experiments --config-dir .
+""",
+    "new": """\
 usage: gpebo new {plant|estimator|observer|recipe} NAME [--config-dir DIR] [--from FILE …]
        gpebo new recording FILE.csv --plant NAME [--config-dir DIR]
 
@@ -170,9 +177,8 @@ examples:
   gpebo new estimator ridge --config-dir ridge
   gpebo new recipe two_gains
   gpebo run --config-dir . experiment=two_gains
-"""
-
-COMPLETION_HELP = """\
+""",
+    "completion": """\
 usage: gpebo completion bash|zsh|fish
 
 Prints a script that completes commands, options, groups and their values (yours, too, after
@@ -181,19 +187,9 @@ Prints a script that completes commands, options, groups and their values (yours
   ~/.bashrc                     eval "$(gpebo completion bash)"
   ~/.zshrc, after compinit      eval "$(gpebo completion zsh)"
   ~/.config/fish/config.fish    gpebo completion fish | source
-"""
-
-LIST_HELP = """\
-usage: gpebo list [KIND …] [--config-dir DIR]
-
-What can be chosen in gpebo run, one line each: its name and what it is. KIND is plants,
-observers, estimators or experiments; without one, all are listed. With --config-dir, yours too.
-
-examples:
-  gpebo list
-  gpebo list plants
-  gpebo list plants experiments --config-dir .
-"""
+""",
+}
+"""The help of each command but ``run``."""
 
 _RUN_HELP = """\
 usage: gpebo run [OVERRIDES] [OPTIONS]
@@ -259,16 +255,14 @@ def run_help() -> str:
 
 
 def _wrapped(head: str, text: str) -> list[str]:
-    """Lines of at most ``_WIDTH`` characters, the words of all but the first below each other."""
+    """Lines of at most 100 characters; ``textwrap`` takes longer to load than all of this."""
     lines = [head]
     for word in text.split(" "):
-        if len(lines[-1]) + len(word) >= _WIDTH:
+        if len(lines[-1]) + len(word) >= 100:
             lines.append(" " * len(head))
         lines[-1] += f"{word} "
     return [f"{line.rstrip()}\n" for line in lines]
 
-
-_WIDTH = 100
 
 # As in conf/gpebo.yaml, which is not read: a YAML parser costs more than all the rest of this.
 _DEFAULTS = {

@@ -10,7 +10,7 @@ from typing import Any
 
 from gpebo_cli.configs.text import dump
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.schema import convert, nearest, read, shown
+from gpebo_cli.schema import convert, read, shown, unknown
 from gpebo_cli.settings import (
     DataSettings,
     ExcitationSettings,
@@ -79,10 +79,7 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
     """
     for key in config:
         if key not in KEYS:
-            raise ConfigError(
-                f"{key}: no such key; the configuration has {', '.join(KEYS)}"
-                + nearest(str(key), KEYS)
-            )
+            raise unknown(f"{key}: no such key", key, KEYS, "the configuration has")
     data = read(DataSettings, _group(config, "data"), "data")
     built = Settings(
         plant=config["plant"],

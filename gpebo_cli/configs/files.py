@@ -19,7 +19,7 @@ from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, PRIMARY, conf_folde
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import read_text
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import shown, unknown
 
 GLOBAL = "_global_"
 """Where the content of a recipe belongs: at the top."""
@@ -145,10 +145,7 @@ def _recipe(path: str, content: Mapping[str, Any]) -> dict[str, Any]:
     """A recipe or a whole configuration: choices, values of known keys, and a sweep."""
     for key in content:
         if key not in (*KEYS, "defaults", "hydra"):
-            raise ConfigError(
-                f"{path}: {shown(key)}: no such key; there are {', '.join(KEYS)}"
-                + nearest(key, KEYS)
-            )
+            raise unknown(f"{path}: {shown(key)}: no such key", key, KEYS, "there are")
     recipe = dict(content)
     defaults = recipe.pop("defaults", None)
     if defaults is not None:

@@ -20,11 +20,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators.instrumental import Instrumental
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import shown, unknown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +45,8 @@ class Annihilator(Instrumental):
         """
         for name in self.perturbed:
             if name not in names:
-                raise ConfigError(
-                    f"estimator.perturbed: there is no parameter {shown(name)}; the parameters "
-                    f"are {', '.join(names)}{nearest(str(name), names)}"
-                )
+                what = f"estimator.perturbed: there is no parameter {shown(name)}"
+                raise unknown(what, name, names, "the parameters are")
         kept = [name not in self.perturbed for name in names] + [True] * len(names)
         return np.asarray(transpose(means[..., : len(names)]) * np.array(kept))
 

@@ -190,9 +190,14 @@ def merged(before: Array, after: Array, kept: IntArray) -> Array:
     """
     if before.shape[:2] == after.shape[:2] == (1, 1):
         return before
-    found = before.take(kept, axis=0, mode="clip")
-    found[kept < 0] = after
-    return found
+    fresh = kept < 0
+    count, shape = int(kept.max()) + 1, before.shape[1:]
+    before, after = (
+        x if len(x) > 1 else np.broadcast_to(x, (size, *shape))
+        for x, size in ((before, count), (after, int(fresh.sum())))
+    )
+    place = np.where(fresh, len(before) - 1 + fresh.cumsum(), kept)
+    return np.concatenate([before, after]).take(place, axis=0)
 
 
 def _element_maps(

@@ -41,7 +41,7 @@ from gpebo_cli.observers._observation import (
     log_norm,
 )
 from gpebo_cli.regression.linear import LinearRegression, outer_products
-from gpebo_cli.schema import nearest
+from gpebo_cli.schema import unknown
 from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
@@ -351,10 +351,8 @@ def _output_for_zw(
     )
     if settings.output is not None:
         if settings.output not in system.outputs:
-            raise ConfigError(
-                f"observer.output: {settings.output!r} is not an output; known: "
-                f"{', '.join(system.outputs)}" + nearest(settings.output, system.outputs)
-            )
+            what = f"observer.output: {settings.output!r} is not an output"
+            raise unknown(what, settings.output, system.outputs)
         ell = system.outputs.index(settings.output)
         if fits[ell]:
             return ell

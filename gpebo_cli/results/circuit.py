@@ -7,13 +7,12 @@ compares the two.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module, util
 from typing import TYPE_CHECKING, Any
 
+from gpebo_cli.results.files import csv_text
 from gpebo_cli.results.style import TEXT, WIDTH, new_figure, our_rc
 from gpebo_cli.results.symbols import typeset
 
@@ -57,11 +56,8 @@ def available() -> bool:
 
 def netlist() -> str:
     """What is drawn, as CSV: element, nodes it connects, and the current between them."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["element", "from", "to", "current"])
-    writer.writerows([b.element, b.start, b.end, b.current] for b in BRANCHES)
-    return text.getvalue()
+    head = ("element", "from", "to", "current")
+    return csv_text([head, *((b.element, b.start, b.end, b.current) for b in BRANCHES)])
 
 
 def circuit() -> Figure:

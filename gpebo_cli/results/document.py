@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ import numpy as np
 from gpebo_cli.errors import GpeboError
 from gpebo_cli.results import html
 from gpebo_cli.results.comparison import figures
-from gpebo_cli.results.finished import Case, read_columns, read_summary
+from gpebo_cli.results.finished import Found, read_columns, read_summary
 from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.page import case_table
 from gpebo_cli.results.style import file_content
@@ -27,56 +26,40 @@ _LARGEST = 20_000_000  # bytes of a picture
 _MOST_CASES = 50
 
 
-@dataclass(frozen=True)
-class Job:
-    """A row of a sweep: what became of a job."""
-
-    name: str
-    settings: str
-    status: str
-    error: str
-
-
-@dataclass(frozen=True)
-class Part:
-    """One folder that a person named: a run, or a sweep with its ``jobs``."""
-
-    name: str
-    runs: Sequence[tuple[str, Path]]  # what each is called, and where it is
-    jobs: Sequence[Job] = ()
-    cases: Sequence[Case] = ()  # of a sweep
-
-
-def document(parts: Sequence[Part], made_by: Provenance) -> str:
+def document(parts: Sequence[Found], made_by: Provenance) -> str:
     """The page, complete in itself.
 
     Raises:
         GpeboError: a file of a run is missing, or is not what a run writes.
     """
-    title = f"gpebo: {', '.join(part.name for part in parts)}"
+    title = f"gpebo: {', '.join(part.label for part in parts)}"
     sections = "".join(map(_part, parts))
     return html.document(title, sections + html.footer(made_by), embedded=True)
 
 
-def _part(part: Part) -> str:
-    runs = [_run(name, folder) for name, folder in part.runs]
-    if not part.jobs:
+def _part(part: Found) -> str:
+    runs = [_run(name, folder) for name, folder, _ in part.runs]
+    if not part.records:
         return "".join(runs)
-    failed = [number for number, job in enumerate(part.jobs) if job.status != "done"]
-    rows = [("job", "what was chosen", "status", "error"),
-            *((job.name, job.settings, job.status, job.error) for job in part.jobs)]
-    count = f"{len(part.jobs) - len(failed)} of {len(part.jobs)} jobs are done"
+    failed = [number for number, job in enumerate(part.records) if job.status != "done"]
+    rows = [("job", "what was chosen", "status", "error")]
+    rows += [
+        (str(r.job), " ".join(f"{k}={v}" for k, v in r.overrides.items()), r.status, r.error)
+        for r in part.records
+    ]
+    count = f"{len(part.records) - len(failed)} of {len(part.records)} jobs are done"
+    cases = part.cases
     drawn = "".join(
         html.embedded_figure(file_content(figure, "png"), name)
-        for name, figure in (figures(part.cases, METRICS[0]) if part.cases else ())
+        for name, figure in (figures(cases, METRICS[0]) if cases else ())
     )
     heading = (
-        f"<section>\n<h2>{escape(part.name)}</h2>\n{html.paragraph(count, 'verdict')}"
+        f"<section>\n<h2>{escape(part.label)}</h2>\n{html.paragraph(count, 'verdict')}"
         f'{html.table(rows, text=True, failed=failed)}<div class="figures">{drawn}</div>\n'
     )
     inside = "".join(
         f"<details><summary>{escape(name)}</summary>\n{run}</details>\n"
-        for (name, _), run in zip(part.runs, runs, strict=True)
+        for (name, *_), run in zip(part.runs, runs, strict=True)
     )
     return f"{heading}{inside}</section>\n"
 

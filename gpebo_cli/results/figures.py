@@ -21,7 +21,7 @@ from gpebo_cli.results import style
 from gpebo_cli.results.names import FIGURE_NAMES
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
 from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import shown, unknown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -281,10 +281,7 @@ def check_names(names: Iterable[str]) -> None:
     """
     for name in names:
         if name not in FIGURES:
-            raise ConfigError(
-                f"figures: there is no figure {shown(name)}; known: {', '.join(FIGURES)}"
-                + nearest(str(name), FIGURES)
-            )
+            raise unknown(f"figures: there is no figure {shown(name)}", name, FIGURES)
 
 
 def describe(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -34,6 +36,13 @@ def write_file(path: Path, chunks: Iterable[bytes]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write ``text`` to ``path`` as UTF-8; see :func:`write_file`."""
     write_file(path, [text.encode()])
+
+
+def csv_text(rows: Iterable[Iterable[str]]) -> str:
+    """Rows as CSV; the cells that need it are quoted."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def make_folder(path: Path) -> None:

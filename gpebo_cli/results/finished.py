@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
+import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +17,7 @@ from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.reading import open_regular, strict_json
+from gpebo_cli.results.sweep_folder import PLAN, JobRecord, job_folder, read_plan, read_records
 from gpebo_cli.schema import shown
 
 _NUMBER = re.compile(r"-?(?:[0-9]+(?:\.[0-9]+)?(?:e[+-]?[0-9]+)?|inf)")
@@ -44,6 +46,57 @@ class ErrorCurves:
     states: Array  # (M,)
     parameter_size: float
     state_size: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """A run, or a sweep with the ``records`` of its jobs."""
+
+    path: str  # as it was given
+    label: str
+    runs: list[tuple[str, Path, Mapping[str, str]]]  # name, folder, overrides; those that are done
+    records: list[JobRecord] = field(default_factory=list)
+
+    @property
+    def cases(self) -> list[Case]:
+        """All cases of the runs.
+
+        Raises:
+            GpeboError: a file is missing or cannot be understood; it is named.
+        """
+        return [case for run in self.runs for case in read_run(*run)]
+
+
+def find(name: str) -> list[Found]:
+    """What a folder is, or all that is in it.
+
+    Raises:
+        ConfigError: neither a run nor a sweep, and nothing of that kind in it.
+    """
+    folder = Path(name)
+    if not folder.is_dir():
+        raise ConfigError(f"{name}: there is no such folder")
+    label = os.path.relpath(folder)
+    # The stamps in the names of our own folders say more than where these are.
+    label = folder.absolute().name if label.startswith((".", "outputs")) else label
+    if is_run(folder):
+        return [Found(name, label, [(label, folder, {})])]
+    plan = read_plan(folder)
+    if plan is None:
+        inside = [p for p in sorted(folder.iterdir()) if is_run(p) or (p / PLAN).is_file()]
+        if not inside:
+            raise ConfigError(
+                f"{name}: neither a finished run (summary.json) nor a sweep (sweep.json), and "
+                "nothing of that kind in it"
+            )
+        return [found for path in inside for found in find(str(path))]
+    records = read_records(folder, plan)
+    done = [
+        (f"{label}/{r.job}", job_folder(folder, r.job), r.overrides)
+        for r in records
+        if r.status == "done"
+    ]
+    return [Found(name, label, done, records)]
 
 
 def is_run(folder: Path) -> bool:

@@ -5,16 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from gpebo_cli.experiment.result import RunResult
-from gpebo_cli.results import tables
 from gpebo_cli.results.figures import FIGURES, draw
 from gpebo_cli.results.files import make_folder, remove_files, write_text
 from gpebo_cli.results.names import FORMATS
 from gpebo_cli.results.provenance import Provenance, provenance
 from gpebo_cli.results.style import save
 from gpebo_cli.results.summary import summary_text
+from gpebo_cli.results.tables import TABLES, write_noise, write_parquet, write_table
 
-TABLES = ("signals.csv", "regression.csv", "excitation.csv", "estimates.csv", "cases.csv")
-NOISE_TABLE = "noise.csv"  # only where more than one seed was asked for
+_FILES = (*(f"{name}.csv" for name in TABLES), "noise.csv")  # that: of more than one seed only
 
 
 def write_run(
@@ -44,20 +43,13 @@ def write_run(
     _remove_earlier(folder)
 
     write_text(folder / "config.yaml", config_text)
-    tables.write_signals(folder / "signals.csv", result.system, result.signals)
-    regression, estimation = result.regression, result.estimation
-    if regression is not None:
-        tables.write_regression(folder / "regression.csv", regression)
-    if result.excitation is not None:
-        tables.write_excitation(folder / "excitation.csv", result.excitation)
-    if estimation is not None:
-        tables.write_estimates(folder / "estimates.csv", result.system.states, estimation)
-    if estimation is not None and result.metrics is not None:
-        tables.write_cases(folder / "cases.csv", estimation, result.metrics)
-    if estimation is not None and result.noise is not None:
-        tables.write_noise(folder / NOISE_TABLE, estimation, result.noise)
+    for name, make in TABLES.items():
+        if (table := make(result)) is not None:
+            write_table(folder / f"{name}.csv", table)
+    if result.estimation is not None and result.noise is not None:
+        write_noise(folder / "noise.csv", result.estimation, result.noise)
     if result.settings.output.parquet:
-        tables.write_parquet(folder / name for name in (*TABLES, NOISE_TABLE))
+        write_parquet(folder / name for name in _FILES)
     for name, figure in figures:
         make_folder(folder / "figures")
         for suffix in result.settings.output.formats:
@@ -67,6 +59,6 @@ def write_run(
 
 def _remove_earlier(folder: Path) -> None:
     """Remove what an earlier run left, by name: a folder may hold files that are not ours."""
-    made = [folder / name for name in ("summary.json", *TABLES, NOISE_TABLE)]
+    made = [folder / name for name in ("summary.json", *_FILES)]
     remove_files(path.with_suffix(suffix) for path in made for suffix in (path.suffix, ".parquet"))
     remove_files(folder / "figures" / f"{name}.{s}" for name in FIGURES for s in FORMATS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -129,13 +129,12 @@ def estimate_table(result: RunResult) -> list[str]:
     return columns(rows)
 
 
-def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+def columns(
+    rows: Sequence[Sequence[str]], aligned: Callable[[str, int], str] = str.rjust
+) -> list[str]:
     """Rows of text as lines with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
-        for row in rows
-    ]
+    return ["  ".join(map(aligned, row, widths)) for row in rows]
 
 
 def _cell(name: str, row: Mapping[str, float]) -> str:

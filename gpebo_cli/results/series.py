@@ -21,7 +21,6 @@ line's width. A gain that is off by 2e-4 does not pass.
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -31,6 +30,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.results import files
 from gpebo_cli.results.style import MAX_PANELS, Panel, drawn
 
 RELATIVE = 1e-3
@@ -85,15 +85,10 @@ def blocks(panels: Sequence[Panel]) -> list[Block]:
 
 def csv_text(table: Sequence[Block], digits: int = 17) -> str:
     """A header and rows; blocks stand side by side, the shorter ones end in empty cells."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        name for block in table for name in (block.name, *(c.name for c in block.columns))
-    )
+    header = [name for block in table for name in (block.name, *(c.name for c in block.columns))]
     columns = [v for block in table for v in (block.x, *(c.values for c in block.columns))]
     cells = ([_cell(value, digits) for value in column.tolist()] for column in columns)
-    writer.writerows(zip_longest(*cells, fillvalue=""))
-    return text.getvalue()
+    return files.csv_text([header, *zip_longest(*cells, fillvalue="")])
 
 
 def _cell(value: float, digits: int) -> str:

@@ -22,7 +22,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results.files import write_file
 from gpebo_cli.results.symbols import escaped, number_text, power_of_ten, with_unit
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import shown, unknown
 from gpebo_cli.settings import OutputSettings
 
 if TYPE_CHECKING:
@@ -132,11 +132,8 @@ def _style(name: str) -> dict[str, Any]:
     from matplotlib.style import available, library
 
     if name not in library:
-        known = sorted(available)
-        raise ConfigError(
-            f"figures.style: matplotlib has no style {shown(name)}; known: {', '.join(known)}"
-            + nearest(name, known)
-        )
+        what = f"figures.style: matplotlib has no style {shown(name)}"
+        raise unknown(what, name, sorted(available))
     changed: dict[str, Any] = {**library[name]}  # type: ignore[dict-item]
     return {**{key: rcParamsDefault[key] for key in RC}, **changed}  # type: ignore[index]
 

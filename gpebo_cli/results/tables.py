@@ -7,41 +7,35 @@ it takes longer than most runs.
 
 from __future__ import annotations
 
-import csv
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.evidence.excitation import Excitation
-from gpebo_cli.evidence.metrics import Metrics
-from gpebo_cli.experiment.result import (
-    EstimationResult,
-    NoiseStatistics,
-    RegressionResult,
-    SignalsResult,
-)
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.results.files import write_file
+from gpebo_cli.experiment.result import EstimationResult, NoiseStatistics, RunResult
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.results.files import csv_text, write_file
 
 _CHUNK_ROWS = 2048  # large enough to amortise the call, small enough to stay in cache
 
 
 @dataclass(frozen=True)
 class Table:
-    """Names of columns and their values, (rows, columns)."""
+    """Names of columns and their values; the first one is ``case`` or ``t``."""
 
     header: list[str]
-    rows: Array
+    pieces: Iterable[Array]  # (rows, columns) each, one below the other
 
 
-def signals_table(system: DescriptorSystem, signals: SignalsResult) -> Table:
+def _signals(result: RunResult) -> Table:
     """``t``, inputs, outputs and true states that are known; what was measured, if it differs."""
+    system, signals = result.system, result.signals
     known = np.flatnonzero(~np.isnan(signals.states).all(axis=0))
     header = ["t", *system.inputs, *system.outputs, *(system.states[i] for i in known)]
     columns = [signals.t, signals.inputs, signals.outputs, signals.states[:, known]]
@@ -52,61 +46,60 @@ def signals_table(system: DescriptorSystem, signals: SignalsResult) -> Table:
         if seen is not None:
             header += [f"{name}_measured" for name in names]
             columns.append(seen)
-    return Table(header, np.column_stack(columns))
+    return Table(header, [np.column_stack(columns)])
 
 
-def write_signals(path: Path, system: DescriptorSystem, signals: SignalsResult) -> None:
-    """Write :func:`signals_table`."""
-    write_file(path, _lines(signals_table(system, signals)))
-
-
-def regression_table(regression: RegressionResult) -> Table:
+def _regression(result: RunResult) -> Table | None:
     """``t``, ``Y_1…``, then ``psi_<row>_<parameter>`` row by row."""
+    regression = result.regression
+    if regression is None:
+        return None
     count = regression.Y.shape[1]
     rows = range(1, count + 1)
     header = ["t", *(f"Y_{i}" for i in rows)]
     header += [f"psi_{i}_{name}" for i in rows for name in regression.parameters]
     width = count * len(regression.parameters)  # spelled out: -1 is ambiguous if there are none
     psi = regression.psi.reshape(len(regression.t), width)
-    return Table(header, np.column_stack([regression.t, regression.Y, psi]))
+    return Table(header, [np.column_stack([regression.t, regression.Y, psi])])
 
 
-def write_regression(path: Path, regression: RegressionResult) -> None:
-    """Write :func:`regression_table`."""
-    write_file(path, _lines(regression_table(regression)))
-
-
-def excitation_table(excitation: Excitation) -> Table:
+def _excitation(result: RunResult) -> Table | None:
     """``t``, the eigenvalues of G in ascending order, ``pe_level`` and ``normalised_min``."""
-    count = excitation.gram_eigenvalues.shape[1]
+    e = result.excitation
+    if e is None:
+        return None
+    count = e.gram_eigenvalues.shape[1]
     header = ["t", *(f"gram_eig_{i}" for i in range(1, count + 1)), "pe_level", "normalised_min"]
-    e = excitation
-    return Table(
-        header, np.column_stack([e.t, e.gram_eigenvalues, e.pe_level, e.normalised_min])
-    )
+    columns = [e.t, e.gram_eigenvalues, e.pe_level, e.normalised_min]
+    return Table(header, [np.column_stack(columns)])
 
 
-def write_excitation(path: Path, excitation: Excitation) -> None:
-    """Write :func:`excitation_table`."""
-    write_file(path, _lines(excitation_table(excitation)))
-
-
-def estimates_header(states: Sequence[str], estimation: EstimationResult) -> list[str]:
+def _estimates(result: RunResult) -> Table | None:
     """``case, t, <parameter>_hat…, <state>_hat…``, ``delta`` if mixed, deviations, checks.
 
     Deviations ``<parameter>_std…, <state>_std…`` are there where the noise is known. Then
-    ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value.
+    ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value. Columns
+    of states that the observer does not see are empty.
     """
-    header = ["case", "t", *(f"{name}_hat" for name in (*estimation.names, *states))]
+    estimation = result.estimation
+    if estimation is None:
+        return None
+    names = (*estimation.names, *result.system.states)
+    header = ["case", "t", *(f"{name}_hat" for name in names)]
     if estimation.delta is not None:
         header.append("delta")
     if estimation.parameters_std is not None:
-        header += [f"{name}_std" for name in (*estimation.names, *states)]
-    return [*header, *estimation.checks, *(f"{name}_true" for name, _ in varying_truth(estimation))]
+        header += [f"{name}_std" for name in names]
+    header += [*estimation.checks, *(f"{name}_true" for name, _ in _varying_truth(estimation))]
+    cases, at_once = len(estimation.cases), max(1, _CHUNK_ROWS // max(len(estimation.t), 1))
+    return Table(header, (
+        _rows_of_cases(estimation, slice(first, first + at_once))
+        for first in range(0, cases, at_once)
+    ))
 
 
-def case_values(estimation: EstimationResult, cases: slice) -> Array:
-    """The rows of some cases, (g, M, columns), under :func:`estimates_header`."""
+def _rows_of_cases(estimation: EstimationResult, cases: slice) -> Array:
+    """The rows (g M, columns) of some cases."""
     numbers = np.arange(len(estimation.parameters))[cases]
     columns = [estimation.parameters[cases], estimation.states[cases]]
     if estimation.delta is not None:
@@ -115,21 +108,11 @@ def case_values(estimation: EstimationResult, cases: slice) -> Array:
     if estimation.parameters_std is not None and estimation.states_std is not None:
         columns += [estimation.parameters_std[cases], estimation.states_std[cases]]
     columns += [check[cases][..., None] for check in estimation.checks.values()]
-    columns += [values[:, None] for _, values in varying_truth(estimation)]
+    columns += [values[:, None] for _, values in _varying_truth(estimation)]
     columns = [numbers[:, None, None].astype(float), estimation.t[:, None], *columns]
     shape = columns[2].shape[:2]
-    return np.concatenate([np.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=2)
-
-
-def write_estimates(
-    path: Path, states: Sequence[str], estimation: EstimationResult
-) -> None:
-    """Write the long table of :func:`estimates_header`, case by case.
-
-    Columns of states the observer does not see are empty.
-    """
-    header = estimates_header(states, estimation)
-    write_file(path, _estimate_chunks(header, estimation))
+    wide = [np.broadcast_to(c, (*shape, c.shape[-1])) for c in columns]
+    return np.concatenate(wide, axis=2).reshape(shape[0] * shape[1], -1)
 
 
 def check_parquet() -> None:
@@ -152,17 +135,32 @@ def write_parquet(made: Iterable[Path]) -> None:
             write_file(path.with_suffix(".parquet"), [buffer.getvalue()])
 
 
-def write_cases(path: Path, estimation: EstimationResult, metrics: Metrics) -> None:
-    """Write one row per case: ``case``, its gains, its metrics; NaN is an empty cell."""
-    table = cases_table(estimation, metrics)
-    rows = np.column_stack([np.arange(len(table.rows)), table.rows])
-    write_file(path, [_header(["case", *table.header]), *_rows(rows, "%d")])
-
-
-def cases_table(estimation: EstimationResult, metrics: Metrics) -> Table:
+def _cases(result: RunResult) -> Table | None:
     """One row per case: its gains (NaN: it has no such gain), its metrics."""
+    estimation, metrics = result.estimation, result.metrics
+    if estimation is None or metrics is None:
+        return None
     columns = {**estimation.gains, **metrics.columns}
-    return Table([*columns], np.column_stack([*columns.values()]))
+    rows = np.column_stack([np.arange(len(estimation.cases)), *columns.values()])
+    return Table(["case", *columns], [rows])
+
+
+TABLES: dict[str, Callable[[RunResult], Table | None]] = {
+    "signals": _signals, "regression": _regression, "excitation": _excitation,
+    "estimates": _estimates, "cases": _cases,
+}
+"""What makes each table of a run; None where the run has nothing for it."""
+
+
+def write_table(path: Path, table: Table) -> None:
+    """Write a table as CSV; NaN is an empty cell.
+
+    Raises:
+        GpeboError: the file cannot be written.
+    """
+    first = "%d" if table.header[0] == "case" else "%.17g"
+    pieces = (text for piece in table.pieces for text in _rows(piece, first))
+    write_file(path, chain([_header(table.header)], pieces))
 
 
 def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics) -> None:
@@ -179,7 +177,7 @@ def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics
     write_file(path, lines)
 
 
-def varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
+def _varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
     """What is estimated and is not the same at all times, with its true values (M,)."""
     truth = estimation.true_parameters
     return [
@@ -189,27 +187,11 @@ def varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
     ]
 
 
-def _estimate_chunks(header: Sequence[str], estimation: EstimationResult) -> Iterator[bytes]:
-    yield _header(header)
-    cases, at_once = len(estimation.cases), max(1, _CHUNK_ROWS // max(len(estimation.t), 1))
-    for first in range(0, cases, at_once):
-        values = case_values(estimation, slice(first, first + at_once))
-        yield from _rows(values.reshape(-1, values.shape[2]), "%d")
-
-
-def _lines(table: Table) -> Iterator[bytes]:
-    yield _header(table.header)
-    yield from _rows(table.rows)
-
-
 def _header(names: Sequence[str]) -> bytes:
-    # csv quotes a name that needs it; the numbers below never do.
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerow(names)
-    return stream.getvalue().encode()
+    return csv_text([names]).encode()  # a name may need quotes; the numbers below never do
 
 
-def _rows(table: Array, first: str = "%.17g") -> Iterator[bytes]:
+def _rows(table: Array, first: str) -> Iterator[bytes]:
     """Format ``table`` (rows, columns), its first column by a format of its own."""
     line = ",".join([first] + ["%.17g"] * (table.shape[1] - 1)) + "\n"
     for start in range(0, len(table), _CHUNK_ROWS):

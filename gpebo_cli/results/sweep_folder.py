@@ -10,8 +10,6 @@ counts, so a sweep can be collected, and gone on with, whatever happened to whoe
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -20,7 +18,7 @@ from typing import Any, Literal
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import finite, open_regular, strict_json
-from gpebo_cli.results.files import remove_files, write_text
+from gpebo_cli.results.files import csv_text, remove_files, write_text
 
 PLAN = "sweep.json"
 RESULT = "result.json"
@@ -145,9 +143,7 @@ def write_table(folder: Path, records: Sequence[JobRecord]) -> None:
     Raises:
         GpeboError: it cannot be written.
     """
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(table(records))
-    write_text(folder / TABLE, text.getvalue())
+    write_text(folder / TABLE, csv_text(table(records)))
 
 
 def table(records: Sequence[JobRecord]) -> list[list[str]]:
