@@ -143,6 +143,7 @@ def make_result(
             delta=None if delta is None else delta[None],
             checks={},
             requirement=Requirement("Δ not in L2", True, {"integral": 1e-5}, "enough excitation"),
+            still=np.zeros(len(gammas), dtype=bool),
         ),
         metrics=metrics,
         assumptions=(

@@ -290,3 +290,34 @@ def test_a_run_without_deviations_says_why():
     verdict = run("boost", noise=NOISE, time={"horizon": 0.5}).verdict
     assert "no standard deviations: noise of the signals is in the matrices" in verdict
     assert "no standard deviations" not in run("boost", time={"horizon": 0.5}).verdict
+
+
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.01}])
+@pytest.mark.parametrize("size", [1e-6, 1e-10])  # of ψ: Δ is tiny, or rounding
+def test_an_estimate_that_was_not_moved_has_no_deviation(tmp_path, observer, size):
+    plant = {
+        "name": "tiny", "states": ["x"], "inputs": {"u": "cos(t)"}, "outputs": ["y"],
+        "unknowns": {"a": 1.0, "b": 1.0 / size}, "E": [[1]], "A": [[-1]], "B": [[1]],
+        "F": [["sin(3*t)", f"{size}*cos(2*t)"]], "C": [[1]], "initial_state": {"x": 1},
+    }
+    made = run(plant, observer="none", time={"horizon": 10, "samples": 1001})
+    table = np.column_stack([made.t, made["u"], made["y"]])
+    np.savetxt(tmp_path / "r.csv", table, delimiter=",", header="t,u,y", comments="")
+
+    def lines(**estimator):
+        result = run(
+            plant, data={"file": str(tmp_path / "r.csv")}, estimator=estimator, observer=observer,
+            noise={"name": "gaussian", "outputs": 0.01},
+        )
+        return {line.split()[0]: line for line in run_lines(result.details)}, result.details
+
+    told, result = lines(name="drem", initial=3.0)
+    assert "not moved from 3 " in told["b"]
+    assert np.isnan(result.estimation.parameters_std).all()
+    assert np.isnan(result.estimation.states_std).all()
+    assert "within ±2σ of the end after" not in result.verdict
+    if size == 1e-6:  # a gain that makes up for the units
+        told, result = lines(name="drem", initial=3.0, gamma=1e36)
+        std = result.estimation.parameters_std[0, -1]
+        assert "not moved" not in told["b"]
+        assert (np.abs(result.estimation.parameters[0, -1] - [1, 1e6, -1]) < 5 * std).all()

@@ -48,8 +48,9 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
             columns = [came.t, estimates, made.gram_eigenvalues[:, :1]]
             if made.std is not None and made.level is not None:
                 header += [f"{name}_std" for name in names]
-                level = made.level[:, None]  # NaN: so far the estimates explain any rows
-                columns.append(np.where(np.isnan(level), np.inf, made.std[0] * level))
+                std = made.std[0] * made.level[:, None]  # NaN: the estimates explain any rows
+                untouched = ~made.std[0, :, : len(online.parameters)].any(axis=1, keepdims=True)
+                columns.append(np.where(untouched | np.isnan(std), np.inf, std))
             head = ",".join(header) + "\n" if first else ""
             _write(head + _text(np.column_stack(columns)))
         if wrong:

@@ -43,6 +43,7 @@ from gpebo_cli.experiment.uncertainty import (
     sampled_deviations,
     standard_deviations,
 )
+from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
@@ -58,6 +59,7 @@ _LAGS = 20  # of the residual's autocorrelation
 _PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
 _SILENT = 1e-9  # of an output: a residual below that is rounding
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
+_STILL = 1e-9  # of the same: an estimate that moved by less than that was not moved by data
 _BATCH = 1 << 21  # numbers held at once while cases are evaluated: beyond it calls cost little
 
 # name of a stage of the run -> what measures it
@@ -149,6 +151,7 @@ def continuous(
                 deviations[..., columns] = found[0]
                 deviations[np.isnan(estimation.parameters)] = np.nan
                 of_states = np.where(np.isnan(estimation.states), np.nan, found[1])
+                deviations[estimation.still] = of_states[estimation.still] = np.nan
                 estimation = replace(
                     estimation, parameters_std=deviations, states_std=of_states
                 )
@@ -232,17 +235,18 @@ def at_samples(
         x = source.states(t)
         parameters = made.parameters * _told(made.known.parameters[-1])
         states = made.states * _told(made.seen[-1])
-        sizes = _sizes(truth, online.natural_sizes, x)
         numbers = _numbers(
-            t, parameters - truth, states - x, sizes, _judged(source, truth.shape[1])
+            t, parameters - truth, states - x, _sizes(truth, online.natural_sizes, x),
+            _judged(source, truth.shape[1]),
         )
     chosen = kept_samples(1, len(t), settings.time.samples)
     kept = chosen[kept_samples(len(by.cases), len(chosen), settings.output.max_rows)]
-    std: Array | None = None
     p = parameters.shape[2]
-    if made.std is not None and made.level is not None:
-        std = made.std[:, kept] * made.level[-1]
-        std[np.isnan(np.concatenate([parameters, states], axis=2)[:, kept])] = np.nan
+    still = _still(parameters, by.requirement, online.natural_sizes)
+    std = None if made.std is None or made.level is None else made.std[:, kept] * made.level[-1]
+    if std is not None:
+        told = np.concatenate([parameters, states], axis=2)[:, kept]
+        std[np.isnan(told) | still[:, None, None]] = np.nan
     estimation = EstimationResult(
         cases=by.cases,
         t=t[kept],
@@ -255,6 +259,7 @@ def at_samples(
         requirement=by.requirement,
         parameters_std=None if std is None else std[..., :p],
         states_std=None if std is None else std[..., p:],
+        still=still,
     )
     with stage("excitation"):
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
@@ -363,16 +368,16 @@ def _estimate(
     else:
         seen = np.ones(n, dtype=bool)
     estimates, columns = made(estimator)
-    requirement = estimates.requirement
     if observation.estimator is None:
-        raised = estimators.raised(estimator, requirement)
+        raised = estimators.raised(estimator, estimates.requirement)
         if raised is not estimator:
             estimator, (estimates, columns) = raised, made(raised)
-            requirement = estimates.requirement
+    requirement = estimates.requirement
     if observation.bounds:
         estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
     told = _told(determined), _told(seen)
-    sizes = _sizes(truth, _natural_sizes(regression, p), x)
+    natural = _natural_sizes(regression, p)
+    sizes = _sizes(truth, natural, x)
     evaluate = _evaluation(
         state_map, grid, truth * told[0], x * told[1], sizes, _judged(source, p), chosen,
         each=each,
@@ -407,6 +412,7 @@ def _estimate(
         requirement=requirement,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
         explaining=explaining,
+        still=_still(parameters, requirement, natural),
     )
     return estimator, result, _metrics(numbers, observation.parameters, system)
 
@@ -451,6 +457,15 @@ def _natural_sizes(regression: LinearRegression, p: int) -> Array:
         return np.zeros(p)
     square = Trajectory(regression.mesh, (regression.Y.values**2).sum(axis=-1)).integral().final
     return np.asarray(np.sqrt(np.divide(square, energy, out=np.zeros(p), where=energy > 0.0)))
+
+
+def _still(parameters: Array, requirement: Requirement, natural: Array) -> BoolArray:
+    """Which cases (G,) of η̂ (G, M, p) are where they began, for want of what is required.
+
+    Noise did not move them either, and a deviation of zero would claim that nothing is uncertain.
+    """
+    moved = np.ptp(parameters, axis=1) > _STILL * natural
+    return np.asarray((len(natural) > 0) & (not requirement.holds) & ~moved.any(axis=1))
 
 
 def _sizes(truth: Array, natural: Array, x: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ import numpy as np
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.findings import Assumption, OnDemand, Requirement, evaluated
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.settings import Settings
 
 _TOGETHER = 1.7  # bands of a sum of correlations, which one white noise in a thousand leaves
@@ -154,6 +154,7 @@ class EstimationResult:
     delta: Array | None  # (D, M), D = 1 if it is the same for every case, else G; None: no mixing
     checks: Mapping[str, Array]  # further estimates by column name, (G, M) each
     requirement: Requirement
+    still: BoolArray  # (G,) cases that are where they began: it was not met at all
     parameters_std: Array | None = None  # (G, M, p) standard deviations; None: nobody knows
     states_std: Array | None = None  # (G, M, n)
     active: Mapping[int, tuple[ActiveBound, ...]] = field(default_factory=dict)  # bounds, by case

@@ -125,7 +125,10 @@ def estimate_table(result: RunResult) -> list[str]:
         when = estimation.t[first] if known is None else estimation.t[0] + known[case]
         since = f"{when:.4g} s" if name in estimation.names else ""
         deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
-        rows.append([name, f"{value:.6g}", deviation, told["unit"] or "", since, estimable])
+        shown = f"{value:.6g}"
+        if estimation.still[case] and name in estimation.names:
+            shown, since = f"not moved from {shown}", ""
+        rows.append([name, shown, deviation, told["unit"] or "", since, estimable])
     return columns(rows)
 
 
