@@ -165,9 +165,11 @@ def unresolved_signals(
     ``made_of`` (n, columns).
     """
     size, points, n, columns = values.shape
+    further = () if problem.monitor is None else problem.monitor(values, extras)
+    if problem.told:
+        return unresolved_kinds(further, rule)
     least = least_sizes(problem, made_of, tol).reshape(n * columns)
     own: Kind = (values.reshape(size, points, n * columns), least)
-    further = () if problem.monitor is None else problem.monitor(values, extras)
     return unresolved_kinds(chain([own], further), rule)
 
 

@@ -74,7 +74,7 @@ def inputs_resolved(
 
 def known_joined(
     system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients], mesh: Mesh,
-    c: Coefficients, cuts: Array, tol: float, longest: float,
+    c: Coefficients, cuts: Array, tol: float, longest: float = np.inf,
 ) -> tuple[Mesh, Coefficients]:
     """Elements joined where known functions are resolved all the same; the cuts (B,) stay.
 

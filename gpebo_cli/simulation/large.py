@@ -46,6 +46,7 @@ from gpebo_cli.simulation.signals import Signals, Simulation
 SMALL = 8  # states, up to which dense matrices are faster in any case
 _FULL = 50  # states, beyond which full or stiff constant plants are simulated here, too
 _ENTRIES = 4  # per row of E; with more of them E counts as full
+_LENGTH = 2.6  # h‖A‖ of an element: products of two solutions, too, are resolved to 1e-9 there
 _NOTHING = 8.0 * EPS  # of what it is made of: a state that is smaller is rounding itself
 _ROUNDING = 32.0  # units in the last place by which a consistent state may miss one asked for
 _VALUE = 32.0  # units in the last place that any value may be wrong by
@@ -193,27 +194,29 @@ def _simulated(
     if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
         return None  # what jumps then is for the derivative array to say
     M, units = plant.matrix(), form.units
-    longest = 0.75 * sweeps.LENGTH / max(M.norms(M.sizes(mesh), units).max(), _TINY)
-    parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
-    stiff = system.n > _FULL and len(M.entries) == 1 and parts.sum() > sweeps.MOST_ELEMENTS
+    longest = _LENGTH / max(M.norms(M.sizes(mesh), units).max(), _TINY)
+    stiff = np.ceil(mesh.steps / longest).sum() > sweeps.MOST_ELEMENTS
+    stiff = stiff and system.n > _FULL and len(M.entries) == 1
     if stiff:
-        enough = SHORT / float(mesh.steps.max())
-        parts = np.maximum(np.ceil(mesh.steps * (M.growth(enough) / SHORT)), 1.0)
-    if not parts.sum() <= solver.max_elements:
-        return None
-    given = mesh = mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
-    c = plant.entries(mesh)
-    used = plant.found.places["u"][0]
+        longest = SHORT / max(M.growth(SHORT / float(mesh.steps.max())), _TINY)
 
     def looked_at(t: Array) -> Coefficients:
         return entries(system.coefficients, t, 0).values
 
+    given, c, used = mesh, plant.found.values, plant.found.places["u"][0]
     beside = _beside_inputs(plant.found, np.abs(system.initial_state))[used]
     mesh, c = inputs_resolved(
         system, plant.entries, looked_at, mesh, c, beside, solver, bounded=bounded
     )
     if mesh is given:
-        mesh, c = known_joined(system, plant.entries, mesh, c, cuts, MARGIN * tol, longest)
+        mesh, c = known_joined(system, plant.entries, mesh, c, cuts, MARGIN * tol)
+    parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
+    if not parts.sum() <= solver.max_elements:
+        return None
+    if parts.max() > 1.0:
+        mesh = mesh.split(parts.astype(np.intp))[0]
+        # What begins at zero is small in the first element, and is to be resolved there, too.
+        mesh = Mesh(np.insert(mesh.edges, 1, mesh.edges[:2].mean()), mesh.rule)
     form = plant.eliminate(mesh)
     x0, z0 = _start(plant)
     floor_z = SHARE * np.abs(form.reduced(x0))[:, None]

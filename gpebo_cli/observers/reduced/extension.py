@@ -458,7 +458,10 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         )
 
     name = f"observer of plant {system.name}"
-    problem = LinearProblem(coefficients, start / units, monitor, name)
+    # Along axes offset and gain are these components, each compared with its own state's size.
+    on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
+    on_axes &= basis.shape[1] == reduced.rank  # else what is eliminated is taken from them
+    problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
     if solver.name == "ivp":
         solution = ivp.solve(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
     else:
