@@ -60,29 +60,50 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(name, ho
     assert np.sqrt(few.regression.misfit(eta) / 4.0) == pytest.approx(rms, rel=1e-8)
 
 
-def test_samples_in_groups_have_the_deviations_of_each_alone(tmp_path, monkeypatch):
-    """Of two files, whose errors begin anew, with filters that are slower and faster than they."""
+@pytest.mark.parametrize(("plant", "horizon", "count", "estimator"), [
+    ("descriptor", 5.0, 550, {"name": "drem", "gamma": 1e8}),
+    ("battery", 600.0, 1500, "least_squares"),
+])
+def test_samples_in_groups_have_the_deviations_of_each_alone(
+    plant, horizon, count, estimator, tmp_path, monkeypatch
+):
+    """Of two files, whose errors begin anew, with filters that are slower and faster than they.
+
+    The battery's ψ follows a signal, which bends at every sample.
+    """
     rng = np.random.default_rng(0)
+    made = run(plant, observer="none", time={"horizon": horizon, "samples": 501})
+    (u,), (y,) = made.inputs, made.outputs
     files = []
-    for k, rows in enumerate((600, 550)):
-        t = np.linspace(0.0, 5.0, rows)
-        made = run("descriptor", observer="none", time={"horizon": 5.0, "samples": 501})
-        table = [t, np.interp(t, made.t, made["u"]), np.interp(t, made.t, made["y"])]
+    for k, rows in enumerate((count, count + 50)):
+        t = np.linspace(0.0, horizon, rows)
+        table = [t, np.interp(t, made.t, made[u]), np.interp(t, made.t, made[y])]
         table[2] = table[2] + 0.05 * rng.standard_normal(rows)
         files.append(tmp_path / f"{k}.csv")
-        np.savetxt(files[-1], np.transpose(table), delimiter=",", header="t,u,y", comments="")
+        np.savetxt(files[-1], np.transpose(table), delimiter=",", header=f"t,{u},{y}", comments="")
     found = []
     for groups in (150, 10**9):
         monkeypatch.setattr(uncertainty, "_GROUPS", groups)
         result = run(
-            "descriptor", data={"file": list(map(str, files))}, time={"samples": 31},
-            estimator={"name": "drem", "gamma": 1e8},
+            plant, data={"file": list(map(str, files))}, time={"samples": 31}, estimator=estimator
         )
         found.append(result.details.estimation)
     for part in ("parameters_std", "states_std"):
         groups, alone = (getattr(each, part)[0] for each in found)
         np.testing.assert_allclose(groups, alone, rtol=1e-2, atol=1e-2 * alone.max())
         assert not np.array_equal(groups, alone)
+
+
+def test_a_bend_at_a_sample_within_a_group_is_no_edge():
+    """Edges elsewhere, such as a jump of the matrices, stay."""
+    samples, jump = np.linspace(0.0, 100.0, 20_001), 12.3456
+    edges = np.sort(np.append(samples, jump))
+    groups = uncertainty._grouped(samples[:-1], 100.0, np.array([50.0]), np.zeros(1), 20, 16)
+    mesh, fresh, _ = uncertainty._mesh(edges, groups)
+    expected = np.union1d(groups.starts, [jump, 100.0])
+    np.testing.assert_array_equal(mesh.edges, expected)
+    assert mesh.size < 1500
+    np.testing.assert_array_equal(mesh.edges[:-1][fresh], groups.starts)
 
 
 TANKS = {

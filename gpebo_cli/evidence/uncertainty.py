@@ -35,7 +35,7 @@ _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
 _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
 _GROUPS = 2000  # of samples, by which many of them are replaced at first
-_PER_ELAPSED = 16  # groups at least, since the start
+_PER_ELAPSED = 64  # groups at least, since the start, at first
 _AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
 _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
 
@@ -56,15 +56,17 @@ def deviations(
         t: ascending.
         starts: edges at which ζ begins anew, of several experiments; None: at the first one only.
     """
-    most, before = len(instants) // _GROUPS, list[Array]()
+    most, per, before = len(instants) // _GROUPS, _PER_ELAPSED, list[Array]()
+    anew = edges[:1] if starts is None else starts
     while True:
-        groups = _grouped(instants, edges[-1], t, edges[:1] if starts is None else starts, most)
+        groups = _grouped(instants, edges[-1], t, anew, most, per)
         *found, _ = propagated(
             observer, estimator, gain, edges, groups, variances, t, None, starts
         )
         if most <= 1 or (before and all(map(_agree, before, found))):
             return found[0], found[1]
-        before, most = found, most // (4 if before else 2)
+        finer = 4 if before else 2
+        before, most, per = found, most // finer, per * finer
 
 
 def _agree(coarse: Array, fine: Array) -> bool:
@@ -77,12 +79,16 @@ class Groups(NamedTuple):
 
     starts: Array  # (G,) the times of their first samples
     shares: Array  # (G,) of a sample's deviation: √(Σ h²)/Σ h over the steps h in the group
+    others: Array  # the times of all other samples
 
 
-def _grouped(instants: Array, end: float, t: Array, starts: Array, most: int) -> Groups:
-    """Samples (N,) up to ``end`` in groups of up to ``most``, small ones soon after a start.
+def _grouped(
+    instants: Array, end: float, t: Array, starts: Array, most: int, per: int
+) -> Groups:
+    """Samples (N,) up to ``end`` in groups of up to ``most``.
 
-    The sample at or before a time of ``t`` or ``starts`` is the first one of its group.
+    After k samples from a start they are of up to k/``per``. The sample at or before a time of
+    ``t`` or ``starts`` is the first one of its group.
     """
     if most <= 1:
         return each_alone(instants)
@@ -98,15 +104,15 @@ def _grouped(instants: Array, end: float, t: Array, starts: Array, most: int) ->
     for (k, stop), origin in zip(pairwise(bounds.tolist()), origins.tolist(), strict=False):
         while k < stop:
             first.append(k)
-            k += max(1, min(most, (k - origin) // _PER_ELAPSED))  # noqa: PLW2901
+            k += max(1, min(most, (k - origin) // per))  # noqa: PLW2901
     steps = np.diff(instants, append=end)
     whole, squares = (np.add.reduceat(steps**power, first) for power in (1, 2))
-    return Groups(instants[first], np.sqrt(squares) / whole)
+    return Groups(instants[first], np.sqrt(squares) / whole, np.delete(instants, first))
 
 
 def each_alone(instants: Array) -> Groups:
     """Samples (N,), each with its own error."""
-    return Groups(instants, np.ones(len(instants)))
+    return Groups(instants, np.ones(len(instants)), instants[:0])
 
 
 def propagated(
@@ -290,13 +296,17 @@ def _stretch(observer: ErrorsAt, estimator: ErrorsAt, mesh: Mesh, n: int) -> int
 
 
 def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, Array]:
-    """Elements between all edges and groups, whether one is new at each one's start, its share."""
+    """Elements between edges and groups, whether one is new at each one's start, its share.
+
+    Edges at samples within a group are left out: ψ bends there at most, as the errors do.
+    """
     instants = groups.starts
     near = 1e-9 * float(np.diff(edges).min())
-    own = instants[np.abs(edges[np.searchsorted(edges, instants).clip(0, len(edges) - 1)]
-                          - instants) > near]
+    inner = ~_among(edges, groups.others, near)
+    inner[[0, -1]] = True
+    own = instants[~_among(instants, edges, near)]
     own = own[(own > edges[0]) & (own < edges[-1])]
-    mesh = Mesh(np.union1d(edges, own), radau_rule(_STAGES))
+    mesh = Mesh(np.union1d(edges[inner], own), radau_rule(_STAGES))
     parts = int(np.clip(np.ceil(_ELEMENTS / mesh.size), 1, _MOST_PARTS))
     mesh, _ = mesh.split(np.full(mesh.size, parts, dtype=np.intp))
     at = np.searchsorted(mesh.edges, instants - near)
@@ -305,6 +315,13 @@ def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, Array]:
     fresh[0] = True
     group = np.searchsorted(instants - near, mesh.edges[:-1], side="right") - 1
     return mesh, fresh[:-1], groups.shares[group.clip(0)]
+
+
+def _among(t: Array, times: Array, near: float) -> BoolArray:
+    """Which of t (N,) are as ``near`` as that to one of the ascending times."""
+    padded = np.concatenate([[-np.inf], times, [np.inf]])
+    k = np.searchsorted(padded, t).clip(1)
+    return np.asarray(np.minimum(t - padded[k - 1], padded[k] - t) <= near)
 
 
 def _element_maps(
