@@ -75,15 +75,19 @@ def test_zb3_is_not_invented():
     assert np.isfinite(result.metrics.final_error_states).all()
 
 
-def test_zb3_is_estimated_where_an_output_sees_it():
+@pytest.mark.parametrize("sign", ["", "-"])
+@pytest.mark.parametrize(
+    ("sees", "known"), [("(2 + sin(t))", True), ("cos(t)", False), ("step(t - 1)", False)]
+)
+def test_zb3_is_estimated_where_an_output_sees_it_at_every_time(sign, sees, known):
     system = shipped(
         "canonical", outputs=["y1", "y2", "y3"],
-        C=[[1, 0, 0, 0, 0], [0.5, 0, "c1", "c2", 0], [0, 1, 0, 0, "2 + sin(t)"]],
+        C=[[1, 0, 0, 0, 0], [0.5, 0, f"{sign}c1", f"{sign}c2", 0], [0, 1, 0, 0, sign + sees]],
     )
     result = run(system)
     error = result.estimation.states[0, -1] - result.simulation.states[-1]
-    assert abs(error[4]) < 1e-4  # limited by ẑ_w, which decays with M_w
-    assert np.abs(error).max() < 1e-4
+    assert np.isfinite(error).tolist() == [True] * 4 + [known]
+    assert np.nanmax(np.abs(error)) < 1e-4  # limited by ẑ_w, which decays with M_w
 
 
 def test_all_suitable_outputs_are_stacked():
@@ -128,13 +132,19 @@ def test_any_gain_gives_the_same_limit(L_w):
 
 
 def test_remark_4_gain_for_constant_coefficients():
-    """a1 c1/c2 > 0 and constant: Remark 4's L_w gives a stable M_w."""
-    system = shipped(
-        "canonical", parameters={"N21": 1, "N31": 0.5, "N32": 1.5, "c1": 1, "c2": 2}
-    )
+    """a1 c1/c2 > 0 and constant: Remark 4's L_w gives a stable M_w, and all evidence is closed."""
+    mapping = {"N21": 1, "N31": 0.5, "N32": 1.5, "c1": 1, "c2": 2}
+    A = np.diag([0.05, -0.5, 1.0, 1.0, 1.0]).tolist()
+    C = [[0, 0, 0, 0, 0], [1, 1, 0, 0, 0], [0.5, 0, "c1", "c2", 0]]
+    system = shipped("canonical", parameters=mapping, A=A, C=C, outputs=["none", "y1", "y2"])
     result = run(system, L_w="remark4")
-    seven = {a.name: a for a in result.assumptions}["Assumption 7"]
+    found = {a.name: a for a in result.assumptions}
+    assert found["Assumption 3"].evidence["outputs"] == "y1"
+    assert found["Growth of Φ"].evidence["rate"] == pytest.approx(0.05)
+    seven = found["Assumption 7"]
     assert seven.holds
+    assert seven.evidence["integral_M11"] == pytest.approx(-0.5 * 20)
+    assert seven.evidence["integral_M22"] == pytest.approx(-2.5 * 20)
     error = result.estimation.states[0, -1, 2:4] - result.simulation.states[-1, 2:4]
     assert np.abs(error).max() < 1e-3
 
@@ -166,9 +176,18 @@ def test_matrices_against_their_definition():
     [
         ({"C": [[1, 0, 0, 0, 1], [0.5, 0, "c1", "c2", 0]]}, {}, ModelError, "Assumption 3 fails"),
         ({"C": [[1, 0, 0, 0, 0], [0.5, 0, 0, "c2", 0]]}, {}, ModelError, "Assumption 6 fails"),
+        *(
+            ({"C": [[1, 0, 0, 0, 0], [0.5, 0, *row]]}, {}, ModelError, "Assumption 6 fails: no")
+            for row in (["c1", "c2", "sin(t)"], ["c1", "cos(t)", 0], ["cos(t)", "c2", 0])
+        ),
+        (
+            {"A": (np.diag([-1.0, -2, 1, 1, 1]) + 0.2 * np.eye(5, k=-2)).tolist()}, {},
+            ModelError, r"A\[2\]\[0\] is 0\.2 at t = 0 instead of 0",
+        ),
         ({}, {"output": "y1"}, ModelError, "Assumption 6 fails: output y1"),
         ({}, {"output": "y9"}, ConfigError, "'y9' is not an output"),
-        ({}, {"L_w": ["t", "x"]}, ConfigError, "observer.L_w"),
+        ({}, {"L_w": ["t", "x"]}, ConfigError, r"observer.L_w\[1\]"),
+        ({}, {"L_w": "ab"}, ConfigError, "observer.L_w: got 'ab'; accepted: diagonal"),
         ({}, {"r0": [1.0]}, ConfigError, "two finite numbers"),
     ],
 )

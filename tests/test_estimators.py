@@ -15,11 +15,13 @@ from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
 from gpebo_cli.estimators._extension import kreisselmeier, lion
+from gpebo_cli.estimators._following import SolvedEstimates, follow
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import observe
+from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -185,6 +187,8 @@ def means_ode(gamma, delay, settle, rows):
          least_squares_ode(2, 0.5, 0.3), 1e-9),
         ("least_squares", {"alpha": 2, "f0": 0.5, "beta": 0.3, "bound": 5},
          least_squares_ode(2, 0.5, 0.3, 5), 1e-8),
+        ("least_squares", {"alpha": 2, "f0": 0.5, "beta": 10, "bound": 5},  # β of several elements
+         least_squares_ode(2, 0.5, 10, 5), 1e-9),
         ("drem", {"gamma": 100, "lambda": [0.1, 0.2, 0.3]},
          drem_ode(100, [0.1, 0.2, 0.3], "kreisselmeier"), 1e-7),
         ("drem", {"gamma": 1e4, "lambda": 0.5}, drem_ode(1e4, [0.5] * 3, "kreisselmeier"), 1e-7),
@@ -634,6 +638,28 @@ def test_one_wrong_gain_of_many_is_found():
     gains = [*map(float, range(1, 9)), float("nan")]
     with pytest.raises(ConfigError, match="positive number, got nan"):
         estimators.build({"name": "drem", "gamma": gains})
+
+
+@pytest.mark.parametrize(("share", "holds"), [(0.99, False), (1.01, True)])
+def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
+    """η' = diag(0.1, −1) η and Ω = 2I over 10 s: ∫Δ² = 160, which stands against e^1."""
+    mesh = CLEAN.mesh
+
+    def always(value):
+        return Trajectory(mesh, np.broadcast_to(value, (*mesh.points.shape, *np.shape(value))))
+
+    dynamics = Dynamics(always(np.diag([0.1, -1.0])), always(np.zeros(2)), 0.0)
+    least = (1.0 + np.log(100.0)) / 160.0
+    gains = share * least * np.array([[1.0], [5.0]])
+    found = follow(always(2.0 * np.eye(2, 3)), dynamics, np.zeros(2), gains, T).requirement
+    assert found.holds == holds
+    assert found.evidence["gamma_times_integral"] == pytest.approx(share * (1.0 + np.log(100.0)))
+    # And where η̂ = Ω⁻¹𝒴, the last Ω of every case has to be regular.
+    ends = [np.diag([1.0, 4.0]), np.diag([1e-11 if holds else 1e-13, 1.0])]
+    extended = tuple(np.array([[[0, 0, 0], [0, 0, 0]], np.eye(2, 3), np.eye(2, 3)]) for _ in ends)
+    for whole, end in zip(extended, ends, strict=True):
+        whole[-1, :, :2] = end
+    assert SolvedEstimates(extended).requirement.holds == holds
 
 
 # A plain field as an axis -----------------------------------------------------------------------

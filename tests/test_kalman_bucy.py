@@ -228,6 +228,18 @@ def test_a_wandering_unknown_is_followed():
     assert still.metrics.final_error_parameters[0] > 0.3
 
 
+def test_no_word_of_noise_is_noise_of_size_zero():
+    system = shipped("descriptor")
+    signals = simulate(system, TimeSettings(horizon=1.0), SOLVER).signals
+    none = SignalNoise(np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time)
+    t, deviations = np.linspace(0.0, 1.0, 5), []
+    for noise in (None, none):
+        measured = replace(seen(signals), noise=noise)
+        found = observe(system, measured, SOLVER, name="kalman_bucy")
+        deviations.append(np.hstack(found.state_map.spread.deviations(t)))
+    np.testing.assert_array_equal(*deviations)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -22,11 +22,12 @@ from test_observer import ROTATING
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, SolverError
-from gpebo_cli.evidence.excitation import segment_level, window_level
+from gpebo_cli.evidence.excitation import segment_level
 from gpebo_cli.experiment.assumptions import check
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import largest
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm
@@ -276,17 +277,39 @@ def test_knowledge_of_what_has_decayed_is_bounded():
 
 
 def test_windows_of_excitation_run_through_resets():
-    """Resets that change nothing change no level."""
+    """Behind each reset to η₊ = Tη a level is that of the plain regression's T⁻ᵀGT⁻¹."""
     plain = make_regression(three, ETA)
-    edges = plain.mesh.edges
-    resets = tuple(
-        Reset(float(edges[k]), np.eye(3), np.zeros(3), 0.0) for k in (16, 40, 41)
+    edges, at = plain.mesh.edges, (16, 40, 41)
+    transform = np.array([[1.2, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.3, 0.8]])
+    resets = tuple(Reset(float(edges[k]), transform, np.zeros(3), 0.0) for k in at)
+    before = np.array([np.linalg.matrix_power(np.linalg.inv(transform), k) for k in range(4)])
+    psi = plain.psi.values @ before[np.searchsorted(at, np.arange(len(edges) - 1), "right"), None]
+    cut = type(plain)(
+        plain.Y, Trajectory(plain.mesh, psi), plain.parameters, plain.scale, resets
     )
     t = np.linspace(0.0, 10.0, 57)
-    cut = type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
-    expected = window_level(type(plain.outer)(plain.mesh, plain.outer.values[..., :3]), t, 3.0)
-    np.testing.assert_allclose(segment_level(cut, t, 3.0), expected, atol=1e-12)
-    np.testing.assert_allclose(cut.gram.values, plain.gram.values, atol=1e-12)
+    whole = t >= 3.0
+    G = (plain.gram(t[whole]) - plain.gram(t[whole] - 3.0))[..., :3]
+    inverse = before[(t[whole, None] > edges[list(at)]).sum(axis=1)]
+    expected = np.linalg.eigvalsh(np.swapaxes(inverse, 1, 2) @ G @ inverse)[:, 0]
+    level = segment_level(cut, t, 3.0)
+    assert np.isnan(level[~whole]).all()
+    np.testing.assert_allclose(level[whole], expected, rtol=1e-9)
+    final = before[3].T @ plain.gram.final[:, :3] @ before[3]
+    np.testing.assert_allclose(cut.gram.final[:, :3], final, atol=1e-11)
+
+
+def test_an_unknown_whose_value_nobody_knows_spoils_no_other():
+    """The errors of the extension behind resets do not need θ, as long as it is constant."""
+    two = {**MIXED, "unknowns": {"a": 0.7, "b": 0.2}, "F": [[1, 0], [0, 1], [0, 0]]}
+    system = plant_from_mapping(two)
+    signals = simulate(system, TimeSettings(horizon=10.0), SOLVER).signals
+    truth = observe(system, seen(signals), SOLVER, remedy="reset", reset_interval=4.0).truth
+    t = np.linspace(0.0, 10.0, 11)
+    known, partly = (np.tile(theta, (11, 1)) for theta in ([0.7, 0.2], [0.7, np.nan]))
+    found = truth(t, partly, signals.states)[:, 2:]
+    np.testing.assert_array_equal(found, truth(t, known, signals.states)[:, 2:])
+    assert np.isfinite(found).all()
 
 
 @pytest.mark.parametrize(

@@ -237,6 +237,16 @@ def test_a_covariance_that_cannot_be_resolved_is_refused_with_what_to_change():
         )
 
 
+def test_a_covariance_that_becomes_indefinite_is_refused():
+    """A 'noise' of negative intensity: P = (1 − t/2) I."""
+    one, none = np.ones((1, 1)), np.zeros((2, 2))
+    case = constant(none, np.zeros((1, 2)), -0.5 * np.eye(2), one, np.zeros((2, 1)))
+    P, _ = case.filtered(np.zeros(2), np.eye(2), 1.5).at(np.ones(1))
+    np.testing.assert_allclose(P[0], 0.5 * np.eye(2), atol=1e-14)
+    with pytest.raises(SolverError, match=r"not positive semidefinite near t = 2.*lower"):
+        case.filtered(np.zeros(2), np.eye(2), 3.0)
+
+
 def test_window_gramians_of_a_constant_system():
     """M = ∫₀ᵀ e^{Aᵀs} cᵀc e^{As} ds, by the block exponential, for windows that start anywhere."""
     A, c = np.array([[0.3, 1.0], [-2.0, 0.1]]), np.array([[1.0, 0.5]])

@@ -17,7 +17,7 @@ from test_cli import environment, gpebo
 from test_observer import ROTATING
 
 from gpebo_cli import estimators
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, quotient_of, spectrum
 from gpebo_cli.experiment.online import Online
@@ -94,6 +94,27 @@ def test_a_turning_kernel_of_e():
         for step in (0.02, 0.01)
     ]
     assert errors[1] < 0.35 * errors[0]
+
+
+def test_a_kernel_of_e_that_turns_later():
+    """At rest at first: what turns within a second is noticed at the start, else it is refused."""
+    for start in (0.5, 1.5):
+        # ROTATING with the angle w in the place of t; v = w'.
+        angle = {
+            "w": f"max(0, t - {start})**6", "v": "d(w)",
+            "c": "cos(w)", "s": "sin(w)", "C": "cos(w/2)", "S": "sin(w/2)",
+        }
+        system = plant_from_mapping({**ROTATING, "parameters": angle, "A": [
+            ["-c - s + v*s", 0, "-s + c - v*c", 0],
+            ["c", "-C - S + v*S/2", "s", "-S + C - v*C/2"], *ROTATING["A"][2:],
+        ]})
+        settings = {"sample_time": 0.02, "hold": "linear"}
+        if start < 1.0:
+            found = run(system, {"name": "least_squares"}, 3.0, **settings).estimation
+            assert found.parameters[0, -1] == pytest.approx(found.true_parameters[-1], rel=0.01)
+        else:
+            with pytest.raises(ModelError, match=r"the kernel of E turns from t = 1\.5\d* on"):
+                run(system, {"name": "least_squares"}, 3.0, **settings)
 
 
 def test_the_sampled_run_tells_what_the_continuous_one_tells():

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from gpebo_cli import ConfigError, GpeboError, run
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.reduction.structure import _PLACES
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -120,6 +121,16 @@ def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
         initial_state=[1, 1],
     )
     with pytest.raises(ModelError, match=rf"rank of the derivative array changes at t = {where}"):
+        simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+
+
+def test_a_rank_drop_between_two_breakpoints_that_no_other_probe_sees_is_found():
+    """The longest piece in which no probe would be otherwise; E is 0 in it."""
+    k = int(np.argmax(np.diff(_PLACES)))
+    a, b = (_PLACES[k] + share * (_PLACES[k + 1] - _PLACES[k]) for share in (0.05, 0.95))
+    off = f"step(t - {float(a)}) - step(t - {float(b)})"
+    singular = plant(states=["x"], E=[[f"1 - ({off})"]], A=[[-1]], initial_state=[1])
+    with pytest.raises(ModelError, match=r"from 7 at t = 0\.001 to 6 at t = "):
         simulate(singular, TimeSettings(horizon=1.0), SOLVER)
 
 

@@ -28,7 +28,7 @@ from scipy.integrate import trapezoid
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
@@ -46,6 +46,7 @@ from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp
 
 _ZERO = 1e-12  # entries below this share of their matrix are zero
+_SMALL = 1e-9  # nothing is divided by entries below this share
 _FINER = 4  # the observer for z_b runs on elements this many times shorter: ẑ_a may be steep
 
 
@@ -316,10 +317,10 @@ def _unknown_input_observer(
     def on_mesh(values: Array) -> Trajectory:
         return Trajectory(mesh, values.reshape(*mesh.points.shape, *values.shape[1:]))
 
-    seen = [k for k in range(system.r) if (np.abs(b.C[:, k, n_a + 2]) > 1e-9).all()]
+    size = np.abs(b.C).max(axis=(0, 2))
     third = None
-    if seen:
-        j = seen[0]
+    if (seen := _apart_from_zero(b.C[:, :, n_a + 2], size)).any():
+        j = int(np.argmax(seen))
         row = np.concatenate([b.C[:, j, : n_a + 2], y[:, j : j + 1]], axis=1)
         third = on_mesh(row / b.C[:, j, n_a + 2 : n_a + 3])
     return UnknownInputObserver(
@@ -338,17 +339,19 @@ def _unknown_input_observer(
     )
 
 
+def _apart_from_zero(entries: Array, size: Array) -> BoolArray:
+    """Which of the entries (N, …) keep their sign and are, beside ``size``, never small."""
+    low, high = entries.min(axis=0), entries.max(axis=0)
+    return np.asarray(np.maximum(low, -high) > _SMALL * size)
+
+
 def _output_for_zw(
     system: DescriptorSystem, settings: Canonical, b: Blocks, n_a: int
 ) -> int:
     """ℓ of Assumption 6: asked for by name, or the first output that satisfies it."""
-    row = np.abs(b.C[:, :, n_a:])
-    size = np.maximum(np.abs(b.C).max(axis=(0, 2)), np.finfo(float).tiny)
-    fits = (
-        (row[:, :, 0].min(axis=0) > 1e-9 * size)
-        & (row[:, :, 1].min(axis=0) > 1e-9 * size)
-        & (row[:, :, 2].max(axis=0) <= _ZERO * size)
-    )
+    row, size = b.C[:, :, n_a:], np.abs(b.C).max(axis=(0, 2))
+    fits = _apart_from_zero(row[:, :, :2], size[:, None]).all(axis=1)
+    fits &= np.abs(row[:, :, 2]).max(axis=0) <= _ZERO * size
     if settings.output is not None:
         if settings.output not in system.outputs:
             what = f"observer.output: {settings.output!r} is not an output"
@@ -394,7 +397,7 @@ def _assumptions(
     system: DescriptorSystem, N: Array, c: Array, M: Trajectory, ell: int
 ) -> tuple[Assumption, ...]:
     """Assumptions 4, 6 and 7 with their evidence."""
-    divided = np.minimum(np.abs(N[:, 1, 0]), np.abs(N[:, 2, 1]))
+    divided = N[:, [1, 2], [0, 1]]
     decay = transition_decay(M)
     diagonal = trapezoid(
         np.diagonal(M.values, axis1=2, axis2=3), M.mesh.points[..., None], axis=1
@@ -403,8 +406,8 @@ def _assumptions(
         Assumption(
             "Assumption 4",
             "N21 and N32, which are divided by, have no zero (the other entries may)",
-            bool((divided > 1e-9 * np.abs(N).max()).all()),
-            {"smallest": float(divided.min())},
+            bool(_apart_from_zero(divided, np.abs(N).max()).all()),
+            {"smallest": float(np.abs(divided).min())},
         ),
         Assumption(
             "Assumption 6",

@@ -218,11 +218,11 @@ def split_by_svd(
     else:
         basis, dual, _ = initial_basis(P[0], n_a, system.states, units)
     if like is not None and basis.shape[1] < system.n:
-        off = np.abs(P - (basis @ dual) * units / own).max(axis=(1, 2))
-        if off.max() >= 10 * _PROJECTOR_TURNED:
+        off = np.abs(P - (basis @ dual) * units / own).max(axis=(1, 2)) >= 10 * _PROJECTOR_TURNED
+        if off.any():
             raise ModelError(
-                f"plant {system.name}: the kernel of E turns near t = {t[int(np.argmax(off))]:.6g} "
-                "and nowhere else; start a run there, or make E smooth"
+                f"plant {system.name}: the kernel of E turns from t = {t[int(np.argmax(off))]:.6g} "
+                "on; start a run there, or make E smooth"
             )
     return Split(
         rank=n_a, basis=basis, dual=dual, pinv=without_rounding(dual @ (own * pinv_E)),
