@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.estimators._vector import VectorLaw
+from gpebo_cli.estimators._mixed import energy_requirement
+from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
@@ -19,56 +20,13 @@ from gpebo_cli.regression.resets import ExtensionState
 _DIGITS = 1e-12  # reciprocal condition of Ω below which some direction is rounding
 
 
-@dataclass(frozen=True, eq=False)
-class FollowingEstimates:
-    """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂), one integration per case when it is asked for."""
-
-    law: VectorLaw
-    mixed: Trajectory  # Δ
-    grown: float  # logarithm of what the fastest direction of η may grow by
-    start: Array  # (p,)
-    gains: Array  # (g, p or 1)
-    t: Array  # (M,)
-    reached: tuple[ExtensionState, ...] = ()
-
-    def delta(self, t: Array) -> Array:
-        """Δ at the times t (M,), shape (1, M)."""
-        return self.mixed(t)[None]
-
-    @property
-    def requirement(self) -> Requirement:
-        """γ∫Δ² has to be larger than the growth of η, so that the error falls."""
-        energy = float(Trajectory(self.mixed.mesh, self.mixed.values**2).integral().final)
-        gain = float(self.gains.min())
-        needed = self.grown + DECAY
-        return Requirement(
-            name="γ∫Δ² above the growth of the state",
-            holds=gain * energy >= needed,
-            evidence={
-                "integral_delta_squared": energy,
-                "gamma_times_integral": gain * energy,
-                "needed": needed,
-            },
-            text=(
-                f"γ∫Δ² = {gain * energy:.3g} at the smallest gain {gain:.3g}; 1 % of the initial "
-                f"error of a state that may grow by e^{self.grown:.3g} needs {needed:.3g}"
-            ),
-        )
-
-    def parameters(self, cases: slice, start: Array | None = None) -> Array:
-        """η̂ of some cases, shape (g, M, p)."""
-        gains, p = self.gains[cases], len(self.start)
-        starts = np.broadcast_to(self.start if start is None else start, (len(gains), p))
-        return np.array([
-            self.law.solve(np.broadcast_to(gain, (p,)), own)(self.t)[..., 0]
-            for gain, own in zip(gains, starts, strict=True)
-        ])
-
-
 def follow(
     extended: Trajectory, dynamics: Dynamics, start: Array, gains: Array, t: Array
-) -> FollowingEstimates:
-    """Mix [Ω | 𝒴] (p, p + 1); the law has Δ and 𝐘 = adj(Ω)𝒴 on the filters' mesh."""
+) -> VectorEstimates:
+    """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) with Δ and 𝐘 = adj(Ω)𝒴 of [Ω | 𝒴] (p, p + 1), on its mesh.
+
+    γ∫Δ² has to be larger than the growth of η, so that the error falls.
+    """
     values = extended.values
     delta, Y, _ = determinant_and_adjugate_action(values[..., :-1], values[..., -1:])
     mesh = extended.mesh
@@ -77,7 +35,13 @@ def follow(
     A = dynamics.A
     rate = Trajectory(A.mesh, np.linalg.eigvals(A.values).real.max(axis=-1))
     grown = max(float(rate.integral().final), 0.0)
-    return FollowingEstimates(law, Trajectory(mesh, delta), grown, start, gains, t)
+    mixed = Trajectory(mesh, delta)
+    energy = float(Trajectory(mesh, delta**2).integral().final)
+    requirement = energy_requirement(
+        "γ∫Δ² above the growth of the state", float(gains.min()), energy, grown + DECAY,
+        f"1 % of the initial error of a state that may grow by e^{grown:.3g}",
+    )
+    return VectorEstimates(law, start, gains, t, requirement, mixed=mixed)
 
 
 @dataclass(frozen=True, eq=False)

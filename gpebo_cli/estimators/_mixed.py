@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -69,16 +69,13 @@ class FilteredEstimator(ResumableEstimator):
         rates = filter_rates(self.rates, names)
         extended = self.extend(regression, rates, known[0].values if known else None)
 
-        def of_case(gain: Array) -> ErrorsAt:
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                omega = extended(t, inside)[..., :p]
-                delta, adjugate, _ = determinant_and_adjugate_action(omega)
-                into = rates[:, None] * self.seen(regression.psi(t, inside))
-                return scalar_errors(rates, into, delta, adjugate, gain)
+        def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
+            omega = extended(t, inside)[..., :p]
+            delta, adjugate, _ = determinant_and_adjugate_action(omega)
+            into = rates[:, None] * self.seen(regression.psi(t, inside))
+            return scalar_errors(rates, into, delta, adjugate, gain)
 
-            return at
-
-        return tuple(map(of_case, self.gains("gamma", names)))
+        return tuple(partial(at, gain) for gain in self.gains("gamma", names))
 
     @abstractmethod
     def seen(self, psi: Array) -> Array:

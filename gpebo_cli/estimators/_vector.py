@@ -108,10 +108,11 @@ class VectorEstimates:
     requirement: Requirement
     realisations: tuple[int, ...] = ()
     reached: tuple[ExtensionState, ...] = ()
+    mixed: Trajectory | None = None  # Δ, where the law is that of a mixed regression
 
-    def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
-        """Nothing is mixed, at any of the times t (M,)."""
-        return
+    def delta(self, t: Array) -> Array | None:
+        """Δ at the times t (M,), shape (1, M); None where nothing is mixed."""
+        return None if self.mixed is None else self.mixed(t)[None]
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._following import FollowingEstimates, follow
+from gpebo_cli.estimators._following import follow
 from gpebo_cli.estimators._mixed import FilteredEstimator, energy_requirement, filter_rates
 from gpebo_cli.estimators._recursive import (
     KreisselmeierFilter,
@@ -16,6 +16,7 @@ from gpebo_cli.estimators._recursive import (
     inverse_sampled,
     mix_sampled,
 )
+from gpebo_cli.estimators._vector import VectorEstimates
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
@@ -52,7 +53,7 @@ class Drem(FilteredEstimator):
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
-    ) -> FollowingEstimates:
+    ) -> VectorEstimates:
         """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) at the times t (M,).
 
         It follows where γΔ² exceeds the growth of η.

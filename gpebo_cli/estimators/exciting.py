@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -115,24 +116,21 @@ class Exciting(GainEstimator):
         (law,) = self.estimate(regression, end).groups
         first, second = np.arange(p, 2 * p), np.arange(2 * p, 3 * p)
 
-        def of_case(gain: Array) -> ErrorsAt:
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                omega = extended(t, inside)[..., :p]
-                delta, adjugate, _ = determinant_and_adjugate_action(omega)
-                turn = (turning(t, inside) * delta)[:, None]
-                filters = np.zeros((len(t), 3 * p, 3 * p))
-                filters[:, :p, :p] = np.diag(rates)
-                filters[:, first, second] = turn * delta[:, None]
-                filters[:, second, first] = -filters[:, first, second]
-                filters[:, second, :p] = -turn[..., None] * adjugate
-                into = np.zeros((len(t), 3 * p, regression.psi.values.shape[2]))
-                into[:, :p] = rates[:, None] * transpose(regression.psi(t, inside))
-                e_2 = np.eye(3 * p)[None, 2 * p :]
-                return scalar_errors(filters, into, law.signals(t, inside)[0], e_2, gain)
+        def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
+            omega = extended(t, inside)[..., :p]
+            delta, adjugate, _ = determinant_and_adjugate_action(omega)
+            turn = (turning(t, inside) * delta)[:, None]
+            filters = np.zeros((len(t), 3 * p, 3 * p))
+            filters[:, :p, :p] = np.diag(rates)
+            filters[:, first, second] = turn * delta[:, None]
+            filters[:, second, first] = -filters[:, first, second]
+            filters[:, second, :p] = -turn[..., None] * adjugate
+            into = np.zeros((len(t), 3 * p, regression.psi.values.shape[2]))
+            into[:, :p] = rates[:, None] * transpose(regression.psi(t, inside))
+            e_2 = np.eye(3 * p)[None, 2 * p :]
+            return scalar_errors(filters, into, law.signals(t, inside)[0], e_2, gain)
 
-            return at
-
-        return tuple(map(of_case, self.gains("gamma", names)))
+        return tuple(partial(at, gain) for gain in self.gains("gamma", names))
 
 
 ESTIMATOR = Exciting

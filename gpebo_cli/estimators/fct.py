@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -70,17 +71,16 @@ class FiniteTime(ResumableEstimator):
         inner = self.inner.resume(regression, regression.mesh.edges[-1:], known)
         mu, gains = float(self.mu), inner.gains
 
-        def of_case(errors: ErrorsAt, path: ScalarPath, gain: Array) -> ErrorsAt:
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                energy = np.maximum(path.mesh.sampler(t, inside)(path.energy), 0.0)
-                w_c = np.minimum(np.exp(-energy[:, None] * gain), 1.0 - mu)
-                found = errors(t, inside)
-                return found._replace(C=found.C / (1.0 - w_c)[..., None])
-
-            return at
+        def at(
+            errors: ErrorsAt, path: ScalarPath, gain: Array, t: Array, inside: Array
+        ) -> ErrorSystem:
+            energy = np.maximum(path.mesh.sampler(t, inside)(path.energy), 0.0)
+            w_c = np.minimum(np.exp(-energy[:, None] * gain), 1.0 - mu)
+            found = errors(t, inside)
+            return found._replace(C=found.C / (1.0 - w_c)[..., None])
 
         return tuple(
-            of_case(errors, inner.groups[i // len(gains)], gains[i % len(gains)])
+            partial(at, errors, inner.groups[i // len(gains)], gains[i % len(gains)])
             for i, errors in enumerate(self.inner.errors(regression, known))
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -52,17 +53,15 @@ class Gradient(ResumableEstimator):
         """δη̂' = Γψᵀ(δY − ψ δη̂), of every case."""
         p = regression.p
 
-        def of_case(gain: Array) -> ErrorsAt:
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                psi = regression.psi(t, inside)
-                into = gain[:, None] * transpose(psi)
-                return ErrorSystem(
-                    -into @ psi, into, np.eye(p)[None], np.zeros((1, p, psi.shape[1]))
-                )
+        def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
+            psi = regression.psi(t, inside)
+            into = gain[:, None] * transpose(psi)
+            return ErrorSystem(
+                -into @ psi, into, np.eye(p)[None], np.zeros((1, p, psi.shape[1]))
+            )
 
-            return at
-
-        return tuple(of_case(np.broadcast_to(gain, p)) for gain in self._gains(regression))
+        gains = self._gains(regression)
+        return tuple(partial(at, np.broadcast_to(gain, p)) for gain in gains)
 
     def _gains(self, regression: LinearRegression) -> Array:
         return self.gains("gamma", regression.parameters)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -78,19 +79,16 @@ class Instrumental(GainEstimator):
         names, p = regression.parameters, regression.p
         means, began = self.means(regression), regression.mesh.edges[0]
 
-        def of_case(gain: Array) -> ErrorsAt:
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                rows = means(t, inside)
-                left = self.left(rows, names)
-                delta, adjugate, _ = determinant_and_adjugate_action(left @ rows[..., :p])
-                rate = 1.0 / (self.settle + t - began)
-                rates = np.repeat(rate[:, None], 2 * p, axis=1)
-                into = rates[..., None] * lagged(regression, self.delay, t, inside)
-                return scalar_errors(rates, into, delta, adjugate @ left, gain)
+        def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
+            rows = means(t, inside)
+            left = self.left(rows, names)
+            delta, adjugate, _ = determinant_and_adjugate_action(left @ rows[..., :p])
+            rate = 1.0 / (self.settle + t - began)
+            rates = np.repeat(rate[:, None], 2 * p, axis=1)
+            into = rates[..., None] * lagged(regression, self.delay, t, inside)
+            return scalar_errors(rates, into, delta, adjugate @ left, gain)
 
-            return at
-
-        return tuple(map(of_case, self.gains("gamma", names)))
+        return tuple(partial(at, gain) for gain in self.gains("gamma", names))
 
 
 ESTIMATOR = Instrumental

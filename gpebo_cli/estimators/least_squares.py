@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import repeat
 
 import numpy as np
@@ -11,7 +12,13 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._following import SolvedEstimates
-from gpebo_cli.estimators._information import InformationAt, Spectrum, check_held, information
+from gpebo_cli.estimators._information import (
+    Information,
+    InformationAt,
+    Spectrum,
+    check_held,
+    information,
+)
 from gpebo_cli.estimators._recursive import InformationRoot, integrating, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
@@ -94,23 +101,29 @@ class LeastSquares(ResumableEstimator):
         self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
     ) -> tuple[ErrorsAt, ...]:
         """δh_z' = −β δh_z + ψᵀδY, δη̂ = α (z f₀ I + α G_z)⁻¹ δh_z, of every case."""
-        bound = self.covariance_bound
 
-        def of_case(case: Mapping[str, float], before: ExtensionState | None) -> ErrorsAt:
-            alpha, f0 = case["alpha"], case["f0"]
-            info = information(regression, alpha, f0, case["beta"], bound, before)
+        def at(
+            case: Mapping[str, float], info: Information, t: Array, inside: Array
+        ) -> ErrorSystem:
+            s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
+            rate = s.forgetting(case["alpha"], case["f0"], case["beta"], self.covariance_bound)
+            A = -rate[:, None, None] * np.eye(regression.p)
+            C = s.covariance(case["alpha"], case["f0"])
+            return ErrorSystem(A, into, C, np.zeros((1, *into.shape[1:])))
 
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
-                rate = s.forgetting(alpha, f0, case["beta"], bound)
-                A = -rate[:, None, None] * np.eye(regression.p)
-                return ErrorSystem(
-                    A, into, s.covariance(alpha, f0), np.zeros((1, *into.shape[1:]))
-                )
+        infos = self.informations(regression, known)
+        return tuple(map(partial, repeat(at), self.cases, infos))
 
-            return at
-
-        return tuple(map(of_case, self.cases, known or repeat(None)))
+    def informations(
+        self, regression: LinearRegression, known: Sequence[ExtensionState]
+    ) -> tuple[Information, ...]:
+        """G_z, h_z and z of every case, from what was known before."""
+        return tuple(
+            information(
+                regression, case["alpha"], case["f0"], case["beta"], self.covariance_bound, before
+            )
+            for case, before in zip(self.cases, known or repeat(None), strict=False)
+        )
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLeastSquares:
         """The estimator at samples.

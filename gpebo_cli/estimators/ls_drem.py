@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import repeat
+from functools import partial
 
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._information import Information, Spectrum, check_held, information
+from gpebo_cli.estimators._information import Information, Spectrum, check_held
 from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement, scalar_errors
 from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import ScalarLaw, integrating, quotient_of
@@ -69,27 +69,20 @@ class LsDrem(ResumableEstimator):
     ) -> tuple[ErrorsAt, ...]:
         """δh_z as of least squares, δη̂' = γΔ(adj(H) αF δh_z − Δ δη̂), of every case."""
         part = self.least_squares
-        bound = part.covariance_bound
 
-        def of_case(
-            case: Mapping[str, float], gain: Array, before: ExtensionState | None
-        ) -> ErrorsAt:
-            alpha, f0 = case["alpha"], case["f0"]
-            info = information(regression, alpha, f0, case["beta"], bound, before)
+        def at(
+            case: Mapping[str, float], info: Information, gain: Array, t: Array, inside: Array
+        ) -> ErrorSystem:
+            s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
+            rate = s.forgetting(case["alpha"], case["f0"], case["beta"], part.covariance_bound)
+            delta, weights = _adjugate(s, case["alpha"], case["f0"])
+            adjugate = (s.vectors * weights[:, None]) @ transpose(s.vectors)
+            rates = np.broadcast_to(rate[:, None], weights.shape)
+            return scalar_errors(rates, into, delta, adjugate, gain)
 
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
-                rate = s.forgetting(alpha, f0, case["beta"], bound)
-                delta, weights = _adjugate(s, alpha, f0)
-                adjugate = (s.vectors * weights[:, None]) @ transpose(s.vectors)
-                rates = np.broadcast_to(rate[:, None], weights.shape)
-                return scalar_errors(rates, into, delta, adjugate, gain)
-
-            return at
-
+        pairs = zip(part.cases, part.informations(regression, known), strict=True)
         gains = self.gains("gamma", regression.parameters)
-        pairs = zip(part.cases, known or repeat(None), strict=False)
-        return tuple(of_case(case, gain, before) for case, before in pairs for gain in gains)
+        return tuple(partial(at, case, info, gain) for case, info in pairs for gain in gains)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLsDrem:
         """The estimator at samples.
@@ -105,13 +98,7 @@ class LsDrem(ResumableEstimator):
         """Mix every combination of α, f₀, β at the times t (M,)."""
         part = self.least_squares
         check_held(regression, len(part.cases))
-        infos = tuple(
-            information(
-                regression, case["alpha"], case["f0"], case["beta"], part.covariance_bound,
-                known[i] if known else None,
-            )
-            for i, case in enumerate(part.cases)
-        )
+        infos = part.informations(regression, known)
         return MixedEstimates(
             groups=tuple(
                 mix_least_squares(info, case["alpha"], case["f0"], t, regression.floor)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -33,6 +34,8 @@ from gpebo_cli.regression.parametrisation import Parametrisation
 from gpebo_cli.schema import per_name, shown
 
 _TOLERANCE = 1e-11
+
+Theta = Callable[[Array], Array]  # times (N,) -> θ̂ (N, c, q)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,20 +92,16 @@ class Monotone(GainEstimator):
         made = self.estimate(regression, regression.mesh.edges[-1:])
         S, T = made.S, made.T
 
-        def of_case(gamma: float) -> ErrorsAt:
-            path = made.solution(gamma)
+        def at(gamma: float, path: Theta, t: Array, inside: Array) -> ErrorSystem:
+            omega = extended(t, inside)[..., :k]
+            delta, adjugate, _ = determinant_and_adjugate_action(omega)
+            slope, weighted = S.jacobian(path(t)[:, 0]), gamma * delta[:, None, None] * T
+            law = delta[:, None, None] * (weighted @ slope)
+            into = rates[:, None] * transpose(regression.psi(t, inside))
+            return filtered_errors(rates, into, law, weighted @ adjugate, slope)
 
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                omega = extended(t, inside)[..., :k]
-                delta, adjugate, _ = determinant_and_adjugate_action(omega)
-                slope, weighted = S.jacobian(path(t)[:, 0]), gamma * delta[:, None, None] * T
-                law = delta[:, None, None] * (weighted @ slope)
-                into = rates[:, None] * transpose(regression.psi(t, inside))
-                return filtered_errors(rates, into, law, weighted @ adjugate, slope)
-
-            return at
-
-        return tuple(of_case(float(gamma)) for gamma in made.gains)
+        gains = made.gains.tolist()
+        return tuple(partial(at, gamma, made.solution(gamma)) for gamma in gains)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +116,7 @@ class MonotoneEstimates:
     gains: Array  # (g,)
     realisations: tuple[int, ...]
 
-    def solution(self, gamma: float) -> Callable[[Array], Array]:
+    def solution(self, gamma: float) -> Theta:
         """θ̂ (N, c, q) at times (N,), for c realisations of Y.
 
         Raises:

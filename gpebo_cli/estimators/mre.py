@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -60,16 +61,13 @@ class MemoryExtension(ResumableEstimator):
         rates = self._rates(p)
         extended = kreisselmeier(regression, rates, known[0].values if known else None)
 
-        def of_case(gain: Array) -> ErrorsAt:
-            def at(t: Array, inside: Array) -> ErrorSystem:
-                into = rates[:, None] * transpose(regression.psi(t, inside))
-                law = gain * extended(t, inside)[..., :p]
-                return filtered_errors(rates, into, law, gain * np.eye(p))
-
-            return at
+        def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
+            into = rates[:, None] * transpose(regression.psi(t, inside))
+            law = gain * extended(t, inside)[..., :p]
+            return filtered_errors(rates, into, law, gain * np.eye(p))
 
         gains = self.gains("gamma", regression.parameters)
-        return tuple(of_case(np.broadcast_to(gain, p)[:, None]) for gain in gains)
+        return tuple(partial(at, np.broadcast_to(gain, p)[:, None]) for gain in gains)
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
