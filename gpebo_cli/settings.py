@@ -9,7 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from math import inf
+from typing import Any, Literal
+
+
+def within(default: float, low: float, high: float = inf) -> Any:
+    """A field whose number is refused outside of a range: beyond it nothing sensible happens."""
+    return field(default=default, metadata={"range": (low, high)})
+
+
+def positive(default: float | None) -> Any:
+    """A field whose number is refused unless it is positive."""
+    return field(default=default, metadata={"positive": True})
 
 
 @dataclass(frozen=True)
@@ -20,8 +31,8 @@ class TimeSettings:
     """
 
     start: float = 0.0  # seconds
-    horizon: float = 20.0  # seconds
-    samples: int = 1001
+    horizon: float = positive(20.0)  # seconds
+    samples: int = within(1001, 2, 1_000_000)
 
 
 @dataclass(frozen=True)
@@ -46,12 +57,13 @@ class SolverSettings:
     """How differential equations are integrated; ``tol`` is relative to each signal's own size."""
 
     name: Literal["collocation", "ivp"] = "collocation"
-    tol: float = 1e-12
-    stages: int = 14  # Radau IIA stages per element, order 2 * stages - 1
-    max_elements: int = 200_000
-    max_seconds: float = 90.0  # of computing, of a loop over cases, seeds or samples
-    max_strangeness_index: int = 6
-    rank_tol: float = 1e-10  # singular values below rank_tol * (size of the factors) are zero
+    tol: float = within(1e-12, 1e-15, 0.1)
+    stages: int = within(14, 2, 16)  # Radau IIA stages per element, order 2 * stages - 1
+    max_elements: int = within(200_000, 1)
+    max_seconds: float = within(90.0, 1)  # of computing, of a loop over cases, seeds or samples
+    max_strangeness_index: int = within(6, 0, 20)
+    # Singular values below rank_tol * (size of the factors) are zero.
+    rank_tol: float = within(1e-10, 1e-15, 0.1)
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,7 @@ class NoiseSettings:
     """Sampled noise on what the observer sees; the plant does not feel it."""
 
     name: str = "none"
-    sample_time: float = 0.01  # seconds; elements end at the sample instants
+    sample_time: float = positive(0.01)  # seconds; elements end at the sample instants
     # Standard deviation of every sample: one for all, by order, or by name (absent: zero).
     outputs: float | list[float] | Mapping[str, float] = 0.0
     inputs: float | list[float] | Mapping[str, float] = 0.0
@@ -67,16 +79,19 @@ class NoiseSettings:
     quantisation: float | list[float] | Mapping[str, float] = 0.0
     # Between samples: the last one, or the one signal without frequencies above 1/(2 sample_time).
     shape: Literal["hold", "band_limited"] = "hold"
-    seed: int = 0
-    seeds: int = 1  # more than one: statistics of the estimates over seed, seed + 1, …
+    seed: int = within(0, 0)
+    # More than one: statistics of the estimates over seed, seed + 1, ….
+    seeds: int = within(1, 1, 10_000)
 
 
 @dataclass(frozen=True)
 class ExcitationSettings:
     """Level and window of the excitation evidence."""
 
-    rho: float | None = None  # level asked of lambda_min(G); None: 1e-8 of the regressor's own size
-    window: float | None = None  # sliding window of the PE level, seconds; None: horizon / 10
+    # Level asked of lambda_min(G); None: 1e-8 of the regressor's own size.
+    rho: float | None = positive(None)
+    # Sliding window of the PE level, seconds; None: horizon / 10.
+    window: float | None = positive(None)
 
 
 @dataclass(frozen=True)
@@ -86,10 +101,10 @@ class OutputSettings:
     figures: bool | list[str] = True  # True: all, False: none, or names of figures
     formats: list[Literal["png", "pdf", "svg"]] = field(default_factory=lambda: ["png"])
     width: Literal["column", "page"] | float = "column"  # of a two-column journal, or inches
-    dpi: int = 200
+    dpi: int = within(200, 30, 1200)
     style: str | None = None  # one that comes with matplotlib; None: ours
     error: Literal["log", "linear"] = "log"  # |error| on a logarithmic axis, or with its sign
-    max_rows: int = 100_000  # of estimates.csv; many cases keep fewer samples each
+    max_rows: int = within(100_000, 2)  # of estimates.csv; many cases keep fewer samples each
     parquet: bool = False  # each table also as a Parquet file
 
 

@@ -21,27 +21,9 @@ from gpebo_cli.model.text import MatrixEntries, coefficients_of
 from gpebo_cli.schema import nearest
 
 KEYS = (
-    "name",
-    "title",
-    "reference",
-    "parameters",
-    "states",
-    "inputs",
-    "unknowns",
-    "outputs",
-    "E",
-    "A",
-    "B",
-    "F",
-    "phi",
-    "C",
-    "D",
-    "H",
-    "initial_state",
-    "units",
-    "labels",
-    "observer_defaults",
-    ARCHIVE,
+    "name", "title", "reference", "parameters", "states", "inputs", "unknowns", "outputs",
+    "E", "A", "B", "F", "phi", "C", "D", "H", "initial_state", "units", "labels",
+    "observer_defaults", ARCHIVE,
 )
 """Keys of a plant file; name, states, E, A and initial_state are required."""
 

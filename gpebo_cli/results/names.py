@@ -1,25 +1,11 @@
 """Names that the shell completes: of figures and metrics, without importing what makes them."""
 
 FIGURE_NAMES = (
-    "signals",
-    "regressor",
-    "states",
-    "estimates",
-    "estimates_a",
-    "estimates_b",
-    "parameters",
-    "fit",
-    "whiteness",
-    "parameter_error",
-    "state_error",
-    "state_error_a",
-    "state_error_b",
-    "gram",
-    "delta",
-    "gains",
-    "error_norms",
+    "signals", "regressor", "states", "estimates", "estimates_a", "estimates_b", "parameters",
+    "fit", "whiteness", "parameter_error", "state_error", "state_error_a", "state_error_b", "gram",
+    "delta", "gains", "error_norms",
 )
-"""Every figure of a run, a function of that name in ``outputs/figures.py``, in this order."""
+"""Every figure of a run, a function of that name in ``results/figures.py``, in this order."""
 
 METRICS = (
     "seconds_to_1pct_parameters",

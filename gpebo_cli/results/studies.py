@@ -9,15 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 _OF_THE_PAPER = (
-    "regressor",
-    "states",
-    "estimates_a",
-    "estimates_b",
-    "parameter_error",
-    "state_error_a",
-    "state_error_b",
-    "gram",
-    "delta",
+    "regressor", "states", "estimates_a", "estimates_b", "parameter_error", "state_error_a",
+    "state_error_b", "gram", "delta",
 )
 
 
