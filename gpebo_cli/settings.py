@@ -90,8 +90,7 @@ class ExcitationSettings:
 
     # Level asked of lambda_min(G); None: 1e-8 of the regressor's own size.
     rho: float | None = positive(None)
-    # Sliding window of the PE level, seconds; None: horizon / 10.
-    window: float | None = positive(None)
+    window: float | None = positive(None)  # of the PE level, in seconds; None: horizon / 10
 
 
 @dataclass(frozen=True)

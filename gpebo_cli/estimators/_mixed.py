@@ -39,7 +39,6 @@ class FilteredEstimator(ResumableEstimator):
             parameter (one gain each).
         rates: λ of the filters, a number, one per parameter, or a mapping by parameter; None is
             0.1, 0.2, 0.3, …, for three parameters the paper's choice.
-        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
     gamma: object = gain(1e10, by_parameter=True, auto=True)

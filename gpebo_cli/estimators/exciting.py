@@ -52,7 +52,6 @@ class Exciting(GainEstimator):
         kappa: κ of the rotation, of the size of 1/∫Δ²; with a larger one Φ_21 is there earlier, and
             what comes later counts less.
         rates: λ of the filters, as of ``drem``.
-        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
     gamma: object = gain(10.0, by_parameter=True, auto=True)

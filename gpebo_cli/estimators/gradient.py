@@ -27,7 +27,6 @@ class Gradient(ResumableEstimator):
     Attributes:
         gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
             parameter (one gain each).
-        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
     gamma: object = gain(10.0, by_parameter=True)

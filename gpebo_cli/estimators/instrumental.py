@@ -40,7 +40,6 @@ class Instrumental(GainEstimator):
             parameter (one gain each).
         delay: d of the instrument in seconds.
         settle: T₀ of the means in seconds.
-        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
     gamma: object = gain(1e10, by_parameter=True, auto=True)

@@ -46,7 +46,6 @@ class LeastSquares(ResumableEstimator):
         f0: f₀ > 0, given in the same ways.
         beta: forgetting rate ≥ 0, given in the same ways; 0 remembers everything.
         bound: M ≥ 1/f₀ of β (1 − ‖F‖/M), or None for constant forgetting.
-        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
     alpha: object = gain(1.0)

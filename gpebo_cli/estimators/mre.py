@@ -37,7 +37,6 @@ class MemoryExtension(ResumableEstimator):
         gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
             parameter (one gain each).
         rate: λ of the filters.
-        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
     gamma: object = gain(100.0, by_parameter=True)

@@ -38,7 +38,6 @@ class Power(ResumableEstimator):
         gamma2: γ₂; 0 is the finite-time law, more than 0 the fixed-time one.
         beta: β, above 1.
         rates: λ of the filters, as of ``drem``.
-        initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
 
     gamma: object = gain(1e10, by_parameter=True, auto=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Simulation
+
+if TYPE_CHECKING:  # that is made of what is here
+    from gpebo_cli.experiment.online import Online
 
 _EVERY_POINT = 16  # states, up to which a pencil is looked at where all is decided
 _GROWTH = 1e6  # of Φ: above it, the state loses six digits of what the parameters know
@@ -258,23 +261,8 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
     ]
 
 
-class Observed(Protocol):
-    """What an observer says about itself, in continuous time or at samples."""
-
-    @property
-    def assumptions(self) -> tuple[Assumption, ...]:
-        """The assumptions of this observer, with their evidence."""
-        ...
-
-    @property
-    def growth(self) -> float | None:
-        """Largest entry of Φ; None: the states do not rest on it."""
-        ...
-
-    @property
-    def growth_rate(self) -> float | None:
-        """In 1/s, ln ‖Φ‖ over the horizon."""
-        ...
+Observed: TypeAlias = "Observation | Online"
+"""What an observer says about itself, in continuous time or at samples."""
 
 
 def designable(system: DescriptorSystem) -> str:

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
-from typing import Protocol
 
 import numpy as np
 
@@ -50,40 +49,6 @@ class StateChange:
     given: float
     used: float
     time: float
-
-
-class SignalsResult(Protocol):
-    """Signals on the output grid, wherever they are from."""
-
-    @property
-    def t(self) -> Array:
-        """Times, (N,)."""
-        ...
-
-    @property
-    def inputs(self) -> Array:
-        """u, (N, m)."""
-        ...
-
-    @property
-    def outputs(self) -> Array:
-        """y, (N, r)."""
-        ...
-
-    @property
-    def states(self) -> Array:
-        """True states, (N, n), NaN for one that nobody knows."""
-        ...
-
-    @property
-    def measured_inputs(self) -> Array | None:
-        """What the observer saw, (N, m); None: the same."""
-        ...
-
-    @property
-    def measured_outputs(self) -> Array | None:
-        """What the observer saw, (N, r); None: the same."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -128,6 +93,10 @@ class SimulationResult:
     measured_outputs: Array | None = None  # (N, r)
     state_errors: Array | None = None  # (n,) the estimate for each state, relative to its own size
     linear_solves: float | None = None  # what Newton's method cost; None: the plant is linear
+
+
+SignalsResult = RecordingResult | SimulationResult
+"""Signals on the output grid, wherever they are from."""
 
 
 @dataclass(frozen=True)

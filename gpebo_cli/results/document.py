@@ -176,12 +176,10 @@ def _cases(folder: Path) -> list[list[str]]:
     if not path.is_file():
         return []
     columns = read_columns(path, "case")
-    metrics = {name: columns.get(name, np.full(len(columns["case"]), np.nan)) for name in METRICS}
-    gains = {name: values for name, values in columns.items()
-             if name != "case" and not name.startswith(("seconds_to_", "final_error_", "rms_"))}
-    count = min(len(columns["case"]), _MOST_CASES)
-    shown = gains | metrics
-    return case_table([("", {k: float(v[i]) for k, v in shown.items()}) for i in range(count)])
+    count = len(columns.pop("case"))
+    shown = dict.fromkeys(METRICS, np.full(count, np.nan)) | columns
+    rows = [{k: float(v[i]) for k, v in shown.items()} for i in range(min(count, _MOST_CASES))]
+    return case_table([("", row) for row in rows])
 
 
 def _picture(path: Path) -> bytes:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.results import circuit
 from gpebo_cli.results.figures import describe, overlay
 from gpebo_cli.results.files import make_folder, remove_files, write_text
 from gpebo_cli.results.names import FORMATS
 from gpebo_cli.results.page import Picture, Section, case_table
+from gpebo_cli.results.report import case_rows
 from gpebo_cli.results.series import blocks, csv_text, differences, reference_text
 from gpebo_cli.results.studies import CAPTIONS, REFERENCE, STUDIES, Study, heading, stem
 from gpebo_cli.results.style import Panel, compose, save
@@ -72,7 +72,7 @@ def write_recipe(
         reference=recipe.reference,
         note=study.note,
         verdicts=tuple(run.verdict for run in runs.values()) if len(runs) == 1 else (),
-        table=case_table([(name, row) for name, run in runs.items() for row in _cases(run)]),
+        table=case_table([(name, row) for name, run in runs.items() for row in case_rows(run)]),
         pictures=tuple(pictures),
     )
 
@@ -135,14 +135,3 @@ def _branch_text(branch: circuit.Branch) -> str:
     ends = ("ground" if node == circuit.GROUND else node for node in (branch.start, branch.end))
     current = f" with current {branch.current}" if branch.current else ""
     return f"{branch.element} from {' to '.join(ends)}{current}"
-
-
-def _cases(run: RunResult) -> list[dict[str, float]]:
-    """Gains and metrics of each case, as in ``cases.csv``."""
-    estimation, metrics = run.estimation, run.metrics
-    if estimation is None or metrics is None:
-        return []
-    return [
-        {**case, **{name: float(getattr(metrics, name)[i]) for name in METRICS}}
-        for i, case in enumerate(estimation.cases)
-    ]

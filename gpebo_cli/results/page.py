@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
+from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.results.html import document, footer, paragraph, table
 from gpebo_cli.results.names import FORMATS
 from gpebo_cli.results.provenance import Provenance
@@ -103,7 +104,7 @@ def case_table(named: Sequence[tuple[str, dict[str, float]]]) -> list[list[str]]
     """
     if not named:
         return []
-    gains = list(dict.fromkeys(key for _, row in named for key in row if key not in _METRICS))
+    gains = list(dict.fromkeys(key for _, row in named for key in row if not is_metric(key)))
     several = any(name for name, _ in named)
     # Gains that are the same everywhere tell nothing; those of other estimators are not theirs.
     shown = [g for g in gains if len({row.get(g) for _, row in named}) > 1] or gains[:1]

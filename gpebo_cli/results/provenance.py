@@ -57,15 +57,8 @@ def git_state(root: Path) -> GitState | None:
         return None
     # One process tells both. Without optional locks it never disturbs a git command of the user;
     # inside a git hook GIT_DIR and friends would point it at another repository.
-    command = [
-        "git",
-        "--no-optional-locks",
-        "-C",
-        str(root),
-        "status",
-        "--porcelain=v2",
-        "--branch",
-    ]
+    command = ["git", "--no-optional-locks", "-C", str(root), "status", "--porcelain=v2",
+               "--branch"]
     environment = {k: v for k, v in os.environ.items() if not k.startswith("GIT_")}
     try:
         done = subprocess.run(  # noqa: S603  git, with arguments of our own
@@ -73,12 +66,7 @@ def git_state(root: Path) -> GitState | None:
         )
     except (OSError, ValueError, subprocess.SubprocessError):
         return None
-    commit = None
-    dirty = False
-    for line in done.stdout.splitlines():
-        if line.startswith("# branch.oid "):
-            word = line.split()[2]
-            commit = None if word == "(initial)" else word
-        elif not line.startswith("#"):
-            dirty = True
-    return GitState(commit, dirty)
+    lines = done.stdout.splitlines()
+    commit = next((line.split()[2] for line in lines if line.startswith("# branch.oid ")), None)
+    dirty = any(not line.startswith("#") for line in lines)
+    return GitState(None if commit == "(initial)" else commit, dirty)
