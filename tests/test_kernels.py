@@ -81,6 +81,22 @@ def _maps(rng, k=7, s=4, n=3, c=2, one=False):
     )
 
 
+def _carried(rng, k=6, s=5, n=3, c=2, constant=False):
+    rule, maps = radau_rule(s), 1 if constant else k
+    noise = rng.uniform(size=(1, n, n + c)) * np.ones((k, 1, 1)) if constant else (
+        rng.uniform(size=(k, n, n + c))
+    )
+    t = rng.uniform(size=(k, s + 1, n, c))  # some components are smooth, and one is zero
+    values = np.where(rng.uniform(size=(n, c)) < 0.5, np.cos(0.01 * t), rng.normal(size=t.shape))
+    values[:, :, 0, 0] = 0.0
+    used = min(4, s - 1)
+    return (
+        values, rule.to_legendre, (s + 1) / np.arange(s + 1 - used, s + 1),
+        rng.normal(size=(maps, n, n)), rng.normal(size=(k, n, c)), noise,
+        rng.choice([-1.0, 1.0], size=(k + 1, n, 6)), np.full(k, 0.1), 0.3, 8.0, 16.0, 1e-9,
+    )
+
+
 def _swept(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True, guess=False):
     """x' = A x + f with a third of the entries, none of them in one row."""
     i, j = np.nonzero(rng.uniform(size=(d, d)) < 0.35 * (np.arange(d) != 1)[:, None])
@@ -204,6 +220,9 @@ CASES: list[tuple[str, str, Case]] = [
     ("elements", "chain", _maps),
     ("elements", "chain", partial(_maps, one=True)),
     ("elements", "chain", partial(_maps, k=1, n=16, c=9)),
+    *(("elements", "carried_errors", partial(_carried, **options)) for options in (
+        {}, {"k": 9, "constant": True}, {"k": 1, "s": 2, "n": 1, "c": 1}, {"s": 14, "n": 5},
+    )),
     *(("elements", "sweeps", partial(_swept, **options)) for options in (
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
         {"k": 1, "d": 1, "c": 3, "forced": 3}, {"c": 12, "guess": True},
@@ -211,6 +230,8 @@ CASES: list[tuple[str, str, Case]] = [
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
     ("signals", "tails", partial(_signal, least=True)),
+    ("signals", "largest", lambda rng: (rng.normal(size=(4, 7, 21)),)),
+    ("signals", "largest", lambda rng: (np.swapaxes(rng.normal(size=(3, 2, 30)), 0, 1),)),
     ("signals", "sample", _samples),
     ("signals", "sample", partial(_samples, c=33)),
     ("signals", "interpolation", _places),
@@ -301,6 +322,8 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("chain", _maps, 0, np.s_[:-1]),
     ("chain", _maps, 1, np.s_[:, :-1]),
     ("chain", _maps, 2, np.s_[:-1]),
+    *(("carried_errors", _carried, place, np.s_[:-1]) for place in (1, 3, 4, 5, 6, 7)),
+    *(("carried_errors", _carried, place, np.s_[:, :-1]) for place in (0, 3, 4, 5, 6)),
     ("tails", _signal, 1, np.s_[:-1]),
     ("tails", partial(_signal, least=True), 6, np.s_[:-1]),
     ("sample", _samples, 1, np.s_[:-1]),

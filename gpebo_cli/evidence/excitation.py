@@ -111,10 +111,13 @@ def assess(
 
     # What is looked at later must not keep what is known of this regression by now.
     later = replace(evidence, regression=replace(regression))
+    final, t_c = evidence.known(t[-1:]), _first_time(gram, ends, reached)
+    # From when on parameters are well determined a run says in any case.
+    said = t_c is not None and (final.share >= WELL).all()
     return excitation(
-        evidence.known(t[-1:]), t, regression.parameters,
-        float(evidence.eigenvalues(t[-1:])[0, 0]) if p else 0.0, later.known, later.eigenvalues,
-        later.levels, window, _first_time(gram, ends, reached), rho,
+        final, t, regression.parameters, float(evidence.eigenvalues(t[-1:])[0, 0]) if p else 0.0,
+        evidence.known() if said else later.known, later.eigenvalues, later.levels, window, t_c,
+        rho,
     )
 
 

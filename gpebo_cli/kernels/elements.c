@@ -257,6 +257,87 @@ static Outcome chain(Call *call)
     return DONE;
 }
 
+/* What element k adds to the errors, kinds (2, C): what its polynomial leaves out, and rounding.
+   Raises most (4, C), see elements_numpy.py; `shown` has room for 5 C numbers. */
+EVERY_WIDTH static void own_errors(const Call *call, npy_intp k, double *shown, double *most,
+                                   double *kinds)
+{
+    const npy_intp t = SIZE(t), n = SIZE(n), c = SIZE(c), C = n * c, rows = t < 4 ? t : 4;
+    const double *values = call->in[0] + k * t * C, *last = call->in[3] + k * call->step[3];
+    const double *alone = call->in[4] + k * call->step[4];
+    const double *noise = call->in[5] + k * call->step[5], stages = (double)(t - 1);
+    double *size = shown + rows * C;
+    memset(size, 0, C * sizeof(double));
+    enlarge(size, values, t, C);
+    last_coefficients(shown, call->in[1] + (t - rows) * t, values, rows, t, C);
+    for (npy_intp e = 0; e < C; e++) {
+        const npy_intp i = e / c, b = e % c;
+        double share = 0.0, made_of = fabs(alone[e]), rounding = noise[i * (n + c) + n + b];
+        double pairs[2] = {0.0, 0.0};
+        for (npy_intp j = 0, power = SIZE(u) - rows; j < rows; j++, power++) {
+            const double one = shown[j * C + e] / larger(size[e], DBL_MIN);
+            pairs[j / 2] = larger(pairs[j / 2], shown[j * C + e]);
+            if (power >= 0 && !(one <= share)) /* else its power is not above it either */
+                share = larger(share, one >= 1.0 ? 1.0 : pow(one, call->in[2][power]));
+        }
+        for (npy_intp j = 0; j < n; j++) {
+            made_of += fabs(last[i * n + j]) * fabs(values[j * c + b]);
+            rounding += noise[i * (n + c) + j] * size[j * c + b];
+        }
+        const int visible = rows == 4 && pairs[1] >= call->number[8] * pairs[0];
+        const double found[] = {size[e] * share, size[e], visible ? pairs[1] : 0.0, made_of};
+        for (npy_intp m = 0; m < 4; m++)
+            most[m * C + e] = larger(most[m * C + e], found[m]);
+        kinds[e] = found[0] * pow(share, 0.5 - 0.5 / stages);
+        kinds[C + e] = DBL_EPSILON * (call->number[9] * made_of + rounding);
+    }
+}
+
+/* How far errors are carried through the elements; see elements_numpy.py. */
+static Outcome carried_errors(Call *call)
+{
+    const npy_intp K = SIZE(K), n = SIZE(n), c = SIZE(c), C = n * c, S = SIZE(w) / 2, N = 2 * n * S;
+    const double *noise = call->in[5], *h = call->in[7], *sign = call->in[6];
+    double *kinds = scratch(call, 7 * C + 3 * N * c), *most = call->out[1];
+    if (K < 1)
+        return refused("elements", K);
+    if (kinds == NULL)
+        return ERROR;
+    double *shown = kinds + 2 * C, *error = shown + 5 * C, *added = error + N * c;
+    double *next = added + N * c, chance = HUGE_VAL;
+    memset(most, 0, 5 * C * sizeof(double));
+    for (npy_intp k = 0; k < (call->step[5] ? K : 1); k++)
+        for (npy_intp i = 0; i < n * (n + c); i++) {
+            const double first = noise[i] / h[0], rate = noise[k * call->step[5] + i] / h[k];
+            if (i % (n + c) < n && !(fabs(rate - first) <= call->number[11] * first))
+                chance = call->number[10]; /* errors of what moves differ in their signs */
+        }
+    for (npy_intp i = 0; i < N * c; i++)
+        error[i] = i / c / S % 2
+                       ? sign[i / c] * DBL_EPSILON * fabs(call->in[0][i / c / S / 2 * c + i % c])
+                       : 0.0;
+    for (npy_intp k = 0; k < K; k++) {
+        own_errors(call, k, shown, most + C, kinds);
+        sign += N;
+        for (npy_intp i = 0; i < N * c; i++)
+            added[i] = sign[i / c] * kinds[i / c / S % 2 * C + i / c / S / 2 * c + i % c];
+        affine(next, call->in[3] + k * call->step[3], error, added, n, n, 2 * S * c);
+        memcpy(error, next, N * c * sizeof(double));
+        for (npy_intp e = 0; e < C; e++) {
+            double sum[2] = {0.0, 0.0};
+            for (npy_intp s = 0; s < 2 * S; s++) {
+                const double one = error[(e / c * 2 * S + s) * c + e % c];
+                sum[s / S] += one * one;
+            }
+            const double factor = (double)(k + 2), other = factor < chance ? factor : chance;
+            const double found = sqrt(sum[0] * (factor / S)) + sqrt(sum[1] * (other / S));
+            call->out[0][k * C + e] = found;
+            most[e] = larger(most[e], found);
+        }
+    }
+    return DONE;
+}
+
 #define MOST_STAGES 16 /* of a rule; its nodes lie side by side: loops have this length */
 #define AT_ONCE 8 /* columns: their sums are in registers, and what is swept over in the cache */
 typedef double Nodes[MOST_STAGES];
@@ -367,20 +448,10 @@ static Outcome sweeps(Call *call)
         call->out[1][k] = 0.0;
     for (npy_intp first = 0; first < all; first += width) {
         const npy_intp b = all - first < width ? all - first : width;
-        Swept q = {s,
-                   d,
-                   b,
-                   first < forced,
-                   row,
-                   column,
-                   (const Nodes *)hR,
-                   (const Nodes *)A,
-                   (const Nodes *)f,
-                   X,
-                   left,
-                   call->in[9],
-                   size,
-                   change};
+        Swept q = {.s = s, .d = d, .columns = b, .forced = first < forced, .row = row};
+        q.column = column, q.R = (const Nodes *)hR, q.A = (const Nodes *)A;
+        q.f = (const Nodes *)f, q.X = X, q.left = left, q.weight = call->in[9];
+        q.size = size, q.change = change;
         memset(size, 0, d * sizeof(double));
         for (npy_intp i = 0; i < d; i++)
             for (npy_intp c = 0; c < b; c++)
@@ -434,6 +505,7 @@ static Outcome sweeps(Call *call)
 const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
+    {"carried_errors", "Ktnc tt u K?nn K?nc K?nv K+nw K # # # # v=n+c", "Knc 5nc", carried_errors},
     {"sweeps", "ss K @d+ @e P?e Q?df |Kdc |Ks+dc dc d # # %m", "Ks+dc K", sweeps},
     {NULL, NULL, NULL, NULL},
 };

@@ -46,6 +46,21 @@ def chain(
     return values, int(whole[0])
 
 
+def carried_errors(
+    values: Array, to_legendre: Array, powers: Array, last: Array, particular: Array, noise: Array,
+    signs: Array, h: Array, level: float, end: float, chance: float, same: float,
+    renew: Callable[[Array, Array], Array] | None = None,
+) -> tuple[Array, Array]:
+    """In C for few components that nothing replaces."""
+    arguments = (
+        values, to_legendre, powers, last, particular, noise, signs, h, level, end, chance, same
+    )
+    if renew is not None or not _is_small(*values.shape[2:]):
+        return elements_numpy.carried_errors(*arguments, renew)
+    found: tuple[Array, Array] = _compiled.carried_errors(*arguments)
+    return found
+
+
 def sweeps(
     R: Array, h: Array, rows: IntArray, indices: IntArray, entries: Array, f: Array,
     kicks: Array | None, guess: Array | None, start: Array, weights: Array, tol: float,

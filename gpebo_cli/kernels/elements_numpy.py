@@ -8,7 +8,7 @@ import numpy as np
 
 from gpebo_cli.kernels.arrays import Array, IntArray
 
-_TINY = float(np.finfo(float).tiny)
+_EPS, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 
 
 def element_maps(
@@ -141,6 +141,75 @@ def chain(
         values[:, 1:] = maps @ values[:, :1] + particular
     finite = np.isfinite(values).all(axis=(1, 2, 3))
     return values, size if finite.all() else int(np.argmin(finite))
+
+
+def carried_errors(
+    values: Array, to_legendre: Array, powers: Array, last: Array, particular: Array, noise: Array,
+    signs: Array, h: Array, level: float, end: float, chance: float, same: float,
+    renew: Callable[[Array, Array], Array] | None = None,
+) -> tuple[Array, Array]:
+    """How far errors of elements may be carried, and what else counts of the solution.
+
+    Each element adds what its polynomial leaves out, and rounding of everything its values are
+    made of. End points are superconvergent, of order 2s − 1 against s + 1 inside: with ρ the decay
+    per coefficient their error is about ρ^(s−1) times the tail. Half that exponent is used.
+
+    Args:
+        values: at the points (K, s + 1, n, c).
+        to_legendre: from them to Legendre coefficients (s + 1, s + 1).
+        powers: that make of each of the last coefficients the next one (j,).
+        last: maps from left ends to right ends (K or 1, n, n).
+        particular: right ends from zero (K or 1, n, c).
+        noise: of the terms in an element, see :func:`numerics.errors.estimated_errors`.
+        signs: of each kind of error, at the start and the ends (K + 1, n, 2 S).
+        h: lengths (K,).
+        level: coefficients that fall by less over two degrees are noise.
+        end: units in the last place of what an end value is made of, lost in solving an element.
+        chance: square of how much a sum of independent errors may exceed its root mean square.
+        same: relative difference of rates that are constant: then errors may be wrong in the same
+            direction each time.
+        renew: what becomes of errors (e, n, c) of the limit (n, c) at an edge.
+
+    Returns:
+        bounds of the errors at right ends (K, n, c); and the largest over time (5, n, c) of these,
+        of tails, of values, of noise that shows, and of what right ends are made of.
+    """
+    K, points, n, columns = values.shape
+    S = signs.shape[2] // 2
+    with np.errstate(over="ignore", invalid="ignore"):
+        turned = np.ascontiguousarray(np.swapaxes(values, 0, 1)).reshape(points, -1)
+        most = np.zeros((5, K, n, columns))
+        carried, tail, sizes, visible, made_of = most
+        np.abs(turned).max(axis=0, out=sizes.ravel())
+        shown = np.abs(to_legendre[-4:] @ turned)
+        share = np.minimum(shown[-len(powers) :] / np.maximum(sizes, _TINY).ravel(), 1.0)
+        share = (share ** powers[:, None]).max(axis=0).reshape(sizes.shape)
+        if len(shown) == 4:
+            before, after = np.maximum(shown[::2], shown[1::2])
+            np.copyto(visible.ravel(), after, where=after >= level * before)
+        made_of[:] = np.abs(last) @ np.abs(values[:, 0]) + np.abs(particular)
+        tail[:] = sizes * share
+        kinds = np.empty((K, n, 2, 1, columns))
+        kinds[:, :, 0, 0] = tail * share ** (0.5 - 0.5 / (points - 1))
+        kinds[:, :, 1, 0] = _EPS * (end * made_of + noise[..., :n] @ sizes + noise[..., n:])
+        apart = signs.reshape(K + 1, n, 2, S, 1)
+        added = (apart[1:] * kinds).reshape(K, n, 2 * S * columns)
+        start = apart[0] * (_EPS * np.abs(values[0, 0]))[:, None, None]
+        start[:, 0] = 0.0
+        error, ends = start.reshape(n, -1), np.empty_like(added)
+        for k in range(K):
+            if k and renew is not None:
+                error = np.moveaxis(error.reshape(n, 2 * S, columns), 1, 0)
+                error = np.moveaxis(renew(values[k - 1, -1], error), 0, 1).reshape(n, -1)
+            ends[k] = error = last[k if len(last) > 1 else 0] @ error + added[k]
+        squares = np.square(ends).reshape(K, n, 2, S, columns).sum(axis=3)
+        rates = noise[..., :n] / h[: len(noise), None, None]
+        factors = np.empty((K, 1, 2, 1))
+        factors[:, 0, :, 0] = np.arange(2, K + 2)[:, None]
+        if not (np.abs(rates - rates[0]) <= same * rates[0]).all():
+            np.minimum(factors[:, :, 1], chance, out=factors[:, :, 1])
+        np.sqrt(squares * (factors / S)).sum(axis=2, out=carried)
+        return carried, most.max(axis=1)
 
 
 def sweeps(

@@ -1,18 +1,6 @@
 /* Elimination for systems of some tens of unknowns: what LAPACK does, without its calls. */
 #include "elements.h"
 
-#include <float.h>
-
-/* Rows a and b change places. */
-static inline void swap_rows(double *restrict a, double *restrict b, npy_intp length)
-{
-    for (npy_intp j = 0; j < length; j++) {
-        const double kept = a[j];
-        a[j] = b[j];
-        b[j] = kept;
-    }
-}
-
 /* The row from `first` on with the largest number in a column of W. */
 static inline npy_intp largest_in(const double *column, npy_intp m, npy_intp length, npy_intp first)
 {

@@ -1,8 +1,7 @@
 /* Known functions over cells of time: gpebo_cli/model/expressions/intervals.py and bounds.py. */
 #include "program.h"
 
-#define WIDER (4 * 2.220446049250313e-16)
-#define TINY 2.2250738585072014e-308
+#define WIDER (4 * DBL_EPSILON)
 #define HALF_PI 1.5707963267948966
 
 typedef struct {
@@ -16,7 +15,7 @@ static inline Interval widened(double low, double high)
 {
     if (low != low || high != high)
         return anything;
-    return (Interval){low - WIDER * fabs(low) - TINY, high + WIDER * fabs(high) + TINY};
+    return (Interval){low - WIDER * fabs(low) - DBL_MIN, high + WIDER * fabs(high) + DBL_MIN};
 }
 
 /* 0 · ∞ is 0: the bound is never reached. */

@@ -87,13 +87,6 @@ EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, np
     }
 }
 
-/* Does all operations for `count` times. */
-static void run(const Rows *rows, const Operation *code, npy_intp operations, npy_intp count)
-{
-    for (npy_intp k = 0; k < operations; k++)
-        operate(rows, code + k, count);
-}
-
 npy_intp rows_used(const Operation *operation, npy_intp count, npy_intp given, npy_intp constants)
 {
     npy_intp rows = given;
@@ -232,7 +225,8 @@ static int fill_matrices(const Call *call, Rows *rows, double *const *out)
         rows->given[0] = call->in[0] + first;
         rows->given[1] = call->in[1] + first;
         rows->signals = call->in[2] + first;
-        run(rows, (const Operation *)call->index[3], SIZE(v), here);
+        for (npy_intp k = 0; k < SIZE(v); k++)
+            operate(rows, (const Operation *)call->index[3] + k, here);
         const npy_intp *target = call->index[6];
         for (npy_intp j = 0; j < outputs; j++, target += 2) {
             const npy_intp entries = PyArray_SIZE(call->array[FIRST + target[0]]) / orders;

@@ -89,6 +89,16 @@ PyObject *keep(Call *call, PyObject *made);
 /* The larger one; what is not a number stays. */
 static inline double larger(double a, double b) { return a >= b || a != a ? a : b; }
 
+/* Rows a and b change places. */
+static inline void swap_rows(double *restrict a, double *restrict b, npy_intp length)
+{
+    for (npy_intp j = 0; j < length; j++) {
+        const double kept = a[j];
+        a[j] = b[j];
+        b[j] = kept;
+    }
+}
+
 /* Adds all kernels to the module; −1 with an exception. */
 int add_all_kernels(PyObject *module);
 

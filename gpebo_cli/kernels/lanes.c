@@ -1,5 +1,16 @@
 #include "lanes.h"
 
+int lanes_scratch(Call *call, const npy_intp *sizes, Lane ***parts, size_t count)
+{
+    npy_intp total = 0;
+    for (size_t i = 0; i < count; i++)
+        total += sizes[i];
+    Lane *memory = (Lane *)scratch(call, total * LANES);
+    for (size_t i = 0; memory != NULL && i < count; memory += sizes[i++])
+        *parts[i] = memory;
+    return memory != NULL;
+}
+
 void lanes_load(Lane *to, const double *from, npy_intp step, npy_intp entries, npy_intp first,
                 npy_intp used)
 {
@@ -29,28 +40,13 @@ static inline void add_row(Lane *restrict C, const double *factor, const Lane *r
         EACH C[j][l] += factor[l] * B[j][l];
 }
 
-EVERY_WIDTH void lanes_multiply(Lane *C, npy_intp c, const Lane *A, npy_intp a, const Lane *B,
-                                npy_intp b, npy_intp rows, npy_intp inner, npy_intp columns,
-                                double sign)
+EVERY_WIDTH void lanes_product(Lane *C, npy_intp c, const Lane *A, npy_intp down, npy_intp right,
+                               const Lane *B, npy_intp b, npy_intp rows, npy_intp inner,
+                               npy_intp columns, double sign)
 {
     for (npy_intp i = 0; i < rows; i++)
         for (npy_intp k = 0; k < inner; k++) {
-            const double *one = A[i * a + k];
-            Lane factor;
-            if (is_zero(one))
-                continue;
-            EACH factor[l] = sign * one[l];
-            add_row(C + i * c, factor, B + k * b, columns);
-        }
-}
-
-EVERY_WIDTH void lanes_multiply_transposed(Lane *C, npy_intp c, const Lane *A, npy_intp a,
-                                           const Lane *B, npy_intp b, npy_intp rows, npy_intp inner,
-                                           npy_intp columns, double sign)
-{
-    for (npy_intp i = 0; i < rows; i++)
-        for (npy_intp k = 0; k < inner; k++) {
-            const double *one = A[k * a + i];
+            const double *one = A[i * down + k * right];
             Lane factor;
             if (is_zero(one))
                 continue;

@@ -18,6 +18,10 @@ static inline int is_zero(const double *a)
     return sum == 0.0;
 }
 
+/* Memory for `count` matrices of so many entries each; 0 with an exception. */
+int lanes_scratch(Call *call, const npy_intp *sizes, Lane ***parts, size_t count);
+#define LENGTH(array) (sizeof(array) / sizeof((array)[0]))
+
 static inline void lanes_clear(Lane *out, npy_intp entries)
 {
     memset(out, 0, entries * sizeof(Lane));
@@ -32,14 +36,11 @@ void lanes_load(Lane *to, const double *from, npy_intp step, npy_intp entries, n
 void lanes_store(double *to, const Lane *from, npy_intp rows, npy_intp width, npy_intp column,
                  npy_intp columns, npy_intp first, npy_intp used);
 
-/* C (rows, columns) += sign A B, A (rows, inner), B (inner, columns), of row lengths c, a, b. */
-void lanes_multiply(Lane *C, npy_intp c, const Lane *A, npy_intp a, const Lane *B, npy_intp b,
-                    npy_intp rows, npy_intp inner, npy_intp columns, double sign);
-
-/* The same with Aᵀ, A (inner, rows). */
-void lanes_multiply_transposed(Lane *C, npy_intp c, const Lane *A, npy_intp a, const Lane *B,
-                               npy_intp b, npy_intp rows, npy_intp inner, npy_intp columns,
-                               double sign);
+/* C (rows, columns) += sign A B, A (rows, inner), B (inner, columns), of row lengths c, a, b; the
+   entries of A may be any numbers `down` and `right` apart. */
+void lanes_product(Lane *C, npy_intp c, const Lane *A, npy_intp down, npy_intp right, const Lane *B,
+                   npy_intp b, npy_intp rows, npy_intp inner, npy_intp columns, double sign);
+#define lanes_multiply(C, c, A, a, ...) lanes_product(C, c, A, a, 1, __VA_ARGS__)
 
 /* C += M A with M (rows, inner) the same at all times, its numbers `down` and `right` apart. */
 void lanes_from_left(Lane *C, npy_intp c, const double *M, npy_intp down, npy_intp right,

@@ -5,11 +5,9 @@
 static double times_power(double one, double other, int *exponent)
 {
     const double product = one * other;
-    if ((fabs(product) > 1e-100 && fabs(product) < 1e100) || product == 0.0 || !isfinite(one) ||
-        !isfinite(other)) {
-        if (product != 0.0 || one == 0.0 || other == 0.0)
-            return product;
-    }
+    if ((fabs(product) > 1e-100 && fabs(product) < 1e100) || one == 0.0 || other == 0.0 ||
+        (product != 0.0 && !(isfinite(one) && isfinite(other))))
+        return product;
     int first, second;
     const double mantissa = frexp(one, &first) * frexp(other, &second);
     *exponent += first + second;

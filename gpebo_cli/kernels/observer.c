@@ -104,7 +104,7 @@ static void combine_all(Frame *f)
     lanes_multiply(f->whole + d, width, f->pinv, n, f->F, f->q, d, n, f->q, 1.0);
     lanes_multiply(f->whole + d + f->q, width, f->pinv, n, f->B, f->m, d, n, f->m, 1.0);
     lanes_clear(f->seen, b * width);
-    lanes_multiply_transposed(f->seen, width, f->Q1, b, f->through, width, b, f->all, width, 1.0);
+    lanes_product(f->seen, width, f->Q1, 1, b, f->through, width, b, f->all, width, 1.0);
     lanes_multiply(f->whole, width, f->LH, b, f->seen, width, d, b, width, -1.0);
 }
 
@@ -120,15 +120,7 @@ static int prepare(Call *call, Frame *f)
     Lane **parts[] = {&f->E,  &f->A,    &f->B,      &f->F,     &f->C,         &f->Q,       &f->R,
                       &f->X,  &f->pinv, &f->Lambda, &f->LH,    &f->algebraic, &f->through, &f->Q1,
                       &f->R1, &f->X1,   &f->H,      &f->whole, &f->seen,      &f->work};
-    npy_intp total = 0;
-    for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++)
-        total += sizes[i];
-    Lane *memory = (Lane *)scratch(call, total * LANES);
-    for (size_t i = 0; memory != NULL && i < sizeof(sizes) / sizeof(sizes[0]); i++) {
-        *parts[i] = memory;
-        memory += sizes[i];
-    }
-    return memory != NULL;
+    return lanes_scratch(call, sizes, parts, LENGTH(sizes));
 }
 
 /* E, A, B, F, C, sizes of the rows, √w of the outputs, domain, range, kernel, equations, and how
@@ -207,14 +199,11 @@ static Outcome regression_signals(Call *call)
     const npy_intp sizes[] = {k * columns,    0,           0,          rows * k,
                               rows,           rows * q,    rows * b,   n * b,
                               rows * columns, b * columns, n * columns};
-    npy_intp total = 0;
-    for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++)
-        total += sizes[i];
-    Lane *at[11], *memory = (Lane *)scratch(call, total * LANES);
-    if (memory == NULL)
+    Lane *at[LENGTH(sizes)], **parts[LENGTH(sizes)];
+    for (size_t i = 0; i < LENGTH(sizes); i++)
+        parts[i] = at + i;
+    if (!lanes_scratch(call, sizes, parts, LENGTH(sizes)))
         return ERROR;
-    for (int i = 0; i < 11; memory += sizes[i++])
-        at[i] = memory;
     Lane *z = at[0], *G = at[5], *Q1 = at[6], *terms = at[8], *seen = at[9], *state = at[10];
     double *most = call->out[4];
     memset(most, 0, columns * sizeof(double));
@@ -242,7 +231,7 @@ static Outcome regression_signals(Call *call)
             }
         }
         lanes_clear(seen, b * columns);
-        lanes_multiply_transposed(seen, columns, Q1, b, terms, columns, b, rows, columns, 1.0);
+        lanes_product(seen, columns, Q1, 1, b, terms, columns, b, rows, columns, 1.0);
         lanes_multiply(terms, columns, Q1, b, seen, columns, rows, b, columns, -1.0);
         lanes_clear(state, n * columns);
         lanes_from_left(state, columns, call->in[2], k, 1, z, n, k, columns);

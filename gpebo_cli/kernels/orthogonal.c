@@ -18,11 +18,7 @@ void triangularise(double *W, npy_intp rows, npy_intp length, double *mirrors, n
                     most = square, best = i;
             }
             if (best != k) {
-                for (npy_intp j = 0; j < length; j++) {
-                    const double kept = W[k * length + j];
-                    W[k * length + j] = W[best * length + j];
-                    W[best * length + j] = kept;
-                }
+                swap_rows(W + k * length, W + best * length, length);
                 const npy_intp kept = order[k];
                 order[k] = order[best];
                 order[best] = kept;
@@ -112,13 +108,8 @@ void sort_down(double *sigma, double *W, npy_intp count, npy_intp length)
 {
     for (npy_intp i = 1; i < count; i++)
         for (npy_intp k = i; k > 0 && sigma[k] > sigma[k - 1]; k--) {
-            const double kept = sigma[k];
-            sigma[k] = sigma[k - 1];
-            sigma[k - 1] = kept;
-            for (npy_intp j = 0; W && j < length; j++) {
-                const double number = W[k * length + j];
-                W[k * length + j] = W[(k - 1) * length + j];
-                W[(k - 1) * length + j] = number;
-            }
+            swap_rows(sigma + k, sigma + k - 1, 1);
+            if (W != NULL)
+                swap_rows(W + k * length, W + (k - 1) * length, length);
         }
 }

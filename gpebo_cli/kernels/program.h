@@ -7,33 +7,9 @@
 #define GIVEN 2 /* rows that are always given: t, inside; those of signals follow */
 
 /* In the order of _OPERATIONS in expressions/program.py. */
-enum {
-    ADD,
-    SUBTRACT,
-    MULTIPLY,
-    DIVIDE,
-    POWER,
-    GREATER_EQUAL,
-    NEGATIVE,
-    SQRT,
-    EXP,
-    LOG,
-    SIN,
-    COS,
-    TAN,
-    SINH,
-    COSH,
-    TANH,
-    ASIN,
-    ACOS,
-    ATAN,
-    ASINH,
-    ACOSH,
-    ATANH,
-    ERF,
-    SIGN,
-    OPERATIONS
-};
+enum { ADD, SUBTRACT, MULTIPLY, DIVIDE, POWER, GREATER_EQUAL, BINARY_OPERATIONS };
+enum { NEGATIVE = BINARY_OPERATIONS, SQRT, EXP, LOG, SIN, COS, TAN, SINH, COSH, TANH, ASIN };
+enum { ACOS = ASIN + 1, ATAN, ASINH, ACOSH, ATANH, ERF, SIGN, OPERATIONS };
 
 /* One operation: what, the row of its result, its operands; see `operand`. */
 typedef struct {

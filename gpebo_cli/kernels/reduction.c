@@ -31,15 +31,7 @@ static Outcome begin(Call *call, int place, const Model *m, Elimination *el)
                               a * n,    n * n,    n * n, 2 * widest * (widest + n + 1)};
     Lane **parts[] = {&el->e, &el->A,  &el->M11, &el->M12,   &el->M21,     &el->M22,
                       &el->X, &el->N1, &el->N2,  &el->whole, &el->inverse, &el->work};
-    npy_intp total = 0;
-    for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++)
-        total += sizes[i];
-    Lane *memory = (Lane *)scratch(call, total * LANES);
-    for (size_t i = 0; memory != NULL && i < sizeof(sizes) / sizeof(sizes[0]); i++) {
-        *parts[i] = memory;
-        memory += sizes[i];
-    }
-    return memory == NULL ? ERROR : DONE;
+    return lanes_scratch(call, sizes, parts, LENGTH(sizes)) ? DONE : ERROR;
 }
 
 /* The first coefficients at some times, each order times a power of `time` and of `weights`. */
@@ -378,8 +370,6 @@ static Outcome eliminated(Call *call)
             most[i] /= m.columns[i % (n + 1)];
     return DONE;
 }
-
-#define MODEL "oN?nn oN?nn n n # %v "
 
 const Kernel reduction_kernels[] = {
     {"bounds", MODEL "@z @z %r nd z=v*n a=z-r d=n-a", "N3 N Ndd", bounds},

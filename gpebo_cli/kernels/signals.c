@@ -32,6 +32,8 @@ EVERY_WIDTH static void tails_of_kind(double *tail, const double *to_legendre, n
             for (npy_intp b = 0; b < c; b++)
                 last[j * c + b] /= scale[b];
             const double most = largest_of(0.0, last + j * c, c);
+            if (most <= tail[k])
+                continue; /* and so is its power */
             const double power = points / (double)(points - used + j);
             tail[k] = larger(tail[k], most < 1.0 ? pow(most, power) : most != most ? most : 1.0);
         }
@@ -53,6 +55,16 @@ static Outcome tails(Call *call)
         tails_of_kind(call->out[0], call->in[1] + (t - used) * t, used, K, t, call->in[0], c,
                       call->in[6], larger(call->number[5], DBL_MIN), call->number[3],
                       call->number[4], work);
+    return DONE;
+}
+
+/* values (K, points, c) -> the largest size of each component (K, c). */
+static Outcome largest(Call *call)
+{
+    const npy_intp K = SIZE(K), t = SIZE(t), c = SIZE(c);
+    memset(call->out[0], 0, K * c * sizeof(double));
+    for (npy_intp k = 0; k < K; k++)
+        enlarge(call->out[0] + k * c, call->in[0] + k * t * c, t, c);
     return DONE;
 }
 
@@ -120,6 +132,7 @@ static Outcome interpolation(Call *call)
 
 const Kernel signal_kernels[] = {
     {"tails", "Ktc tt %u # # # |c", "K", tails},
+    {"largest", "Ktc", "Kc", largest},
     {"sample", "@N Nt Ktc", "Nc", sample},
     {"interpolation", "K+ t t N N #", "@N Nt", interpolation},
     {NULL, NULL, NULL, NULL},

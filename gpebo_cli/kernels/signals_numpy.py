@@ -47,6 +47,12 @@ def tails(
     return np.asarray((np.minimum(worst, 1.0) ** powers).max(axis=1, initial=0.0))
 
 
+def largest(values: Array) -> Array:
+    """Largest sizes (K, c) of values (K, points, c); 0 of none. Points first in memory are fast."""
+    sizes = np.abs(np.swapaxes(values, 0, 1), order="C")
+    return np.asarray(sizes.max(axis=0, initial=0.0), dtype=np.float64)
+
+
 def interpolation(
     edges: Array, places: Array, barycentric: Array, t: Array, belongs: Array, exact: float
 ) -> tuple[IntArray, Array]:

@@ -64,10 +64,8 @@ static int prepare(Call *call, const Model *m, Look *look)
                         &look->A2,      &look->T2,     &look->Z1};
     const npy_intp sizes[] = {n * size, n * size, many,  many,  many, many,
                               many,     size,     n * n, n * n, n * n};
-    for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); i++) {
+    for (size_t i = 0; i < sizeof(sizes) / sizeof(sizes[0]); memory += sizes[i++])
         *parts[i] = memory;
-        memory += sizes[i];
-    }
     return 1;
 }
 
@@ -267,8 +265,6 @@ static Outcome reference(Call *call)
     flagged_first(call->index_out[3], size, look.order);
     return DONE;
 }
-
-#define MODEL "oN?nn oN?nn n n # %v "
 
 const Kernel structure_kernels[] = {
     {"levels", MODEL "# #", "N N3", levels},

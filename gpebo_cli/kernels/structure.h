@@ -23,19 +23,14 @@ static inline Series series(const Call *call, int place, npy_intp entries)
     return (Series){call->in[place], call->order[place], call->step[place], entries};
 }
 
-/* Arguments 0 to 5, "oN?nn oN?nn n n # %v": E, A, rows, columns, time, orders used. */
+/* Arguments 0 to 5: E, A, rows, columns, time, orders used. */
+#define MODEL "oN?nn oN?nn n n # %v "
 static inline Outcome read_model(Call *call, Model *m)
 {
     const npy_intp n = SIZE(n), v = SIZE(v);
-    *m = (Model){series(call, 0, n * n),
-                 series(call, 1, n * n),
-                 call->in[2],
-                 call->in[3],
-                 call->number[4],
-                 n,
-                 v,
-                 v * n,
-                 SIZE(N)};
+    *m = (Model){.n = n, .orders = v, .size = v * n, .times = SIZE(N), .time = call->number[4]};
+    m->E = series(call, 0, n * n), m->A = series(call, 1, n * n);
+    m->rows = call->in[2], m->columns = call->in[3];
     if (n < 1 || v < 1 || SIZE(o) < v || SIZE(N) < 1)
         return refused("Taylor coefficients", SIZE(o));
     return DONE;

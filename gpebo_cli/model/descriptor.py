@@ -190,18 +190,18 @@ def check_sizes(system: DescriptorSystem, t: Array) -> None:
     initial = np.atleast_1d(system.initial_state)
     entries: dict[str, Array] = {"initial_state": initial[None, None]}
     source = system.coefficients
-    with np.errstate(all="ignore"), suppress(ConfigError):
-        source = source.of_time if system.depends_on_outputs else source
-        if system.n <= _FEW:
-            entries |= source.taylor(t, 0)._asdict()
+    with np.errstate(all="ignore"):
+        with suppress(ConfigError):
+            source = source.of_time if system.depends_on_outputs else source
+            if system.n <= _FEW:
+                entries |= source.taylor(t, 0)._asdict()
+        flat = {name: distinct(values)[0].ravel() for name, values in entries.items()}
+        whole, E = np.concatenate([*flat.values()]), np.abs(flat.get("E", initial[:0]))
+        if whole.dot(whole) <= LARGEST and E[E > 0.0].min(initial=1.0) >= 1.0 / LARGEST:
+            return  # no need to look at each
     named = {"initial_state": ("initial_state", system.states), "u": ("inputs", system.inputs),
              "theta": ("unknowns", system.unknowns)}
     for name, values in entries.items():
-        flat = distinct(values)[0].ravel()
-        with np.errstate(over="ignore"):
-            none_large = flat.dot(flat) <= LARGEST  # no need to look at each
-        if none_large and name != "E":
-            continue
         sizes = np.abs(distinct(values)[0])
         wrong = np.isfinite(sizes) & (sizes > LARGEST)
         if name == "E":  # by which rates are divided

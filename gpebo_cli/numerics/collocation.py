@@ -18,7 +18,7 @@ so T need not be smooth in time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
 
@@ -98,8 +98,7 @@ def solve(
         if before is None:
             maps = _element_maps(problem, mesh, None, known)
         else:
-            fresh = kept < 0
-            maps = _merge(before[0], _element_maps(problem, mesh, fresh), kept)
+            maps = _merge(before[0], _element_maps(problem, mesh, kept < 0), kept)
         values, whole = _chain(maps, problem, mesh, restarts or {})
         tail = _tail_of_numbers(problem, mesh, values, maps, whole, tol)
         return (maps, values, whole), tail
@@ -174,32 +173,37 @@ def unresolved_signals(
 
 
 def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray) -> _ElementMaps:
-    return _ElementMaps(
-        merged(old.homogeneous, new.homogeneous, kept),
-        merged(old.particular, new.particular, kept),
-        merged(old.noise, new.noise, kept),
-        tuple(merged(a, b, kept) for a, b in zip(old.extras, new.extras, strict=True)),
+    before, after = (
+        (maps.homogeneous, maps.particular, maps.noise, *maps.extras) for maps in (old, new)
     )
+    homogeneous, particular, noise, *extras = merged(before, after, len(old.particular), kept)
+    return _ElementMaps(homogeneous, particular, noise, tuple(extras))
 
 
-def merged(before: Array, after: Array, kept: IntArray) -> Array:
+def merged(
+    before: Sequence[Array], after: Sequence[Array], size: int, kept: IntArray
+) -> list[Array]:
     """Of all elements of a mesh, from those of the mesh before and of the fresh ones.
 
     Args:
-        before: of the elements before (K, s, ...), or (1, 1, ...) where all have the same.
+        before: of the elements before (K, s, ...) each, or (1, 1, ...) where all have the same.
         after: of the fresh elements, in the same way.
+        size: number of elements before, K.
         kept: for each element which one before it is, −1 for a fresh one (K',).
     """
-    if before.shape[:2] == after.shape[:2] == (1, 1):
-        return before
-    fresh = kept < 0
-    count, shape = int(kept.max()) + 1, before.shape[1:]
-    before, after = (
-        x if len(x) > 1 else np.broadcast_to(x, (size, *shape))
-        for x, size in ((before, count), (after, int(fresh.sum())))
-    )
-    place = np.where(fresh, len(before) - 1 + fresh.cumsum(), kept)
-    return np.concatenate([before, after]).take(place, axis=0)
+    numbers = (kept < 0).cumsum()
+    place = np.where(kept < 0, size - 1 + numbers, kept)
+
+    def whole(one: Array, other: Array) -> Array:
+        if one.shape[:2] == other.shape[:2] == (1, 1):
+            return one
+        both = [
+            x if len(x) == count else np.broadcast_to(x, (count, *x.shape[1:]))
+            for x, count in ((one, size), (other, numbers[-1]))
+        ]
+        return np.concatenate(both).take(place, axis=0)
+
+    return [whole(one, other) for one, other in zip(before, after, strict=True)]
 
 
 def _element_maps(

@@ -57,58 +57,20 @@ def estimated_errors(
             element (K or 1, n, n + columns); relative rounding of them is an error.
         values: the solution.
     """
-    K, points, n, columns = values.shape
-    rule, width = mesh.rule, 2 * _SIGNS * columns
-    powers = _to_next(rule)
-    with np.errstate(over="ignore", invalid="ignore"):
-        turned = np.ascontiguousarray(np.swapaxes(values, 0, 1)).reshape(points, -1)
-        most = np.zeros((5, K, n, columns))  # what counts with its largest value over time
-        carried, tail, sizes, visible, made_of = most
-        np.abs(turned).max(axis=0, out=sizes.ravel())
-        shown = np.abs(rule.to_legendre[-4:] @ turned)
-        share = np.minimum(shown[-len(powers) :] / np.maximum(sizes, _TINY).ravel(), 1.0) ** powers
-        share = share.max(axis=0).reshape(sizes.shape)
-        if len(shown) == 4:
-            before, after = np.maximum(shown[::2], shown[1::2])
-            np.copyto(visible.ravel(), after, where=after >= LEVEL * before)
-        made_of[:] = np.abs(last) @ np.abs(values[:, 0]) + np.abs(particular)
-        # End points are superconvergent, of order 2s − 1 against s + 1 inside: with ρ the decay per
-        # coefficient their error is about ρ^(s−1) times the tail. Half that exponent is used.
-        tail[:] = sizes * share
-        kinds = np.empty((K, n, 2, 1, columns))
-        kinds[:, :, 0, 0] = tail * share ** (0.5 - 0.5 / rule.stages)
-        kinds[:, :, 1, 0] = EPS * (END * made_of + noise[..., :n] @ sizes + noise[..., n:])
-        signs = _signs(K, n).reshape(K + 1, n, 2, _SIGNS, 1)
-        added = (signs[1:] * kinds).reshape(K, n, width)
-        start = signs[0] * (EPS * np.abs(values[0, 0]))[:, None, None]
-        start[:, 0] = 0.0
-        error, renewal = start.reshape(n, width), problem.renewal
-        if renewal is None:  # X' = last X + added is what a chain of elements is
-            ends = elements.chain(last[:, None], added[:, None], error)[0][:, 1]
-        else:
-            ends = np.empty_like(added)
-            for k in range(K):
-                if k:
-                    apart = np.moveaxis(error.reshape(n, 2 * _SIGNS, columns), 1, 0)
-                    error = renewal.error(values[k - 1, -1], apart)
-                    error = np.moveaxis(error, 0, 1).reshape(n, width)
-                ends[k] = error = last[k if len(last) > 1 else 0] @ error + added[k]
-        squares = np.square(ends).reshape(K, n, 2, _SIGNS, columns).sum(axis=3)
-        rates = noise[..., :n] / mesh.steps[: len(noise), None, None]
-        constant = bool((np.abs(rates - rates[0]) <= _SAME * rates[0]).all())
-        factors = np.empty((K, 1, 2, 1))
-        factors[:, 0, :, 0] = np.arange(2, K + 2)[:, None]
-        if not constant:
-            np.minimum(factors[:, :, 1], _CHANCE**2, out=factors[:, :, 1])
-        np.sqrt(squares * (factors / _SIGNS)).sum(axis=2, out=carried)
-        return judged_errors(problem, carried, *most.max(axis=1))
+    rule, renewal = mesh.rule, problem.renewal
+    carried, largest = elements.carried_errors(
+        values, rule.to_legendre, _to_next(rule), last, particular, noise,
+        _signs(len(values), len(problem.start)), mesh.steps, LEVEL, END, _CHANCE**2, _SAME,
+        None if renewal is None else renewal.error,
+    )
+    return judged_errors(problem, carried, *largest)
 
 
 @lru_cache(maxsize=16)
 def _to_next(rule: RadauRule) -> Array:
-    """Powers (j, 1) that make of the last Legendre coefficients the next: (ρ^j)^this = ρ^(s+1)."""
+    """Powers (j,) that make of the last Legendre coefficients the next: (ρ^j)^this = ρ^(s + 1)."""
     points = rule.stages + 1
-    powers: Array = points / np.arange(points - used_coefficients(rule), points)[:, None]
+    powers: Array = points / np.arange(points - used_coefficients(rule), points)
     powers.flags.writeable = False
     return powers
 

@@ -10,11 +10,11 @@ from math import prod
 
 import numpy as np
 
+from gpebo_cli.kernels import signals
 from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray
 
 _TINY = float(np.finfo(float).tiny)
-_ROW = 256  # numbers
 _CANCELLED = 1e-13  # of the terms of an entry: what is left is rounding
 
 
@@ -40,24 +40,15 @@ def transpose(a: Array) -> Array:
 
 
 def largest_within(values: Array) -> Array:
-    """Largest sizes (K, …) of values (K, points, …). With points first in memory that is fast."""
-    return np.asarray(np.abs(np.swapaxes(values, 0, 1), order="C").max(axis=0))
+    """Largest sizes (K, …) of values (K, points, …)."""
+    found = signals.largest(values.reshape(*values.shape[:2], prod(values.shape[2:])))
+    return found.reshape(len(values), *values.shape[2:])
 
 
 def largest_over_time(values: Array, axes: int = 1) -> Array:
-    """Largest sizes (…) of values (N, …), or of (K, points, …) with two axes of time; 0 of none.
-
-    Reductions are fast along long rows only, so that many times make one row at first.
-    """
+    """Largest sizes (…) of values (N, …), or of (K, points, …) with two axes of time; 0 of none."""
     shape = values.shape[axes:]
-    sizes = np.abs(values, order="C").reshape(prod(values.shape[:axes]), prod(shape))
-    count, width = sizes.shape
-    together = _ROW // max(1, width)
-    if width and count > together > 1:
-        whole = count - count % together
-        rows = sizes[:whole].reshape(-1, together * width).max(axis=0).reshape(together, width)
-        sizes = rows if whole == count else np.concatenate([rows, sizes[whole:]])
-    return np.asarray(sizes.max(axis=0, initial=0.0).reshape(shape))
+    return signals.largest(values.reshape(1, prod(values.shape[:axes]), prod(shape))).reshape(shape)
 
 
 def exact_product(left: Array, right: Array) -> Array:

@@ -13,7 +13,7 @@ from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import elements, signals
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.linalg import largest_over_time, largest_within
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.radau import RadauRule
 
 # Functions that jump are decided this far (relative to the element) inside its ends, so that both
@@ -109,7 +109,8 @@ class Mesh:
         bounds = [0, *sorted(inner - {0, self.size}), self.size]
         if len(bounds) > _MANY_PIECES + 1:
             return self
-        allowed = tol * _scale_so_far(values, counts)[:, None]
+        rows = values.transpose(2, 0, 1)  # all times of one in a row: that is fast
+        allowed = tol * _scale_so_far(rows, counts)
         stays = np.ones(self.size + 1, dtype=bool)
         free = np.ones(self.size, dtype=bool)
         for count in _JOINED:
@@ -117,16 +118,16 @@ class Mesh:
                 [np.arange(a, b - count + 1, count) for a, b in pairwise(bounds)]
             )
             first = first[free[first] & (count * self.steps[first] <= longest)]
-            if not len(first):
-                continue
             together = first[:, None] + np.arange(count)
             there, back = joining(self.rule, count)
-            seen = values[together].reshape(len(first), len(back), values.shape[2])
-            change = np.abs(back @ (there @ seen) - seen)
-            change = change.reshape(*together.shape, len(there), values.shape[2])
-            fits = (change <= allowed[together]).reshape(len(first), -1).all(axis=1)
+            seen = rows[:, together].reshape(len(rows) * len(first), len(back))
+            change = np.abs(seen @ there.T @ back.T - seen).reshape(len(seen) * count, len(there))
+            change = change.max(axis=1).reshape(len(rows), *together.shape)
+            fits = (change <= allowed[:, together]).all(axis=2).all(axis=0)
             stays[together[fits, 1:]] = False
             free[together[fits]] = False
+            if not free.any():
+                break
         return self if stays.all() else Mesh(self.edges[stays], self.rule)
 
     def sampler(self, t: Array, inside: Array | None = None) -> Sampler:
@@ -350,15 +351,15 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
 
 
 def _scale_so_far(values: Array, counts: IntArray) -> Array:
-    """Size of each component up to each element, (K, c), floored as in :func:`signal_scale`.
+    """Sizes (c, K) of components (c, K, s + 1) up to each element, floored as :func:`signal_scale`.
 
     Also floored at a share of the final size, so that the foot of a pulse costs nothing. Components
     of one kind, ``counts`` of them, stand together and share a floor.
     """
-    size = np.maximum.accumulate(largest_within(values), axis=0)
-    size = np.maximum(size, _FOOT * size[-1])
-    level = SHARE * np.maximum.reduceat(size, np.cumsum(counts) - counts, axis=1)
-    return np.asarray(np.maximum(size, np.repeat(np.maximum(level, _TINY), counts, axis=1)))
+    size = np.maximum.accumulate(np.abs(values).max(axis=2), axis=1)
+    size = np.maximum(size, _FOOT * size[:, -1:])
+    level = SHARE * np.maximum.reduceat(size, counts.cumsum() - counts, axis=0)
+    return np.asarray(np.maximum(size, np.maximum(level, _TINY).repeat(counts, axis=0)))
 
 
 def signal_scale(values: Array, floor: float = 0.0) -> Array:

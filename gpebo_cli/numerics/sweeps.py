@@ -212,15 +212,14 @@ def solve_dense(
             raise _StiffError
         f, extras = c.f, tuple(at_points(e, count, s) for e in c.extras)
         if before is not None:
-            def whole(old: Array, new: Array) -> Array:
-                """Points one after the other (P or 1, ...), of all elements."""
-                K = before[0].size
-                found = merged(at_points(old, K, s), at_points(new, count, s), kept)
-                return found.reshape(-1, *found.shape[2:])
-
-            A = A._replace(entries=whole(before[1].within(A), A.entries))
-            f = whole(before[2], f)
-            extras = tuple(merged(a, b, kept) for a, b in zip(before[3], extras, strict=True))
+            K = before[0].size
+            old, new = (before[1].within(A), before[2]), (A.entries, f)
+            entries, f, *more = merged(
+                [*(at_points(x, K, s) for x in old), *before[3]],
+                [*(at_points(x, count, s) for x in new), *extras], K, kept,
+            )
+            A = A._replace(entries=entries.reshape(-1, *entries.shape[2:]))
+            f, extras = f.reshape(-1, *f.shape[2:]), tuple(more)
         last[:] = [(mesh, A, f, extras)]
         return A, f, extras
 

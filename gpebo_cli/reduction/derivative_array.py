@@ -107,9 +107,8 @@ def units_at(c: Coefficients) -> Units:
         np.abs(matrix[:, 0]) for matrix in (c.E, c.A, c.F)
     )
     entries[:, 1, n:, :n], entries[:, 1, n:, n:] = np.abs(c.C[:, 0]), np.abs(c.H[:, 0])
-    order = (entries > 0.0).argmax(axis=0)
-    sizes = np.take_along_axis(entries, order[None], axis=0)[0]
-    order = order.astype(np.int8)
+    order = (entries > 0.0).argmax(axis=0).astype(np.int8)
+    sizes = np.choose(order, entries)
     factors, there = _factors(sizes, order, 1.0)
     terms, logs = _terms(there, order), np.log(sizes[there])
     for _ in range(_ROUNDS):
@@ -183,7 +182,9 @@ def _squares(terms: Any, counts: Array) -> Callable[[Array], Array]:
     Singular values of a thousand states would take longer than a run.
     """
     if isinstance(terms, np.ndarray):
-        inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
+        values, vectors = np.linalg.eigh((counts * terms.T) @ terms)
+        some = values > 1e-12 * values[-1:]
+        inverse = (vectors[:, some] / values[some]) @ vectors[:, some].T
         return lambda right: np.asarray(inverse @ right)
     from scipy.sparse import diags_array, eye_array
     from scipy.sparse.linalg import splu

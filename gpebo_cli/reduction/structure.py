@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +37,7 @@ _DIP_POINTS = 17
 _MOST_DIPS = 6  # of each kind
 
 
-@dataclass(frozen=True, eq=False)
-class Pivots:
+class Pivots(NamedTuple):
     """Rows and columns of M that carry its rank at one time, for cheap elimination at others.
 
     Z2 and Z1 are only needed up to scalings of rows, so any basis will do: M[rest] − X M[rows]
@@ -246,16 +246,15 @@ def _differs(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float, a: in
     A rate λ has singular values of λ^−2μ, which may count as zero. In E, [E A] or [E; A] it has
     some of 1/λ: stages are looked at only where there are any.
     """
-    middle, s = len(t) // 2, scaling
-    there, n = slice(middle, middle + 1), len(s.rows)
+    middle, of = len(t) // 2, scaling
+    there, n = slice(middle, middle + 1), len(of.rows)
     E, A = (x if x.shape[1] == 1 else x[:, there] for x in (c.E, c.A))
-    e, aa = scaled(E, A, s.rows, s.columns, s.time, len(E))
+    e, aa = scaled(E, A, of.rows, of.columns, of.time, len(E))
     beside = np.zeros((3, n, 2 * n))
     beside[:2, :, :n], beside[2, :, :n] = e[0, 0], e[0, 0].T
     beside[1, :, n:], beside[2, :, n:] = aa[0, 0], aa[0, 0].T
-    spread = np.linalg.svd(beside, compute_uv=False)
-    spread = spread / np.maximum(spread[:, :1], np.finfo(float).tiny)
-    if not ((spread > rank_tol) & (spread < _APART)).any():
+    spread = np.linalg.svd(beside, compute_uv=False).tolist()
+    if not any(rank_tol * s[0] < value < _APART * s[0] for s in spread for value in s):
         return False
     try:
         stages = in_stages(e, aa, np.zeros((len(e), 1, n, 0)), rank_tol, 1)
@@ -285,9 +284,9 @@ def _refuse_overflow(
     """
     with np.errstate(all="ignore"):
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
-        whole = [distinct(matrix) * weight for matrix in (c.E, c.A)]
+        whole = [(distinct(matrix) * weight).ravel() for matrix in (c.E, c.A)]
         # A sum is finite only where all its terms are; a finite one says it at once.
-        finite = all(isfinite(x.sum()) or np.isfinite(x).all() for x in whole)
+        finite = all(isfinite(x.dot(x)) or np.isfinite(x).all() for x in whole)
     if not finite:
         raise ModelError(
             f"{who(system)}: E and A change by more powers of ten than numbers hold; shorten "
@@ -369,8 +368,7 @@ def _too_many(a: int, n: int, t: Array) -> str:
     return f"{a} constraints appear for {n} states (t = {t[0]:.6g})"
 
 
-@dataclass(frozen=True, eq=False)
-class _Levels:
+class _Levels(NamedTuple):
     """Singular values that must stay away from zero, or why this μ will not do."""
 
     a: int

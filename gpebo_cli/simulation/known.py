@@ -165,25 +165,22 @@ def _known_kinds(
     Reciprocals of what E holds are among them: the state sees those, and they may be harder to
     resolve by far.
     """
-    parts = [
-        np.swapaxes(getattr(c, name).reshape(len(c.E), c.E.shape[1], -1), 1, 2)
-        for name in MATRIX_NAMES if name not in system.coefficients.constant
-    ]
-    parts = [part for part in parts if part.shape[1]]
-    if not parts:
+    moving = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
+    orders, times = c.E.shape[:2]
+    parts = [getattr(c, name).reshape(orders, times, -1).swapaxes(1, 2) for name in moving]
+    if not any(part.shape[1] for part in parts):
         return np.zeros((*mesh.points.shape, 0)), np.zeros(0, dtype=np.intp)
     whole = np.concatenate(parts, axis=1)  # all times of a function in a row: that is fast
     high, low = whole[0].max(axis=1), whole[0].min(axis=1)
-    moving = high > low
-    kinds = list(whole[:, moving])
+    moves = high > low
+    kinds = list(whole[:, moves])
     ends = accumulate([part.shape[1] for part in parts], initial=0)
-    counts = [int(np.count_nonzero(moving[a:b])) for a, b in pairwise(ends)]
-    counts *= len(kinds)
-    if "E" not in system.coefficients.constant:
+    counts = [int(np.count_nonzero(moves[a:b])) for a, b in pairwise(ends)] * orders
+    if moving[0] == "E":
         first = slice(parts[0].shape[1])
         size = np.abs([high[first], low[first]])
         away = (size.min(axis=0) > _NEAR_ZERO * size.max(axis=0)) & (high[first] * low[first] > 0.0)
-        kinds.append(1.0 / whole[0, first][moving[first] & away])
+        kinds.append(1.0 / whole[0, first][moves[first] & away])
         counts.append(len(kinds[-1]))
-    values = np.concatenate(kinds).T.reshape(*mesh.points.shape, -1)
-    return np.ascontiguousarray(values), np.array([k for k in counts if k], dtype=np.intp)
+    values = np.concatenate(kinds).reshape(-1, *mesh.points.shape).transpose(1, 2, 0)
+    return values, np.array([k for k in counts if k], dtype=np.intp)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -190,7 +191,7 @@ class ReducedSystem:
         """Coordinates in which w is integrated, (n, k): n_a of them, or n if the kernel rotates."""
         return self.first.split.basis
 
-    @property
+    @cached_property
     def units(self) -> Array:
         """Of w's coordinates, (k,)."""
         return units_along(self.basis, self.form.units.states)
@@ -395,16 +396,13 @@ class Extension:
         """The mesh."""
         return self.solution.trajectory.mesh
 
-    def growth(self, q: int) -> float:
-        """Largest entry of Φ in comparable units, in which its columns start at size 1."""
-        return largest_entry(self._Phi(q))
+    def growth(self, q: int) -> tuple[float, float]:
+        """Largest entry of Φ in comparable units, in which its columns start at size 1.
 
-    def logarithm(self, q: int) -> float:
-        """ln ‖Φ(end)‖₂, which is 0 at the start."""
-        return log_norm(self._Phi(q)[-1, -1])
-
-    def _Phi(self, q: int) -> Array:
-        return comparable(self.solution.trajectory.values[..., 1 + q :], self.units)
+        And ln ‖Φ(end)‖₂, which is 0 at the start.
+        """
+        Phi = comparable(self.solution.trajectory.values[..., 1 + q :], self.units)
+        return largest_entry(Phi), log_norm(Phi[-1, -1])
 
 
 def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:

@@ -32,6 +32,7 @@ class Plain:
         kept = final.kept_rows(system, reduced.regression)
         all_kept = len(kept) == final.Y.shape[1]
         start, stop = reduced.signals.span
+        growth, logarithm = extension.growth(q)
         # Along noisy signals the matrices change, too, and Y is not affine in the noise.
         errors = None if noisy_matrices(reduced) else errors_of(reduced, kept)
         return Observation(
@@ -51,8 +52,8 @@ class Plain:
             ),
             error_estimate=extension.solution.error_estimate,
             assumptions=assumptions(reduced, mesh, final),
-            growth=extension.growth(q),
-            growth_rate=extension.logarithm(q) / (stop - start),
+            growth=growth,
+            growth_rate=logarithm / (stop - start),
             errors=errors,
             respond=None if errors is None else (
                 lambda e_u, e_y: respond(mesh, errors, len(kept), e_u, e_y)

@@ -188,7 +188,7 @@ def _joined(
         ]),
     )
     kept = whole.kept_rows(system, reduced.regression)
-    q = system.q
+    growth, logarithms = zip(*(e.growth(system.q) for e in extensions), strict=True)
     return Observation(
         regression=LinearRegression(
             Y=on_mesh(mesh, whole.Y[:, kept]),
@@ -207,9 +207,9 @@ def _joined(
         error_estimate=max(e.solution.error_estimate for e in extensions),
         assumptions=assumptions(reduced, mesh, whole),
         note=reduced.note,
-        growth=max(e.growth(q) for e in extensions),
+        growth=max(growth),
         errors=None if noisy_matrices(reduced) else errors_of(reduced, kept),
-        growth_rate=sum(e.logarithm(q) for e in extensions) / float(mesh.edges[-1] - mesh.edges[0]),
+        growth_rate=sum(logarithms) / float(mesh.edges[-1] - mesh.edges[0]),
     )
 
 
