@@ -204,9 +204,12 @@ def test_schur_form_of_the_differentiation_matrix(stages):
     assert not np.tril(T, -1).any()
 
 
-def test_many_samples_are_those_of_few():
+@pytest.mark.parametrize("copies", [1, 20])
+def test_many_samples_are_those_of_few(copies, monkeypatch):
+    """Of many columns by elements, several at once."""
+    monkeypatch.setattr("gpebo_cli.numerics.mesh._CHUNK", 80_000)
     mesh = initial_mesh(0.5, 4.5, [1.3], 12, radau_rule(9))
-    signal = smooth_signal(mesh)
+    signal = Trajectory(mesh, np.tile(smooth_signal(mesh).values, copies))
     t = np.linspace(0.5, 4.5, 4001)
     few = np.concatenate([signal(part) for part in np.array_split(t, 40)])
     np.testing.assert_allclose(signal(t), few, rtol=0, atol=1e-12)

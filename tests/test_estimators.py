@@ -14,7 +14,7 @@ from regressions import ETA, adjugate, fading, integrate, regression, three
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
-from gpebo_cli.estimators._extension import kreisselmeier, lion
+from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
 from gpebo_cli.estimators._following import SolvedEstimates, follow
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
@@ -239,6 +239,9 @@ def test_the_power_law_is_exact_after_a_finite_time_and_not_before(alpha, gamma2
         np.testing.assert_allclose(error, left, atol=1e-10)
     requirement = estimate("power", CLEAN, gamma=gamma, alpha=alpha, **rates).requirement
     assert requirement.holds == (left[-1].max() == 0.0)
+    near = estimate("power", CLEAN, gamma=gamma, alpha=alpha, initial=list(ETA - 0.1), **rates)
+    needed = 0.1 ** (1.0 - alpha) / (1.0 - alpha)
+    assert near.requirement.evidence["needed"] == pytest.approx(needed)
 
 
 def test_a_regressor_that_stays_exciting_when_the_excitation_ends():
@@ -638,6 +641,17 @@ def test_one_wrong_gain_of_many_is_found():
     gains = [*map(float, range(1, 9)), float("nan")]
     with pytest.raises(ConfigError, match="positive number, got nan"):
         estimators.build({"name": "drem", "gamma": gains})
+
+
+def test_elements_are_cut_where_a_filter_is_faster_than_they_are():
+    """Z = 1 − e^{−300t} on elements of a second; a rough signal is no reason to cut."""
+    mesh = initial_mesh(0.0, 4.0, [], 4, radau_rule(9))
+    filtered = low_pass(Trajectory(mesh, np.ones(mesh.points.shape)), np.array(300.0))
+    t = np.linspace(0.0, 0.1, 101)
+    np.testing.assert_allclose(filtered(t), 1.0 - np.exp(-300.0 * t), atol=1e-10)
+    assert filtered.mesh.size < 100
+    rough = Trajectory(mesh, np.random.default_rng(0).normal(size=mesh.points.shape))
+    assert low_pass(rough, np.array(0.1)).mesh is mesh
 
 
 @pytest.mark.parametrize(("share", "holds"), [(0.99, False), (1.01, True)])

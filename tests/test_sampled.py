@@ -179,6 +179,23 @@ def test_it_does_not_matter_how_samples_are_grouped():
             np.testing.assert_allclose(joined, getattr(whole, field), rtol=1e-8, atol=1e-9)
 
 
+def test_every_case_is_what_it_is_alone():
+    """Two extensions with two gains each: estimates, and Δ, which gains share."""
+    system, t = shipped("descriptor"), np.arange(0.0, 1.0, 0.02)
+    u, y = signals(system, t)
+
+    def found(f0, gamma):
+        estimator = {"name": "ls_drem", "f0": f0, "gamma": gamma}
+        first = np.append(u[0], y[0])
+        return Online(Settings({}, estimator), system, "zoh", t[0], first).feed(t, u, y)
+
+    together = found([1e-4, 1.0], [1.0, 10.0])
+    alone = [found(f0, gamma) for f0 in (1e-4, 1.0) for gamma in (1.0, 10.0)]
+    for field in ("parameters", "delta"):
+        expected = np.concatenate([getattr(each, field) for each in alone])
+        np.testing.assert_allclose(getattr(together, field), expected, rtol=1e-12)
+
+
 def test_what_is_remembered_does_not_grow():
     system = shipped("circuit")
     t = np.arange(0.0, 4.0, 0.01)

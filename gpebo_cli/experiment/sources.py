@@ -260,7 +260,7 @@ def _sample_simulation(
 def _changes(
     system: DescriptorSystem, before: Array, after: Array, time: float, size: Array
 ) -> list[StateChange]:
-    scale = _MOVED * np.maximum(size, np.maximum(np.abs(before), np.abs(after)))
+    scale = _MOVED * np.maximum(size, np.abs(before))
     return [
         StateChange(state, old, new, time)
         for state, old, new, least in zip(

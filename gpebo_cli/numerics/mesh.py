@@ -187,12 +187,12 @@ class Sampler:
     def __call__(self, values: Array) -> Array:
         """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
         flat = _flat(values)
-        if flat.shape[2] <= _WIDE or self._grouped is None:
+        grouped = None if flat.shape[2] <= _WIDE else self._grouped
+        if grouped is None:
             sampled = signals.sample(self.element, self.weights, flat)
-            return sampled.reshape(len(sampled), *values.shape[2:])
-        out = np.empty((len(self.element), flat.shape[2]))
-        self._by_element(flat, out)
-        return out.reshape(len(out), *values.shape[2:])
+        else:
+            sampled = self._by_element(flat, *grouped)
+        return sampled.reshape(len(sampled), *values.shape[2:])
 
     @cached_property
     def _grouped(self) -> tuple[IntArray, IntArray, int] | None:
@@ -206,11 +206,9 @@ class Sampler:
             return None
         return self.element[ends - 1], ends, most
 
-    def _by_element(self, flat: Array, out: Array) -> None:
+    def _by_element(self, flat: Array, elements: IntArray, ends: IntArray, most: int) -> Array:
         """One product per element with all its times: nothing is gathered per time."""
-        if self._grouped is None:
-            return
-        elements, ends, most = self._grouped
+        out = np.empty((len(self.element), flat.shape[2]))
         starts = np.append(0, ends[:-1])
         points, columns = flat.shape[1:]
         chunk = max(1, _CHUNK // max(1, most * (points + columns)))
@@ -222,6 +220,7 @@ class Sampler:
             weights = np.zeros((len(counts), most, points))
             weights[group, place] = self.weights[first:last]
             out[first:last] = np.matmul(weights, flat[elements[i : i + chunk]])[group, place]
+        return out
 
 
 @dataclass(frozen=True, eq=False)
