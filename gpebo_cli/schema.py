@@ -14,7 +14,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import lru_cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
@@ -50,6 +50,20 @@ def unknown(what: str, given: object, known: Iterable[str], there: str = "known:
     """The error for a name that is none: ``what`` is wrong, ``there`` are others, one is near."""
     names = [str(name) for name in known]
     return ConfigError(f"{what}; {there} {', '.join(names) or 'none'}{nearest(str(given), names)}")
+
+
+def check_keys(given: Iterable[object], known: Collection[str], where: str) -> None:
+    """Refuse a key of a file that is not among those that are known.
+
+    Raises:
+        ConfigError: names it, and the keys that are.
+    """
+    for key in given:
+        if key not in known:
+            raise ConfigError(
+                f"{where}: unknown key {shown(str(key))}{nearest(str(key), known)} "
+                f"(accepted: {', '.join(known)})"
+            )
 
 
 def shown(value: object) -> str:

@@ -14,11 +14,13 @@ from collections.abc import Iterable, Sequence
 
 from gpebo_cli.cli.arguments import OPTIONS, VALUES
 from gpebo_cli.cli.listing import KINDS, described
+from gpebo_cli.cli.usage import HELP_OF
 from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.results.names import FIGURE_NAMES, FORMATS, METRICS
 from gpebo_cli.schema import nearest, shown
 
+VOLUME = ("--quiet", "--verbose")
 FOLDERS = ":folders"
 """Answered instead of candidates where a folder is wanted: the shell knows them better."""
 
@@ -150,32 +152,19 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
     if not before:
         return _starting(word, [*commands, "--help", "--version"])
     command, *before = before
-    if command in ("run", "check"):
-        return _of_run(command, before, word)
+    flag, equals, _ = word.partition("=")
     if before and before[-1] in _FOLDER_OPTIONS:
         return [FOLDERS]
-    if word.startswith("--") and word.partition("=")[0] in _FOLDER_OPTIONS and "=" in word:
-        return [f"{FOLDERS}{word.partition('=')[0]}="]
+    if equals and flag in _FOLDER_OPTIONS:
+        return [f"{FOLDERS}{flag}="]
+    if command in ("run", "check"):
+        return _of_run(command, before, word)
     found: dict[str, list[str]] = {
-        "list": [*KINDS, "--config-dir", "--help"],
-        "figures": [
-            *choices(conf_folder(), "experiment"),
-            *("--output", "--check", "--update", "--config-dir", "--quiet", "--verbose", "--help"),
-            "figures.formats=",
-        ],
-        "compare": [
-            "--sort", "--reverse", "--columns", "--csv", "--output", "--no-figures", "--help",
-        ],
-        "report": ["--output", "--help"],
-        "new": [
-            "--config-dir", "--from", "--measure", "--unknown", "--plant", "--help",
-            *(["plant", "estimator", "observer", "recipe", "recording"] if not before else []),
-        ],
-        "reproduce": [
-            *choices(conf_folder(), "experiment/published"), "--page", "--quiet", "--verbose",
-            "--help",
-        ],
-        "completion": [*SCRIPTS, "--help"],
+        "list": list(KINDS),
+        "figures": [*choices(conf_folder(), "experiment"), "figures.formats=", *VOLUME],
+        "new": [] if before else ["plant", "estimator", "observer", "recipe", "recording"],
+        "reproduce": [*choices(conf_folder(), "experiment/published"), *VOLUME],
+        "completion": list(SCRIPTS),
     }
     if word.startswith("figures.formats="):
         return _listed("figures.formats=", word, FORMATS)
@@ -184,23 +173,28 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
             return _starting(word, METRICS)
         if not word.startswith("-"):
             return [FOLDERS]
-    return _starting(word, found.get(command, []))
+    return _starting(word, [*found.get(command, []), *_options(command)])
+
+
+def _options(command: str) -> list[str]:
+    """The options that the help of a command names."""
+    if command not in HELP_OF:
+        return []
+    text = "" if command == "completion" else HELP_OF[command]  # that one names those of others
+    words = [word.strip("[],") for word in text.split()]
+    return [*(word for word in words if word.startswith("--")), "--help"]
 
 
 def _of_run(command: str, before: Sequence[str], word: str) -> list[str]:
     """Options, groups and keys, and the values of those that have a few."""
     folders = [conf_folder(), *_config_dir(before)]
     last = before[-1] if before else ""
-    if last in _FOLDER_OPTIONS:
-        return [FOLDERS]
     if last in ("--config-name", "-cn"):
         return _starting(word, [name for folder in folders for name in choices(folder, "")])
     for short, long in (("-c", "--cfg"), ("-i", "--info")):
         if last in (short, long):
             return _starting(word, VALUES[long])
     if word.startswith("-"):
-        if word.partition("=")[0] in _FOLDER_OPTIONS and "=" in word:
-            return [f"{FOLDERS}{word.partition('=')[0]}="]
         more = ["--json"] if command == "check" else ["-m"]
         return _starting(word, [*more, "--help", *OPTIONS])
     key, equals, _ = word.partition("=")

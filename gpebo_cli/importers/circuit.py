@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.cluster.hierarchy import DisjointSet
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
@@ -96,32 +97,32 @@ def examine(netlist: Netlist, file: str) -> Topology:
     nodes = {node for e in branches for node in e.nodes}
     if GROUND not in nodes:
         raise ConfigError(f"{file}: no element is connected to ground, which is the node 0")
-    connected = _Joined(nodes)
+    connected = DisjointSet(nodes)
     for e in branches:
         for pair in _branches_of(e):
-            connected.join(*pair)
-    floating = sorted(node for node in nodes if connected.root(node) != connected.root(GROUND))
+            connected.merge(*pair)
+    floating = sorted(node for node in nodes if not connected.connected(node, GROUND))
     if floating:
         raise ConfigError(
             f"{file}: no path leads from node {floating[0]} to ground; connect it, through a large "
             "resistor for instance"
         )
-    fixed = _Joined(nodes)  # by sources alone: their loops have no unique current
+    fixed = DisjointSet(nodes)  # by sources alone: their loops have no unique current
     for e in branches:
         if e.kind in "VEH":
             a, b = e.nodes[:2]
-            if not fixed.join(a, b):
+            if not fixed.merge(a, b):
                 raise e.place.error(
                     f"{e.name} closes a loop of voltage sources, or is shorted; its current would "
                     "be anything"
                 )
-    carried = _Joined(nodes)
+    carried = DisjointSet(nodes)
     for e in branches:
         if e.kind not in "IGF":
             for pair in _branches_of(e):
-                carried.join(*pair)
+                carried.merge(*pair)
     for e in branches:
-        if e.kind in "IGF" and carried.root(e.nodes[0]) != carried.root(e.nodes[1]):
+        if e.kind in "IGF" and not carried.connected(*e.nodes[:2]):
             raise e.place.error(
                 f"{e.name} drives a current that can flow back through current sources only; its "
                 "voltage would be anything"
@@ -151,25 +152,6 @@ def _branches_of(e: Element) -> list[tuple[str, str]]:
     if e.kind == "T":
         return [(e.nodes[0], e.nodes[1]), (e.nodes[2], e.nodes[3])]
     return [(e.nodes[0], e.nodes[1])]
-
-
-class _Joined:
-    """Sets of nodes that are joined, a union–find."""
-
-    def __init__(self, nodes: Iterable[str]) -> None:
-        self._parent = {node: node for node in nodes}
-
-    def root(self, node: str) -> str:
-        while self._parent[node] != node:
-            self._parent[node] = self._parent[self._parent[node]]
-            node = self._parent[node]
-        return node
-
-    def join(self, a: str, b: str) -> bool:
-        """Join two nodes; whether they were apart."""
-        x, y = self.root(a), self.root(b)
-        self._parent[x] = y
-        return x != y
 
 
 def _loops(branches: Sequence[Element]) -> Iterable[tuple[str, ...]]:
@@ -205,15 +187,16 @@ def _path(branches: Sequence[Element], start: str, stop: str) -> list[str] | Non
 
 def _cutsets(branches: Sequence[Element], nodes: set[str]) -> Iterable[tuple[str, ...]]:
     """Inductors and current sources around each part that nothing else connects to ground."""
-    rest = _Joined(nodes)
+    rest = DisjointSet(nodes)
     for e in branches:
         if e.kind not in "LIGF":
             for pair in _branches_of(e):
-                rest.join(*pair)
-    parts = {rest.root(node) for node in nodes} - {rest.root(GROUND)}
+                rest.merge(*pair)
     crossing = [e for e in branches if e.kind in "LIGF"]
-    for part in sorted(parts):
-        sides = [[rest.root(node) == part for node in e.nodes[:2]] for e in crossing]
+    for part in sorted(rest.subsets(), key=min):
+        if GROUND in part:
+            continue
+        sides = [[node in part for node in e.nodes[:2]] for e in crossing]
         yield tuple(e.name for e, (a, b) in zip(crossing, sides, strict=True) if a != b)
 
 

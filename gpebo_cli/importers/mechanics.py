@@ -13,7 +13,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import Entry, PlantDraft
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import check_keys, per_name, shown
 
 KEYS = (
     "title", "reference", "parameters", "positions", "inputs", "unknowns", "M", "D", "K", "G", "B",
@@ -38,12 +38,7 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
         ConfigError: an unknown key, or a size that does not fit; says both numbers.
     """
     where = f"{source or name}: "
-    for key in model:
-        if key not in KEYS:
-            raise ConfigError(
-                f"{where}unknown key {shown(key)}{nearest(str(key), KEYS)} "
-                f"(accepted: {', '.join(KEYS)})"
-            )
+    check_keys(model, KEYS, source or name)
     M = _matrix(model, "M", None, None, where)
     k = len(M)
     if k == 0:
@@ -223,20 +218,9 @@ def _start(
     value = model.get(key)
     if value is None:
         return [0.0] * len(positions)
-    if isinstance(value, Mapping):
-        for label in value:
-            if label not in positions:
-                raise ConfigError(
-                    f"{where}{key} has {shown(label)}, which is no position"
-                    f"{nearest(str(label), positions)}"
-                )
-        value = [value.get(position, 0.0) for position in positions]
-    if not isinstance(value, Sequence | np.ndarray) or len(value) != len(positions):
-        raise ConfigError(f"{where}{key} needs a number for each of the {len(positions)} positions")
-    try:
-        return [float(item) for item in value]
-    except (TypeError, ValueError):
-        raise ConfigError(f"{where}{key} takes numbers, got {shown(value)}") from None
+    value = list(value) if isinstance(value, np.ndarray) else value
+    found = per_name(value, positions, "position", f"{where}{key}", "finite", absent=0.0)
+    return [float(number) for number in found]
 
 
 def _units(model: Mapping[str, object], where: str) -> dict[str, str]:

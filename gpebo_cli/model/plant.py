@@ -18,7 +18,7 @@ from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.expressions import RESERVED, Expression, parse, shorten, signal
 from gpebo_cli.model.matrix import Side, brief, counted, is_empty, items_of, listed, matrix
 from gpebo_cli.model.text import MatrixEntries, coefficients_of
-from gpebo_cli.schema import nearest
+from gpebo_cli.schema import check_keys, nearest
 
 KEYS = (
     "name", "title", "reference", "parameters", "states", "inputs", "unknowns", "outputs",
@@ -59,12 +59,7 @@ def plant_from_mapping(
         raise ConfigError(f"{kind}{file} must be a mapping with the keys {', '.join(KEYS)}")
     name = _plant_name(mapping.get("name"), file, kind)
     plant = f"{kind} {name}{file}"
-    for key in mapping:
-        if key not in KEYS:
-            hint = nearest(str(key), KEYS)
-            raise ConfigError(
-                f"{plant}: unknown key {brief(key)}{hint} (accepted: {', '.join(KEYS)})"
-            )
+    check_keys(mapping, KEYS, plant)
     mapping = with_archive(mapping, source, plant)
 
     states = _names(plant, "states", _required(mapping, "states", plant))

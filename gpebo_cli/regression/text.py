@@ -32,7 +32,7 @@ from gpebo_cli.recordings.drive import driven, tables
 from gpebo_cli.reduction.structure import without_equations
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.regression.parametrisation import Parametrisation, read_box
-from gpebo_cli.schema import nearest, number, shown
+from gpebo_cli.schema import check_keys, number, shown
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.signals import Signals, Simulation
 from gpebo_cli.simulation.simulate import simulate
@@ -227,12 +227,7 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"regression{file} must be a mapping with the keys {', '.join(KEYS)}")
     where = f"regression {mapping.get('name')}{file}"
-    for key in mapping:
-        if key not in KEYS:
-            raise ConfigError(
-                f"{where}: unknown key {shown(key)}{nearest(str(key), KEYS)} "
-                f"(accepted: {', '.join(KEYS)})"
-            )
+    check_keys(mapping, KEYS, where)
     signals = mapping.get("signals") or {}
     if not isinstance(signals, Mapping):
         raise ConfigError(f"{where}: signals must map names to expressions, such as {{u: sin(t)}}")
