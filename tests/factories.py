@@ -112,6 +112,7 @@ def make_result(
         weakest_direction=Direction({name: 1 / np.sqrt(p) for name in parameters}),
         parameters=tuple(parameters),
         known=known,
+        least_share=known.share.min(axis=1, initial=1.0),
         final=known.at(slice(-1, None)),
     )
     coarse = t[::thin]

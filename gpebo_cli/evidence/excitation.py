@@ -8,14 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.evidence.knowledge import Knowledge, knowledge, smallest_and_margin
+from gpebo_cli.evidence.knowledge import (
+    Knowledge,
+    knowledge,
+    least_share,
+    smallest_and_margin,
+    smallest_at_most,
+)
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
-from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
 from gpebo_cli.regression.linear import LinearRegression
@@ -27,7 +34,7 @@ WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hun
 _TINY = float(np.finfo(float).tiny)
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
-_AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
+_AROUND = np.concatenate([-(0.0625 ** np.arange(5.0)), [0.0], 0.0625 ** np.arange(4.0, -1.0, -1.0)])
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -50,6 +57,7 @@ class Excitation:
     weakest_direction: Direction  # in units of each parameter's own size
     parameters: tuple[str, ...]
     final: Knowledge  # at the last of the times
+    least_share: OnDemand[Array] = OnDemand()  # (N,) of all parameters' ``known.share``
     known: OnDemand[Knowledge] = OnDemand()
     gram_eigenvalues: OnDemand[Array] = OnDemand()  # (N, p)
     # (N,) smallest eigenvalue of the Gram matrix over the trailing window
@@ -77,7 +85,7 @@ class Excitation:
         """From when on all parameters are well determined."""
         if not self.parameters or not (self.final.share >= WELL).all():
             return None
-        return max(t for t in self.determined_at.values() if t is not None)
+        return since(self.t, self.least_share[:, None] >= WELL)[0]
 
 
 def assess(
@@ -109,15 +117,21 @@ def assess(
             level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
+    def hopeless(at: Array, matrices: Array) -> BoolArray:
+        """Where ψ is surely not exciting yet."""
+        if rho is not None or not enough:
+            return np.zeros(len(at), dtype=bool)
+        return smallest_at_most(matrices, *evidence.beside(at)) < enough
+
     # What is looked at later must not keep what is known of this regression by now.
     later = replace(evidence, regression=replace(regression))
-    final, t_c = evidence.known(t[-1:]), _first_time(gram, ends, reached)
+    final, t_c = evidence.known(t[-1:]), _first_time(gram, ends, reached, hopeless)
     # From when on parameters are well determined a run says in any case.
     said = t_c is not None and (final.share >= WELL).all()
     return excitation(
         final, t, regression.parameters, float(evidence.eigenvalues(t[-1:])[0, 0]) if p else 0.0,
-        evidence.known() if said else later.known, later.eigenvalues, later.levels, window, t_c,
-        rho,
+        evidence.least_share() if said else later.least_share, later.known, later.eigenvalues,
+        later.levels, window, t_c, rho,
     )
 
 
@@ -142,6 +156,10 @@ class _Evidence:
         at = self.t if at is None else at
         return knowledge(self.regression.gram(at), *self.beside(at))
 
+    def least_share(self) -> Array:
+        """Of the parameters, (N,)."""
+        return least_share(self.regression.gram(self.t), *self.beside(self.t))
+
     def eigenvalues(self, at: Array | None = None) -> Array:
         """Those of G, (M, p)."""
         gram = self.regression.gram(self.t if at is None else at)
@@ -154,8 +172,9 @@ class _Evidence:
 
 def excitation(
     final: Knowledge, t: Array, parameters: Sequence[str], lambda_min: float,
-    known: Knowledge | Callable[[], Knowledge], gram_eigenvalues: Array | Callable[[], Array],
-    pe_level: Array | Callable[[], Array], window: float, t_c: float | None, rho: float | None,
+    least_share: Array | Callable[[], Array], known: Knowledge | Callable[[], Knowledge],
+    gram_eigenvalues: Array | Callable[[], Array], pe_level: Array | Callable[[], Array],
+    window: float, t_c: float | None, rho: float | None,
 ) -> Excitation:
     """The evidence from what is known at the times t (N,) and at their end."""
     spectrum = final.eigenvalues[-1]
@@ -167,7 +186,7 @@ def excitation(
         window=window, is_ie=t_c is not None, t_c=t_c, rho=rho, lambda_min=lambda_min,
         condition=max(spectrum.tolist(), default=1.0) / smallest if smallest > 0.0 else np.inf,
         weakest_direction=Direction(dict(zip(parameters, (sign * v).tolist(), strict=True))),
-        parameters=tuple(parameters), known=known, final=final,
+        parameters=tuple(parameters), least_share=least_share, known=known, final=final,
     )
 
 
@@ -195,28 +214,38 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 
 
 def _first_time(
-    gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array]
+    gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array],
+    hopeless: Callable[[Array, Array], BoolArray],
 ) -> float | None:
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
     Each round looks where the polynomial through the four nearest points, t of the level, points,
-    else the secant, and at distances around it that fall by fours.
+    else the secant, and at distances around it that fall by sixteens.
 
     Args:
         gram: G (p, p), perhaps with further columns.
         edges: right ends of its elements (K,).
         reached: of times (M,) and G there.
+        hopeless: where it is surely negative, of the same.
     """
     mesh = gram.mesh
     ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
     if len(ends) == 0:
         return None
-    before = int(ends[0]) + 1  # elements up to the first at whose end it is reached
-    t = mesh.points[:before].ravel()
-    level = reached(t, gram.values[:before].reshape(len(t), *gram.values.shape[2:]))
-    level = level.reshape(before, -1)
-    k = int(np.argmax((level >= 0.0).any(axis=1)))
-    points, level = mesh.points[k], level[k]
+
+    def within(elements: IntArray, of: Callable[[Array, Array], Any]) -> Any:
+        """At the points of some elements, (M, s + 1)."""
+        t, G = mesh.points[elements], gram.values[elements]
+        return of(t.ravel(), G.reshape(t.size, *G.shape[2:])).reshape(t.shape)
+
+    # Up to the first element at whose end it is reached.
+    some = np.arange(ends[0] + 1)
+    if len(some) > 1:
+        some = some[np.append(~within(some[:-1], hopeless).all(axis=1), True)]
+    levels = within(some, reached)
+    first = int(np.argmax((levels >= 0.0).any(axis=1)))
+    k = int(some[first])
+    points, level = mesh.points[k], levels[first]
     piece = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
     for _ in range(_ROUNDS):
         j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1

@@ -9,12 +9,14 @@ no such size: its parameter is not seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 
 from gpebo_cli import kernels
+from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 
 _UNRESOLVED = 10.0  # tolerances of the terms of a column of ψ: what is smaller says nothing
@@ -146,6 +148,27 @@ def smallest_and_margin(
     spectrum = kernels.laws.eigenvalues(normalised)
     smallest = np.maximum(spectrum.min(axis=1, initial=1.0), 0.0)
     return smallest, np.asarray(smallest / level.max(axis=1, initial=_SINGULAR))
+
+
+def smallest_at_most(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Array:
+    """Bounds (M,) of ``smallest``, at less expense: 1/‖N⁻¹v‖ for the last one's weakest v."""
+    normalised, _, _ = _normalised(gram, terms, elapsed, tol)
+    bounds = np.einsum("mjj->mj", normalised).min(axis=1, initial=1.0)
+    v = np.linalg.eigh(normalised[-1])[1][:, :1]
+    seen = np.flatnonzero(bounds > 0.0)
+    with suppress(np.linalg.LinAlgError):
+        bounds[seen] = 1.0 / np.linalg.norm(np.linalg.solve(normalised[seen], v), axis=(1, 2))
+    return np.asarray(bounds)
+
+
+def least_share(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Array:
+    """The smallest ``share`` (M,) of :func:`knowledge`, by inverses; 1 if there is nothing."""
+    normalised, _, _ = _normalised(gram, terms, elapsed, tol)
+    least = np.einsum("mjj->mj", normalised).min(axis=1, initial=1.0)
+    seen = np.flatnonzero(least > 0.0)
+    inverse = np.abs(np.einsum("mjj->mj", inverses(normalised[seen])))
+    least[seen] = 1.0 / inverse.max(axis=1, initial=1.0)
+    return np.asarray(least)
 
 
 def _normalised(

@@ -242,8 +242,9 @@ class Online:
         known, eigenvalues = known.at(shown), eigenvalues[shown]
         return excitation(
             known.at(_NEWEST), t[shown], self.parameters,
-            float(eigenvalues[-1, 0]) if self.parameters else 0.0, known, eigenvalues, pe_level,
-            window, self._t_c[0] if self._t_c[1] is None else self._t_c[1], self._rho,
+            float(eigenvalues[-1, 0]) if self.parameters else 0.0,
+            lambda: known.share.min(axis=1, initial=1.0), known, eigenvalues, pe_level, window,
+            self._t_c[0] if self._t_c[1] is None else self._t_c[1], self._rho,
         )
 
     @property
