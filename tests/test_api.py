@@ -264,6 +264,12 @@ def test_a_folder_of_ones_own(tmp_path):
     assert load_plant("mine", tmp_path).source.endswith("mine.yaml")
 
 
+def test_plants_and_regressions_in_folders_of_their_group_are_found():
+    assert run("published/hires", observer="none", time={"samples": 11}).details.system.n == 8
+    found = run(regression="published/sdu_drem", time={"samples": 11})
+    assert found.details.system.name == "sdu_drem"
+
+
 def test_check_is_the_commands():
     assert all(a.holds for a in check("circuit"))
     failed = [a.name for a in check("circuit", observer={"regression": "paper"}) if not a.holds]
@@ -279,6 +285,8 @@ WRONG = [
     ({"estimator": {"name": "drem", "gama": 1}}, "estimator.gama: no such key"),
     ({"plant": "circut"}, "did you mean circuit?"),
     ({"plant": "nowhere.yaml"}, "nowhere.yaml: there is no such file"),
+    ({"plant": "./nowhere"}, "./nowhere: there is no such file"),
+    ({"plant": "published/nowhere"}, "plant=published/nowhere: there is no such plant"),
     ({"plant": 3}, "plant: expected a name, a path, a mapping or a DescriptorSystem, got 3"),
     ({"plant": {"name": "a"}}, "plant a: states is missing"),
     ({"time": 3}, 'time: expected a mapping such as {"horizon": 10}, got 3'),

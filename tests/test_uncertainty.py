@@ -118,6 +118,9 @@ def fed(system, estimator, t, u, y, hold="linear", noise=None, cut=0):
     ("zoh", {"name": "least_squares"}), ("linear", {"name": "least_squares", "beta": 0.3}),
     ("linear", {"name": "ls_drem", "beta": 0.2}), ("zoh", {"name": "drem", "gamma": 1e8}),
     ("linear", {"name": "drem", "gamma": 1e8}),
+    ("zoh", {"name": "gradient"}), ("linear", {"name": "gradient"}), ("zoh", {"name": "mre"}),
+    ("linear", {"name": "mre"}), ("linear", {"name": "fct", "gamma": 1e8}),
+    ("zoh", {"name": "exciting"}), ("linear", {"name": "exciting", "kappa": 1e7}),
 ])
 def test_at_samples_they_are_what_each_error_by_itself_does(hold, estimator):
     """Estimates are affine in every sample: the variances of the responses add up, to rounding."""

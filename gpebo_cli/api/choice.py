@@ -87,9 +87,8 @@ def _as_path(given: object) -> str | None:
     """``given`` as the path of a file, or None if it is no path."""
     if isinstance(given, os.PathLike):
         return str(os.fspath(given))
-    if isinstance(given, str) and (given.endswith((".yaml", ".yml")) or os.sep in given):
-        return given
-    return None
+    own = isinstance(given, str) and given.startswith((os.sep, ".", "~"))
+    return str(given) if own or str(given).endswith((".yaml", ".yml")) else None
 
 
 def _named(

@@ -6,20 +6,30 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._mixing import mix
+from gpebo_cli.estimators._recursive import (
+    Filter,
+    KreisselmeierFilter,
+    ScalarLaw,
+    inverse_sampled,
+    mix_sampled,
+)
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import per_name
 
 
@@ -134,6 +144,62 @@ def energy_requirement(
         ),
         gain=least,
     )
+
+
+def finite_time(mu: float) -> tuple[str, float, str]:
+    """What e^{−γ∫Δ²} ≤ 1 − μ needs: the condition's name, γ∫Δ², and what for."""
+    return "IE with enough ∫Δ²", float(-np.log1p(-mu)), "finite-time convergence"
+
+
+def sampled_requirement(law: ScalarLaw, condition: str) -> Requirement:
+    """γ∫Δ² so far, at the smallest gain and in the group that has the least."""
+    gain, energy = float(law.gains.min()), float(law.energy.min())
+    if law.mu == 1.0:
+        return energy_requirement(condition, gain, energy)
+    condition, needed, needed_for = finite_time(law.mu)
+    return energy_requirement(condition, gain, energy, needed, needed_for)
+
+
+class Mixed(NamedTuple):
+    """𝐘 = Δη at K samples, as :class:`ScalarLaw` takes it, in one group."""
+
+    delta: Array  # Δ (K, 1)
+    quotient: Array  # η̄ = 𝐘/Δ (K, 1, p)
+    usable: BoolArray  # where η̄ is more than rounding (K, 1)
+    behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]]
+
+
+class SampledMixing:
+    """The filters of an estimator at samples, and mixing."""
+
+    def __init__(self, settings: FilteredEstimator, parameters: Sequence[str]) -> None:
+        self._filter = KreisselmeierFilter(filter_rates(settings.rates, parameters), settings.seen)
+
+    def update(self, regression: SampledRegression) -> Mixed:
+        """Δ and η̄ at K samples."""
+        extended = self._filter.update(regression)
+        return Mixed(
+            *mix_sampled(extended),
+            lambda: ([self._filter.errors(regression)], [inverse_sampled(extended)]),
+        )
+
+
+class RecursiveMixed:
+    """Filters of held signals, mixing, a closed-form step of the scalar law."""
+
+    def __init__(self, settings: FilteredEstimator, parameters: Sequence[str], mu: float) -> None:
+        self._mixing = SampledMixing(settings, parameters)
+        gains = settings.gains("gamma", parameters)
+        self._law = ScalarLaw(settings.start(parameters), gains, 1, mu)
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each."""
+        return self._law.update(regression, *self._mixing.update(regression))
+
+    @property
+    def requirement(self) -> Requirement:
+        """γ∫Δ² so far."""
+        return sampled_requirement(self._law, "Δ not in L2")
 
 
 # (η̂ (g, M, P), γ∫Δ² (g, M, P or 1), η̂ at the start (1 or g, 1, P)) -> estimates

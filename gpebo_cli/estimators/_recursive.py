@@ -23,7 +23,6 @@ from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, transpose
 from gpebo_cli.regression.errors import ErrorRecursion
 from gpebo_cli.regression.estimator import SampledEstimates
-from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.samples import SampledRegression
 
 _SINGULAR = 1e-10  # below this ratio of singular values of S the quotient 𝐘/Δ is rounding
@@ -83,10 +82,14 @@ def quotient_of(s: Spectrum) -> tuple[Array, BoolArray, Array]:
 
 
 class ScalarLaw:
-    """η̂' = γΔ(𝐘 − Δη̂) over each sample, for D mixed regressions with g gains each."""
+    """η̂' = γΔ(𝐘 − Δη̂) over each sample, for D mixed regressions with g gains each.
 
-    def __init__(self, start: Array, gains: Array, groups: int) -> None:
-        self._gains = gains  # (g, 1 or p)
+    With μ < 1 its estimates are (η̂ − w_c η̂(0))/(1 − w_c), w_c = min(e^{−γ∫Δ²}, 1 − μ).
+    """
+
+    def __init__(self, start: Array, gains: Array, groups: int, mu: float = 1.0) -> None:
+        self._start, self.mu = start, mu
+        self.gains = gains  # (g, 1 or p)
         self._eta = np.broadcast_to(start, (groups, len(gains), len(start))).copy()
         self._delta = np.zeros((1, groups))
         self._quotient: Array | None = None
@@ -111,10 +114,8 @@ class ScalarLaw:
         before = quotient[:1] if self._quotient is None else self._quotient
         previous = np.concatenate([before, quotient[:-1]])
         had = np.concatenate([self._usable, usable[:-1]])
-        earlier = np.concatenate([self._delta, delta[:-1]])
-        square = delta**2 if regression.hold == "zoh" else 0.5 * (delta**2 + earlier**2)
-        energy = np.where(usable, regression.steps[:, None] * square, 0.0)  # (K, D)
-        x = self._gains * energy[:, :, None, None]  # (K, D, g, 1 or p)
+        energy = np.where(usable, over_steps(regression, delta**2, self._delta**2), 0.0)  # (K, D)
+        x = self.gains * energy[:, :, None, None]  # (K, D, g, 1 or p)
         decay = np.exp(-x)
         new, old = quotient[:, :, None], np.where(had[..., None], previous, quotient)[:, :, None]
         # η̄ is that of the new sample, or linear in ∫Δ² between both.
@@ -122,51 +123,78 @@ class ScalarLaw:
         eta = affine_scan(decay, of_new * new + of_old * old, self._eta)[1:]  # (K, D, g, p)
         self._eta, self._delta = eta[-1], delta[-1:]
         self._quotient, self._usable = quotient[-1:], usable[-1:]
-        self.energy = self.energy + energy.sum(axis=0)
+        so_far = self.energy + np.cumsum(energy, axis=0)
+        self.energy = so_far[-1]
+        w_c = np.minimum(np.exp(-self.gains * so_far[:, :, None, None]), 1.0 - self.mu)
+        eta = (eta - w_c * self._start) / (1.0 - w_c)
         K, D, g, p = eta.shape
         parameters = np.moveaxis(eta.reshape(K, D * g, p), 0, 1)
         shown = delta.T if D == 1 else np.repeat(delta.T, g, axis=0)
         return SampledEstimates(
             parameters, shown,
-            behind and (lambda: self._errors(*behind(), decay, of_new, of_old, had)),
+            behind and (lambda: self._errors(*behind(), decay, of_new, of_old, had, 1.0 - w_c)),
         )
 
     def _errors(
         self, filters: Sequence[Filter], quotients: Sequence[Array],
-        decay: Array, of_new: Array, of_old: Array, had: BoolArray,
+        decay: Array, of_new: Array, of_old: Array, had: BoolArray, share: Array,
     ) -> tuple[ErrorRecursion, ...]:
         """The systems of the filters' errors and of η̂ behind them, for each case of an update."""
         out = []
         before, self._inverse = self._inverse, [Q[-1:] for Q in quotients]
         for d, (own, Q) in enumerate(zip(filters, quotients, strict=True)):
             previous = np.concatenate([Q[:1] if before is None else before[d], Q[:-1]])
-            K, p = own.decay.shape
-            A_f = own.decay[:, :, None] * np.eye(p)
+            A_f, (K, p, s) = own.A, Q.shape
             for g in range(decay.shape[2]):
-                keep, new, old = (
+                keep, new, old, by = (
                     np.broadcast_to(each[:, d, g], (K, p))[:, :, None]
-                    for each in (decay, of_new, of_old)
+                    for each in (decay, of_new, of_old, share)
                 )
                 both = had[:, d, None, None]
                 on_new, on_old = (new + np.where(both, 0.0, old)) * Q, np.where(both, old, 0.0)
-                A = np.zeros((K, 2 * p, 2 * p))
-                A[:, :p, :p] = A_f
-                A[:, p:, :p] = on_new @ A_f + on_old * previous
-                A[:, p:, p:] = keep * np.eye(p)
+                A = np.zeros((K, s + p, s + p))
+                A[:, :s, :s] = A_f
+                A[:, s:, :s] = on_new @ A_f + on_old * previous
+                A[:, s:, s:] = keep * np.eye(p)
                 out.append(ErrorRecursion(
                     A, np.concatenate([own.old, on_new @ own.old], axis=1),
                     np.concatenate([own.new, on_new @ own.new], axis=1),
-                    np.broadcast_to(np.eye(p, 2 * p, p), (K, p, 2 * p)),
+                    np.eye(p, s + p, s) / by,
                 ))
         return tuple(out)
 
 
 class Filter(NamedTuple):
-    """δ𝒴' = decay δ𝒴 + old δY + new δY' over each step."""
+    """δf' = A δf + old δY + new δY' over each step, f = 𝒴 or more."""
 
-    decay: Array  # (K, p)
-    old: Array  # (K, p, rows)
-    new: Array  # (K, p, rows)
+    A: Array  # (K, s, s)
+    old: Array  # (K, s, rows)
+    new: Array  # (K, s, rows)
+
+
+def over_steps(regression: SampledRegression, values: Array, before: Array) -> Array:
+    """Integrals over the steps (K, …) of values at the samples, (1, …) the one ``before`` them."""
+    old, new = (share.reshape(-1, *[1] * (values.ndim - 1)) for share in regression.shares)
+    return np.asarray(old * np.concatenate([before, values[:-1]]) + new * values)
+
+
+def between(
+    regression: SampledRegression, quotient: Array, usable: BoolArray, before: Array,
+    was_usable: BoolArray,
+) -> Array:
+    """η̄ (K, D, p) of the steps: that of the new sample, or with lines between samples the mean.
+
+    Args:
+        regression: its hold rule.
+        quotient: η̄ at the samples (K, D, p).
+        usable: where it is more than rounding (K, D).
+        before: η̄ at the sample before (1, D, p).
+        was_usable: whether it was usable (1, D).
+    """
+    if regression.hold == "zoh":
+        return quotient
+    both = (usable & np.concatenate([was_usable, usable[:-1]]))[..., None]
+    return np.where(both, 0.5 * (quotient + np.concatenate([before, quotient[:-1]])), quotient)
 
 
 def integrating(regression: SampledRegression, beta: float) -> Filter:
@@ -174,7 +202,7 @@ def integrating(regression: SampledRegression, beta: float) -> Filter:
     p = regression.p
     into = transpose(regression.rows[..., :p])
     old, new = (share[:, None, None] for share in regression.shares)
-    decay = np.repeat(np.exp(-beta * regression.steps)[:, None], p, axis=1)
+    decay = np.exp(-beta * regression.steps)[:, None, None] * np.eye(p)
     return Filter(decay, old * into[:-1], new * into[1:])
 
 
@@ -187,16 +215,18 @@ def _shares(x: Array, decay: Array, hold: str) -> tuple[Array, Array]:
 
 
 class KreisselmeierFilter:
-    """Ω' = −Λ(Ω − ψᵀψ) over each sample, exact for ψᵀψ as the hold rule has it between samples."""
+    """Ω' = −Λ(Ω − ζψ) over each sample, exact for ζψ as the hold rule has it between samples.
 
-    def __init__(self, rates: Array) -> None:
-        self._rates = rates[:, None]  # one per row
+    ζ (p, rows) is ψᵀ, or what else an extension makes of ψ.
+    """
+
+    def __init__(self, rates: Array, seen: Callable[[Array], Array] = transpose) -> None:
+        self._seen, self._rates = seen, rates[:, None]  # one per row
         self._value = np.zeros((len(rates), len(rates) + 1))
 
     def update(self, regression: SampledRegression) -> Array:
         """[Ω | 𝒴] (K, p, p + 1) at the samples."""
-        p = regression.p
-        outer = outer_products(regression.rows[..., :p], regression.rows[..., p])
+        outer = self._seen(regression.rows[..., : regression.p]) @ regression.rows
         decay, of_new, of_old = self._steps(regression)
         values = affine_scan(decay, of_new * outer[1:] + of_old * outer[:-1], self._value)[1:]
         self._value = values[-1]
@@ -210,8 +240,8 @@ class KreisselmeierFilter:
     def errors(self, regression: SampledRegression) -> Filter:
         """What the filter of 𝒴 does to errors of Y."""
         decay, of_new, of_old = self._steps(regression)
-        into = transpose(regression.rows[..., : regression.p])
-        return Filter(decay[..., 0], of_old * into[:-1], of_new * into[1:])
+        into = self._seen(regression.rows[..., : regression.p])
+        return Filter(decay * np.eye(regression.p), of_old * into[:-1], of_new * into[1:])
 
 
 def inverse_sampled(extended: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Vector laws η̂' = Γ Mᵀ (b − N η̂), integrated so that no gain is too large."""
+"""Vector laws η̂' = Γ Mᵀ (b − N η̂), integrated, or stepped, so that no gain is too large."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
@@ -123,3 +124,40 @@ class VectorEstimates:
             for gain, own in zip(gains, starts, strict=True)
         ])
         return eta.reshape(*eta.shape[:3], *self.realisations)
+
+
+class VectorRecursion:
+    """η̂ + L (b − N η̂) from sample to sample, for g gains; it remembers how errors shrank."""
+
+    def __init__(self, start: Array, gains: Array) -> None:
+        self._smallest = float(gains.min())
+        self.roots = np.sqrt(np.broadcast_to(gains, (len(gains), len(start))))  # Γ^½
+        self._eta = np.broadcast_to(start, self.roots.shape).copy()
+        self._left = np.broadcast_to(np.eye(len(start)), (*self._eta.shape, len(start)))
+
+    def advance(self, L: Array, N: Array, b: Array) -> tuple[Array, Array]:
+        """η̂ (g, K, p) at K samples, for L (g, K, p, m), N (K, m, p) and b (K, m).
+
+        Returns:
+            also I − L N (g, K, p, p), by which errors shrink
+        """
+        shrunk = np.eye(N.shape[-1]) - L @ N
+        out = np.empty((*L.shape[:2], N.shape[-1]))
+        for k in range(len(N)):
+            rest = b[k] - self._eta @ N[k].T
+            self._eta = self._eta + (L[:, k] @ rest[..., None])[..., 0]
+            self._left = shrunk[:, k] @ self._left
+            out[:, k] = self._eta
+        return out, shrunk
+
+    @property
+    def requirement(self) -> Requirement:
+        """How much of an error of the start is left, at most, measured in the units of Γ^½."""
+        scaled = self._left * self.roots[:, None] / self.roots[:, :, None]
+        left = float(np.linalg.norm(scaled, 2, axis=(1, 2)).max(initial=0.0))
+        needed = float(np.exp(-DECAY))
+        return Requirement(
+            "PE", left <= needed, {"left_of_the_initial_error": left, "needed": needed},
+            f"{left:.3g} of the initial error is left, at the smallest gain {self._smallest:.3g}; "
+            f"the aim is {needed:.2g}",
+        )

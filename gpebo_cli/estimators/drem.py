@@ -9,22 +9,13 @@ import numpy as np
 
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._following import follow
-from gpebo_cli.estimators._mixed import FilteredEstimator, energy_requirement, filter_rates
-from gpebo_cli.estimators._recursive import (
-    KreisselmeierFilter,
-    ScalarLaw,
-    inverse_sampled,
-    mix_sampled,
-)
+from gpebo_cli.estimators._mixed import FilteredEstimator, RecursiveMixed, filter_rates
 from gpebo_cli.estimators._vector import VectorEstimates
-from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered
-from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.samples import SampledRegression
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +38,9 @@ class Drem(FilteredEstimator):
         """The size of ψᵀψ, which no filter exceeds."""
         return largest(regression.outer.values)
 
-    def recursive(self, parameters: Sequence[str]) -> RecursiveDrem:
-        """The estimator at samples."""
-        return RecursiveDrem(self, parameters)
+    def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
+        """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
+        return RecursiveMixed(self, parameters, mu)
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
@@ -64,29 +55,6 @@ class Drem(FilteredEstimator):
         return follow(
             extended, dynamics, self.start(names), self.gains("gamma", names), np.asarray(t)
         )
-
-
-class RecursiveDrem:
-    """DREM at samples: filters of held signals, mixing, a closed-form step of the scalar law."""
-
-    def __init__(self, settings: Drem, parameters: Sequence[str]) -> None:
-        self._filter = KreisselmeierFilter(filter_rates(settings.rates, parameters))
-        self._gains = settings.gains("gamma", parameters)
-        self._law = ScalarLaw(settings.start(parameters), self._gains, 1)
-
-    def update(self, regression: SampledRegression) -> SampledEstimates:
-        """Take K samples and give the estimates at each."""
-        extended = self._filter.update(regression)
-        return self._law.update(
-            regression, *mix_sampled(extended),
-            lambda: ([self._filter.errors(regression)], [inverse_sampled(extended)]),
-        )
-
-    @property
-    def requirement(self) -> Requirement:
-        """γ∫Δ² so far."""
-        energy = float(self._law.energy[0])
-        return energy_requirement("Δ not in L2", float(self._gains.min()), energy)
 
 
 ESTIMATOR = Drem

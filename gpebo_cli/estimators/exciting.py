@@ -17,7 +17,7 @@ what stands here, and need not be the paper's own.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -25,17 +25,27 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import MixedEstimates, filter_rates, scalar_errors
+from gpebo_cli.estimators._mixed import (
+    MixedEstimates,
+    SampledMixing,
+    filter_rates,
+    sampled_requirement,
+    scalar_errors,
+)
 from gpebo_cli.estimators._mixing import filled, mix
+from gpebo_cli.estimators._recursive import Filter, ScalarLaw, between, over_steps
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.drem import Drem
+from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import number
 
 _TOLERANCE, _MAX_ELEMENTS = 1e-12, 200_000
@@ -58,15 +68,18 @@ class Exciting(GainEstimator):
     kappa: float = 1e10
     rates: object = field(default=None, metadata={"key": "lambda"})
 
+    @property
+    def linear(self) -> Drem:
+        """The estimator whose Δ and 𝐘 the new regressor is made of."""
+        return Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
+
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
         """Extend, mix, rotate, and keep what the closed form needs at the times t (M,).
 
         Raises:
             ConfigError: κ is not positive.
         """
-        inner = Drem(gamma=self.gamma, rates=self.rates, initial=self.initial).resume(
-            regression, t, ()
-        )
+        inner = self.linear.resume(regression, t, ())
         (path,) = inner.groups
         columns, turning = 1 + path.quotient.shape[-1], self._turning(path)
 
@@ -96,6 +109,14 @@ class Exciting(GainEstimator):
         quotient = filled(right / np.where(usable, new, 1.0)[..., None], usable)
         law = scalar_path(found.mesh, signals, new, quotient, np.asarray(t), None, path.floor)
         return replace(inner, groups=(law,), condition="IE")
+
+    def recursive(self, parameters: Sequence[str]) -> RecursiveExciting:
+        """The estimator at samples.
+
+        Raises:
+            ConfigError: κ is not positive.
+        """
+        return RecursiveExciting(self, parameters)
 
     def _turning(self, path: ScalarPath) -> Callable[[Array, Array], Array]:
         """φ'/Δ² = κ (π/2) e^{−κ∫Δ²} at times (N,)."""
@@ -130,6 +151,72 @@ class Exciting(GainEstimator):
             return scalar_errors(filters, into, law.signals(t, inside)[0], e_2, gain)
 
         return tuple(partial(at, gain) for gain in self.gains("gamma", names))
+
+
+class RecursiveExciting:
+    """The rotation over each sample, exact for 𝐘/Δ as it is there or in the middle, and the law.
+
+    With c = e_1 + i e_2 and η̄ = 𝐘/Δ a turn by δ makes e^{iδ}(c + η̄) − η̄ of c.
+    """
+
+    def __init__(self, settings: Exciting, parameters: Sequence[str]) -> None:
+        p, gains = len(parameters), settings.gains("gamma", parameters)
+        self._mixing = SampledMixing(settings.linear, parameters)
+        self._kappa = number(settings.kappa, "estimator.kappa")
+        self._law = ScalarLaw(settings.start(parameters), gains, 1)
+        self._before = np.zeros((1, 1)), np.zeros((1, 1, p)), np.zeros((1, 1), bool)
+        self._energy, self._turned = 0.0, np.zeros(p, complex)  # ∫Δ², c e^{−iφ}
+        self._inverse: Array | None = None
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each."""
+        delta, quotient, usable, behind = self._mixing.update(regression)
+        square = delta**2
+        energy = np.where(usable, over_steps(regression, square, self._before[0]), 0.0)[:, 0]
+        had = np.concatenate([self._before[2], usable[:-1]])[:, 0]
+        mean = between(regression, quotient, usable, *self._before[1:])[:, 0]
+        self._before = square[-1:], quotient[-1:], usable[-1:]
+        so_far = np.cumsum(np.concatenate([[self._energy], energy]))
+        phi = -0.5 * np.pi * np.expm1(-self._kappa * so_far)
+        self._energy, turn = float(so_far[-1]), np.exp(1j * np.diff(phi))
+        new = np.sin(phi[1:])
+        steps = ((turn - 1.0) * np.exp(-1j * phi[1:]))[:, None] * mean
+        turned = self._turned + np.cumsum(steps, axis=0)
+        self._turned = turned[-1]
+        known = new > _KNOWN
+        e_2 = (turned * np.exp(1j * phi[1:, None])).imag
+        inverse = np.divide(1.0, new, out=np.zeros_like(new), where=known)
+
+        def errors() -> tuple[list[Filter], list[Array]]:
+            (own,), (Q,) = behind()
+            K, p = mean.shape
+            before = Q[:1] if self._inverse is None else self._inverse
+            previous, self._inverse = np.concatenate([before, Q[:-1]]), Q[-1:]
+            both = (regression.hold != "zoh") & had & usable[:, 0]
+            share = np.where(both, 0.5, 1.0)[:, None, None]
+            # δη̄ of a step is what follows from δ𝒴 before it and from both ends of it.
+            of_state = share * Q @ own.A + (1.0 - share) * previous
+            of_old, of_new = share * Q @ own.old, share * Q @ own.new
+            cos, sin, eye = turn.real[:, None, None], turn.imag[:, None, None], np.eye(p)
+            A = np.zeros((K, 3 * p, 3 * p))
+            A[:, :p, :p] = own.A
+            A[:, p : 2 * p, p:] = np.concatenate([cos * eye, -sin * eye], axis=2)
+            A[:, 2 * p :, p:] = np.concatenate([sin * eye, cos * eye], axis=2)
+            A[:, p:, :p] = np.concatenate([(cos - 1.0) * of_state, sin * of_state], axis=1)
+            old, new = (
+                np.concatenate([first, (cos - 1.0) * then, sin * then], axis=1)
+                for first, then in ((own.old, of_old), (own.new, of_new))
+            )
+            return [Filter(A, old, new)], [inverse[:, None, None] * np.eye(p, 3 * p, 2 * p)]
+
+        return self._law.update(
+            regression, new[:, None], (inverse[:, None] * e_2)[:, None], known[:, None], errors
+        )
+
+    @property
+    def requirement(self) -> Requirement:
+        """γ∫Φ_21² so far."""
+        return sampled_requirement(self._law, "IE")
 
 
 ESTIMATOR = Exciting

@@ -11,12 +11,13 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._mixed import MixedEstimates
+from gpebo_cli.estimators._mixed import MixedEstimates, finite_time
 from gpebo_cli.estimators._scalar import ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.estimators.ls_drem import LsDrem
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.estimator import Recursion
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.schema import number
@@ -84,6 +85,14 @@ class FiniteTime(ResumableEstimator):
             for i, errors in enumerate(self.inner.errors(regression, known))
         )
 
+    def recursive(self, parameters: Sequence[str]) -> Recursion:
+        """The estimator at samples: w_c is exact there, too.
+
+        Raises:
+            ConfigError: forgetting with a bound, which there is in continuous time only.
+        """
+        return self.inner.recursive(parameters, float(self.mu))
+
     def resume(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> MixedEstimates:
@@ -98,12 +107,9 @@ class FiniteTime(ResumableEstimator):
             w_c = np.minimum(np.exp(-energy), 1.0 - mu)
             return np.asarray((eta - w_c * start) / (1.0 - w_c))
 
+        condition, needed, needed_for = finite_time(mu)
         return replace(
-            inner,
-            transform=correct,
-            condition="IE with enough ∫Δ²",
-            needed=float(-np.log1p(-mu)),
-            needed_for="finite-time convergence",
+            inner, transform=correct, condition=condition, needed=needed, needed_for=needed_for
         )
 
 

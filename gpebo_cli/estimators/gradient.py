@@ -9,15 +9,20 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
+from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw, VectorRecursion
 from gpebo_cli.evidence.excitation import persistent
+from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
+from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.samples import SampledRegression
+
+_ALL = 10.0  # σ from which on e^{−σ²} is nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +67,10 @@ class Gradient(ResumableEstimator):
         gains = self._gains(regression)
         return tuple(partial(at, np.broadcast_to(gain, p)) for gain in gains)
 
+    def recursive(self, parameters: Sequence[str]) -> RecursiveGradient:
+        """The estimator at samples: exact for a ψ that is held between them."""
+        return RecursiveGradient(self, parameters)
+
     def _gains(self, regression: LinearRegression) -> Array:
         return self.gains("gamma", regression.parameters)
 
@@ -71,6 +80,42 @@ class Gradient(ResumableEstimator):
         """η̂' = 𝔸η̂ + 𝕓 + Γψᵀ(Y − ψη̂) at the times t (M,)."""
         plain = self.resume(regression, t, ())
         return replace(plain, law=replace(plain.law, dynamics=dynamics))
+
+
+class RecursiveGradient:
+    """The law over each sample, for ψ and Y as the hold rule has them between samples."""
+
+    def __init__(self, settings: Gradient, parameters: Sequence[str]) -> None:
+        gains = settings.gains("gamma", parameters)
+        self._law = VectorRecursion(settings.start(parameters), gains)
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each.
+
+        With ψΓ^½√h = U Σ Vᵀ a step is η̂ + Γ^½ V (1 − e^{−Σ²})/Σ Uᵀ √h (Y − ψη̂).
+        """
+        rows, p, roots = regression.weighted(), regression.p, self._law.roots[:, None, None]
+        U, sigma, Vt = np.linalg.svd(rows[..., :p] * roots, full_matrices=False)
+        done = -np.expm1(-np.minimum(sigma, _ALL) ** 2)
+        done = np.divide(done, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
+        L = transpose((U * done[..., None, :]) @ Vt * roots)
+        eta, shrunk = self._law.advance(L, rows[..., :p], rows[..., p])
+
+        def errors() -> tuple[ErrorRecursion, ...]:
+            """δη̂' = (I − LN) δη̂ + L δY, of every case."""
+            eye, r = np.eye(p)[None], regression.rows.shape[1]
+            old, new = (np.sqrt(share)[:, None, None] for share in regression.shares)
+            return tuple(
+                ErrorRecursion(A, old * own[..., :r], new * own[..., -r:], eye)
+                for own, A in zip(L, shrunk, strict=True)
+            )
+
+        return SampledEstimates(eta, None, errors)
+
+    @property
+    def requirement(self) -> Requirement:
+        """How far errors have shrunk so far."""
+        return self._law.requirement
 
 
 ESTIMATOR = Gradient

@@ -268,10 +268,9 @@ class RecursiveLeastSquares:
         def errors() -> tuple[ErrorRecursion, ...]:
             """δη̂ = αF δh_z."""
             filters = [integrating(regression, case["beta"]) for case in self._cases]
-            eye = np.eye(regression.p)
             return tuple(
                 ErrorRecursion(
-                    own.decay[:, :, None] * eye, own.old, own.new,
+                    own.A, own.old, own.new,
                     s.covariance(case["alpha"], case["f0"]),
                 )
                 for own, case, s in zip(filters, self._cases, spectra, strict=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._information import Information, Spectrum, check_held
-from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement, scalar_errors
+from gpebo_cli.estimators._mixed import MixedEstimates, sampled_requirement, scalar_errors
 from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import ScalarLaw, integrating, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
@@ -84,13 +84,13 @@ class LsDrem(ResumableEstimator):
         gains = self.gains("gamma", regression.parameters)
         return tuple(partial(at, case, info, gain) for case, info in pairs for gain in gains)
 
-    def recursive(self, parameters: Sequence[str]) -> RecursiveLsDrem:
-        """The estimator at samples.
+    def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveLsDrem:
+        """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law.
 
         Raises:
             ConfigError: forgetting with a bound, which there is in continuous time only.
         """
-        return RecursiveLsDrem(self, parameters)
+        return RecursiveLsDrem(self, parameters, mu)
 
     def resume(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
@@ -115,11 +115,11 @@ class LsDrem(ResumableEstimator):
 class RecursiveLsDrem:
     """LS+DREM at samples: least squares, mixing, and a closed-form step of the scalar law."""
 
-    def __init__(self, settings: LsDrem, parameters: Sequence[str]) -> None:
+    def __init__(self, settings: LsDrem, parameters: Sequence[str], mu: float) -> None:
         part = settings.least_squares
         self._part, self._cases = part.recursive(parameters), part.cases
-        self._gains = settings.gains("gamma", parameters)
-        self._law = ScalarLaw(settings.start(parameters), self._gains, len(self._cases))
+        gains = settings.gains("gamma", parameters)
+        self._law = ScalarLaw(settings.start(parameters), gains, len(self._cases), mu)
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
@@ -139,7 +139,7 @@ class RecursiveLsDrem:
     @property
     def requirement(self) -> Requirement:
         """γ∫Δ² so far."""
-        return energy_requirement("IE", float(self._gains.min()), float(self._law.energy.min()))
+        return sampled_requirement(self._law, "IE")
 
 
 def mix_least_squares(

@@ -15,15 +15,20 @@ import numpy as np
 from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import reached
-from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
+from gpebo_cli.estimators._recursive import KreisselmeierFilter, over_steps
+from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw, VectorRecursion
 from gpebo_cli.evidence.excitation import persistent
+from gpebo_cli.findings import Requirement
+from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered
-from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
+from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import number
 
 
@@ -76,6 +81,12 @@ class MemoryExtension(ResumableEstimator):
         plain = self._estimates(regression, filtered(regression.outer, rates, rates, dynamics), t)
         return replace(plain, law=replace(plain.law, dynamics=dynamics))
 
+    def recursive(self, parameters: Sequence[str]) -> RecursiveMemoryExtension:
+        """The estimator at samples."""
+        return RecursiveMemoryExtension(
+            self.gains("gamma", parameters), self._rates(len(parameters)), self.start(parameters)
+        )
+
     def _rates(self, p: int) -> Array:
         return np.full(p, number(self.rate, "estimator.lambda"))
 
@@ -100,6 +111,52 @@ class MemoryExtension(ResumableEstimator):
             realisations=regression.realisations,
             requirement=persistent(omega, float(gains.min())),
         )
+
+
+class RecursiveMemoryExtension:
+    """Filters of held signals, and the law over each sample for Ω and 𝒴 as they are on average."""
+
+    def __init__(self, gains: Array, rates: Array, start: Array) -> None:
+        self._filter = KreisselmeierFilter(rates)
+        self._law = VectorRecursion(start, gains)
+        self._before = np.zeros((1, len(start), len(start) + 1))
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each.
+
+        With Γ^½ ∫Ω Γ^½ = V M Vᵀ a step is η̂ + Γ^½ V (1 − e^{−M})/M Vᵀ Γ^½ (∫𝒴 − ∫Ω η̂).
+        """
+        extended, p = self._filter.update(regression), regression.p
+        whole = over_steps(regression, extended, self._before)
+        self._before = extended[-1:]
+        omega, roots = whole[..., :p], self._law.roots[:, None]
+        M, V = np.linalg.eigh(roots[..., None] * omega * roots[..., None, :])
+        V = roots[..., None] * V
+        # It is the mean of e^{−x} over 0 to M.
+        L = (V * mean_decay(np.maximum(M, 0.0))[..., None, :]) @ transpose(V)
+        eta, shrunk = self._law.advance(L, omega, whole[..., p])
+
+        def errors() -> tuple[ErrorRecursion, ...]:
+            """δ𝒴 of the filters, δη̂' = (I − L∫Ω) δη̂ + L ∫δ𝒴, of every case."""
+            own, K = self._filter.errors(regression), len(omega)
+            old, new = (share[:, None, None] for share in regression.shares)
+            out = []
+            for by, left in zip(L, shrunk, strict=True):
+                A = np.zeros((K, 2 * p, 2 * p))
+                A[:, :p, :p], A[:, p:, p:] = own.A, left
+                A[:, p:, :p] = by @ (old * np.eye(p) + new * own.A)
+                of_old, of_new = (
+                    np.concatenate([e, by @ (new * e)], axis=1) for e in (own.old, own.new)
+                )
+                out.append(ErrorRecursion(A, of_old, of_new, np.eye(p, 2 * p, p)[None]))
+            return tuple(out)
+
+        return SampledEstimates(eta, None, errors)
+
+    @property
+    def requirement(self) -> Requirement:
+        """How far errors have shrunk so far."""
+        return self._law.requirement
 
 
 ESTIMATOR = MemoryExtension

@@ -16,15 +16,18 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement
+from gpebo_cli.estimators._mixed import MixedEstimates, SampledMixing, energy_requirement
 from gpebo_cli.estimators._power import PowerLaw
+from gpebo_cli.estimators._recursive import between, over_steps
 from gpebo_cli.estimators._scalar import ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.samples import SampledRegression
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,14 +62,30 @@ class Power(ResumableEstimator):
             )
         return super().axes()
 
+    @property
+    def linear(self) -> Drem:
+        """The estimator with the same errors and a linear law."""
+        return Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
+
+    def recursive(self, parameters: Sequence[str]) -> RecursivePower:
+        """The finite-time law at samples.
+
+        Raises:
+            ConfigError: γ₂ is not zero; the fixed-time law has no closed form.
+        """
+        if self.gamma2:
+            raise ConfigError(
+                "estimator.gamma2 works in continuous time only; at samples leave it 0"
+            )
+        return RecursivePower(self, parameters)
+
     def resume(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> PowerEstimates:
         """Extend and mix as ``drem``, for the times t (M,)."""
-        linear = Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
-        inner = linear.resume(regression, t, known)
-        return PowerEstimates(**{**vars(inner), "condition": "IE with enough ∫|Δ|^(1+α)",
-                                 "alpha": self.alpha, "beta": self.beta, "gamma2": self.gamma2})
+        inner = self.linear.resume(regression, t, known)
+        own = {"alpha": self.alpha, "beta": self.beta, "gamma2": self.gamma2}
+        return PowerEstimates(**{**vars(inner), **own})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,15 +105,60 @@ class PowerEstimates(MixedEstimates):
         energy = float(Trajectory(path.mesh, powers).integral().final)
         start = np.repeat(self.start, path.quotient.shape[-1] // len(self.start))
         error = float(np.abs(path.quotient[-1, -1] - start).max(initial=0.0))
-        needed = error ** (1.0 - self.alpha) / (1.0 - self.alpha)
-        return energy_requirement(
-            self.condition, float(self.gains.min()), energy, max(needed, 1e-300),
-            "finite-time convergence", "∫|Δ|^(1+α)",
-        )
+        return power_requirement(self.alpha, float(self.gains.min()), energy, error)
 
     def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
         """η̂ (g, M, P) from ``start`` (P,) or (g, P) with the gains (g, P or 1)."""
         return PowerLaw(path, self.alpha, self.gamma2, self.beta).solve(start, gains)
+
+
+class RecursivePower:
+    """The law over each sample, exact where 𝐘/Δ is constant: as it is there, or in the middle.
+
+    The error e = 𝐘/Δ − η̂ has |e|^{1−α} = |e₀|^{1−α} − (1 − α) γ ∫|Δ|^{1+α}, until it is zero.
+    """
+
+    def __init__(self, settings: Power, parameters: Sequence[str]) -> None:
+        self._mixing = SampledMixing(settings.linear, parameters)
+        self._alpha, self._gains = settings.alpha, settings.gains("gamma", parameters)
+        self._start = settings.start(parameters)
+        self._eta = np.broadcast_to(self._start, (len(self._gains), len(self._start)))
+        self._before = np.zeros((1, 1)), np.zeros((1, 1, len(self._start))), np.zeros((1, 1), bool)
+        self._energy, self._error = 0.0, 0.0
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each; nobody knows how errors go through."""
+        delta, quotient, usable, _ = self._mixing.update(regression)
+        powers, rest = np.abs(delta) ** (1.0 + self._alpha), 1.0 - self._alpha
+        energy = np.where(usable, over_steps(regression, powers, self._before[0]), 0.0)
+        goal = between(regression, quotient, usable, *self._before[1:])[:, 0]
+        self._before = powers[-1:], quotient[-1:], usable[-1:]
+        out = np.empty((len(self._eta), len(goal), goal.shape[1]))
+        for k, towards in enumerate(goal):
+            error = towards - self._eta
+            left = np.abs(error) ** rest - rest * self._gains * energy[k, 0]
+            self._eta = towards - np.sign(error) * np.maximum(left, 0.0) ** (1.0 / rest)
+            out[:, k] = self._eta
+        self._energy += float(energy.sum())
+        if usable.any():
+            last = quotient[np.flatnonzero(usable[:, 0])[-1], 0]
+            self._error = float(np.abs(last - self._start).max(initial=0.0))
+        return SampledEstimates(out, delta.T)
+
+    @property
+    def requirement(self) -> Requirement:
+        """γ∫|Δ|^{1+α} so far."""
+        return power_requirement(
+            self._alpha, float(self._gains.min()), self._energy, self._error
+        )
+
+
+def power_requirement(alpha: float, gain: float, energy: float, error: float) -> Requirement:
+    """γ∫|Δ|^{1+α} against what errors of the start of this size need to be zero."""
+    needed = max(error ** (1.0 - alpha) / (1.0 - alpha), 1e-300)
+    return energy_requirement(
+        "IE with enough ∫|Δ|^(1+α)", gain, energy, needed, "finite-time convergence", "∫|Δ|^(1+α)"
+    )
 
 
 ESTIMATOR = Power
