@@ -21,12 +21,11 @@ from gpebo_cli.numerics.radau import RadauRule
 # that nobody announced then shows up as an unresolved element, not as a wrong number.
 _INSIDE = 1e-3
 FIRST_ELEMENTS = 24  # of a first mesh: enough nodes to notice a pulse, few enough to be free
-_CHUNK = 1 << 22  # numbers gathered at once when sampling
 _COEFFICIENTS = 4  # of the last ones, from which the next is predicted
 SHARE = 1e-3  # of the largest component: what is smaller is measured against that
 _FOOT = 1e-8  # of its final size: what a component was before may be that wrong
 _WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
-_MANY = 2000  # times, from which on sampling them by element pays
+_MANY = 1 << 16  # numbers, from which on sampling them by element pays
 _KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
 _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
 _JOINED = (8, 4, 2)  # as many elements become one
@@ -187,40 +186,30 @@ class Sampler:
     def __call__(self, values: Array) -> Array:
         """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
         flat = _flat(values)
-        grouped = None if flat.shape[2] <= _WIDE else self._grouped
+        columns = flat.shape[2]
+        grouped = None
+        if columns > _WIDE and columns * len(self.element) >= _MANY:
+            grouped = self._grouped
         if grouped is None:
             sampled = signals.sample(self.element, self.weights, flat)
         else:
-            sampled = self._by_element(flat, *grouped)
+            sampled = np.empty((len(self.element), columns))
+            for element, first, last in grouped:
+                some = slice(first, last)
+                np.matmul(self.weights[some], flat[element], out=sampled[some])
         return sampled.reshape(len(sampled), *values.shape[2:])
 
     @cached_property
-    def _grouped(self) -> tuple[IntArray, IntArray, int] | None:
-        """Where many ascending times share elements: the elements, their ends in t, most times."""
-        if len(self.element) < _MANY:
-            return None
-        changes = np.diff(self.element)
-        ends = np.append(np.flatnonzero(changes) + 1, len(self.element))
-        most = int(np.diff(ends, prepend=0).max())
-        if (changes < 0).any() or len(ends) * most > 2 * len(self.element):
-            return None
-        return self.element[ends - 1], ends, most
+    def _grouped(self) -> list[tuple[int, int, int]] | None:
+        """Where several times in a row share elements: these, and the first and last of the times.
 
-    def _by_element(self, flat: Array, elements: IntArray, ends: IntArray, most: int) -> Array:
-        """One product per element with all its times: nothing is gathered per time."""
-        out = np.empty((len(self.element), flat.shape[2]))
-        starts = np.append(0, ends[:-1])
-        points, columns = flat.shape[1:]
-        chunk = max(1, _CHUNK // max(1, most * (points + columns)))
-        for i in range(0, len(elements), chunk):
-            first, last = starts[i], ends[min(i + chunk, len(ends)) - 1]
-            counts = (ends - starts)[i : i + chunk]
-            group = np.repeat(np.arange(len(counts)), counts)
-            place = np.arange(last - first) - np.repeat(starts[i : i + chunk] - first, counts)
-            weights = np.zeros((len(counts), most, points))
-            weights[group, place] = self.weights[first:last]
-            out[first:last] = np.matmul(weights, flat[elements[i : i + chunk]])[group, place]
-        return out
+        Then there is one product for each element, and nothing is gathered for each time.
+        """
+        changes = np.append(np.flatnonzero(np.diff(self.element)) + 1, len(self.element))
+        if 2 * len(changes) > len(self.element):
+            return None
+        ends, elements = changes.tolist(), self.element[changes - 1].tolist()
+        return list(zip(elements, [0, *ends[:-1]], ends, strict=True))
 
 
 @dataclass(frozen=True, eq=False)

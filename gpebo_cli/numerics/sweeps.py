@@ -29,6 +29,7 @@ from gpebo_cli.numerics.collocation import (
     unresolved_signals,
 )
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
+from gpebo_cli.numerics.linalg import largest_within
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, legendre_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray
@@ -360,7 +361,7 @@ def _terms(A: Sparse, f: Array, mesh: Mesh, values: Array) -> tuple[Array, Array
     """What right ends are made of, and what rounding of the equation's terms moves, (K, d, c)."""
     K, points, n, _ = values.shape
     h, late = mesh.steps[:, None, None], np.abs(mesh.edges[1:, None, None])
-    sizes = np.abs(values).max(axis=1)
+    sizes = largest_within(values)
     within = A.product(A.sizes(mesh), sizes)
     moved = np.zeros_like(within)
     if len(A.entries) > 1:
@@ -383,7 +384,7 @@ def _errors(
     """
     A, values, rule = found.A, found.trajectory.values, mesh.rule
     K, points, n, columns = values.shape
-    sizes = np.abs(values).max(axis=1)
+    sizes = largest_within(values)
     size, flat = np.maximum(sizes, _TINY), values.reshape(K, points, n * columns)
     tail = legendre_tail(flat, rule, size.reshape(K, -1)).reshape(sizes.shape)
     # As in numerics.errors; and what sweeps have not finished.

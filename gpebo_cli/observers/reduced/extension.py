@@ -14,7 +14,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution, solve
-from gpebo_cli.numerics.linalg import exact_product
+from gpebo_cli.numerics.linalg import exact_product, largest_over_time
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import (
@@ -401,8 +401,10 @@ class Extension:
 
         And ln ‖Φ(end)‖₂, which is 0 at the start.
         """
-        Phi = comparable(self.solution.trajectory.values[..., 1 + q :], self.units)
-        return largest_entry(Phi), log_norm(Phi[-1, -1])
+        values = self.solution.trajectory.values
+        some = np.stack([values[0, 0], largest_over_time(values, 2), values[-1, -1]])
+        Phi = comparable(some[..., 1 + q :], self.units)
+        return largest_entry(Phi), log_norm(Phi[-1])
 
 
 def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
