@@ -32,29 +32,10 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ belo
     from gpebo_cli.simulation.simulate import simulate
 
 __all__ = [
-    "ConfigError",
-    "DescriptorSystem",
-    "GpeboError",
-    "Measurements",
-    "ModelError",
-    "Names",
-    "Result",
-    "SolverError",
-    "SolverSettings",
-    "TimeSettings",
-    "__version__",
-    "available",
-    "check",
-    "from_control",
-    "from_file",
-    "from_matrices",
-    "from_mechanics",
-    "from_netlist",
-    "load_plant",
-    "observe",
-    "run",
-    "simulate",
-    "system_from_functions",
+    "ConfigError", "DescriptorSystem", "GpeboError", "Measurements", "ModelError", "Names",
+    "Result", "SolverError", "SolverSettings", "TimeSettings", "__version__", "available", "check",
+    "from_control", "from_file", "from_matrices", "from_mechanics", "from_netlist", "load_plant",
+    "observe", "run", "simulate", "system_from_functions",
 ]
 
 _HOMES = {

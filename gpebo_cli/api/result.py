@@ -282,9 +282,7 @@ class Result:
         draw_on(ax, panels[figure])
         return ax
 
-    def save(
-        self, folder: str | os.PathLike[str], figures: bool | Sequence[str] = True
-    ) -> Path:
+    def save(self, folder: str | os.PathLike[str], figures: bool | Sequence[str] = True) -> Path:
         """Write the folder that ``gpebo run`` writes: tables, summary, configuration, figures.
 
         Args:

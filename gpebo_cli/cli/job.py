@@ -56,9 +56,7 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     return Job(settings, system, configuration.complete(config, settings))
 
 
-def run_job(
-    job: Job, folder: str, *, quiet: bool = False, loud: bool = False
-) -> RunResult:
+def run_job(job: Job, folder: str, *, quiet: bool = False, loud: bool = False) -> RunResult:
     """Run the experiment of ``job`` and write ``folder``.
 
     Args:

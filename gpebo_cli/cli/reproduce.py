@@ -210,9 +210,7 @@ def atlas(findings: Sequence[Finding], folder: Path) -> str:
             name = f"`{f.recipe}`: {f.title}; {f.reference}{marked}"
             file = _PICTURES / f"{f.recipe}.png"
             picture = f"![{f.title}]({file.as_posix()})" if (folder / file).exists() else ""
-            notes += [
-                f"| `{f.recipe}` | {_NOTES[key]} | {text} |" for key, text in f.notes.items()
-            ]
+            notes += [f"| `{f.recipe}` | {_NOTES[key]} | {text} |" for key, text in f.notes.items()]
         previous = f.recipe
         ours = "needs their data" if f.ours is None else f"{f.ours:.7g}"
         lines.append(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 
-GROUPS = (
-    "plant", "regression", "data", "observer", "estimator", "solver", "noise", "experiment",
-)
+GROUPS = ("plant", "regression", "data", "observer", "estimator", "solver", "noise", "experiment")
 
 DATA_GROUPS = ("plant", "data", "observer", "estimator", "solver", "noise")
 """Groups whose files are values only; an experiment may choose from groups and set anything."""

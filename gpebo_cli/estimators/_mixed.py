@@ -116,9 +116,7 @@ def scalar_errors(
     return filtered_errors(filters, into, law, weighted * adjugate)
 
 
-def reached(
-    size: float, extended: Trajectory, known: Sequence[ExtensionState]
-) -> ExtensionState:
+def reached(size: float, extended: Trajectory, known: Sequence[ExtensionState]) -> ExtensionState:
     """[Ω | 𝒴] (p, p + 1) at the end, of filters whose input is of that ``size``."""
     level = max(size, known[0].level) if known else size
     return ExtensionState(extended.final, level, surplus=1.0)

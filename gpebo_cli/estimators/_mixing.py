@@ -47,9 +47,7 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
 def mixed_points(extended: Array) -> tuple[Array, Array]:
     """Δ (K, s + 1) and η̄ = 𝐘/Δ, usable everywhere, (K, s + 1, p c) of [Ω | 𝒴] (.., p, p + c)."""
     points = extended.shape[:-2]
-    delta, quotient, usable = determinant_and_quotient(
-        extended.reshape(-1, *extended.shape[-2:])
-    )
+    delta, quotient, usable = determinant_and_quotient(extended.reshape(-1, *extended.shape[-2:]))
     return delta.reshape(points), filled(quotient.reshape(*points, -1), usable.reshape(points))
 
 

@@ -74,9 +74,7 @@ def quotient_of(s: Spectrum) -> tuple[Array, BoolArray, Array]:
     """𝐘/Δ = G_z⁻¹ h_z (K, p), where it is more than rounding (K,), and G_z⁻¹ there (K, p, p)."""
     largest = s.eigenvalues[:, -1:] if s.eigenvalues.shape[1] else np.zeros((len(s.memory), 1))
     usable = (s.eigenvalues > _SINGULAR**2 * largest).all(axis=1) & (largest[:, 0] > 0.0)
-    inverse = np.divide(
-        1.0, s.eigenvalues, out=np.zeros_like(s.eigenvalues), where=usable[:, None]
-    )
+    inverse = np.divide(1.0, s.eigenvalues, out=np.zeros_like(s.eigenvalues), where=usable[:, None])
     whole = (s.vectors * inverse[:, None]) @ transpose(s.vectors)
     return (s.vectors @ (inverse[..., None] * s.rotated))[..., 0], usable, whole
 
@@ -249,9 +247,7 @@ def inverse_sampled(extended: Array) -> Array:
     omega = extended[..., :-1]
     delta, adjugate, reciprocal = determinant_and_adjugate_action(omega)
     usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))[:, None, None]
-    return np.divide(
-        adjugate, delta[:, None, None], out=np.zeros_like(omega), where=usable
-    )
+    return np.divide(adjugate, delta[:, None, None], out=np.zeros_like(omega), where=usable)
 
 
 def mix_sampled(extended: Array) -> tuple[Array, Array, BoolArray]:

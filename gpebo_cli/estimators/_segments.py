@@ -35,9 +35,7 @@ def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
     )
 
 
-def tuned_for(
-    estimator: Estimator, requirement: Callable[[Estimator], Requirement]
-) -> Estimator:
+def tuned_for(estimator: Estimator, requirement: Callable[[Estimator], Requirement]) -> Estimator:
     """:func:`tuned`, by what data make an estimator require."""
     if isinstance(estimator, GainEstimator | Several):
         return estimator.tuned(requirement)
@@ -116,9 +114,7 @@ class Chain:
     def delta(self, t: Array) -> Array | None:
         """Δ at the times t (M,); it jumps where the parameters do."""
         cuts = np.searchsorted(t, [reset.time for reset in self.resets], side="left")
-        pieces = [
-            part.delta(own) for part, own in zip(self.parts, np.split(t, cuts), strict=True)
-        ]
+        pieces = [part.delta(own) for part, own in zip(self.parts, np.split(t, cuts), strict=True)]
         found = [piece for piece in pieces if piece is not None]
         return np.concatenate(found, axis=1) if found else None
 

@@ -60,9 +60,7 @@ class Gradient(ResumableEstimator):
         def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
             psi = regression.psi(t, inside)
             into = gain[:, None] * transpose(psi)
-            return ErrorSystem(
-                -into @ psi, into, np.eye(p)[None], np.zeros((1, p, psi.shape[1]))
-            )
+            return ErrorSystem(-into @ psi, into, np.eye(p)[None], np.zeros((1, p, psi.shape[1])))
 
         gains = self._gains(regression)
         return tuple(partial(at, np.broadcast_to(gain, p)) for gain in gains)

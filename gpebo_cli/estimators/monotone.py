@@ -155,9 +155,7 @@ class MonotoneEstimates:
     def requirement(self) -> Requirement:
         """γμ∫Δ² over the horizon: the error has shrunk by its exponential."""
         energy = float(self.path.energy_at_t[-1])
-        return energy_requirement(
-            "Δ not in L2", float(self.gains.min()), energy, DECAY / self.mu
-        )
+        return energy_requirement("Δ not in L2", float(self.gains.min()), energy, DECAY / self.mu)
 
 
 ESTIMATOR = Monotone

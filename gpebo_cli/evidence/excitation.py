@@ -342,9 +342,7 @@ def between(signal: Trajectory, a: Array, b: Array) -> Array:
 def _window_sums(signal: Trajectory, start: Sampler, stop: Sampler, columns: int) -> Array:
     """:func:`between` of the first columns, with the times where these samplers look."""
     mesh, R = signal.mesh, signal.mesh.rule.integration
-    totals = mesh.steps[:, None, None] * np.tensordot(
-        signal.values[:, 1:], R[-1], axes=(1, 0)
-    )
+    totals = mesh.steps[:, None, None] * np.tensordot(signal.values[:, 1:], R[-1], axes=(1, 0))
 
     def within(places: Sampler) -> Array:
         """Integrals from the left ends of elements to places in them."""

@@ -68,9 +68,7 @@ class Knowledge:
     @cached_property
     def clarity(self) -> Array:
         """The eigenvalues over the levels of their vectors, (M, p): below 1 they are rounding."""
-        return np.asarray(
-            self.eigenvalues / np.einsum("mjk,mj->mk", self.vectors**2, self.level)
-        )
+        return np.asarray(self.eigenvalues / np.einsum("mjk,mj->mk", self.vectors**2, self.level))
 
     @cached_property
     def _kernel(self) -> tuple[Array, Array]:
@@ -182,16 +180,12 @@ def _normalised(
     return gram[..., :p] * factors[:, :, None] * factors[:, None, :], sizes, level
 
 
-def knowledge_of_roots(
-    root: Array, terms: Array, elapsed: Array, tol: float = 1e-12
-) -> Knowledge:
+def knowledge_of_roots(root: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:
     """The same from S (M, p, p) with SᵀS = G: no squares are formed."""
     sizes, level = _sizes(np.linalg.norm(root, axis=1), terms, elapsed, tol)
     scaled = root / sizes[:, None, :] * np.where(level < 1.0, 1.0, 0.0)[:, None, :]
     _, sigma, Vt = np.linalg.svd(scaled)
-    return Knowledge(
-        sizes, sigma[:, ::-1] ** 2, np.swapaxes(Vt, 1, 2)[:, :, ::-1], level
-    )
+    return Knowledge(sizes, sigma[:, ::-1] ** 2, np.swapaxes(Vt, 1, 2)[:, :, ::-1], level)
 
 
 def _sizes(sizes: Array, terms: Array, elapsed: Array, tol: float) -> tuple[Array, Array]:

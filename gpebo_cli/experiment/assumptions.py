@@ -70,9 +70,7 @@ def examine(
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if seen is None and settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
-        seen = Measurements(
-            recording.inputs, recording.outputs, derivatives=recording.derivatives
-        )
+        seen = Measurements(recording.inputs, recording.outputs, derivatives=recording.derivatives)
     if seen is not None:
         return Examination(()) if observer is None else _of_observer(
             observer, settings, system, seen, [], both
@@ -81,9 +79,7 @@ def examine(
     try:
         simulation = simulation_of(system, settings.time, settings.solver)
     except ModelError as error:
-        return Examination(
-            (Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),)
-        )
+        return Examination((Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),))
     found += of_simulation(system, simulation)
     if observer is None:
         return Examination(tuple(found))

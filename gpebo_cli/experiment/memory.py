@@ -15,9 +15,7 @@ from gpebo_cli.settings import Settings
 _HELD = 4  # arrays of every kind that are alive at once; measured
 
 
-def check(
-    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cases: int
-) -> None:
+def check(settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cases: int) -> None:
     """Refuse a run that would need more memory than one run may.
 
     Args:

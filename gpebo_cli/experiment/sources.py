@@ -195,9 +195,7 @@ def _judged(system: DescriptorSystem) -> slice:
     return slice(system.q if system.theta_varies else None)
 
 
-def _sample_recording(
-    system: DescriptorSystem, recording: Recording, t: Array
-) -> RecordingResult:
+def _sample_recording(system: DescriptorSystem, recording: Recording, t: Array) -> RecordingResult:
     table, sampled = recording.table, recording.sampled(t)
     return RecordingResult(
         t=t,
@@ -245,9 +243,7 @@ def _sample_simulation(
         differential=structure.d,
         algebraic=structure.a,
         initial_state=simulation.initial_state,
-        moved=tuple(
-            _changes(system, system.initial_state, simulation.initial_state, start, size)
-        ),
+        moved=tuple(_changes(system, system.initial_state, simulation.initial_state, start, size)),
         jumps=tuple(jumps),
         impulses=tuple(impulses),
         error_estimate=simulation.error_estimate,

@@ -82,9 +82,7 @@ def _explains(fit: Fit, case: int) -> str:
     if fit.white and (fit.ratio is None or fit.ratio < _MORE):
         return f": the estimates explain the data up to white noise{noise}"
     if fit.white:
-        return (
-            f": the residual is white{noise}, which suggests a noisier sensor than was said"
-        )
+        return f": the residual is white{noise}, which suggests a noisier sensor than was said"
     return (
         f": the residual{noise and noise + ','} is not white (its correlation is "
         f"{np.abs(fit.correlation).max():.2f}), which "

@@ -10,9 +10,9 @@ import keyword
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.cluster.hierarchy import DisjointSet
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
@@ -93,6 +93,8 @@ def examine(netlist: Netlist, file: str) -> Topology:
     Raises:
         ConfigError: a floating node, a loop of voltage sources, or a cutset of current sources.
     """
+    from scipy.cluster.hierarchy import DisjointSet  # a third of a second to import
+
     branches = [e for e in netlist.elements if e.kind != "K"]
     nodes = {node for e in branches for node in e.nodes}
     if GROUND not in nodes:
@@ -128,7 +130,7 @@ def examine(netlist: Netlist, file: str) -> Topology:
                 "voltage would be anything"
             )
     return Topology(
-        tuple(_loops(branches)), tuple(_cutsets(branches, nodes)),
+        tuple(_loops(branches)), tuple(_cutsets(branches, DisjointSet(nodes))),
         all(e.kind in "RLCVIS" for e in netlist.elements),
     )
 
@@ -185,9 +187,11 @@ def _path(branches: Sequence[Element], start: str, stop: str) -> list[str] | Non
     return reached.get(stop)
 
 
-def _cutsets(branches: Sequence[Element], nodes: set[str]) -> Iterable[tuple[str, ...]]:
-    """Inductors and current sources around each part that nothing else connects to ground."""
-    rest = DisjointSet(nodes)
+def _cutsets(branches: Sequence[Element], rest: Any) -> Iterable[tuple[str, ...]]:
+    """Inductors and current sources around each part that nothing else connects to ground.
+
+    Nodes are joined in ``rest``, a ``DisjointSet`` of them.
+    """
     for e in branches:
         if e.kind not in "LIGF":
             for pair in _branches_of(e):

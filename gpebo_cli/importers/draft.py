@@ -241,9 +241,7 @@ class PlantDraft:
             pairs = zip(written, notes, strict=True)
             body = [line for row, note in pairs for line in (f"  # {note}", row)]
         else:
-            body = [
-                f"{row:<{longest}}  # {note}" for row, note in zip(written, notes, strict=True)
-            ]
+            body = [f"{row:<{longest}}  # {note}" for row, note in zip(written, notes, strict=True)]
         return [f"{matrix}:", *body]
 
 

@@ -187,9 +187,7 @@ def _modelica(path: Path) -> dict[str, Any]:
     names = (("states", "stateVars"), ("inputs", "inputVars"), ("outputs", "outputVars"),
              ("initial_state", "x0"))
     for key, word in names:
-        line = re.search(
-            rf"(?ms)^\s*(?:local\s+)?{word}\s*=\s*[\[{{](.*?)[\]}}]\s*;?\s*$", text
-        )
+        line = re.search(rf"(?ms)^\s*(?:local\s+)?{word}\s*=\s*[\[{{](.*?)[\]}}]\s*;?\s*$", text)
         if line is None:
             continue
         if key == "initial_state":

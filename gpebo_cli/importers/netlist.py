@@ -260,18 +260,14 @@ class _Reader:
             else:
                 self._element(line, place, nodes, known, prefix)
 
-    def _parameter(
-        self, name: str, value: str, scope: Mapping[str, str], place: Place
-    ) -> str:
+    def _parameter(self, name: str, value: str, scope: Mapping[str, str], place: Place) -> str:
         taken = {key.lower() for key in self.parameters}.union(RESERVED, keyword.kwlist)
         while name.lower() in taken:
             name += "_"
         self.parameters[name] = self.value(value, scope, place, name)
         return name
 
-    def value(
-        self, text: str, scope: Mapping[str, str], place: Place, what: str
-    ) -> float | str:
+    def value(self, text: str, scope: Mapping[str, str], place: Place, what: str) -> float | str:
         """A number, or an expression translated into the language of plants."""
         inner = text[1:-1] if text.startswith("{") and text.endswith("}") else text
         plain = number(inner.strip())

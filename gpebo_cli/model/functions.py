@@ -186,9 +186,7 @@ class FunctionCoefficients:
                 )
         return found
 
-    def _call(
-        self, name: str, function: Function, t: Any, signals: Array | None, away: Any
-    ) -> Any:
+    def _call(self, name: str, function: Function, t: Any, signals: Array | None, away: Any) -> Any:
         """The function at times t + away (N, 1), signals being the polynomials that they are."""
         arguments: list[Any] = []
         if signals is not None:
@@ -199,9 +197,7 @@ class FunctionCoefficients:
         t = t + away[:, 0] if np.iscomplexobj(away) else t
         try:
             value = function(t, *arguments[: _arguments(function) - 1])
-            value = np.asarray(
-                self._picked(name, value) if name in self.places else value
-            )
+            value = np.asarray(self._picked(name, value) if name in self.places else value)
         except TypeError as error:
             if not np.iscomplexobj(t):
                 raise
@@ -328,9 +324,7 @@ def system_from_functions(
                 signals[key] = frozenset(inputs if count == 2 else (*inputs, *outputs))
         else:
             given: Any = entry
-            value = np.asarray(
-                given.toarray() if is_sparse(given) else given, dtype=np.float64
-            )
+            value = np.asarray(given.toarray() if is_sparse(given) else given, dtype=np.float64)
             if value.shape != shapes[key]:
                 raise ConfigError(
                     f"plant {name}: {key} has shape {value.shape}, expected {shapes[key]} "

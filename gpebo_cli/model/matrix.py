@@ -139,9 +139,7 @@ def _by_place(
     return [sorted(row.items()) for row in grid]
 
 
-def _place(
-    plant: str, where: str, label: str, side: Side, places: Mapping[str, int]
-) -> int:
+def _place(plant: str, where: str, label: str, side: Side, places: Mapping[str, int]) -> int:
     """Number of a row or column by its name, or by its number from 0 on."""
     label = label.strip()
     if label in places:

@@ -238,8 +238,7 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
     system = plant_from_mapping(
         {
             "states": [], "E": [], "A": [], "initial_state": [],
-            **{k: v for k, v in mapping.items()
-               if k not in ("signals", "Y", "psi", "S", "box")},
+            **{k: v for k, v in mapping.items() if k not in ("signals", "Y", "psi", "S", "box")},
             "inputs": signals,
             "outputs": [] if right is not None else [f"Y_{i + 1}" for i in range(count)],
             **own,
@@ -270,9 +269,7 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         if len(texts) != count:
             raise ConfigError(f"{where}: Y has {len(texts)} entries and psi has {count} rows")
         Y = record([read(value, f"Y[{i}]") for i, value in enumerate(texts)])
-    return TextRegression(
-        system, tuple(operators.found.values()), record(psi), Y, parametrisation
-    )
+    return TextRegression(system, tuple(operators.found.values()), record(psi), Y, parametrisation)
 
 
 def _parametrisation(

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 _SHOWN_CASES = 12
 
 
-def case_rows(
-    result: RunResult, chosen: Iterable[int] | None = None
-) -> list[dict[str, float]]:
+def case_rows(result: RunResult, chosen: Iterable[int] | None = None) -> list[dict[str, float]]:
     """Gains and metrics of cases (None: all), named as in ``cases.csv``; none if unestimated."""
     estimation, metrics = result.estimation, result.metrics
     if estimation is None or metrics is None:

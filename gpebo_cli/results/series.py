@@ -64,19 +64,17 @@ def blocks(panels: Sequence[Panel]) -> list[Block]:
     for panel in panels[:MAX_PANELS]:
         for curve in panel.curves:
             name = f"{panel.label}: {curve.label}" if curve.label else panel.label
-            columns: tuple[Column, ...] = (
-                Column(name, drawn(panel, curve), panel.log, panel.size),
-            )
+            columns = [Column(name, drawn(panel, curve), panel.log, panel.size)]
             if curve.down_to is not None:
                 lower = Column(f"{name}, lower edge", curve.down_to, panel.log, panel.size)
-                columns = (*columns, lower)
+                columns.append(lower)
             for k, block in enumerate(found):
                 if np.array_equal(block.x, curve.x):
                     found[k] = Block(block.name, block.x, (*block.columns, *columns))
                     break
             else:
                 x = panel.axis.name
-                found.append(Block(f"{x} of {name}" if found else x, curve.x, columns))
+                found.append(Block(f"{x} of {name}" if found else x, curve.x, tuple(columns)))
         if panel.vertical is not None:
             time, name = panel.vertical
             found.append(Block(name, np.array([time]), ()))
@@ -99,9 +97,7 @@ def reference_text(panels: Sequence[Panel]) -> str:
     """The first block in 41 rows and 10 digits: small enough to be committed."""
     first = blocks(panels)[0]
     rows = np.unique(np.linspace(0, len(first.x) - 1, _REFERENCE_ROWS).round().astype(np.intp))
-    columns = tuple(
-        Column(c.name, c.values[rows], c.log, c.size) for c in first.columns
-    )
+    columns = tuple(Column(c.name, c.values[rows], c.log, c.size) for c in first.columns)
     return csv_text([Block(first.name, first.x[rows], columns)], digits=10)
 
 

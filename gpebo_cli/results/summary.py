@@ -105,9 +105,7 @@ def _change(change: StateChange) -> dict[str, float]:
     return {"from": change.given, "to": change.used, "change": change.used - change.given}
 
 
-def _simulation(
-    system: DescriptorSystem, simulation: SimulationResult | None
-) -> dict[str, Any]:
+def _simulation(system: DescriptorSystem, simulation: SimulationResult | None) -> dict[str, Any]:
     """Index, consistent start and jumps of the simulated plant; None for each of a recording."""
     if simulation is None:
         keys = ("index", "strangeness_index", "differential", "algebraic", "initial_state",

@@ -115,8 +115,7 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
             [{str(k): None if v is None else finite(v) for k, v in case.items()}
              for case in content["cases"]],
         )
-    except (ConfigError, OSError, ValueError, KeyError, TypeError, AttributeError,
-            RecursionError):
+    except (ConfigError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return missing
 
 

@@ -20,18 +20,6 @@ from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shor
 from gpebo_cli.model.expressions.tape import Assembly, Tape, record, taylor
 
 __all__ = [
-    "RESERVED",
-    "Assembly",
-    "Bounds",
-    "Expression",
-    "Tape",
-    "breakpoints",
-    "breakpoints_of_tape",
-    "divisors_of",
-    "parse",
-    "record",
-    "resolved",
-    "shorten",
-    "signal",
-    "taylor",
+    "RESERVED", "Assembly", "Bounds", "Expression", "Tape", "breakpoints", "breakpoints_of_tape",
+    "divisors_of", "parse", "record", "resolved", "shorten", "signal", "taylor",
 ]
