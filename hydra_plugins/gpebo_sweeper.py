@@ -33,18 +33,9 @@ class GpeboSweeper(BasicSweeper):
     """
 
     def __init__(
-        self,
-        max_batch_size: int | None = None,
-        params: dict[str, str] | None = None,
-        resume: str | None = None,
-        *,
-        fail_fast: bool = False,
-        dry_run: bool = False,
-        quiet: bool = False,
+        self, max_batch_size: int | None = None, params: dict[str, str] | None = None, **_: object
     ) -> None:
         super().__init__(max_batch_size, params)
-        self._resume, self._fail_fast, self._dry_run = resume, fail_fast, dry_run
-        self._quiet = quiet
 
     def sweep(self, arguments: list[str]) -> Any:
         """Run the jobs of ``arguments`` and of ``params``; arguments win.
@@ -53,7 +44,7 @@ class GpeboSweeper(BasicSweeper):
             GpeboError: a job failed or has no result; the table has been written then.
         """
         from gpebo_cli.cli.arguments import logspace
-        from gpebo_cli.cli.sweep import Orders, check_number, run_sweep
+        from gpebo_cli.cli.sweep import check_number, run_sweep
 
         if self.config is None or self.launcher is None or self.hydra_context is None:
             raise RuntimeError("sweep() before setup()")  # Hydra never does
@@ -65,10 +56,7 @@ class GpeboSweeper(BasicSweeper):
         parsed = parser.parse_overrides([*stored, *arguments])
         check_number(parsed)
         (jobs,) = self.split_arguments(parsed, None)
-        orders = Orders(
-            self._resume, self._fail_fast, self._dry_run, self.max_batch_size, self._quiet
-        )
-        run_sweep(jobs, orders, self.config, self.launcher, loader)
+        run_sweep(jobs, self.config, self.launcher, loader)
 
 
 ConfigStore.instance().store(

@@ -8,7 +8,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -55,17 +55,6 @@ _MAX_JOBS = 100_000
 _SUBDIR = "${hydra:job.num}"
 
 
-@dataclass(frozen=True)
-class Orders:
-    """How a sweep is run: the words of the command line that are not Hydra's."""
-
-    resume: str | None
-    fail_fast: bool
-    dry_run: bool
-    max_batch_size: int | None
-    quiet: bool = False  # nothing on stdout and on a terminal
-
-
 def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
     """Run one job and record what became of it, in whatever process this is.
 
@@ -110,18 +99,14 @@ def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
 
 
 def run_sweep(
-    jobs: Sequence[Sequence[str]],
-    orders: Orders,
-    config: DictConfig,
-    launcher: Launcher,
-    loader: ConfigLoader,
+    jobs: Sequence[Sequence[str]], config: DictConfig, launcher: Launcher, loader: ConfigLoader
 ) -> None:
     """Run those of ``jobs`` that are not done, write ``results.csv``, print its beginning.
 
     Args:
         jobs: the overrides of each job; its number is its place here.
-        orders: where to go on, when to stop.
-        config: the composed configuration the jobs start from.
+        config: the composed configuration the jobs start from; ``hydra.sweeper`` says where to go
+            on and when to stop.
         launcher: Hydra's, which runs :func:`run_sweep_job` somewhere and returns when all is done.
         loader: composes the configuration of a job.
 
@@ -129,6 +114,7 @@ def run_sweep(
         ConfigError: a job cannot be composed, or the folder has another sweep.
         GpeboError: a job failed or has no result.
     """
+    orders = config.hydra.sweeper
     folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()
     plan = Plan(tuple(map(_overrides, jobs)), _digest(config))
     _refuse_subdir(config)
@@ -186,7 +172,7 @@ def _launch(
     jobs: Sequence[Sequence[str]],
     waiting: Sequence[int],
     folder: Path,
-    orders: Orders,
+    orders: DictConfig,
     launcher: Launcher,
     errors: dict[int, str],
 ) -> str:

@@ -60,18 +60,16 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
 
 @np.errstate(all="ignore")  # as in a run
 def examine(
-    settings: Settings, system: DescriptorSystem, seen: Measurements | None = None, *,
-    both: bool = False,
+    settings: Settings, system: DescriptorSystem, *, both: bool = False
 ) -> Examination:
-    """:func:`check`, with what can be known; of given signals the observer's part only.
+    """:func:`check`, with what can be known; of a recording the observer's part only.
 
     ``both``: where the observer may choose, evidence of the form that it does not take, too.
     """
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
-    if seen is None and settings.data.name == "csv":
+    if settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
         seen = Measurements(recording.inputs, recording.outputs, derivatives=recording.derivatives)
-    if seen is not None:
         return Examination(()) if observer is None else _of_observer(
             observer, settings, system, seen, [], both
         )

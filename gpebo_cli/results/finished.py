@@ -167,8 +167,6 @@ def span(folder: Path) -> tuple[float, float]:
             last = stream.read().splitlines()[-1]
         k = names.index("t")
         return float(first.split(b",")[k]), float(last.split(b",")[k])
-    except OSError as error:
-        raise GpeboError(f"{path}: {error.strerror or error}") from error
     except (ValueError, IndexError):
         raise GpeboError(f"{path}: not the signals of a run") from None
 
@@ -245,8 +243,6 @@ def read_summary(folder: Path) -> dict[str, Any]:
     path = folder / "summary.json"
     try:
         content = strict_json(_bytes(path))
-    except OSError as error:
-        raise GpeboError(f"{path}: {error.strerror or error}") from error
     except (ValueError, RecursionError):
         raise GpeboError(f"{path}: not JSON") from None
     if not isinstance(content, dict):
@@ -291,8 +287,6 @@ def read_columns(path: Path, *filled: str, present: Sequence[str] = ()) -> dict[
     try:
         content = _bytes(path)
         header, *rows = csv.reader(content.decode().splitlines())
-    except OSError as error:
-        raise GpeboError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise GpeboError(f"{path}, line {line}: not UTF-8 text") from None

@@ -8,6 +8,7 @@ product grow exponentially); ``d`` is one more node, resolved by Taylor arithmet
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -102,18 +103,24 @@ def _fold(function: Callable[..., float], *values: float) -> Node:
     return number(result)
 
 
+def _is(a: Node, value: float) -> bool:
+    return a.is_number and a.value == value
+
+
+def _sum(a: Node, b: Node, sign: float) -> tuple[float, float] | None:
+    """(c, s) of a ± b."""
+    if a.affine is None or b.affine is None:
+        return None
+    return a.affine[0] + sign * b.affine[0], a.affine[1] + sign * b.affine[1]
+
+
 def add(a: Node, b: Node) -> Node:
     """a + b."""
     if a.is_number and b.is_number:
-        return _fold(lambda x, y: x + y, a.value, b.value)
-    if a.is_number and a.value == 0.0:
+        return _fold(operator.add, a.value, b.value)
+    if _is(a, 0.0):
         return b
-    if b.is_number and b.value == 0.0:
-        return a
-    affine = None
-    if a.affine and b.affine:
-        affine = (a.affine[0] + b.affine[0], a.affine[1] + b.affine[1])
-    return _node("add", a, b, affine=affine)
+    return a if _is(b, 0.0) else _node("add", a, b, affine=_sum(a, b, 1.0))
 
 
 def negative(a: Node) -> Node:
@@ -128,40 +135,34 @@ def negative(a: Node) -> Node:
 def subtract(a: Node, b: Node) -> Node:
     """a - b."""
     if a.is_number and b.is_number:
-        return _fold(lambda x, y: x - y, a.value, b.value)
-    if a.is_number and a.value == 0.0:
+        return _fold(operator.sub, a.value, b.value)
+    if _is(a, 0.0):
         return negative(b)
-    if b.is_number and b.value == 0.0:
-        return a
-    affine = None
-    if a.affine and b.affine:
-        affine = (a.affine[0] - b.affine[0], a.affine[1] - b.affine[1])
-    return _node("subtract", a, b, affine=affine)
+    return a if _is(b, 0.0) else _node("subtract", a, b, affine=_sum(a, b, -1.0))
 
 
 def multiply(a: Node, b: Node) -> Node:
     """a b. A factor 0 is not folded: 0 log(t) must keep failing where log(t) does."""
     if a.is_number and b.is_number:
-        return _fold(lambda x, y: x * y, a.value, b.value)
-    if a.is_number and a.value == 1.0:
+        return _fold(operator.mul, a.value, b.value)
+    if _is(a, 1.0):
         return b
-    if b.is_number and b.value == 1.0:
+    if _is(b, 1.0):
         return a
+    factor, other = (a, b) if a.is_number else (b, a)
     affine = None
-    if a.is_number and b.affine:
-        affine = (a.value * b.affine[0], a.value * b.affine[1])
-    elif b.is_number and a.affine:
-        affine = (a.affine[0] * b.value, a.affine[1] * b.value)
+    if factor.is_number and other.affine:
+        affine = (factor.value * other.affine[0], factor.value * other.affine[1])
     return _node("multiply", a, b, affine=affine)
 
 
 def divide(a: Node, b: Node) -> Node:
     """a / b."""
-    if b.is_number and b.value == 0.0:
+    if _is(b, 0.0):
         raise FoldError("it divides by zero")
     if a.is_number and b.is_number:
-        return _fold(lambda x, y: x / y, a.value, b.value)
-    if b.is_number and b.value == 1.0:
+        return _fold(operator.truediv, a.value, b.value)
+    if _is(b, 1.0):
         return a
     affine = (a.affine[0] / b.value, a.affine[1] / b.value) if b.is_number and a.affine else None
     return _node("divide", a, b, affine=affine)
@@ -170,7 +171,7 @@ def divide(a: Node, b: Node) -> Node:
 def power(a: Node, b: Node) -> Node:
     """a ** b: a power with a constant exponent, else exp(b log a), which needs a > 0."""
     if a.is_number and b.is_number:
-        return _fold(lambda x, y: x**y, a.value, b.value)
+        return _fold(operator.pow, a.value, b.value)
     if not b.is_number:
         return function("exp", multiply(b, function("log", a)))
     if b.value == 0.0:
@@ -186,24 +187,11 @@ def sign(x: float) -> float:
 
 
 FUNCTIONS: dict[str, Callable[[float], float]] = {
-    "sin": math.sin,
-    "cos": math.cos,
-    "tan": math.tan,
-    "exp": math.exp,
-    "log": math.log,
-    "sqrt": math.sqrt,
-    "sinh": math.sinh,
-    "cosh": math.cosh,
-    "tanh": math.tanh,
-    "asin": math.asin,
-    "acos": math.acos,
-    "atan": math.atan,
-    "asinh": math.asinh,
-    "acosh": math.acosh,
-    "atanh": math.atanh,
-    "erf": math.erf,
-    "abs": abs,
-    "sign": sign,
+    **{name: getattr(math, name) for name in (
+        "sin", "cos", "tan", "exp", "log", "sqrt", "sinh", "cosh", "tanh", "asin", "acos", "atan",
+        "asinh", "acosh", "atanh", "erf",
+    )},
+    "abs": abs, "sign": sign,
 }
 
 
