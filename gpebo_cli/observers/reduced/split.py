@@ -224,8 +224,10 @@ def split_by_svd(
                 f"plant {system.name}: the kernel of E turns from t = {t[int(np.argmax(off))]:.6g} "
                 "on; start a run there, or make E smooth"
             )
+    along = units_along(basis, units)[:, None]
+    inverse = along * without_rounding((dual * units / along) @ pinv_E)
     return Split(
-        rank=n_a, basis=basis, dual=dual, pinv=without_rounding(dual @ (own * pinv_E)),
+        rank=n_a, basis=basis, dual=dual, pinv=inverse,
         turn=(dual * units) @ (S + transpose(S)) / units,
         equations=without_rounding(orthonormal_complement(U1)),
         kernel=own * V2, projector=own * P / units, frame=None,
