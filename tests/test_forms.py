@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from plants import shipped
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
@@ -511,3 +513,60 @@ def test_the_horizon_does_not_change_the_past():
         squares = [np.einsum("nr...,nr...->n...", x, x) for x in (
             getattr(regression, name)(t) for regression in (one, other))]
         np.testing.assert_allclose(*squares, rtol=1e-9, atol=1e-12)
+
+
+@settings(deadline=None, max_examples=8)
+@given(st.floats(0.5, 30.0), st.sampled_from([0.0, 0.4, 2.0]))
+def test_what_grows_away_from_hidden_constraints_stays_on_them(rate, turn):
+    """p' = v, v' = κ²p + λ, p = sin t: away from the last equation p and v grow as e^{κt}."""
+    c, s = f"cos({turn!r}*t)", f"sin({turn!r}*t)"
+    plant = {
+        "name": "held", "states": ["p", "v", "force", "q"], "inputs": {"u": "sin(t)"},
+        "unknowns": {"bias": 0.7}, "outputs": ["y"],
+        "E": [[c, s, 0, 0], [f"-{s}", c, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]],
+        "A": [[f"{rate**2!r}*{s}", c, s, 0], [f"{rate**2!r}*{c}", f"-{s}", c, 0], [1, 0, 0, 0],
+              [0, 1, 0, -1]],
+        "B": [[0], [0], [-1], [0]], "F": [[0], [0], [0], [1]], "C": [[0, 0, 0, 1]],
+        "initial_state": [0.0, 1.0, 0.0, 0.0],
+    }
+    found = run(plant, time={"horizon": 20, "samples": 51})
+    estimation, x = found.details.estimation, found.details.simulation.states
+    assert set(found.details.estimable) >= {"p", "v", "force", "q", "bias", "e0_q"}
+    assert None not in found.details.estimable.values()
+    assert np.abs(x[:, 0] - np.sin(estimation.t)).max() < 1e-10
+    assert (np.abs(estimation.states[0, -1] - x[-1]) < 1e-9 * np.abs(x).max(axis=0)).all()
+    assert estimation.parameters[0, -1, 0] == pytest.approx(0.7, rel=1e-9)
+
+
+@settings(deadline=None, max_examples=8)
+@given(st.lists(st.integers(-7, 7), min_size=4, max_size=4), st.sampled_from(["0.3", "12"]))
+def test_states_of_very_different_sizes_turn_in_the_kernel_of_E(decades, rate):
+    """E = diag(1, 1, 0, 0) Q(t), index 2: E⁺ has rows that are 1e-14 of each other."""
+    Q = [["1", f"sin({rate}*t)", 0, "0.4"], [0, "1", f"cos({rate}*t)", "-0.3"],
+         [f"sin({rate}*t)/2", 0, "1", 0], [0, f"cos({rate}*t)/3", 0, "1"]]
+    size = [10.0**k for k in decades]
+    A = [["0.2", "1", "0.5", 0], ["-1", "-0.1", 0, "1"], [0, 0, "1", 0], [0, "1", 0, 0]]
+
+    def times(left):
+        return [[" + ".join(f"({row[k]})*({Q[k][j]})" for k in range(4) if row[k] and Q[k][j]) or 0
+                 for j in range(4)] for row in left]
+
+    def in_units(matrix):
+        return [[f"({entry})/{size[j]!r}" if entry else 0 for j, entry in enumerate(row)]
+                for row in matrix]
+
+    # E x' = A x + B u of z' = A z + B u in two rows: A Q − Q' there.
+    A = [[f"{entry} - d({Q[k][j]})" if k < 2 and Q[k][j] else entry for j, entry in enumerate(row)]
+         for k, row in enumerate(times(A))]
+    plant = {
+        "name": "turning", "states": list("abce"), "inputs": {"u": "sin(t)", "v": "cos(2*t)"},
+        "outputs": ["y"], "E": in_units(times([["1", 0, 0, 0], [0, "1", 0, 0], [0] * 4, [0] * 4])),
+        "A": in_units(A), "B": [[1, 0], [0, 1], [0, 1], [1, 0]],
+        "C": in_units(times([["1", 0, "0.3", 0]])),
+        "initial_state": [0.0] * 4,
+    }
+    found = run(plant, time={"horizon": 5, "samples": 51},
+                observer={"name": "gpebo", "form": "strangeness_free"})
+    x, told = found.details.simulation.states, found.details.estimation.states[0, -1]
+    assert None not in [found.details.estimable[name] for name in "abce"]
+    assert (np.abs(told - x[-1]) < 1e-7 * np.abs(x).max(axis=0)).all()

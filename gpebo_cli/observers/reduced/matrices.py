@@ -28,10 +28,13 @@ from gpebo_cli.observers.reduced.split import (
     fits,
     split_by_svd,
     split_in_frame,
+    units_along,
     within_frame,
 )
 from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
+
+_LACKING = 1e-8  # of the largest singular value of what constraints say of w: it is rounding
 
 
 class NotObservableError(ModelError):
@@ -245,7 +248,7 @@ def _by_steps(
     )
     k = basis.shape[1]
     dynamics = whole[:, :, :k]
-    return ObserverMatrices(
+    found = ObserverMatrices(
         split=split,
         output_scale=scale,
         dynamics=dynamics[:1] if len(E) == len(A) == len(C) == 1 and hidden is None else dynamics,
@@ -259,6 +262,25 @@ def _by_steps(
         elimination=K,
         injectivity=injectivity,
     )
+    return found if hidden is None else _held(found, units.states, rank_tol)
+
+
+def _held(found: ObserverMatrices, units: Array, rank_tol: float) -> ObserverMatrices:
+    """The same with a term that pulls w onto the hidden constraints, which w then never leaves.
+
+    w has as many components as E has rank. Constraints that leave fewer hold because they held at
+    the start, and rounding need not stay small: away from them w may grow as no solution does. What
+    they lack comes back at twice the rate at which anything grows, −2‖A_0‖ (R𝒜)⁺R(𝒜w + g_y + Gθ).
+    """
+    own = units_along(found.split.basis, units)
+    hidden = found.algebraic.shape[1] - found.outputs
+    lacking = (found.residual @ found.on_basis)[:, :hidden] * own
+    if not (np.abs(lacking) > rank_tol).any():
+        return found
+    rate = 2.0 * np.linalg.norm(found.dynamics * own / own[:, None], axis=(1, 2))
+    gain = np.zeros((len(lacking), len(own), hidden + found.outputs))
+    gain[:, :, :hidden] = own[:, None] * np.linalg.pinv(lacking, rcond=_LACKING)
+    return found.injected(rate[:, None, None] * (gain @ found.residual))
 
 
 def _seen_through(
