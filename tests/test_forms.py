@@ -496,8 +496,8 @@ def test_a_plant_without_derivatives():
         "A": [[-1, 0.3], [0, -2]], "B": [[1], [0]], "F": [[0], [1]], "C": [[1, 0]],
         "initial_state": [0, 0],
     }
-    for settings in ({}, {"remedy": "reset"}, {"remedy": "output_injection"}):
-        found, error, of_states = observed(plant, 5.0, **settings)
+    for chosen in ({}, {"remedy": "reset"}, {"remedy": "output_injection"}):
+        found, error, of_states = observed(plant, 5.0, **chosen)
         assert found.regression.parameters == ("a",)
         assert np.abs(error).max() < 1e-12
         assert of_states < 1e-12
