@@ -239,7 +239,6 @@ def test_wrong_weights(weights, message):
 
 
 @pytest.mark.parametrize(("observer", "noise", "message"), [
-    ("gpebo", {"seeds": 0, "outputs": 0.1}, "noise.seeds: expected 1 or more"),
     ("gpebo", {"seeds": 5}, "noise.seeds = 5, but there is no noise"),
     ("none", {"seeds": 5, "outputs": 0.1}, "needs an observer in continuous time"),
 ])

@@ -45,8 +45,6 @@ def check_seeds(settings: NoiseSettings, levels: NoiseLevels, horizon: float) ->
     Raises:
         ConfigError: says what is needed.
     """
-    if settings.seeds < 1:
-        raise ConfigError(f"noise.seeds: expected 1 or more, got {settings.seeds}")
     if settings.seeds > 1 and levels.silent:
         raise ConfigError(f"noise.seeds = {settings.seeds}, but there is no noise; set its levels")
     samples = settings.seeds * horizon / settings.sample_time
