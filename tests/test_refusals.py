@@ -42,10 +42,6 @@ def canonical(**changes):
             "data has 1 rows without gaps; 2",
         ),
         (
-            {"time": {"horizon": 5.0}, "solver": {"name": "ivp", "tol": 1e-12, "max_elements": 9}},
-            "solver=ivp: the plant circuit is not resolved to 1.0e-12 near t = ",
-        ),
-        (
             {
                 "plant": plant_from_mapping(UNBOUNDED),
                 "observer": {"name": "gpebo", "remedy": "current_coordinates"},

@@ -58,6 +58,14 @@ def test_a_delay_moves_jumps_exactly():
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+def test_delays_that_make_too_many_corners_are_refused():
+    text = "w"
+    for k in range(14):  # 2^14 sums of these
+        text = f"delay({text}, {0.1 + 0.7**k})"
+    with pytest.raises(ConfigError, match="corners in the horizon; at most 10000 are followed"):
+        values(text, w="step(t - 0.5)")
+
+
 @given(rate=st.floats(1e-3, 1e6), frequency=st.floats(0.1, 30.0))
 @settings(max_examples=15, deadline=None)
 def test_low_and_high_pass_add_up_to_the_signal(rate, frequency):
