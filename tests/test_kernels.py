@@ -35,6 +35,7 @@ def _symmetric(rng, count=37, p=3, c=2):
     root = rng.normal(size=(count, p, p)) * 10.0 ** rng.integers(-3, 3, size=(count, p, 1))
     root[1:2], root[-1, 0] = 0.0, root[-1, -1]
     gram = np.concatenate([np.swapaxes(root, 1, 2) @ root, rng.normal(size=(count, p, c))], axis=2)
+    gram[:, *np.triu_indices(p, 1)] *= -0.5  # the lower triangle counts
     return (gram * 10.0 ** rng.integers(-300, 200, size=(count, 1, 1)),)
 
 
@@ -391,6 +392,13 @@ def test_numbers_too_large_for_squares_are_left_to_lapack(value):
     arguments[1][0, 1, 0, 0] = value
     compiled = import_module("gpebo_cli.kernels._compiled")
     assert compiled.levels(*arguments) is None
+
+
+@needs_kernels
+def test_numbers_too_small_for_squares_are_left_to_lapack():
+    E, A, *others = _levels(np.random.default_rng(0), times=2)
+    compiled = import_module("gpebo_cli.kernels._compiled")
+    assert compiled.levels(1e-145 * E, 1e-145 * A, *others) is None
 
 
 def test_kernels_are_there_where_they_were_asked_for():

@@ -203,6 +203,19 @@ def test_every_case_is_what_it_is_alone():
         np.testing.assert_allclose(getattr(together, field), expected, rtol=1e-12)
 
 
+def test_assumption_1_is_judged_by_its_weakest_sample():
+    """𝒜 = [1 0; 0 c] on the kernel of E is c: of all |c|/‖𝒜‖ the smallest, at t = π."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["a", "b"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, 0]], "B": [[0], [1]],
+        "C": [[0, "1 + cos(t)/2"]], "initial_state": [0, 0],
+    })
+    found = run(system, {"name": "least_squares"}, sample_time=0.01, form="given")
+    (one,) = (a for a in found.assumptions if a.name == "Assumption 1")
+    smallest = one.evidence["smallest_singular_value_at_least"]
+    assert smallest == pytest.approx(0.5 / np.sqrt(1.25), rel=1e-4)
+
+
 def test_what_is_remembered_does_not_grow():
     system = shipped("circuit")
     t = np.arange(0.0, 4.0, 0.01)

@@ -524,7 +524,9 @@ class LineReader:
         try:
             text = line.decode("utf-8-sig" if number == 1 else "utf-8").removesuffix("\r")
         except UnicodeDecodeError:
-            raise ConfigError(f"{self._source}, line {number}: not UTF-8 text") from None
+            raise ConfigError(
+                f"{self._source}, line {number}: not UTF-8 text; save it as UTF-8"
+            ) from None
         cells = split_cells(self._source, number, text, self._data)
         if self._reader is None or self._header is None:
             self._header = read_header(self._source, cells, self._data, self._system)
