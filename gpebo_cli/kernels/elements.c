@@ -424,10 +424,9 @@ static double largest_change(const Swept *q, double share)
 static Outcome sweeps(Call *call)
 {
     const npy_intp K = SIZE(K), s = SIZE(s), d = SIZE(d), entries = SIZE(e), all = SIZE(c);
-    const npy_intp forced = SIZE(f), most = SIZE(m), *row = call->index[2],
-                   *column = call->index[3];
-    const double *R = call->in[0], *h = call->in[1], *kicks = call->in[6];
-    const double *guess = call->in[7], tol = call->number[10], share = call->number[11];
+    const npy_intp forced = SIZE(f), *row = call->index[2], *column = call->index[3];
+    const double *R = call->in[0], *h = call->in[1], *kicks = call->in[6], *onward = call->in[7];
+    const double tol = call->number[10], share = call->number[11];
     if (s > MOST_STAGES || (SIZE(P) != 1 && SIZE(P) != K * (s + 1)))
         return refused("stages, or points of all elements", SIZE(P));
     if (forced > all || (SIZE(Q) != 1 && SIZE(Q) != K * (s + 1)))
@@ -439,19 +438,18 @@ static Outcome sweeps(Call *call)
         if (column[e] < 0 || column[e] >= d)
             return refused("a column", column[e]);
     const npy_intp width = all < AT_ONCE ? all : AT_ONCE, block = d * width;
-    double *memory = scratch(call, (entries + 2 * block + s) * MOST_STAGES + block + 2 * d);
+    double *memory = scratch(call, (entries + 2 * block + 2 * s + 1) * MOST_STAGES + block + 2 * d);
     if (memory == NULL)
         return ERROR;
-    Nodes *A = (Nodes *)memory, *f = A + entries, *X = f + block, *hR = X + block;
-    double *left = (double *)(hR + s), *size = left + block, *change = size + d;
-    for (npy_intp k = 0; k < K; k++)
-        call->out[1][k] = 0.0;
+    Nodes *A = (Nodes *)memory, *f = A + entries, *X = f + block, *hR = X + block, *W = hR + s;
+    double *left = (double *)(W + s + 1), *size = left + block, *change = size + d;
+    memset(call->out[1], 0, K * sizeof(double));
+    memset(A, 0, entries * sizeof(Nodes));
     for (npy_intp first = 0; first < all; first += width) {
         const npy_intp b = all - first < width ? all - first : width;
-        Swept q = {.s = s, .d = d, .columns = b, .forced = first < forced, .row = row};
-        q.column = column, q.R = (const Nodes *)hR, q.A = (const Nodes *)A;
-        q.f = (const Nodes *)f, q.X = X, q.left = left, q.weight = call->in[9];
-        q.size = size, q.change = change;
+        Swept q = {.s = s, .d = d, .columns = b, .forced = first < forced, .row = row, .X = X};
+        q.column = column, q.R = (const Nodes *)hR, q.A = (const Nodes *)A, q.left = left;
+        q.f = (const Nodes *)f, q.weight = call->in[9], q.size = size, q.change = change;
         memset(size, 0, d * sizeof(double));
         for (npy_intp i = 0; i < d; i++)
             for (npy_intp c = 0; c < b; c++)
@@ -460,27 +458,30 @@ static Outcome sweeps(Call *call)
             double *out = call->out[0] + k * (s + 1) * d * all + first, found = INFINITY;
             const double *values = call->in[4] + k * (s + 1) * call->step[4];
             const double *given = call->in[5] + k * (s + 1) * call->step[5] + first;
-            memset(hR, 0, s * sizeof(Nodes));
+            memset(hR, 0, (2 * s + 1) * sizeof(Nodes));
             memset(f, 0, d * b * sizeof(Nodes));
             for (npy_intp j = 0; j < s; j++) {
                 for (npy_intp l = 0; l < s; l++)
                     hR[l][j] = h[k] * R[j * s + l];
+                for (npy_intp l = 0; l <= s; l++)
+                    W[l][j] = onward[(k * s + j) * (s + 1) + l];
                 for (npy_intp e = 0; e < entries && (k == 0 || call->step[4]); e++)
                     A[e][j] = values[(j + 1) * call->step[4] + e];
                 for (npy_intp i = 0; i < d; i++)
                     for (npy_intp c = 0; c < b && first + c < forced; c++)
                         f[i * b + c][j] = given[(j + 1) * call->step[5] + i * forced + c];
             }
-            for (npy_intp j = s; k == 0 && j < MOST_STAGES; j++)
-                for (npy_intp e = 0; e < entries; e++)
-                    A[e][j] = 0.0;
             for (npy_intp i = 0; i < d * b; i++) {
-                EACH_NODE X[i][j] = left[i];
-                for (npy_intp j = 0; guess != NULL && j < s; j++)
-                    X[i][j] = guess[((k * (s + 1) + j + 1) * d + i / b) * all + first + i % b];
+                Nodes x;
+                EACH_NODE x[j] = left[i];
+                for (npy_intp l = 0; k > 0 && l <= s; l++) { /* as before, to begin with */
+                    const double *at = l ? &X[i][l - 1] : out + i / b * all + i % b - (s + 1) * d * all;
+                    EACH_NODE x[j] += W[l][j] * (*at - X[i][s - 1]);
+                }
+                memcpy(X[i], x, sizeof(Nodes));
                 size[i / b] = larger(fabs(left[i]), size[i / b]);
             }
-            for (npy_intp m = 0; m < most && found > tol; m++) {
+            for (npy_intp m = 0; m < SIZE(m) && found > tol; m++) {
                 sweep(&q, m & 1);
                 found = largest_change(&q, share);
                 if (!(found <= DBL_MAX))
@@ -494,8 +495,7 @@ static Outcome sweeps(Call *call)
                     for (npy_intp j = 0; j < s; j++)
                         at[(j + 1) * d * all] = X[i * b + c][j];
                     left[i * b + c] = X[i * b + c][s - 1];
-                    if (kicks != NULL)
-                        left[i * b + c] += kicks[(k * d + i) * all + first + c];
+                    left[i * b + c] += kicks ? kicks[(k * d + i) * all + first + c] : 0.0;
                 }
         }
     }
@@ -506,6 +506,6 @@ const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
     {"carried_errors", "Ktnc tt u K?nn K?nc K?nv K+nw K # # # # v=n+c", "Knc 5nc", carried_errors},
-    {"sweeps", "ss K @d+ @e P?e Q?df |Kdc |Ks+dc dc d # # %m", "Ks+dc K", sweeps},
+    {"sweeps", "ss K @d+ @e P?e Q?df |Kdc Kss+ dc d # # %m", "Ks+dc K", sweeps},
     {NULL, NULL, NULL, NULL},
 };

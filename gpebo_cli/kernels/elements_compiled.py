@@ -63,11 +63,11 @@ def carried_errors(
 
 def sweeps(
     R: Array, h: Array, rows: IntArray, indices: IntArray, entries: Array, f: Array,
-    kicks: Array | None, guess: Array | None, start: Array, weights: Array, tol: float,
+    kicks: Array | None, onward: Array, start: Array, weights: Array, tol: float,
     share: float, most: int,
 ) -> tuple[Array, Array]:
     """In C, where each row uses those before it."""
     found: tuple[Array, Array] = _compiled.sweeps(
-        R, h, rows, indices, entries, f, kicks, guess, start, weights, tol, share, most
+        R, h, rows, indices, entries, f, kicks, onward, start, weights, tol, share, most
     )
     return found

@@ -214,7 +214,7 @@ def carried_errors(
 
 def sweeps(
     R: Array, h: Array, rows: IntArray, indices: IntArray, entries: Array, f: Array,
-    kicks: Array | None, guess: Array | None, start: Array, weights: Array, tol: float,
+    kicks: Array | None, onward: Array, start: Array, weights: Array, tol: float,
     share: float, most: int,
 ) -> tuple[Array, Array]:
     """Values at all points of X' = A X + f by fixed-point iteration, one element after the other.
@@ -230,7 +230,7 @@ def sweeps(
         entries: them at the K (s + 1) points of all elements, or at one (P or 1, e).
         f: of the first columns of X (P or 1, d, f).
         kicks: what is added to X at the end of each element (K, d, c), or None.
-        guess: what X nearly is at all points (K, s + 1, d, c), or None.
+        onward: from the points before to where the nodes are, which X begins with (K, s, s + 1).
         start: at the first left end (d, c).
         weights: 1 over the unit of each row (d,).
         tol: see above.
@@ -251,7 +251,9 @@ def sweeps(
         points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
         A[:, all_rows, indices] = entries if len(entries) == 1 else entries[points]
         forcing[:, :, : f.shape[2]] = f if len(f) == 1 else f[points]
-        X = np.repeat(state[None], s, axis=0) if guess is None else guess[k, 1:]
+        X = np.repeat(state[None], s, axis=0)
+        if k:
+            X += np.tensordot(onward[k], values[k - 1] - values[k - 1, -1], axes=1)
         size = np.maximum(size, np.abs(state).max(axis=1, initial=0.0))
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(2 * most):  # each row uses the old ones: that is slower by half

@@ -39,6 +39,7 @@ LENGTH = 4.0  # h‖A‖ of an element at most
 _MOST_SWEEPS = 80
 MOST_ELEMENTS = 800  # with more of them the system counts as stiff
 _DIGITS = 1e-2  # of the tolerance, to which sweeps go on
+_BEYOND = 1.5  # lengths of elements, up to which polynomials are a beginning for the next ones
 _ROUGH = 0.02  # to which errors are carried
 _SPARSE = 0.1  # share of entries, up to which factors are sparse
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
@@ -161,13 +162,12 @@ def solve(
         if parts.max(initial=1.0) > 1.0:
             mesh = mesh.split(np.maximum(parts, 1.0).astype(np.intp))[0]
 
-    def evaluate(mesh: Mesh, before: _Found | None, kept: IntArray) -> tuple[_Found, Array]:
+    def evaluate(mesh: Mesh, _before: _Found | None, kept: IntArray) -> tuple[_Found, Array]:
         A, f, extras = equation(mesh, kept)
         mapped = not stiff and len(A.entries) == 1 and problem.start.shape[1] > _MANY_COLUMNS
         mapped = mapped and _MANY_ALIKE * equal_lengths(mesh.steps)[0].max() < mesh.size
         values, change = _swept(
-            _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {},
-            None if before is None else before.on(mesh),
+            _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {}
         )
         made_of, moved = _terms(A, f, mesh, values)
         found = _Found(A, Trajectory(mesh, values), change, made_of, moved, extras)
@@ -247,15 +247,10 @@ class _Found(NamedTuple):
     moved: Array  # (K, d, c) what rounding of the equation's terms moves
     extras: tuple[Array, ...]
 
-    def on(self, mesh: Mesh) -> Array:
-        """The values at the points of another mesh (K, s + 1, d, c)."""
-        found = self.trajectory(mesh.points.ravel(), mesh.inside.ravel())
-        return found.reshape(*mesh.points.shape, *found.shape[1:])
-
 
 def _mapped(
     R: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array,
-    kicks: Array | None, _guess: Array | None, start: Array, *_: object,
+    kicks: Array | None, _onward: Array, start: Array, *_: object,
 ) -> tuple[Array, Array]:
     """As ``elements.sweeps`` for one constant A and many columns, by maps of elements."""
     s, (d, c) = len(R), start.shape
@@ -287,7 +282,7 @@ class _Solved:
 
     def __call__(
         self, R: Array, h: Array, _rows: IntArray, _columns: IntArray, _entries: Array, f: Array,
-        kicks: Array | None, _guess: Array | None, start: Array, *_: object,
+        kicks: Array | None, _onward: Array, start: Array, *_: object,
     ) -> tuple[Array, Array]:
         s, (d, columns) = len(R), start.shape
         from_left = np.linalg.inv(R).sum(axis=1)[:, None, None]
@@ -325,11 +320,9 @@ class _Solved:
 
 def _swept(
     march: March, A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, units: Array, tol: float,
-    restarts: Mapping[float, Callable[[Array], Array]], guess: Array | None,
+    restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, Array]:
     """Values (K, s + 1, d, c), and the last change in each element (K,).
-
-    ``guess``: what they are nearly.
 
     Raises:
         _StiffError: sweeps do not converge.
@@ -337,7 +330,7 @@ def _swept(
     edges, state = mesh.edges.tolist(), problem.start
     cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
     pieces = []
-    enough = max(_DIGITS * tol, 8.0 * EPS)
+    enough, onward = max(_DIGITS * tol, 8.0 * EPS), _onward(mesh)
     for first, last in pairwise(cuts):
         if first:
             state = restarts[edges[first]](state)
@@ -345,8 +338,8 @@ def _swept(
         values, change = march(
             mesh.rule.integration, mesh.steps[first:last], A.rows, A.columns,
             A.entries if len(A.entries) == 1 else A.entries[part],
-            f if len(f) == 1 else f[part], None, None if guess is None else guess[first:last],
-            state, 1.0 / units, enough, SHARE, _MOST_SWEEPS,
+            f if len(f) == 1 else f[part], None, onward[first:last], state, 1.0 / units, enough,
+            SHARE, _MOST_SWEEPS,
         )
         if not (change <= 8.0 * enough).all() or not np.isfinite(values[-1]).all():
             raise _StiffError
@@ -355,6 +348,17 @@ def _swept(
     if len(pieces) == 1:
         return pieces[0]
     return np.concatenate([v for v, _ in pieces]), np.concatenate([c for _, c in pieces])
+
+
+def _onward(mesh: Mesh) -> Array:
+    """From the points of the element before each one to its nodes, (K, s, s + 1).
+
+    What polynomials are beyond their elements is nearly what follows, and nearly halves the sweeps.
+    Where they would have to reach far, their last value is.
+    """
+    ratio = mesh.steps / np.append(np.inf, mesh.steps[:-1])
+    places = 1.0 + np.where(ratio <= _BEYOND, ratio, 0.0)[:, None] * mesh.rule.nodes
+    return mesh.rule.interpolation(places.ravel()).reshape(*places.shape, -1)
 
 
 def _terms(A: Sparse, f: Array, mesh: Mesh, values: Array) -> tuple[Array, Array]:
@@ -402,7 +406,8 @@ def _errors(
     kicks = (signs[1:] * added[:, :, None]).reshape(K, n, -1)
     ends, _ = march(
         rule.integration, mesh.steps, A.rows, A.columns, A.entries, np.zeros((1, n, 0)), kicks,
-        None, (signs[0] * start[:, None]).reshape(n, -1), 1.0 / units, _ROUGH, SHARE, _MOST_SWEEPS,
+        _onward(mesh), (signs[0] * start[:, None]).reshape(n, -1), 1.0 / units, _ROUGH, SHARE,
+        _MOST_SWEEPS,
     )
     squares = ((ends[:, -1] + kicks) ** 2).reshape(K, n, -1, added.shape[2])
     systematic = np.arange(2, K + 2)[:, None, None]
