@@ -126,28 +126,25 @@ class Result:
 
         Without an observer there are none.
         """
-        estimation = self.details.estimation
-        if estimation is None:
-            return NamedArrays("estimates", (), np.zeros((0, 0, 0)))
-        names = (*estimation.names, *self.details.system.states)
-        values = np.concatenate([estimation.parameters, estimation.states], axis=-1)
-        return NamedArrays("estimates", names, values)
+        return self._estimated("estimates", 0.0, 0.0)
 
     @cached_property
     def errors(self) -> NamedArrays:
         """Estimate minus truth by name, (G, M) each."""
         estimation = self.details.estimation
         if estimation is None:
-            return NamedArrays("errors", (), np.zeros((0, 0, 0)))
+            return self._estimated("errors", 0.0, 0.0)
+        x = truth_at(self.details, estimation.t)
+        return self._estimated("errors", estimation.true_parameters, x)
+
+    def _estimated(self, what: str, eta: Array | float, x: Array | float) -> NamedArrays:
+        """Estimates less η and x, by name; none without an observer."""
+        estimation = self.details.estimation
+        if estimation is None:
+            return NamedArrays(what, (), np.zeros((0, 0, 0)))
         names = (*estimation.names, *self.details.system.states)
-        values = np.concatenate(
-            [
-                estimation.parameters - estimation.true_parameters,
-                estimation.states - truth_at(self.details, estimation.t),
-            ],
-            axis=-1,
-        )
-        return NamedArrays("errors", names, values)
+        values = np.concatenate([estimation.parameters - eta, estimation.states - x], axis=-1)
+        return NamedArrays(what, names, values)
 
     @property
     def parameters(self) -> dict[str, float]:

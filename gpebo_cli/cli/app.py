@@ -87,7 +87,9 @@ def _failed(error: Exception, *, traceback_wanted: bool) -> int:
     if _was_interrupted(error):
         return _interrupted()
     if traceback_wanted:
-        _print_traceback()
+        import traceback
+
+        traceback.print_exc()
     if isinstance(error, GpeboError):
         return _report(str(error), error.exit_code)
     if isinstance(error, MemoryError):
@@ -177,9 +179,3 @@ def _leave(code: int) -> NoReturn:
 def _drop_stdout() -> None:
     """Send what is still buffered nowhere, so that the interpreter's exit does not try again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _print_traceback() -> None:
-    import traceback
-
-    traceback.print_exc()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import prod
 
@@ -74,6 +74,11 @@ class TextCoefficients:
     name: str
     restricted: TextCoefficients | None = None  # ``of_time``, where that is something else
     divisors: tuple[Expression, ...] = ()  # continuous ones of outputs, with the text they stand in
+    # What others have found out about these matrices, by what was asked: they never change.
+    kept: dict[object, object] = field(default_factory=dict, init=False)
+    # Breakpoints (number,) by the span, and edges (number,) of cells by the edges asked for.
+    _breakpoints: dict[tuple[float, float], Array] = field(default_factory=dict, init=False)
+    _resolved: dict[bytes, Array] = field(default_factory=dict, init=False)  # (number,)
 
     @cached_property
     def constant(self) -> frozenset[str]:
@@ -180,25 +185,12 @@ class TextCoefficients:
             self._breakpoints[start, stop] = breakpoints_of_tape(self.tape, start, stop)
         return self._breakpoints[start, stop].copy()
 
-    @cached_property
-    def _breakpoints(self) -> dict[tuple[float, float], Array]:
-        return {}
-
     def resolved(self, edges: Array) -> Array:
         """Edges of cells in which nothing narrow hides, from edges (K + 1,); see the protocol."""
         key = edges.tobytes()
         if key not in self._resolved:
             self._resolved[key] = resolved(self._bounds, edges)
         return self._resolved[key]
-
-    @cached_property
-    def _resolved(self) -> dict[bytes, Array]:
-        return {}
-
-    @cached_property
-    def kept(self) -> dict[object, object]:
-        """What others have found out about these matrices, by what was asked; they never change."""
-        return {}
 
     @cached_property
     def _bounds(self) -> Bounds:

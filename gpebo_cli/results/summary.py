@@ -20,7 +20,6 @@ from gpebo_cli.experiment.result import (
     SimulationResult,
     StateChange,
 )
-from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.results.provenance import Provenance
 
@@ -37,6 +36,8 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
     """Summarise a run as nested dicts in the order they are printed; parts it lacks are None."""
     system, simulation = result.system, result.simulation
     regression, estimation = result.regression, result.estimation
+    errors = None if simulation is None else simulation.state_errors
+    by_state = None if errors is None else dict(zip(system.states, errors.tolist(), strict=True))
     return {
         "status": "done",
         "verdict": result.verdict,
@@ -51,7 +52,9 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         ),
         **_simulation(system, simulation),
         "recording": _recording(result.recording),
-        "parameters": _parameters(result.estimation),
+        "parameters": None if estimation is None else dict(
+            zip(estimation.names, estimation.true_parameters[-1], strict=True)
+        ),
         "estimates": _estimates(result),
         "active_bounds": _active_bounds(estimation),
         "estimable": {name: since is not None for name, since in result.estimable.items()},
@@ -65,7 +68,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "cases": _cases(estimation, result.metrics),
         "error_estimate": {
             "states": simulation.error_estimate if simulation else None,
-            "by_state": _by_state(result.system.states, simulation),
+            "by_state": by_state,
             "regression": regression.error_estimate if regression else None,
         },
         "fit": _fit(result.fit),
@@ -74,14 +77,6 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "versions": made_by.versions,
         "git": {"commit": made_by.git.commit, "dirty": made_by.git.dirty} if made_by.git else None,
     }
-
-
-def _by_state(
-    states: tuple[str, ...], simulation: SimulationResult | None
-) -> dict[str, float] | None:
-    if simulation is None or simulation.state_errors is None:
-        return None
-    return dict(zip(states, simulation.state_errors.tolist(), strict=True))
 
 
 def plain(value: object) -> Any:
@@ -148,12 +143,6 @@ def _fit(fit: Fit | None) -> dict[str, Any] | None:
         "white": fit.white,
         "noise_ratio": fit.ratio,
     }
-
-
-def _parameters(estimation: EstimationResult | None) -> dict[str, float] | None:
-    if estimation is None:
-        return None
-    return dict(zip(estimation.names, estimation.true_parameters[-1], strict=True))
 
 
 def _estimates(result: RunResult) -> object:
@@ -227,13 +216,7 @@ def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:
 def _requirement(estimation: EstimationResult | None) -> dict[str, Any] | None:
     if estimation is None:
         return None
-    requirement: Requirement = estimation.requirement
-    return {
-        "name": requirement.name,
-        "holds": requirement.holds,
-        "evidence": requirement.evidence,
-        "text": requirement.text,
-    }
+    return {k: getattr(estimation.requirement, k) for k in ("name", "holds", "evidence", "text")}
 
 
 def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> object:

@@ -6,8 +6,7 @@ when interval arithmetic says so, and is halved until it does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -34,6 +33,7 @@ class Bounds:
     """Bounds of what a tape's expressions do over cells of time."""
 
     tape: Tape
+    _programs: dict[tuple[int, bool], Program | None] = field(default_factory=dict, init=False)
 
     def of(self, low: Array, high: Array, order: int, inside: Array | None = None
            ) -> tuple[Array, Array]:
@@ -69,10 +69,6 @@ class Bounds:
                     (value.low, value.high) if isinstance(value, Interval) else value
                 )
         return bounds[0], bounds[1]
-
-    @cached_property
-    def _programs(self) -> dict[tuple[int, bool], Program | None]:
-        return {}
 
 
 def resolved(bounds: Bounds, edges: Array) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -279,6 +279,8 @@ class Assembly:
     tape: Tape
     targets: IntArray  # (outputs, 2) the matrix and the entry in it, counted by rows
     fixed: tuple[Array, ...]  # the matrices; what stands at the targets does not matter
+    # What the kernel is given besides times and signals.
+    _plans: dict[_Key, tuple[Any, ...] | None] = field(default_factory=dict, init=False)
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
@@ -311,11 +313,6 @@ class Assembly:
         else:
             rows = np.swapaxes(signals, 1, 2).reshape(-1, len(t)) if len(t) else signals[:, :, 0]
         return kernels.expressions.jets(t, inside if apart else t, rows, *plan)
-
-    @cached_property
-    def _plans(self) -> dict[_Key, tuple[Any, ...] | None]:
-        """What the kernel is given besides times and signals."""
-        return {}
 
     def _plan(
         self, order: int, apart: bool, signals: tuple[int, int] | None = None
