@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from gpebo_cli.cli.arguments import Arguments, checked_folder
 from gpebo_cli.cli.options import CONFIG_DIR, PLAIN, VOLUME, Options, no_option, parse
-from gpebo_cli.configs import configuration
 from gpebo_cli.configs.locations import PRIMARY
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.schema import shown, unknown
@@ -189,13 +188,10 @@ def run_recipe_job(cfg: DictConfig, arguments: Arguments, options: Options) -> R
     Raises:
         GpeboError: it fails.
     """
-    from gpebo_cli.cli import composition
-    from gpebo_cli.cli.job import described_in
+    from gpebo_cli.cli.job import read_job
     from gpebo_cli.cli.progress import Progress
     from gpebo_cli.experiment.pipeline import run_experiment
-    from gpebo_cli.regression.text import system_from_mapping
 
-    settings = configuration.settings(composition.plain(cfg), draw=False)
-    source = described_in(cfg.hydra.runtime.choices, arguments)
+    job = read_job(cfg, arguments, draw=False)
     with Progress(quiet=options.quiet, loud=options.loud) as progress:
-        return run_experiment(settings, system_from_mapping(settings.plant, source), progress)
+        return run_experiment(job.settings, job.system, progress)

@@ -50,7 +50,8 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     from gpebo_cli.regression.text import system_from_mapping
 
     build(settings.estimator)  # used or not: its name becomes part of a folder's
-    source = described_in(HydraConfig.get().runtime.choices, arguments)
+    hydra = cfg.hydra if "hydra" in cfg else HydraConfig.get()
+    source = described_in(hydra.runtime.choices, arguments)
     system = system_from_mapping(settings.plant, source)
     config["plant"] = located(settings.plant, source)
     return Job(settings, system, configuration.complete(config, settings))

@@ -15,6 +15,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.estimator import Unmixed
 from gpebo_cli.regression.resets import ExtensionState
 
 _DIGITS = 1e-12  # reciprocal condition of Ω below which some direction is rounding
@@ -45,15 +46,11 @@ def follow(
 
 
 @dataclass(frozen=True, eq=False)
-class SolvedEstimates:
+class SolvedEstimates(Unmixed):
     """η̂ = Ω⁻¹ 𝒴 of every case, from [Ω | 𝒴] (M, p, p + 1) with Ω > 0."""
 
     extended: tuple[Array, ...]  # (M, p, p + 1) each
     reached: tuple[ExtensionState, ...] = ()
-
-    def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
-        """Nothing is mixed, at any of the times t (M,)."""
-        return
 
     @property
     def requirement(self) -> Requirement:

@@ -18,6 +18,7 @@ from gpebo_cli.regression.estimator import (
     Moving,
     Resumable,
     ResumableEstimates,
+    Unmixed,
 )
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
@@ -79,7 +80,7 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
 
 
 @dataclass(frozen=True)
-class Nothing:
+class Nothing(Unmixed):
     """Estimates of a regression without parameters: constraints alone determine the states."""
 
     count: int  # of cases
@@ -89,9 +90,6 @@ class Nothing:
     def requirement(self) -> Requirement:
         """Nothing is required."""
         return Requirement("none", True, {}, "there is nothing to estimate")
-
-    def delta(self, t: Array) -> None:
-        """Nothing is mixed at the times t (M,)."""
 
     def parameters(self, cases: slice) -> Array:
         """Empty arrays for some cases, (g, M, 0)."""

@@ -25,7 +25,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
-from gpebo_cli.regression.estimator import SampledEstimates
+from gpebo_cli.regression.estimator import SampledEstimates, Unmixed
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
@@ -181,7 +181,7 @@ class LeastSquares(ResumableEstimator):
 
 
 @dataclass(frozen=True, eq=False)
-class LeastSquaresEstimates:
+class LeastSquaresEstimates(Unmixed):
     """The regularised solution of every case."""
 
     cases: tuple[Mapping[str, float], ...]
@@ -189,10 +189,6 @@ class LeastSquaresEstimates:
     start: Array  # (p,)
     reached: tuple[ExtensionState, ...]  # of each case
     realisations: tuple[int, ...] = ()
-
-    def delta(self, t: Array) -> None:  # noqa: ARG002  part of the protocol
-        """Nothing is mixed, at any of the times t (M,)."""
-        return
 
     @property
     def requirement(self) -> Requirement:

@@ -37,6 +37,13 @@ class Estimates(Protocol):
         ...
 
 
+class Unmixed:
+    """Estimates of a law in which nothing is mixed."""
+
+    def delta(self, t: Array) -> None:
+        """There is no Δ at any of the times t (M,)."""
+
+
 class Estimator(Protocol):
     """Settings of one estimator; immutable."""
 
