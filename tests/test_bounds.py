@@ -28,7 +28,7 @@ def integrated(text, E=1, horizon=20.0, states=1):
 
 
 def found(text, start=0.0, stop=20.0):
-    return breakpoints([parse(text, {}, "here")], start, stop)
+    return breakpoints(record([parse(text, {}, "here")]), start, stop)
 
 
 @given(

@@ -161,7 +161,7 @@ def test_min_and_max_take_the_side_that_is_asked_for(order: int) -> None:
     texts = ["min(t, 1)", "max(1, t)", "min(sin(t), cos(t))"]
     expressions = [read(text) for text in texts]
     middle = math.pi / 4
-    cuts = breakpoints(expressions, 0.0, 2.0)
+    cuts = breakpoints(record(expressions), 0.0, 2.0)
     np.testing.assert_allclose(cuts, [middle, 1.0], rtol=1e-14)
     t = np.array([1.0, 1.0, middle, middle])
     values = taylor(expressions, t, order, t + np.array([-1e-3, 1e-3] * 2))
@@ -551,50 +551,51 @@ def test_inside_decides_only_what_jumps() -> None:
 
 def test_breakpoints_that_are_exact() -> None:
     texts = ["step(t - 0.1)", "step(7 - t)*sin(t)", "abs(3*t - 1)", "sign(2 - t)", "step(t - 7)"]
-    got = breakpoints([read(text) for text in texts], 0.0, 10.0)
+    got = breakpoints(record([read(text) for text in texts]), 0.0, 10.0)
     assert got.tolist() == [0.1, 1 / 3, 2.0, 7.0]
 
 
 def test_breakpoints_lie_strictly_inside() -> None:
     expressions = [read("step(t) + step(t - 1) + step(t - 2) + step(t + 1) + abs(t - 5)")]
-    assert breakpoints(expressions, 0.0, 2.0).tolist() == [1.0]
-    assert breakpoints(expressions, 1.0, 1.0).tolist() == []
-    assert breakpoints([read("abs(sin(pi*t))")], 0.0, 1.0).tolist() == []
-    assert breakpoints([read("sin(t)"), read("2")], 0.0, 10.0).shape == (0,)
-    assert breakpoints([], 0.0, 10.0).shape == (0,)
+    assert breakpoints(record(expressions), 0.0, 2.0).tolist() == [1.0]
+    assert breakpoints(record(expressions), 1.0, 1.0).tolist() == []
+    assert breakpoints(record([read("abs(sin(pi*t))")]), 0.0, 1.0).tolist() == []
+    assert breakpoints(record([read("sin(t)"), read("2")]), 0.0, 10.0).shape == (0,)
+    assert breakpoints(record([]), 0.0, 10.0).shape == (0,)
 
 
 def test_breakpoints_that_are_found() -> None:
-    got = breakpoints([read("abs(sin(t)) + sign(2*sin(t))*exp(t)")], 0.5, 10.0)
+    got = breakpoints(record([read("abs(sin(t)) + sign(2*sin(t))*exp(t)")]), 0.5, 10.0)
     np.testing.assert_allclose(got, np.pi * np.arange(1, 4), rtol=1e-15)
-    found = breakpoints([read("abs(t**3 - 2)")], 0.0, 3.0)
+    found = breakpoints(record([read("abs(t**3 - 2)")]), 0.0, 3.0)
     np.testing.assert_allclose(found, [2 ** (1 / 3)], rtol=1e-15)
 
 
 def test_breakpoints_on_the_grid_of_the_search() -> None:
-    assert breakpoints([read("sign((t - 5)*(t + 1))")], 0.0, 10.0).tolist() == [5.0]
-    assert breakpoints([read("abs((t - 5)**2)")], 0.0, 10.0).tolist() == []
-    assert breakpoints([read("abs(t**2*0)")], 0.0, 10.0).tolist() == []
+    assert breakpoints(record([read("sign((t - 5)*(t + 1))")]), 0.0, 10.0).tolist() == [5.0]
+    assert breakpoints(record([read("abs((t - 5)**2)")]), 0.0, 10.0).tolist() == []
+    assert breakpoints(record([read("abs(t**2*0)")]), 0.0, 10.0).tolist() == []
 
 
 def test_breakpoints_of_arguments_that_jump_themselves() -> None:
     # At 4 the argument of abs jumps over zero: one breakpoint, exactly there, not two.
-    got = breakpoints([read("abs(step(t - 4) - 0.5 + 0*t**2)")], 0.0, 10.0)
+    got = breakpoints(record([read("abs(step(t - 4) - 0.5 + 0*t**2)")]), 0.0, 10.0)
     assert got.tolist() == [4.0]
-    got = breakpoints([read("abs(abs(t - 4) - 1)")], 0.0, 10.0)
+    got = breakpoints(record([read("abs(abs(t - 4) - 1)")]), 0.0, 10.0)
     np.testing.assert_allclose(got, [3.0, 4.0, 5.0], rtol=1e-15)
-    got = breakpoints([read("abs(sin(t) + 5*step(t - 4))")], 0.0, 10.0)
+    got = breakpoints(record([read("abs(sin(t) + 5*step(t - 4))")]), 0.0, 10.0)
     np.testing.assert_allclose(got, [np.pi, 4.0], rtol=1e-15)
 
 
 def test_breakpoints_just_before_a_jump() -> None:
     text = "abs(t**2 - 3.9991**2 + 100*step(t - 3.9995))"  # both within one cell of the grid
-    np.testing.assert_allclose(breakpoints([read(text)], 0, 10), [3.9991, 3.9995], rtol=1e-14)
+    got = breakpoints(record([read(text)]), 0, 10)
+    np.testing.assert_allclose(got, [3.9991, 3.9995], rtol=1e-14)
 
 
 def test_breakpoints_of_an_argument_without_a_value() -> None:
     with pytest.raises(ConfigError, match="no finite value at t = 0"):
-        breakpoints([read("abs(log(t - 1))")], 0.0, 10.0)
+        breakpoints(record([read("abs(log(t - 1))")]), 0.0, 10.0)
 
 
 def test_an_inverse_step_is_the_complement() -> None:
@@ -603,7 +604,9 @@ def test_an_inverse_step_is_the_complement() -> None:
     np.testing.assert_array_equal(up + down, np.ones(31))
 
 
-@pytest.mark.parametrize("function", [taylor, breakpoints], ids=["taylor", "breakpoints"])
+@pytest.mark.parametrize("function", [
+    taylor, lambda expressions, *span: breakpoints(record(expressions), *span),
+], ids=["taylor", "breakpoints"])
 def test_nothing_warns(function: Callable[..., Array]) -> None:
     expressions = [read("abs(sin(t))**3/(1 + exp(-t)) + step(t - 1)")]
     with np.errstate(all="warn"):

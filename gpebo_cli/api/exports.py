@@ -11,7 +11,7 @@ from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.observers.reduced.invariant import invariant_observer
 from gpebo_cli.observers.remedies.plain import Plain
-from gpebo_cli.results.frames import frame
+from gpebo_cli.results.tables import frame
 
 
 def to_xarray(result: RunResult, table: str) -> Any:

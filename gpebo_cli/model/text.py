@@ -18,7 +18,7 @@ from gpebo_cli.model.expressions import (
     Bounds,
     Expression,
     Tape,
-    breakpoints_of_tape,
+    breakpoints,
     divisors_of,
     record,
     resolved,
@@ -182,7 +182,7 @@ class TextCoefficients:
     def breakpoints(self, start: float, stop: float) -> Array:
         """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks."""
         if (start, stop) not in self._breakpoints:
-            self._breakpoints[start, stop] = breakpoints_of_tape(self.tape, start, stop)
+            self._breakpoints[start, stop] = breakpoints(self.tape, start, stop)
         return self._breakpoints[start, stop].copy()
 
     def resolved(self, edges: Array) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.model.expressions import Expression, Tape, breakpoints_of_tape, nodes, parse, record
+from gpebo_cli.model.expressions import Expression, Tape, breakpoints, nodes, parse, record
 from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.syntax import signal
 from gpebo_cli.model.plant import plant_from_mapping, read_parameters
@@ -138,7 +138,7 @@ class TextRegression:
         tapes = [self.psi, *([] if self.Y is None else [self.Y])]
         tapes += [operator.argument for operator in self.operators]
         found = [self.system.coefficients.breakpoints(start, stop), _jumps(signals)]
-        cuts = np.concatenate(found + [breakpoints_of_tape(tape, start, stop) for tape in tapes])
+        cuts = np.concatenate(found + [breakpoints(tape, start, stop) for tape in tapes])
         for operator in self.operators:
             if operator.name == "delay":
                 later = np.concatenate([[start], cuts]) + operator.number

@@ -1,8 +1,8 @@
 """The five CSV tables of a run. Floats are written ``%.17g``, so reading them gives them back.
 
 A table is a header and an array, formatted a chunk of rows at a time by one ``%`` operation: some
-0.35 µs per number, three quarters of what ``numpy.savetxt`` takes. pandas is left alone: importing
-it takes longer than most runs.
+0.35 µs per number, three quarters of what ``numpy.savetxt`` takes. pandas is for data frames
+alone: importing it takes longer than most runs.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,10 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import EstimationResult, NoiseStatistics, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results.files import csv_text, write_file
+from gpebo_cli.schema import unknown
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _CHUNK_ROWS = 2048  # large enough to amortise the call, small enough to stay in cache
 
@@ -150,6 +155,32 @@ TABLES: dict[str, Callable[[RunResult], Table | None]] = {
     "estimates": _estimates, "cases": _cases,
 }
 """What makes each table of a run; None where the run has nothing for it."""
+
+
+def frame(result: RunResult, name: str) -> DataFrame:
+    """One table of a run.
+
+    Args:
+        result: the run.
+        name: one of :data:`TABLES`.
+
+    Returns:
+        ``signals``, ``regression`` and ``excitation`` are indexed by ``t`` in seconds,
+        ``estimates`` by ``case`` and ``t``, ``cases`` by ``case``.
+
+    Raises:
+        ConfigError: there is no table of that name, or this run does not have it.
+    """
+    if name not in TABLES:
+        raise unknown(f"there is no table {name!r}", name, TABLES)
+    table = TABLES[name](result)
+    if table is None:
+        raise ConfigError(f"this run has no table {name!r}: it was made with observer=none")
+    from pandas import DataFrame
+
+    found = DataFrame(np.concatenate(list(table.pieces)), columns=table.header)
+    keys = table.header[:2] if name == "estimates" else table.header[:1]
+    return found.astype({key: int for key in keys if key == "case"}).set_index(keys)
 
 
 def write_table(path: Path, table: Table) -> None:

@@ -25,6 +25,7 @@ _DEEPEST = 45  # halvings of a cell
 _CELLS = 64  # to begin with, where roots are looked for
 _NARROWEST = 1e-13  # of the span; cells are not cut further
 _MOST_CELLS = 1 << 15
+_SAME = 1e-12  # of the span: found instants closer than this to another are that one
 _BISECTIONS = 100  # more than enough to leave two neighbouring floats
 
 
@@ -146,6 +147,39 @@ class _Cells:
 
     def __getitem__(self, some: BoolArray) -> _Cells:
         return _Cells(self.which[some], self.low[some], self.high[some])
+
+
+def breakpoints(tape: Tape, start: float, stop: float) -> Array:
+    """Times strictly between ``start`` and ``stop`` where some expression jumps or has a kink.
+
+    Instants of ``step`` and zeros of affine arguments of ``abs``, ``sign``, ``min`` and ``max`` are
+    exact, changes of sign of other arguments isolated by bounds, see :func:`roots`, and bisected to
+    rounding.
+
+    Returns:
+        Sorted, without repetitions, seconds, shape (number,).
+
+    Raises:
+        ConfigError: an argument that is not finite at some time.
+    """
+    if not tape.jumps:
+        return np.zeros(0)
+    steps = [i.value for i in tape.instructions if i.operation == "step"]
+    affine = [s.affine for s in tape.switches if s.affine is not None]
+    instants = np.array([*steps, *(-offset / slope for offset, slope in affine)], dtype=float)
+    exact = np.unique(instants[(instants > start) & (instants < stop)])
+    if len(affine) == len(tape.switches) or not start < stop:
+        return exact
+
+    found = np.sort(roots(tape, exact, start, stop))
+    near = _SAME * (stop - start)
+    known = np.concatenate([[start], exact, [stop]])
+    place = np.searchsorted(known, found)  # between start and stop, where all of them are
+    new = (found - known[np.maximum(place - 1, 0)] > near) & (
+        known[np.minimum(place, len(known) - 1)] - found > near
+    )
+    new[1:] &= np.diff(found) > near
+    return np.sort(np.concatenate([exact, found[new]]))
 
 
 def roots(tape: Tape, knots: Array, start: float, stop: float) -> Array:
