@@ -10,6 +10,7 @@ import pytest
 from gpebo_cli import run
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, build
 from gpebo_cli.recordings.hold import held, on_mesh, recording_mesh
@@ -58,6 +59,30 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(name, ho
     residual = whole.regression.Y(at) - whole.regression.psi(at) @ eta
     rms = np.sqrt((residual**2).sum(axis=1).mean())
     assert np.sqrt(few.regression.misfit(eta) / 4.0) == pytest.approx(rms, rel=1e-8)
+
+
+@pytest.mark.parametrize(("plant", "horizon"), [("battery", 60.0), ("motor", 0.1)])
+@pytest.mark.parametrize("estimator", ["mre", "least_squares"])
+def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monkeypatch):
+    """Where matrices follow signals: the same numbers, and an error estimate of the same size."""
+    made = run(plant, observer="none", time={"horizon": horizon, "samples": 151})
+    names = [*made.inputs, *made.outputs]
+    rng = np.random.default_rng(0)
+    data = {"t": made.t, **{
+        name: made[name] + 0.01 * made[name].std() * rng.standard_normal(151) for name in names
+    }}
+    results = []
+    for window in (10**6, 16):
+        monkeypatch.setattr(mesh, "_WINDOW", window)
+        results.append(run(plant, data=data, estimator=estimator, time={"samples": 31}).details)
+    whole, windows = (
+        np.concatenate([each.estimation.parameters[0], each.estimation.states[0]], axis=1)
+        for each in results
+    )
+    size = np.abs(whole).max(axis=0)
+    np.testing.assert_allclose(windows / size, whole / size, rtol=0.0, atol=1e-8)
+    found = [each.regression.error_estimate for each in results]
+    assert found[0] / 10 < found[1] < 10 * found[0]
 
 
 @pytest.mark.parametrize(("plant", "horizon", "count", "estimator"), [

@@ -11,7 +11,7 @@ from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import with_realisations
@@ -44,15 +44,20 @@ class VectorLaw:
         ordinary differential-algebraic equation. Where b jumps (a sample, a step of the input), ν
         does, too, and starts anew; η̂ does not jump.
         """
-        mesh, p = self.M.mesh, len(start)
-        k = self.b.values.shape[2]
-        packed = Trajectory(
-            mesh,
-            np.concatenate(
-                [self.M.values, self.N.values, with_realisations(self.M.values, self.b.values)],
-                axis=-1,
-            ),
-        )
+        signals = self.M.values, self.N.values, with_realisations(self.M.values, self.b.values)
+        first, eta, found = 0, start, list[Trajectory]()
+        for window in self.M.mesh.windows():
+            part = slice(first, first + window.size)
+            packed = np.concatenate([values[part] for values in signals], axis=-1)
+            found.append(self._over(Trajectory(window, packed), gains, eta))
+            first, eta = part.stop, found[-1].final
+        edges = np.unique(np.concatenate([each.mesh.edges for each in found]))
+        mesh = Mesh(edges, self.M.mesh.rule)
+        return Trajectory(mesh, np.concatenate([each.values for each in found]))
+
+    def _over(self, packed: Trajectory, gains: Array, start: Array) -> Trajectory:
+        """:meth:`solve` for [M | N | b] over a window, from η̂ (p,) or (p, c)."""
+        p, k = len(start), self.b.values.shape[2]
         c = packed.values.shape[-1] - 2 * p
         E = np.zeros((1, p + k, p + k))
         E[0, :p, :p] = np.eye(p)
@@ -71,11 +76,12 @@ class VectorLaw:
             return LinearEquation(E, A, f)
 
         first = packed.values[0, 0]
-        residual = first[:, 2 * p :] - (first[:, p : 2 * p] @ start)[:, None]
-        starts = np.concatenate([np.broadcast_to(start[:, None], (p, c)), residual])
+        start = np.broadcast_to(start.reshape(p, -1), (p, c))
+        residual = first[:, 2 * p :] - first[:, p : 2 * p] @ start
+        starts = np.concatenate([start, residual])
         problem = LinearProblem(coefficients, starts, name="estimator", floor=self.floor)
         solution = solve(
-            problem, mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
+            problem, packed.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
             restarts=_residual_restarts(packed, p),
         )
         trajectory = solution.trajectory

@@ -31,6 +31,7 @@ _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
 _JOINED = (8, 4, 2)  # as many elements become one
 _MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
 _TINY = float(np.finfo(np.float64).tiny)
+_WINDOW = 1 << 12  # elements of a long mesh that are solved together
 
 
 # Point values (K, s + 1, c) of signals of one kind, and what is small among them: ``unresolved``.
@@ -73,6 +74,13 @@ class Mesh:
         inside[:, 0] += _INSIDE * self.steps
         inside[:, -1] -= _INSIDE * self.steps
         return points, inside
+
+    def windows(self) -> list[Mesh]:
+        """This mesh, or the pieces of a long one that are solved one after the other."""
+        if self.size <= _WINDOW:
+            return [self]
+        cuts = range(0, self.size, _WINDOW)
+        return [Mesh(self.edges[k : k + _WINDOW + 1], self.rule) for k in cuts]
 
     def split(self, parts: IntArray) -> tuple[Mesh, IntArray]:
         """Cut element k into ``parts[k]`` equal ones; ``parts`` has shape (K,).

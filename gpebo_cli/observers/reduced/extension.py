@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,7 @@ from gpebo_cli.simulation import ivp
 
 _AT_ONCE = 1 << 15  # points: what is made of all of them at once is what takes the memory
 _SMALL = 8  # coordinates of w, up to which dense collocation is faster
+_OVER_TIME = ("Y", "psi", "offset", "gain", "elimination", "injectivity")  # of what is assembled
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 
 
@@ -283,7 +284,8 @@ def reduced_system(
     lost = None
     try:
         used, first, note = choose_form(
-            system, t, inside, at, signals.derivatives, solver, form, weights, units
+            system, t, inside, at, signals.derivatives, solver, form, weights, units,
+            piecewise=in_part and len(mesh.windows()) > 1,
         )
     except NotObservableError as error:
         used = as_given(system, t, inside, at, signals.derivatives)
@@ -319,7 +321,7 @@ def _beginning(
 def choose_form(
     system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
     derivatives: InputDerivatives | None, solver: SolverSettings, form: str,
-    weights: ByName | None, units: Units | None = None,
+    weights: ByName | None, units: Units | None = None, *, piecewise: bool = False,
 ) -> tuple[EquationForm, ObserverMatrices, str]:
     """The form of the equations, its matrices at the times t (N,), and why it is this one.
 
@@ -333,6 +335,8 @@ def choose_form(
         form: given, strangeness_free or auto.
         weights: of the outputs, ``observer.weights``.
         units: as for :func:`reduced_system`.
+        piecewise: the matrices are looked at piece by piece, and those of the first times are
+            enough, unless E moves.
 
     Raises:
         ModelError: rank of E not constant, Assumption 1 violated, not uniquely solvable.
@@ -345,9 +349,18 @@ def choose_form(
     scale = output_scale(weights, system)
 
     def matrices(chosen: EquationForm) -> ObserverMatrices:
-        return observer_matrices(
-            chosen, t, inside, solver.rank_tol, output_scale=scale, signals=signals
-        )
+        def at(part: slice, like: ObserverMatrices | None = None) -> ObserverMatrices:
+            return observer_matrices(
+                chosen, t[part], inside[part], solver.rank_tol, like, output_scale=scale,
+                signals=None if signals is None else signals[part],
+            )
+
+        if not piecewise or chosen.structure or "E" not in system.coefficients.constant:
+            return at(slice(None))
+        first = at(slice(_AT_ONCE))
+        for k in range(_AT_ONCE, len(t), _AT_ONCE):
+            at(slice(k, k + _AT_ONCE), first)
+        return first
 
     note, given = "", as_given(system, t, inside, signals, derivatives)
     given = given if units is None else replace(given, units=units)
@@ -410,6 +423,8 @@ class Extension:
 def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     """Integrate [ξ_a | ξ_b | Φ] from ``start`` (k, 1 + q + n_a) over ``mesh``, refined.
 
+    A long mesh is taken window by window, so that little is held beside the result.
+
     Raises:
         ModelError: rank of E not constant, Assumption 1 violated.
         SolverError: the tolerance cannot be reached, or the extension grows beyond all bounds.
@@ -462,26 +477,56 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
     on_axes &= basis.shape[1] == reduced.rank  # else what is eliminated is taken from them
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
-    if solver.name == "ivp":
-        solution = ivp.solve(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
-    else:
-        known = None
-        signals = reduced.signals
-        if mesh is signals.mesh and reduced.injection is None:
+    known, signals, found = None, reduced.signals, list[Extension]()
+    limits: dict[str, Any] = {"tol": solver.tol, "max_elements": solver.max_elements}
+    for window in mesh.windows():
+        if window is signals.mesh and reduced.injection is None and solver.name != "ivp":
             u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
             points, inside = _over_time(mesh.points), _over_time(mesh.inside)
             known = equations(reduced.first, reduced.form.driving(points, inside, u), y)
-        swept = sweeps.solve_dense(
-            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
-        ) if large else None
+        swept = sweeps.solve_dense(problem, window, **limits, known=known) if large else None
         if swept is not None:
-            return _assembled(reduced, _in_units(swept, units), latest[0], as_found=True)
-        if large:
-            large, known = False, None
-        solution = solve(
-            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, known=known
+            solution = swept
+        elif solver.name == "ivp":
+            solution = ivp.solve(problem, window, **limits)
+        else:
+            known, large = None if large else known, False
+            solution = solve(problem, window, **limits, known=known)
+        own = _in_units(solution, units)
+        found.append(_assembled(reduced, own, latest[0], as_found=swept is not None))
+        problem = replace(
+            problem, start=solution.trajectory.final, uncertain=solution.uncertain
         )
-    return _assembled(reduced, _in_units(solution, units), latest[0])
+    whole = joined(found)
+    return replace(whole, scale=np.maximum.accumulate(whole.scale, axis=0))
+
+
+def joined(parts: Sequence[Extension]) -> Extension:
+    """One extension of those on neighbouring meshes."""
+    if len(parts) == 1:
+        return parts[0]
+    edges = [part.mesh.edges[:-1] for part in parts[:-1]]
+    mesh = Mesh(np.concatenate([*edges, parts[-1].mesh.edges]), parts[-1].mesh.rule)
+    solutions, found = [part.solution for part in parts], [part.assembled for part in parts]
+
+    def together(name: str) -> Array:
+        values = [(getattr(each, name), len(each.Y)) for each in found]
+        return np.concatenate([np.broadcast_to(v, (N, *v.shape[1:])) for v, N in values])
+
+    return Extension(
+        replace(
+            solutions[-1], extras=(),
+            trajectory=Trajectory(mesh, np.concatenate([s.trajectory.values for s in solutions])),
+            error_estimate=max(solution.error_estimate for solution in solutions),
+        ),
+        Assembled(
+            **{name: together(name) for name in _OVER_TIME},
+            Y_scale=max(each.Y_scale for each in found),
+            column_scale=np.max([each.column_scale for each in found], axis=0),
+        ),
+        np.concatenate([part.scale for part in parts]),
+        parts[-1].units,
+    )
 
 
 def _assembled(

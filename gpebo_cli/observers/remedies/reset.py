@@ -39,8 +39,9 @@ from gpebo_cli.observers.reduced.extension import (
     Start,
     assumptions,
     extend,
+    joined,
 )
-from gpebo_cli.observers.reduced.regression import Assembled, on_mesh
+from gpebo_cli.observers.reduced.regression import on_mesh
 from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices
 from gpebo_cli.observers.reduced.split import comparable
 from gpebo_cli.regression.linear import LinearRegression, outer_products
@@ -170,23 +171,8 @@ def _joined(
 ) -> Observation:
     """One regression and one state map over all segments."""
     system = reduced.system
-    edges = [e.mesh.edges[:-1] for e in extensions[:-1]] + [extensions[-1].mesh.edges]
-    mesh = Mesh(np.concatenate(edges), reduced.mesh.rule)
-    parts = [e.assembled for e in extensions]
-    whole = Assembled(
-        Y=np.concatenate([a.Y for a in parts]),
-        psi=np.concatenate([a.psi for a in parts]),
-        offset=np.concatenate([a.offset for a in parts]),
-        gain=np.concatenate([a.gain for a in parts]),
-        Y_scale=max(a.Y_scale for a in parts),
-        column_scale=np.max([a.column_scale for a in parts], axis=0),
-        elimination=np.concatenate([
-            np.broadcast_to(a.elimination, (len(a.Y), *a.elimination.shape[1:])) for a in parts
-        ]),
-        injectivity=np.concatenate([
-            np.broadcast_to(a.injectivity, (len(a.Y),)) for a in parts
-        ]),
-    )
+    segments = joined(extensions)
+    mesh, whole = segments.mesh, segments.assembled
     kept = whole.kept_rows(system, reduced.regression)
     growth, logarithms = zip(*(e.growth(system.q) for e in extensions), strict=True)
     return Observation(
@@ -194,7 +180,7 @@ def _joined(
             Y=on_mesh(mesh, whole.Y[:, kept]),
             psi=on_mesh(mesh, whole.psi[:, kept]),
             parameters=(*system.unknowns, *reduced.names),
-            scale=np.concatenate([e.scale for e in extensions]),
+            scale=segments.scale,
             resets=tuple(resets),
         ),
         state_map=AffineStateMap(
@@ -202,9 +188,9 @@ def _joined(
         ),
         truth=SegmentErrors(
             tuple(starts), reduced.first.split.dual, reduced.units,
-            Trajectory(mesh, np.concatenate([e.solution.trajectory.values for e in extensions])),
+            segments.solution.trajectory,
         ),
-        error_estimate=max(e.solution.error_estimate for e in extensions),
+        error_estimate=segments.solution.error_estimate,
         assumptions=assumptions(reduced, mesh, whole),
         note=reduced.note,
         growth=max(growth),
