@@ -194,7 +194,7 @@ def _sizes(sizes: Array, terms: Array, elapsed: Array, tol: float) -> tuple[Arra
     A column that is rounding has the size of its terms: what is small beside those is so in x, too.
     """
     whole = terms * np.sqrt(np.maximum(elapsed, 0.0))[:, None]
-    rounding = _UNRESOLVED * tol * whole
-    seen = sizes > rounding
-    level = np.square(np.divide(rounding, sizes, out=np.ones(sizes.shape), where=seen))
-    return np.maximum(np.where(seen, sizes, whole), _TINY), np.maximum(level, _SINGULAR)
+    rounding = np.maximum(_UNRESOLVED * tol * whole, _TINY)
+    level = np.square(rounding / np.maximum(sizes, rounding))
+    seen = np.where(sizes > rounding, sizes, whole)
+    return np.maximum(seen, _TINY), np.maximum(level, _SINGULAR)

@@ -88,12 +88,12 @@ class Mesh:
         Returns:
             The new mesh, and for each new element the old one it equals, or −1 if it is new.
         """
-        parent = np.repeat(np.arange(self.size), parts)
-        first = np.cumsum(parts) - parts
-        position = np.arange(len(parent)) - first[parent]
-        left = self.edges[parent] + self.steps[parent] * (position / parts[parent])
-        edges = np.append(left, self.edges[-1])
-        return Mesh(edges, self.rule), np.where(parts[parent] == 1, parent, -1)
+        parent, own = np.arange(self.size).repeat(parts), parts.repeat(parts)
+        position = np.arange(len(parent)) - (parts.cumsum() - parts)[parent]
+        edges = np.empty(len(parent) + 1)
+        edges[:-1] = self.edges[parent] + self.steps[parent] * (position / own)
+        edges[-1] = self.edges[-1]
+        return Mesh(edges, self.rule), np.where(own == 1, parent, -1)
 
     def joined(
         self, values: Array, counts: IntArray, tol: float, keep: Array, longest: float = np.inf
@@ -262,8 +262,7 @@ class Trajectory:
         np.matmul(rule.integration, flat[:, 1:], out=out[:, 1:])
         out *= mesh.steps[:, None, None]
         if on:
-            total = np.cumsum(out[:, -1], axis=0)
-            out[1:] += total[:-1, None]
+            out[1:] += out[:-1, -1].cumsum(axis=0)[:, None]
         return Trajectory(mesh, out.reshape(self.values.shape))
 
     def low_pass(self, rate: Array | float, start: Array | None = None) -> Trajectory:

@@ -54,7 +54,7 @@ def refine(
             return mesh, found, tail, rounds
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         _check_budget(mesh, tail, parts, max_elements, name)
-        before, cut = np.repeat(floor, parts), np.repeat(tail, parts)
+        before, cut = floor.repeat(parts), tail.repeat(parts)
         mesh, kept = mesh.split(parts)
         floor = np.where(kept < 0, cut, before)
         rounds += 1

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,16 +112,16 @@ def units_at(c: Coefficients) -> Units:
     factors, there = _factors(sizes, order, 1.0)
     terms, logs = _terms(there, order), np.log(sizes[there])
     for _ in range(_ROUNDS):
-        counts = np.clip(np.exp(2.0 * (terms @ factors + logs)), _LITTLE, 1.0)
+        counts = np.minimum(np.maximum(np.exp(2.0 * (terms @ factors + logs)), _LITTLE), 1.0)
         factors = -_squares(terms, counts)((logs * counts) @ terms)
     factors /= np.log(10.0)
-    linked = np.asarray(there.any(axis=0))
-    open_factor = factors[_first_of_each_part(linked, np.roll(np.arange(n + r), r))]
+    linked = there[0] | there[1]
+    outputs_first = np.array([*range(n, n + r), *range(n)], dtype=np.intp)
+    open_factor = factors[_first_of_each_part(linked, outputs_first)]
     of_row = open_factor - factors[: n + r]
     of_column = factors[n + r : -1] + open_factor[linked.argmax(axis=0)]
-    equations, outputs = np.split(10.0 ** np.rint(of_row + _BESIDE_TIES), [n])
-    states, unknowns = np.split(10.0 ** np.rint(of_column + _BESIDE_TIES), [n])
-    return Units(states, equations, outputs, unknowns)
+    rows, columns = (10.0 ** np.rint(part + _BESIDE_TIES) for part in (of_row, of_column))
+    return Units(columns[:n], rows[:n], rows[n:], columns[n:])
 
 
 def _factors(sizes: Array, order: NDArray[np.int8], mass: float) -> tuple[Array, BoolArray]:
@@ -157,6 +157,9 @@ def _balancing(
     present = np.frombuffer(there, dtype=np.bool_).reshape(shape)
     terms = _terms(present, np.frombuffer(order, np.int8).reshape(shape))
     counts = np.where(present.nonzero()[0], 1.0, mass)
+    if isinstance(terms, np.ndarray):  # with the least norm
+        inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
+        return terms, inverse.dot, counts
     return terms, _squares(terms, counts), counts
 
 
@@ -177,15 +180,14 @@ def _terms(there: BoolArray, order: NDArray[np.int8]) -> Any:
 
 
 def _squares(terms: Any, counts: Array) -> Callable[[Array], Array]:
-    """The solution of termsᵀ diag(counts) terms x = b with the least norm, of sparse ones nearly.
+    """The solution of termsᵀ diag(counts) terms x = b, nearly the one with the least norm.
 
     Singular values of a thousand states would take longer than a run.
     """
     if isinstance(terms, np.ndarray):
-        values, vectors = np.linalg.eigh((counts * terms.T) @ terms)
-        some = values > 1e-12 * values[-1:]
-        inverse = (vectors[:, some] / values[some]) @ vectors[:, some].T
-        return lambda right: np.asarray(inverse @ right)
+        return partial(
+            np.linalg.solve, (counts * terms.T) @ terms + _OPEN * np.eye(terms.shape[1])
+        )
     from scipy.sparse import diags_array, eye_array
     from scipy.sparse.linalg import splu
 

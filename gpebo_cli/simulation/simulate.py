@@ -246,8 +246,8 @@ def _amplification(form: StrangenessFree, units: Array, step: float) -> Array:
     T, E1 = np.abs(T), np.abs(E1)
     sizes = T / units[:, None] * (E1 @ units)[:, None]
     rounding = np.where(sizes > NOTHING * sizes.max(initial=0.0), 1.0, 1.0 / EPS)
-    found[:, :-1] += ((T * rounding) @ E1).max(axis=0)
-    within = np.minimum(step * (T @ np.abs(A1)).max(axis=0), 1.0)
+    found[:, :-1] += largest_over_time((T * rounding) @ E1)
+    within = np.minimum(step * largest_over_time(T @ np.abs(A1)), 1.0)
     once = within @ found
     return np.asarray(found + once + within @ once)
 
@@ -296,20 +296,24 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
     if not c.B.shape[3]:
         return lambda _size: np.zeros(0)
     A, B = (largest_over_time(distinct(matrix)[0]) for matrix in (c.A, c.B))
-    seen = [(A[column > 0.0], column[column > 0.0]) for column in B.T]
 
     def terms(size: Array) -> Array:
-        least = [float((a @ size / b).min()) if len(b) else 0.0 for a, b in seen]
-        return np.array([one if isfinite(one) else 0.0 for one in least])
+        beside = np.full(B.shape, np.inf)
+        np.divide((A @ size)[:, None], B, out=beside, where=B > 0.0)
+        least = beside.min(axis=0, initial=np.inf)
+        return np.where(np.isfinite(least), least, 0.0)
 
     return terms
 
 
-def _outputs(C: Array, x: Array, direct: Array | float = 0.0) -> Array:
+def _outputs(C: Array, x: Array, direct: Array | None = None) -> Array:
     """y = C x + direct at points (K, s + 1)."""
+    (K, points, n), r = x.shape, C.shape[2]
     if C.shape[:2] == (1, 1):
-        return np.asarray(x @ C[0, 0].T + direct)
-    return np.asarray(np.matmul(C, x[..., None])[..., 0] + direct)
+        y = (x.reshape(K * points, n) @ C[0, 0].T).reshape(K, points, r)
+    else:
+        y = np.matmul(C, x[..., None])[..., 0]
+    return np.asarray(y if direct is None else y + direct)
 
 
 def _integrate(
