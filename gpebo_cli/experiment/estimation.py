@@ -464,8 +464,9 @@ def _still(parameters: Array, requirement: Requirement, natural: Array) -> BoolA
 
     Noise did not move them either, and a deviation of zero would claim that nothing is uncertain.
     """
-    moved = np.ptp(parameters, axis=1) > _STILL * natural
-    return np.asarray((len(natural) > 0) & (not requirement.holds) & ~moved.any(axis=1))
+    if requirement.holds or not len(natural):
+        return np.zeros(len(parameters), dtype=bool)
+    return np.asarray(~(np.ptp(parameters, axis=1) > _STILL * natural).any(axis=1))
 
 
 def _sizes(truth: Array, natural: Array, x: Array) -> tuple[Array, Array]:
@@ -563,8 +564,10 @@ def _evaluation(
 
     def reconstruct_kept(eta: Array) -> Array:
         """x̂ (g, k, n) of η̂ (g, k, p): a product for each time serves all cases."""
-        x_hat = np.swapaxes(np.matmul(np.swapaxes(eta, 0, 1), gain_kept), 0, 1)
-        return np.asarray(offset_kept + x_hat)
+        x_hat = np.empty((len(eta), *offset_kept.shape))
+        np.matmul(eta.swapaxes(0, 1), gain_kept, out=x_hat.swapaxes(0, 1))
+        x_hat += offset_kept
+        return x_hat
 
     def errors(eta: Array, at: IntArray) -> Array:
         """Of η̂ and x̂ (g, p + n) at one time for each quantity of each case, indices ``at``."""

@@ -59,7 +59,7 @@ static Outcome tails(Call *call)
 }
 
 /* values (K, points, c) -> the largest size of each component (K, c). */
-static Outcome largest(Call *call)
+EVERY_WIDTH static Outcome largest(Call *call)
 {
     const npy_intp K = SIZE(K), t = SIZE(t), c = SIZE(c);
     memset(call->out[0], 0, K * c * sizeof(double));

@@ -473,11 +473,12 @@ def _follow_dips(
         if not len(column):
             break
         # Dips of several columns at one time share a grid.
-        _, first, which = np.unique(
-            left + 1j * right, return_index=True, return_inverse=True
-        )
-        grid = (left[:, None] + (right - left)[:, None] * _CUTS)[first]
-        grid[:, -1] = right[first]
+        brackets = list(zip(left.tolist(), right.tolist(), strict=True))
+        own = list(dict.fromkeys(brackets))
+        which = np.array([own.index(bracket) for bracket in brackets], dtype=np.intp)
+        start, stop = np.array(own).T[..., None]
+        grid = start + (stop - start) * _CUTS
+        grid[:, -1:] = stop
         c = system.coefficients.taylor(grid.ravel(), mu)
         values = lines(grid.ravel(), c, column, which)
         dip, best = np.arange(len(values)), values.argmin(axis=1)
