@@ -562,13 +562,6 @@ def _evaluation(
     size, p = np.concatenate(sizes), truth.shape[1]
     offset_kept, gain_kept = offset[chosen], np.swapaxes(gain[chosen], 1, 2)
 
-    def reconstruct_kept(eta: Array) -> Array:
-        """x̂ (g, k, n) of η̂ (g, k, p): a product for each time serves all cases."""
-        x_hat = np.empty((len(eta), *offset_kept.shape))
-        np.matmul(eta.swapaxes(0, 1), gain_kept, out=x_hat.swapaxes(0, 1))
-        x_hat += offset_kept
-        return x_hat
-
     def errors(eta: Array, at: IntArray) -> Array:
         """Of η̂ and x̂ (g, p + n) at one time for each quantity of each case, indices ``at``."""
         place = len(grid) * np.arange(len(eta))[:, None] + at  # in all cases, one after the other
@@ -603,7 +596,11 @@ def _evaluation(
             times[np.isnan(np.hstack([of_eta, of_x]))] = np.nan
             times[:, :p][:, ~judged] = np.nan
             numbers = np.concatenate([numbers, times.T])
-        return numbers, eta[:, chosen], reconstruct_kept(eta[:, chosen])
+        kept = eta.take(chosen, axis=1)
+        x_hat = np.empty((len(eta), *offset_kept.shape))  # a product per time serves all cases
+        np.matmul(kept.swapaxes(0, 1), gain_kept, out=x_hat.swapaxes(0, 1))
+        x_hat += offset_kept
+        return numbers, kept, x_hat
 
     return evaluate_affine
 
