@@ -68,8 +68,8 @@ int orthogonalise(double *W, npy_intp rows, npy_intp length, double *sigma)
         double total = 0.0, worst = 0.0;
         for (npy_intp i = 0; i < rows; i++)
             total += sigma[i] = dot(W + i * length, W + i * length, length);
-        if (!(total < DBL_MAX) || (total > 0.0 && total < 1e-280))
-            return 0; /* squares that overflow, or are too small to be told apart */
+        if (!(total < 1e120) || (total > 0.0 && total < 1e-120))
+            return 0; /* products of two squares overflow, or are lost */
         const double rounding = 0.0625 * DBL_EPSILON * DBL_EPSILON * total;
         for (npy_intp p = 0; p < rows; p++)
             for (npy_intp q = p + 1; q < rows; q++) {
