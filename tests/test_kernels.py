@@ -31,14 +31,6 @@ def _mixed(rng, count=37, p=3, c=2):
     return (extended,)
 
 
-def _symmetric(rng, count=37, p=3, c=2):
-    root = rng.normal(size=(count, p, p)) * 10.0 ** rng.integers(-3, 3, size=(count, p, 1))
-    root[1:2], root[-1, 0] = 0.0, root[-1, -1]
-    gram = np.concatenate([np.swapaxes(root, 1, 2) @ root, rng.normal(size=(count, p, c))], axis=2)
-    gram[:, *np.triu_indices(p, 1)] *= -0.5  # the lower triangle counts
-    return (gram * 10.0 ** rng.integers(-300, 200, size=(count, 1, 1)),)
-
-
 def _law(rng, cases=11, gains=1, p=3):
     steps, times = 30, 40
     return (
@@ -108,6 +100,18 @@ def _swept(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True):
         rng.normal(size=(points, d, forced)), rng.normal(size=(k, d, c)) if kicked else None,
         rng.normal(size=(k, s, s + 1)), rng.normal(size=(d, c)),
         np.ones(d), 1e-15, 1e-3, 60,
+    )
+
+
+def _steps(rng, k=5, s=4, d=3, c=2, forced=1, kicked=True, one=False):
+    """Steps of an elimination, of which the last blocks are diagonal."""
+    target, source = rng.integers(0, d, size=(2, 20))
+    points = 1 if one else k * (s + 1)
+    return (
+        rng.normal(size=(k, s)), rng.integers(0, 3, size=k), target, source,
+        rng.integers(0, 5, size=20), 0.3 * rng.normal(size=(3, 2, s, s)),
+        0.3 * rng.normal(size=(3, 3, s)), rng.normal(size=(points, d, forced)),
+        rng.normal(size=(k, d, c)) if kicked else None, rng.normal(size=(d, c)),
     )
 
 
@@ -228,6 +232,9 @@ CASES: list[tuple[str, str, Case]] = [
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
         {"k": 1, "d": 1, "c": 3, "forced": 3}, {"c": 12},
     )),
+    *(("elements", "substituted", partial(_steps, **options)) for options in (
+        {}, {"s": 14, "c": 1, "one": True}, {"forced": 0, "kicked": False},
+    )),
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
     ("signals", "tails", partial(_signal, least=True)),
@@ -237,9 +244,6 @@ CASES: list[tuple[str, str, Case]] = [
     ("signals", "sample", partial(_samples, c=33)),
     ("signals", "interpolation", _places),
     ("signals", "interpolation", partial(_places, k=1, s=2)),
-    ("laws", "eigenvalues", _symmetric),
-    ("laws", "eigenvalues", partial(_symmetric, p=7, c=0)),
-    ("laws", "eigenvalues", partial(_symmetric, count=1, p=1)),
     ("laws", "mixed", _mixed),
     ("laws", "mixed", lambda rng: _mixed(rng, 8, 1, 1)),
     ("laws", "mixed", lambda rng: _mixed(rng, 1, 6, 1)),

@@ -181,8 +181,40 @@ def test_pivots_that_come_near_zero_are_left_to_the_derivative_array(factor):
     assert large.large_simulation(system, TIME, SolverSettings()) is None
 
 
-def test_what_is_stiff_is_left_to_dense_collocation():
-    system = plant(ladder, rate=1e5)
+def grid(cells):
+    """Heat on cells × 3 nodes: loops, which elimination fills; conductances over four decades."""
+    n = 3 * cells
+    E, A, B, C = np.eye(n), np.zeros((n, n)), np.zeros((n, 1)), np.zeros((2, n))
+    for i in range(n):
+        for j in {i + 1, i + 3} & set(range(n)):
+            g = 10.0 ** (4 * (i * 7 % n) / n)
+            A[np.ix_([i, j], [i, j])] += g * np.array([[-1.0, 1.0], [1.0, -1.0]])
+    A[0, 0] -= 1.0
+    B[0, 0] = C[0, 0] = C[1, -1] = 1.0
+    return E, A, B, C
+
+
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize(("build", "rate"), [(grid, 1.0), (ladder, 1e5)])
+def test_a_stiff_sparse_plant_is_as_wrong_as_it_says(build, rate, varying):
+    system, settings = plant(build, varying=varying, rate=rate), (TIME, SolverSettings(tol=1e-9))
+    found = large.large_simulation(system, *settings)
+    exact = large.large_simulation(system, TIME, SolverSettings(tol=1e-12))
+    dense = simulate._simulate_linear(system, *settings)
+    t = np.concatenate([np.geomspace(1e-7, TIME.horizon, 50)])
+    true = exact.signals.states(t)
+    for one in (found, dense):
+        wrong = np.abs(one.signals.states(t) - true).max(axis=0) / np.abs(true).max(axis=0)
+        assert (wrong <= 3.0 * (one.state_errors + exact.state_errors)).all()
+        assert wrong.max() < 1e-8
+
+
+def test_a_stiff_varying_plant_that_elimination_would_fill_is_left_to_dense_collocation():
+    def full(cells):
+        A = -1e5 * (np.eye(cells) + np.random.default_rng(0).uniform(0, 0.1, (cells, cells)))
+        return np.eye(cells), A, np.ones((cells, 1)), np.ones((2, cells))
+
+    system = plant(full, varying=True, cells=12)
     assert large.large_simulation(system, TIME, SolverSettings()) is None
 
 

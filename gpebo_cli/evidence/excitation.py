@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.evidence.knowledge import (
     Knowledge,
     knowledge,
@@ -23,7 +22,7 @@ from gpebo_cli.evidence.knowledge import (
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.linalg import largest
+from gpebo_cli.numerics.linalg import largest, symmetric_eigenvalues
 from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
@@ -107,7 +106,7 @@ def assess(
     def reached(at: Array, matrices: Array) -> Array:
         """A number that is at least 0 where ψ is exciting: a distance from that in logarithms."""
         if rho is not None:
-            level = kernels.laws.eigenvalues(matrices)[:, 0] / rho
+            level = symmetric_eigenvalues(matrices)[:, 0] / rho
         elif enough:
             level, of = (smallest, margin) if at is ends else smallest_and_margin(
                 matrices, *evidence.beside(at)
@@ -163,7 +162,7 @@ class _Evidence:
     def eigenvalues(self, at: Array | None = None) -> Array:
         """Those of G, (M, p)."""
         gram = self.regression.gram(self.t if at is None else at)
-        return np.maximum(kernels.laws.eigenvalues(gram), 0.0)
+        return np.maximum(symmetric_eigenvalues(gram), 0.0)
 
     def levels(self) -> Array:
         """The smallest eigenvalue over each trailing window, (N,)."""
@@ -300,7 +299,7 @@ def segment_level(regression: LinearRegression, t: Array, window: float) -> Arra
         here = np.flatnonzero(b > a)
         gram[here] += between(segment.outer, a[here], b[here])
         before = segment
-    level[whole] = np.maximum(kernels.laws.eigenvalues(gram)[:, 0], 0.0)
+    level[whole] = np.maximum(symmetric_eigenvalues(gram)[:, 0], 0.0)
     return level
 
 
@@ -325,7 +324,7 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     to_there = mesh.sampler(t)
     to_there = Sampler(to_there.element[whole], to_there.weights[whole])
     sums = _window_sums(outer, from_there, to_there, outer.values.shape[2])
-    level[whole] = np.maximum(kernels.laws.eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
+    level[whole] = np.maximum(symmetric_eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
     return level
 
 
@@ -374,7 +373,7 @@ def sampled_window_level(regression: SampledRegression, window: float) -> Array:
     first = np.searchsorted(t, t[whole] - window + slack, side="right")
     pairs = np.stack([first, whole + 1], axis=1).ravel()
     sums = np.add.reduceat(steps, pairs, axis=0)[::2]
-    level[whole] = np.maximum(kernels.laws.eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
+    level[whole] = np.maximum(symmetric_eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
     return level
 
 

@@ -15,9 +15,9 @@ from functools import cached_property
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.numerics.linalg import symmetric_eigenvalues
 
 _UNRESOLVED = 10.0  # tolerances of the terms of a column of ψ: what is smaller says nothing
 _SINGULAR = 1e-12  # eigenvalues of N below this are rounding of products of float64 numbers
@@ -143,7 +143,7 @@ def smallest_and_margin(
 ) -> tuple[Array, Array]:
     """``smallest`` and ``margin`` (M,) of :func:`knowledge`, without what takes eigenvectors."""
     normalised, _, level = _normalised(gram, terms, elapsed, tol)
-    spectrum = kernels.laws.eigenvalues(normalised)
+    spectrum = symmetric_eigenvalues(normalised)
     smallest = np.maximum(spectrum.min(axis=1, initial=1.0), 0.0)
     return smallest, np.asarray(smallest / level.max(axis=1, initial=_SINGULAR))
 

@@ -502,10 +502,66 @@ static Outcome sweeps(Call *call)
     return DONE;
 }
 
+/* The steps of an elimination in one element: right-hand sides b and solutions x (d, c, s). */
+EVERY_WIDTH static void substitute(const Call *call, npy_intp g, double *b, double *x)
+{
+    const npy_intp s = SIZE(s), size = SIZE(c) * s, F = SIZE(F);
+    for (npy_intp m = 0; m < SIZE(m); m++) {
+        const npy_intp t = call->index[2][m], from = call->index[3][m], block = call->index[4][m];
+        double *by = (t == from ? b : x) + from * size, *to = (t == from ? x : b) + t * size;
+        const double *B = call->in[5] + (g * F + block) * s * s;
+        const double *diagonal = call->in[6] + (g * SIZE(T) + block - F) * s;
+        for (npy_intp i = 0; i < size; i += s) {
+            if (block < F)
+                combine(to + i, to + i, by + i, s, B, s, s);
+            for (npy_intp j = 0; block >= F && j < s; j++)
+                to[i + j] += diagonal[j] * by[i + j];
+        }
+        if (t == from)
+            memset(by, 0, size * sizeof(double));
+    }
+}
+
+/* Solves one element after the other by the steps of an elimination; see elements_numpy.py. */
+static Outcome substituted(Call *call)
+{
+    const npy_intp s = SIZE(s), d = SIZE(d), c = SIZE(c), forced = SIZE(f), size = d * c;
+    const npy_intp blocks = SIZE(F) + SIZE(T), limit[] = {SIZE(G), d, d, blocks};
+    for (int i = 1; i < 5; i++)
+        for (npy_intp m = 0; m < (i > 1 ? SIZE(m) : SIZE(K)); m++)
+            if (call->index[i][m] < 0 || call->index[i][m] >= limit[i - 1])
+                return refused("an index", call->index[i][m]);
+    if (forced > c || (SIZE(Q) != 1 && SIZE(Q) != SIZE(K) * (s + 1)))
+        return refused("columns, or points of the forcing", SIZE(Q));
+    double *b = scratch(call, (2 * s + 1) * size), *x = b + s * size, *state = x + s * size;
+    if (b == NULL)
+        return ERROR;
+    memcpy(state, call->in[9], size * sizeof(double));
+    for (npy_intp k = 0; k < SIZE(K); k++) {
+        double *out = call->out[0] + k * (s + 1) * size;
+        const npy_intp step = call->step[7];
+        const double *f = call->in[7] + (k * (s + 1) + 1) * step, *left = call->in[0] + k * s;
+        memcpy(out, state, size * sizeof(double));
+        for (npy_intp i = 0; i < size; i++)
+            for (npy_intp j = 0; j < s; j++)
+                b[i * s + j] = left[j] * state[i] +
+                               (i % c < forced ? f[j * step + i / c * forced + i % c] : 0.0);
+        memset(x, 0, s * size * sizeof(double));
+        substitute(call, call->index[1][k], b, x);
+        for (npy_intp i = 0; i < size; i++) {
+            for (npy_intp j = 0; j < s; j++)
+                out[(j + 1) * size + i] = x[i * s + j];
+            state[i] = x[i * s + s - 1] + (call->in[8] ? call->in[8][k * size + i] : 0.0);
+        }
+    }
+    return DONE;
+}
+
 const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
     {"carried_errors", "Ktnc tt u K?nn K?nc K?nv K+nw K # # # # v=n+c", "Knc 5nc", carried_errors},
     {"sweeps", "ss K @d+ @e P?e Q?df |Kdc Kss+ dc d # # %m", "Ks+dc K", sweeps},
+    {"substituted", "Ks @K @m @m @m GFss GTs Q?df |Kdc dc", "Ks+dc", substituted},
     {NULL, NULL, NULL, NULL},
 };

@@ -71,3 +71,14 @@ def sweeps(
         R, h, rows, indices, entries, f, kicks, onward, start, weights, tol, share, most
     )
     return found
+
+
+def substituted(
+    left: Array, place: IntArray, target: IntArray, source: IntArray, block: IntArray, full: Array,
+    diagonal: Array, f: Array, kicks: Array | None, start: Array,
+) -> Array:
+    """In C."""
+    found: Array = _compiled.substituted(
+        left, place, target, source, block, full, diagonal, f, kicks, start
+    )
+    return found

@@ -269,3 +269,49 @@ def sweeps(
         values[k, 0], values[k, 1:] = state, X
         state = X[-1] if kicks is None else X[-1] + kicks[k]
     return values, changes
+
+
+def substituted(
+    left: Array, place: IntArray, target: IntArray, source: IntArray, block: IntArray, full: Array,
+    diagonal: Array, f: Array, kicks: Array | None, start: Array,
+) -> Array:
+    """Values of (D/h ⊗ I − A) X = D𝟙/h x_0 + f by elimination, one element after the other.
+
+    With a right-hand side b, and x = 0, in each step x_t += B b_t and then b_t = 0, where the
+    target t is the source; else b_t += B x_s.
+
+    Args:
+        left: D𝟙/h (K, s).
+        place: of each element among the G factors (K,).
+        target: of each step (m,).
+        source: likewise.
+        block: B of each step (m,): so many in ``full``, and counted on in
+        full: transposed (G, F, s, s), and
+        diagonal: (G, T, s).
+        f: of the first columns of X at the K (s + 1) points of all elements, or at one (P or 1, d,
+            f).
+        kicks: what is added to X at the end of each element (K, d, c), or None.
+        start: at the first left end (d, c).
+
+    Returns:
+        (K, s + 1, d, c), before what is added.
+    """
+    (K, s), (d, columns), F = left.shape, start.shape, full.shape[1]
+    values, state = np.empty((K, s + 1, d, columns)), start
+    steps = list(zip(target.tolist(), source.tolist(), block.tolist(), strict=True))
+    for k, g in enumerate(place.tolist()):
+        right = state[:, None] * left[k, :, None]
+        given = f if len(f) == 1 else f[k * (s + 1) + 1 : (k + 1) * (s + 1)]
+        right[:, :, : f.shape[2]] += np.moveaxis(given, 0, 1)
+        b, x = list(right), [np.zeros((s, columns))] * d
+        for t, r, i in steps:
+            by = b[t] if t == r else x[r]
+            term = full[g, i].T @ by if i < F else diagonal[g, i - F, :, None] * by
+            if t == r:
+                x[t], b[t] = x[t] + term, np.zeros((s, columns))
+            else:
+                b[t] = b[t] + term
+        values[k, 0] = state
+        np.stack(x, axis=1, out=values[k, 1:])
+        state = values[k, -1] if kicks is None else values[k, -1] + kicks[k]
+    return values

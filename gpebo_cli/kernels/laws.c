@@ -254,62 +254,7 @@ static Outcome squared_errors(Call *call)
     return DONE;
 }
 
-#define SWEEPS 30 /* at most, until what is left beside the largest entry, which is 1, is 1e-17 */
-
-/* Rotates rows and columns i < j of symmetric A (p, p) so that entry (i, j) becomes zero. */
-EVERY_WIDTH static void rotate(Lane *A, npy_intp p, npy_intp i, npy_intp j)
-{
-    Lane c, s;
-    for (int l = 0; l < LANES; l++) {
-        const double off = 2.0 * A[i * p + j][l], gap = A[j * p + j][l] - A[i * p + i][l];
-        const double root = fabs(gap) + sqrt(gap * gap + off * off);
-        const double tangent = root > 0.0 ? (gap < 0.0 ? -off : off) / root : 0.0;
-        c[l] = 1.0 / sqrt(1.0 + tangent * tangent), s[l] = tangent * c[l];
-    }
-    for (npy_intp k = 0; k < 2 * p; k++) { /* columns, then rows */
-        double *x = A[k < p ? k * p + i : i * p + k - p], *y = A[k < p ? k * p + j : j * p + k - p];
-        for (int l = 0; l < LANES; l++) {
-            const double before = x[l];
-            x[l] = c[l] * before - s[l] * y[l], y[l] = s[l] * before + c[l] * y[l];
-        }
-    }
-}
-
-/* Symmetric matrices, further columns -> eigenvalues of the lower triangles by Jacobi's method. */
-static Outcome eigenvalues(Call *call)
-{
-    const npy_intp N = SIZE(N), p = SIZE(p), w = SIZE(w);
-    Lane *A = (Lane *)scratch(call, LANES * p * (w + p));
-    if (A == NULL)
-        return ERROR;
-    Lane *given = A + p * p;
-    for (npy_intp first = 0; first < N; first += LANES) {
-        const npy_intp used = N - first < LANES ? N - first : LANES;
-        Lane size = {0};
-        lanes_load(given, call->in[0], call->step[0], p * w, first, used);
-        for (npy_intp i = 0; i < p * p; i++)
-            EACH size[l] = larger(fabs(given[i / p * w + i % p][l]), size[l]);
-        for (npy_intp i = 0; i < p * p; i++) {
-            const npy_intp row = i / p > i % p ? i / p : i % p, column = i / p + i % p - row;
-            EACH A[i][l] = given[row * w + column][l] / larger(size[l], DBL_MIN);
-        }
-        double off = 1.0;
-        for (int sweep = 0; sweep < SWEEPS && off > 1e-17; sweep++) {
-            off = 0.0;
-            for (npy_intp j = 1; j < p; j++)
-                for (npy_intp i = 0; i < j; i++) {
-                    EACH off = larger(fabs(A[i * p + j][l]), off);
-                    rotate(A, p, i, j);
-                }
-        }
-        for (npy_intp k = 0; k < used * p; k++)
-            call->out[0][first * p + k] = A[k % p * (p + 1)][k / p] * size[k / p];
-    }
-    return DONE;
-}
-
 const Kernel law_kernels[] = {
-    {"eigenvalues", "N?pw", "Np", eigenvalues},
     {"mixed", "Npw c=w-p", "N Npc N", mixed},
     {"stepped_law", "S Sp Sp Sp @M M M g?p gw", "gMp", stepped_law},
     {"squared_errors", "gMp M?p p M?n M?np M?n n |gc # c=p+n", "gM gM gc g2", squared_errors},

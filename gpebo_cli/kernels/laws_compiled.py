@@ -5,20 +5,10 @@ from __future__ import annotations
 from gpebo_cli.kernels import _compiled, laws_numpy
 from gpebo_cli.kernels.arrays import Array
 
-_SMALL = 16  # rows, up to which LAPACK's calls cost more than what they compute,
-_FEW = 7  # and those for eigenvalues
+_SMALL = 16  # rows, up to which LAPACK's calls cost more than what they compute
 
 stepped_law = _compiled.stepped_law
 squared_errors = _compiled.squared_errors
-
-
-def eigenvalues(matrices: Array) -> Array:
-    """In C for small matrices."""
-    if matrices.shape[1] > min(_FEW, matrices.shape[2]):
-        return laws_numpy.eigenvalues(matrices)
-    found: Array = _compiled.eigenvalues(matrices)
-    found.sort(axis=1)
-    return found
 
 
 def mixed(extended: Array) -> tuple[Array, Array, Array]:

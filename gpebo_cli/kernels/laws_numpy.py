@@ -26,11 +26,6 @@ def mixed(extended: Array) -> tuple[Array, Array, Array]:
     return delta, solved[:, :, p:], condition
 
 
-def eigenvalues(matrices: Array) -> Array:
-    """Eigenvalues (N, p), ascending, of symmetric matrices (N, p, p + c), of p columns of them."""
-    return np.asarray(np.linalg.eigvalsh(matrices[..., : matrices.shape[1]]), dtype=np.float64)
-
-
 def stepped_law(
     length: Array, left: Array, change: Array, jump: Array, step: IntArray, partial: Array,
     share: Array, start: Array, gains: Array,

@@ -119,6 +119,11 @@ def determinant_and_adjugate_action(
 _SCAN_LIMIT = 1 << 11  # above this many parallel recurrences a plain loop over k moves less memory
 
 
+def symmetric_eigenvalues(matrices: Array) -> Array:
+    """Eigenvalues (N, p), ascending, of symmetric matrices (N, p, p + c), of p columns of them."""
+    return np.asarray(np.linalg.eigvalsh(matrices[..., : matrices.shape[1]]), dtype=np.float64)
+
+
 def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
     """All z_k of z_{k+1} = a_k z_k + b_k along axis 0.
 

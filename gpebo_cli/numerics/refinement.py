@@ -22,7 +22,8 @@ Evaluate = Callable[[Mesh, "Found | None", IntArray], tuple[Found, Array]]
 
 
 def refine(
-    evaluate: Evaluate[Found], mesh: Mesh, *, tol: float, max_elements: int, name: str
+    evaluate: Evaluate[Found], mesh: Mesh, *, tol: float, max_elements: int, name: str,
+    patience: int = 1,
 ) -> tuple[Mesh, Found, Array, int]:
     """Cut the elements of ``mesh`` until the tail of each one is at most ``tol``.
 
@@ -33,6 +34,8 @@ def refine(
         tol: of the tails.
         max_elements: refuse to go beyond.
         name: of what is found, for messages.
+        patience: after so many cuts without effect what is left counts as rounding. What swings
+            within a long element may not become smaller by the first.
 
     Returns:
         The mesh, what was found on it, the tails (K,) and the number of rounds.
@@ -43,18 +46,21 @@ def refine(
     found: Found | None = None
     kept = np.full(mesh.size, -1)
     floor = np.full(mesh.size, np.inf)  # the tail of the element that each one was cut from
+    missed = np.zeros(mesh.size)  # how many cuts had no effect
     rounds = 1
     while True:
         found, tail = evaluate(mesh, found, kept)
         # An element that was cut and is no better than the one it comes from shows rounding.
         poor = tail > tol
         if poor.any():
-            poor &= (tail <= 0.25 * floor) | (tail >= _ROUNDING)
+            missed = np.where((tail <= 0.25 * floor) | (tail >= _ROUNDING), 0, missed + 1)
+            poor &= missed < patience
         if not poor.any():
             return mesh, found, tail, rounds
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         _check_budget(mesh, tail, parts, max_elements, name)
         before, cut = floor.repeat(parts), tail.repeat(parts)
+        missed = missed.repeat(parts)
         mesh, kept = mesh.split(parts)
         floor = np.where(kept < 0, cut, before)
         rounds += 1

@@ -5,8 +5,8 @@ converges like (h‖A‖)^k/k!, and a sweep costs as much as the entries of A. T
 solved are those of collocation, so what holds for their solution holds here. Errors are carried on
 by the same sweeps, to two digits.
 
-Where A is constant and h‖A‖ is not modest, the same equations are solved directly, with one
-factorisation for all elements of one length.
+Where h‖A‖ is not modest, the same equations are solved directly: by :mod:`.elimination`, or where A
+is full and constant with one factorisation for all elements of one length.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from gpebo_cli.numerics.collocation import (
     merged,
     unresolved_signals,
 )
+from gpebo_cli.numerics.elimination import Eliminated, StiffError
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.linalg import largest_within
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, legendre_tail
@@ -41,7 +42,7 @@ MOST_ELEMENTS = 800  # with more of them the system counts as stiff
 _DIGITS = 1e-2  # of the tolerance, to which sweeps go on
 _BEYOND = 1.5  # lengths of elements, up to which polynomials are a beginning for the next ones
 _ROUGH = 0.02  # to which errors are carried
-_SPARSE = 0.1  # share of entries, up to which factors are sparse
+_LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
 _TINY = float(np.finfo(float).tiny)
 _FEW_COLUMNS = 4  # whose errors are carried one by one
@@ -65,10 +66,10 @@ class Sparse(NamedTuple):
         return np.asarray(np.abs(self.entries).reshape(*mesh.points.shape, -1).max(axis=1))
 
     def full(self) -> Array:
-        """The first of them (d, d)."""
+        """With every entry, (N or 1, d, d)."""
         d = len(self.rows) - 1
-        out = np.zeros((d, d))
-        out[np.repeat(np.arange(d), np.diff(self.rows)), self.columns] = self.entries[0]
+        out = np.zeros((len(self.entries), d, d))
+        out[:, np.repeat(np.arange(d), np.diff(self.rows)), self.columns] = self.entries
         return out
 
     def within(self, other: Sparse) -> Array:
@@ -81,15 +82,23 @@ class Sparse(NamedTuple):
         out[:, np.searchsorted(theirs, own)] = self.entries
         return out
 
-    def growth(self, enough: float) -> float:
-        """How fast x' = A x may grow for the first of them, at most; or what is below ``enough``.
+    def growth(self, units: Array, enough: float) -> float:
+        """How fast x' = A x may grow at any of the times, at most; or what is below ``enough``.
 
-        Gershgorin's discs say so without eigenvalues, if these are needed for nothing else.
+        Gershgorin's discs, in ``units`` of the states (d,), say so without eigenvalues, if these
+        are needed for nothing else; eigenvalues are of a few times.
         """
-        A = self.full()
-        own = np.diagonal(A)
-        discs = float((own - np.abs(own) + np.abs(A).sum(axis=1)).max(initial=0.0))
-        return discs if discs <= enough else max(0.0, float(np.linalg.eigvals(A).real.max()))
+        d, N = len(units), len(self.entries)
+        of_row = np.repeat(np.arange(d), np.diff(self.rows))
+        own = np.zeros((N, d))
+        own[:, of_row[of_row == self.columns]] = self.entries[:, of_row == self.columns]
+        sizes = np.broadcast_to(units[:, None], (N, d, 1))
+        discs = own - np.abs(own) + self.product(np.abs(self.entries), sizes)[..., 0] / units
+        if discs.max(initial=0.0) <= enough:
+            return float(discs.max(initial=0.0))
+        some = np.linspace(0, N - 1, int(np.clip(_LOOKED_AT // d**3, 1, 32)), dtype=np.intp)
+        full = self._replace(entries=self.entries[some]).full()
+        return float(np.linalg.eigvals(full).real.max(initial=0.0))
 
     def product(self, entries: Array, x: Array) -> Array:
         """Products (K, d, c) of matrices with these entries (K or 1, e) and x (K, d, c)."""
@@ -123,7 +132,7 @@ def sparse(A: Array, more: Sparse | None = None) -> Sparse | None:
     """Matrices (N or 1, d, d) by their entries, at ``more`` places, too; None if most are there."""
     there = (A != 0.0).any(axis=0)
     if more is not None:
-        there |= more._replace(entries=np.ones((1, len(more.columns)))).full() != 0.0
+        there |= more._replace(entries=np.ones((1, len(more.columns)))).full()[0] != 0.0
     i, j = np.nonzero(there)
     if len(i) > _DENSE * there.size:
         return None
@@ -146,7 +155,7 @@ def solve(
         tol: see there.
         max_elements: see there.
         restarts: see there.
-        stiff: elements are solved and not swept over; A is constant.
+        stiff: elements are solved and not swept over.
 
     Raises:
         SolverError: ``max_elements`` do not reach ``tol``; names the time.
@@ -154,7 +163,10 @@ def solve(
     A, _, _ = equation(mesh, np.full(mesh.size, -1))
     march: March = elements.sweeps
     if stiff:
-        march = _Solved(A)
+        full = len(A.columns) > _DENSE * len(A.rows) ** 2
+        if full and len(A.entries) > 1:
+            return None
+        march = _Solved(A) if full else Eliminated()
     else:
         parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh), units) / LENGTH)
         if not np.maximum(parts, 1.0).sum() <= min(MOST_ELEMENTS, max_elements):
@@ -177,9 +189,10 @@ def solve(
 
     try:
         mesh, found, tail, rounds = refine(
-            evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name
+            evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name,
+            patience=1 + stiff,
         )
-    except _StiffError:
+    except StiffError:
         return None
     errors, lost, last = _errors(march, problem, mesh, units, found)
     return LinearSolution(
@@ -211,7 +224,7 @@ def solve_dense(
         before = None if fresh.all() else last[0]
         A = sparse(c.A, None if before is None else before[1])
         if A is None:
-            raise _StiffError
+            raise StiffError
         f, extras = c.f, tuple(at_points(e, count, s) for e in c.extras)
         if before is not None:
             K = before[0].size
@@ -230,12 +243,8 @@ def solve_dense(
             problem, equation, mesh, units=np.ones(len(problem.start)), tol=tol,
             max_elements=max_elements,
         )
-    except _StiffError:
+    except StiffError:
         return None
-
-
-class _StiffError(Exception):
-    """Sweeps do not converge."""
 
 
 class _Found(NamedTuple):
@@ -258,7 +267,7 @@ def _mapped(
     first = slice(0, f.shape[2])
     group, h = equal_lengths(h)
     D = np.asarray(np.linalg.inv(R), dtype=np.float64)
-    full = Sparse(rows, columns, entries).full()[None]
+    full = Sparse(rows, columns, entries).full()
     maps, forced = decoupled_maps(
         D, h, None, full, f, None, None, group, int(group.max()) + 1
     )
@@ -278,8 +287,7 @@ class _Solved:
     """
 
     def __init__(self, A: Sparse) -> None:
-        self._A, self._solvers = A.full(), dict[str, Callable[[ComplexArray], ComplexArray]]()
-        self._sparse = len(A.columns) < _SPARSE * self._A.size
+        self._A, self._factors = A.full()[0], dict[str, tuple[ComplexArray, IntArray]]()
 
     def __call__(
         self, R: Array, h: Array, _rows: IntArray, _columns: IntArray, _entries: Array, f: Array,
@@ -299,24 +307,14 @@ class _Solved:
 
     def _solve(self, shift: complex, right: ComplexArray) -> ComplexArray:
         """(shift I − A) y = r, with one factorisation for what is equal but for rounding."""
-        known = f"{shift:.13e}"
-        if known not in self._solvers:
-            self._solvers[known] = self._factorised(shift)
-        return self._solvers[known](right)
-
-    def _factorised(self, shift: complex) -> Callable[[ComplexArray], ComplexArray]:
-        matrix = -self._A.astype(np.complex128)
-        matrix[np.diag_indices(len(matrix))] += shift
-        if self._sparse:
-            from scipy.sparse import csc_matrix
-            from scipy.sparse.linalg import splu
-
-            solve: Callable[[ComplexArray], ComplexArray] = splu(csc_matrix(matrix)).solve
-            return solve
         from scipy.linalg import lu_factor, lu_solve
 
-        factors = lu_factor(matrix, overwrite_a=True)
-        return lambda r: np.asarray(lu_solve(factors, r, check_finite=False), dtype=np.complex128)
+        known = f"{shift:.13e}"
+        if known not in self._factors:
+            matrix = shift * np.eye(len(self._A)) - self._A
+            self._factors[known] = lu_factor(matrix, overwrite_a=True)
+        solved = lu_solve(self._factors[known], right, check_finite=False)
+        return np.asarray(solved, dtype=np.complex128)
 
 
 def _swept(
@@ -326,7 +324,7 @@ def _swept(
     """Values (K, s + 1, d, c), and the last change in each element (K,).
 
     Raises:
-        _StiffError: sweeps do not converge.
+        StiffError: sweeps do not converge.
     """
     edges, state = mesh.edges.tolist(), problem.start
     cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
@@ -343,7 +341,7 @@ def _swept(
             SHARE, _MOST_SWEEPS,
         )
         if not (change <= 8.0 * enough).all() or not np.isfinite(values[-1]).all():
-            raise _StiffError
+            raise StiffError
         pieces.append((values, change))
         state = values[-1, -1]
     if len(pieces) == 1:

@@ -1,8 +1,7 @@
 """Simulate a large plant: elimination, then sweeps over its entries, or solves where it is stiff.
 
 A sparse plant is eliminated entry by entry at all times. A constant one that is full, or of which
-pivots do not tell the structure, is reduced once, by singular values. Of stiff plants those with
-constant matrices are simulated here.
+pivots do not tell the structure, is reduced once, by singular values.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from gpebo_cli.simulation.known import MARGIN, SHORT, inputs_resolved, known_joi
 from gpebo_cli.simulation.signals import Signals, Simulation
 
 SMALL = 8  # states, up to which dense matrices are faster in any case
-_FULL = 50  # states, beyond which full or stiff constant plants are simulated here, too
+_FULL = 50  # states, beyond which full constant plants are simulated here, too
 _ENTRIES = 4  # per row of E; with more of them E counts as full
 _LENGTH = 2.6  # h‖A‖ of an element: products of two solutions, too, are resolved to 1e-9 there
 _NOTHING = 8.0 * EPS  # of what it is made of: a state that is smaller is rounding itself
@@ -194,11 +193,10 @@ def _simulated(
     if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
         return None  # what jumps then is for the derivative array to say
     M, units = plant.matrix(), form.units
-    longest = _LENGTH / max(M.norms(M.sizes(mesh), units).max(), _TINY)
-    stiff = np.ceil(mesh.steps / longest).sum() > sweeps.MOST_ELEMENTS
-    stiff = stiff and system.n > _FULL and len(M.entries) == 1
+    shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh), units).max(), _TINY)
+    stiff = bool(np.ceil(mesh.steps / longest).sum() > sweeps.MOST_ELEMENTS)
     if stiff:
-        longest = SHORT / max(M.growth(SHORT / float(mesh.steps.max())), _TINY)
+        longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), _TINY)
 
     def looked_at(t: Array) -> Coefficients:
         return entries(system.coefficients, t, 0).values
@@ -217,6 +215,10 @@ def _simulated(
         mesh = mesh.split(parts.astype(np.intp))[0]
         # What begins at zero is small in the first element, and is to be resolved there, too.
         mesh = Mesh(np.insert(mesh.edges, 1, mesh.edges[:2].mean()), mesh.rule)
+    if stiff:  # what decays at once is not looked for by one round of cuts after the other
+        finer = 8.0 ** -np.arange(np.floor(np.log2(mesh.steps[0] / shortest) / 3.0), 0.0, -1.0)
+        edges = np.insert(mesh.edges, 1, mesh.edges[0] + mesh.steps[0] * finer)
+        mesh = Mesh(edges, mesh.rule)
     form = plant.eliminate(mesh)
     x0, z0 = _start(plant)
     floor_z = SHARE * np.abs(form.reduced(x0))[:, None]

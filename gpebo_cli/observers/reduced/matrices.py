@@ -15,6 +15,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import (
     exact_product,
     orthonormal_complement,
+    symmetric_eigenvalues,
     transpose,
     without_rounding,
 )
@@ -373,7 +374,7 @@ def weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
     def exact(which: IntArray) -> Array:
         # ‖H‖_F/‖H‖₂: the largest eigenvalue of HᵀH has all its digits, and H is of order one.
         some = H[which] / np.maximum(np.abs(H[which]).max(axis=(1, 2), keepdims=True), TINY)
-        squares = kernels.laws.eigenvalues(transpose(some) @ some)
+        squares = symmetric_eigenvalues(transpose(some) @ some)
         norms = np.sqrt(np.maximum(squares, 0.0).sum(axis=1) / np.maximum(squares[:, -1], TINY))
         return np.asarray(injectivity[which] * norms)
 

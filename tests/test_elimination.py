@@ -1,0 +1,88 @@
+"""Elements of stiff systems with few entries, against one dense system for each element."""
+
+import numpy as np
+import pytest
+
+from gpebo_cli.numerics.elimination import Eliminated, StiffError
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.numerics.sweeps import sparse
+
+S, D = 5, 12
+RULE = radau_rule(S)
+H = np.array([0.3, 0.3, 0.01, 0.7])
+
+
+def system(rng, count, varying=True):
+    """A ring with rates over six decades, at all points of so many elements."""
+    A = np.zeros((count * (S + 1) if varying else 1, D, D))
+    for i in range(D):
+        A[:, i, i] = -(10.0 ** rng.uniform(0, 6)) * rng.uniform(1, 2, len(A))
+        A[:, i, (i + 1) % D], A[:, i, i - 1] = rng.normal(size=(2, len(A)))
+    return A, sparse(A)
+
+
+def solved(march, matrix, f, kicks, start, h=H):
+    return march(
+        RULE.integration, h, matrix.rows, matrix.columns, matrix.entries, f, kicks, None, start
+    )
+
+
+def dense(A, f, kicks, start, h=H):
+    """(D/h ⊗ I − A) X = D𝟙/h x_0 + f."""
+    derivative, found, state = np.linalg.inv(RULE.integration), [], start
+    for k, step in enumerate(h):
+        points = np.arange(S) + k * (S + 1) + 1
+        whole = np.kron(derivative / step, np.eye(D))
+        right = (derivative.sum(axis=1) / step)[:, None, None] * state
+        right[:, :, : f.shape[2]] += f[points]
+        for i, point in enumerate(points):
+            whole[i * D : (i + 1) * D, i * D : (i + 1) * D] -= A[point if len(A) > 1 else 0]
+        X = np.linalg.solve(whole, right.reshape(S * D, -1)).reshape(S, D, -1)
+        found.append(np.concatenate([state[None], X]))
+        state = X[-1] if kicks is None else X[-1] + kicks[k]
+    return np.array(found)
+
+
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize("kicked", [False, True])
+def test_the_solution_is_that_of_dense_systems(varying, kicked):
+    rng = np.random.default_rng(1)
+    A, matrix = system(rng, len(H), varying)
+    f, start = rng.normal(size=(len(H) * (S + 1), D, 1)), rng.normal(size=(D, 2))
+    kicks = rng.normal(size=(len(H), D, 2)) if kicked else None
+    values, left = solved(Eliminated(), matrix, f, kicks, start)
+    np.testing.assert_allclose(values, dense(A, f, kicks, start), rtol=1e-10, atol=1e-13)
+    assert left.max() < 1e-14
+
+
+def test_factors_that_are_kept_are_those_of_their_elements():
+    rng = np.random.default_rng(2)
+    A, matrix = system(rng, len(H))
+    f, start = rng.normal(size=(len(H) * (S + 1), D, 1)), rng.normal(size=(D, 1))
+    march = Eliminated()
+    solved(march, matrix, f, None, start)
+    order = [3, 0, 2, 2]
+    points = (np.array(order)[:, None] * (S + 1) + np.arange(S + 1)).ravel()
+    h = np.array([0.7, 0.2, 0.01, 0.01])  # the second element is another one
+    again = matrix._replace(entries=matrix.entries[points])
+    values, _ = solved(march, again, f, None, start, h)
+    np.testing.assert_allclose(
+        values, dense(A[points], f, None, start, h), rtol=1e-10, atol=1e-13
+    )
+
+
+def test_pivots_that_harm_are_seen():
+    """A state that is pivoted first has a pivot of 1e-13: the equations are not satisfied."""
+    largest = np.linalg.eigvals(np.linalg.inv(RULE.integration))
+    real = float(largest[np.abs(largest.imag) < 1e-9].real[0])
+    A = -np.eye(D)[None]
+    A[0, 0, 0], A[0, 0, 1], A[0, 1, 0] = real / H[0] * (1.0 + 1e-13), 1.0, -1.0
+    _, left = solved(Eliminated(), sparse(A), np.zeros((1, D, 0)), None, np.ones((D, 1)), H[:1])
+    assert left.max() > 1e-13
+
+
+def test_what_elimination_fills_is_refused():
+    A = np.random.default_rng(3).normal(size=(1, 60, 60))
+    A[0][np.random.default_rng(4).uniform(size=(60, 60)) < 0.75] = 0.0
+    with pytest.raises(StiffError):
+        solved(Eliminated(), sparse(A), np.zeros((1, 60, 0)), None, np.ones((60, 1)))
