@@ -192,9 +192,10 @@ def _collection(value: object, kind: Any, where: str) -> Any:
     if origin is list and isinstance(value, Sequence) and not isinstance(value, str):
         return [convert(v, arguments[0], f"{where}[{i}]") for i, v in enumerate(value)]
     if origin is not list and isinstance(value, Mapping):
-        return {
-            _name(k, where): convert(v, arguments[1], f"{where}.{k}") for k, v in value.items()
-        }
+        for key in value:
+            if not isinstance(key, str):
+                raise ConfigError(f"{where}: names must be text, got {shown(key)}")
+        return {k: convert(v, arguments[1], f"{where}.{k}") for k, v in value.items()}
     raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}")
 
 
@@ -302,12 +303,6 @@ def per_name(
     return np.array([
         number(one, f"{where}.{name}", accept) for name, one in zip(names, given, strict=True)
     ])
-
-
-def _name(key: object, where: str) -> str:
-    if not isinstance(key, str):
-        raise ConfigError(f"{where}: names must be text, got {shown(key)}")
-    return key
 
 
 def _describe(kind: Any) -> str:

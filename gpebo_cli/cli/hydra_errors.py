@@ -35,12 +35,20 @@ def explain(error: BaseException, arguments: Arguments) -> str:
         return _unparsable(error, arguments)
     text, cause = str(error), error.__cause__
     if match := _SEVERAL.search(text):
-        return _several(match[1])
+        key, _, values = match[1].partition("=")
+        return (
+            f"{match[1]}: several values; write '{key}=[{values}]' for a list (a case for each "
+            "gain in one run), or add -m for a run for each"
+        )
     if (match := _TWICE.search(text)) and match[1] in GROUPS:
         group = match[1]
         return f"{group} is chosen twice; write {group}=NAME once, without +"
     if match := _NO_MATCH.search(text):
-        return _no_match(match[1])
+        key = match[1]
+        return (
+            f"{key}=…: this configuration has {key} written out and chooses no file for it; change "
+            f"its keys ({key}.KEY=VALUE), or leave --config-name away"
+        )
     if match := _QUOTED.search(text):
         return _unknown_key(match[1], cause)
     if isinstance(cause, OmegaConfBaseException):
@@ -100,28 +108,14 @@ def _unparsable(error: OverrideParseException, arguments: Arguments) -> str:
     )
 
 
-def _several(override: str) -> str:
-    key, _, values = override.partition("=")
-    return (
-        f"{override}: several values; write '{key}=[{values}]' for a list (a case for each gain "
-        "in one run), or add -m for a run for each"
-    )
-
-
-def _no_match(key: str) -> str:
-    return (
-        f"{key}=…: this configuration has {key} written out and chooses no file for it; change "
-        f"its keys ({key}.KEY=VALUE), or leave --config-name away"
-    )
-
-
 def _unknown_key(key: str, cause: BaseException | None) -> str:
     """The message for a key that does not exist; OmegaConf's error still knows its neighbours."""
     parent = getattr(cause, "parent_node", None)
     if not isinstance(parent, DictConfig):
         reason = getattr(cause, "msg", None) or "it cannot be set"
         return _one_line(f"{key}: {reason}")
-    path = _path(parent)
+    # There is no public way to ask where a node stands.
+    path = str(parent._get_full_key(None) or "")  # noqa: SLF001
     known = [str(name) for name in parent if name != "hydra"]
     if not path:
         known += [group for group in GROUPS if group not in known]
@@ -145,11 +139,6 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
         others = [name for name in choices(conf_folder(), path) if name != "none"]
         hint = f"; choose {' or '.join(f'{path}={name}' for name in others)} first"
     return f"{full}: no such key; {inside} has {', '.join(known)}{hint}"
-
-
-def _path(node: DictConfig) -> str:
-    full = node._get_full_key(None)  # noqa: SLF001  no public way to ask where a node stands
-    return str(full or "")
 
 
 def _one_line(text: str) -> str:
