@@ -455,6 +455,7 @@ def test_a_stream_gives_what_a_run_at_samples_gives(tmp_path, rows):
     )
     assert done.returncode == 0, done.stderr
     assert "interval-exciting" in done.stderr
+    assert "parameters well determined at the end" in done.stderr
     table = np.array([line.split(",") for line in done.stdout.splitlines()[1:]], dtype=float)
     assert len(table) == len(rows) - 1
     ours = run(shipped("circuit"), {"name": "ls_drem"}, 19.99, sample_time=0.01, hold="linear")

@@ -24,7 +24,7 @@ from gpebo_cli.cli import interrupts, workers
 from gpebo_cli.cli.arguments import Arguments, quoted
 from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS
 from gpebo_cli.cli.job import read_job, run_job
-from gpebo_cli.cli.sweep_progress import Watch
+from gpebo_cli.cli.sweep_progress import Watch, told
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import is_metric
@@ -327,7 +327,7 @@ def _print_table(records: Sequence[JobRecord], folder: Path, *, rows: bool) -> N
     """The table's beginning (without it when interrupted), where it is, and counts."""
     lines = []
     if rows:
-        cells = [[_shown(cell) for cell in row[:-1]] for row in table(records)]  # errors: below
+        cells = [[told(cell) for cell in row[:-1]] for row in table(records)]  # errors: below
         seen = [k for k, name in enumerate(cells[0]) if name in METRICS or not is_metric(name)]
         lines += columns([[row[k] for k in seen] for row in cells[: _SHOWN_ROWS + 1]])
         if len(cells) > _SHOWN_ROWS + 1:
@@ -366,10 +366,3 @@ def _raise_failures(
 
 def _jobs(count: int) -> str:
     return "1 job" if count == 1 else f"{count} jobs"
-
-
-def _shown(cell: str) -> str:
-    try:
-        return f"{float(cell):.4g}" if "." in cell or len(cell) > 6 else cell
-    except ValueError:
-        return cell

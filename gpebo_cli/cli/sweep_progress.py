@@ -77,8 +77,16 @@ def table(ended: Sequence[JobRecord], keys: Sequence[str]) -> Table:
         first = (record.cases or [{}])[0]
         numbers = [record.seconds, *(first.get(name) for name in _METRICS)]
         found.add_row(
-            str(record.job), *(record.overrides.get(key, "") for key in keys), record.status,
+            str(record.job), *(told(record.overrides.get(key, "")) for key in keys), record.status,
             *("" if number is None else f"{number:.4g}" for number in numbers),
             style="red" if record.status == "failed" else None,
         )
     return found
+
+
+def told(cell: str) -> str:
+    """A cell of a table for a person: long numbers with four digits."""
+    try:
+        return f"{float(cell):.4g}" if "." in cell or len(cell) > 6 else cell
+    except ValueError:
+        return cell

@@ -37,7 +37,8 @@ def verdict(
         first = f"interval-exciting from t = {excitation.t_c:.4g} s on ({level})"
         determined = excitation.determined
         if determined is not None:
-            first += f", parameters well determined from t = {determined:.4g} s on"
+            since = f"from t = {determined:.4g} s on" if len(excitation.t) > 1 else "at the end"
+            first += f", parameters well determined {since}"  # a stream knows its end only
     else:
         first = f"NOT interval-exciting: {level}; not excited: {excitation.weakest_direction}"
     without = ("not determined by the data", unknown), ("left out by the observer", left_out)
