@@ -83,10 +83,10 @@ class InformationAt:
         p = len(start)
         weight = (self.memory * f0)[:, None, None]
         right = weight * start[:, None] + alpha * self.values[..., p:]
+        left = alpha * self.values[..., :p]
+        np.einsum("mii->mi", left)[:] += weight[..., 0]
         try:
-            return np.asarray(
-                np.linalg.solve(weight * np.eye(p) + alpha * self.values[..., :p], right)
-            )
+            return np.asarray(np.linalg.solve(left, right))
         except np.linalg.LinAlgError:
             return None
 

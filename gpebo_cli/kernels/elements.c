@@ -475,7 +475,7 @@ static Outcome sweeps(Call *call)
                 Nodes x;
                 EACH_NODE x[j] = left[i];
                 for (npy_intp l = 0; k > 0 && l <= s; l++) { /* as before, to begin with */
-                    const double *at = l ? &X[i][l - 1] : out + i / b * all + i % b - (s + 1) * d * all;
+                    const double *at = l ? &X[i][l - 1] : out + (i / b - (s + 1) * d) * all + i % b;
                     EACH_NODE x[j] += W[l][j] * (*at - X[i][s - 1]);
                 }
                 memcpy(X[i], x, sizeof(Nodes));

@@ -37,12 +37,14 @@ def in_frame(
         leading axis of N, or 1 where all that they are made of is constant, but for the last two.
         What is singular is not finite.
     """
-    E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
+    if (rows != 1.0).any():
+        E, A, B, F = (matrix / rows[:, None] for matrix in (E, A, B, F))
     C = scale[:, None] * C
     m, q, d, e, r = B.shape[2], F.shape[2], domain.shape[1], len(equations), len(scale)
     inner = _across(_down(range_.T, E), domain)
     diagonal = np.einsum("nii->ni", inner)
     alone = np.count_nonzero(inner) == np.count_nonzero(diagonal)
+    same = alone and bool((diagonal == 1.0).all())
     inverse = (1.0 / diagonal)[:, :, None] * np.eye(d) if alone else inverses(inner)
     sizes = np.array([
         max(float(np.abs(part).max(initial=0.0))
@@ -53,6 +55,8 @@ def in_frame(
     def from_left(matrix: Array) -> Array:
         """BᵀE⁺ times a matrix."""
         part = _down(range_.T, matrix)
+        if same:
+            return part
         return part / diagonal[:, :, None] if alone else inverse @ part
 
     pinv = from_left(np.eye(E.shape[1])[None])

@@ -431,9 +431,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     """
     system, solver, basis = reduced.system, reduced.solver, reduced.basis
     q, columns = system.q, start.shape[1]
-    large = len(start) > _SMALL and solver.name != "ivp" and sweeps.sparse(
-        reduced.first.dynamics
-    ) is not None
+    large = len(start) > _SMALL and solver.name != "ivp"
 
     # What is integrated is in comparable units, as written where these are.
     of_rows, of_columns = reduced.units, np.ones(columns)
