@@ -643,6 +643,15 @@ def test_one_wrong_gain_of_many_is_found():
         estimators.build({"name": "drem", "gamma": gains})
 
 
+def test_estimates_do_not_depend_on_the_elements_of_the_regression():
+    """Where a gain is fast beside them they are cut, also where η̄ moves."""
+    few, many = (
+        run("drem", regression(three, ETA, disturbance=wobble, elements=elements), gamma=1e8)
+        for elements in (20, 320)
+    )
+    np.testing.assert_allclose(few, many, atol=1e-7)
+
+
 def test_elements_are_cut_where_a_filter_is_faster_than_they_are():
     """Z = 1 − e^{−300t} on elements of a second; a rough signal is no reason to cut."""
     mesh = initial_mesh(0.0, 4.0, [], 4, radau_rule(9))

@@ -253,6 +253,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("laws", "squared_errors", _errors),
     ("laws", "squared_errors", lambda rng: _errors(rng, 1, 5, constant=True)),
     ("laws", "squared_errors", lambda rng: _errors(rng, levels=False)),
+    ("laws", "squared_errors", lambda rng: (*_errors(rng)[:2], np.zeros(3), *_errors(rng)[3:])),
 ]
 NAMES = [f"{subject}-{name}-{i}" for i, (subject, name, _) in enumerate(CASES)]
 
@@ -383,6 +384,16 @@ def both_kinds_answer(subject: str, name: str, *arguments: Any) -> tuple[Any, An
     return one(*arguments), other(*arguments)
 
 
+def test_columns_that_are_nearly_alike_become_orthogonal():
+    rng = np.random.default_rng(0)
+    arguments = _in_frame(rng)
+    for matrix in (arguments[1][:, 2:], arguments[4]):
+        matrix[..., 3] = matrix[..., 2] + 1e-6 * rng.normal(size=matrix.shape[:2])
+    Q1 = kernels.observer.in_frame(*arguments)[6]
+    products = np.swapaxes(Q1, 1, 2) @ Q1
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(2), products.shape), atol=1e-14)
+
+
 @needs_kernels
 def test_where_the_pivots_will_not_do_both_say_so():
     arguments = _eliminated(np.random.default_rng(0), growth=1e-3)
@@ -396,6 +407,19 @@ def test_numbers_too_large_for_squares_are_left_to_lapack(value):
     arguments[1][0, 1, 0, 0] = value
     compiled = import_module("gpebo_cli.kernels._compiled")
     assert compiled.levels(*arguments) is None
+
+
+@needs_kernels
+def test_a_number_of_constraints_that_the_rank_contradicts_is_left_to_lapack():
+    compiled = import_module("gpebo_cli.kernels._compiled")
+    assert compiled.levels(*_levels(np.random.default_rng(0), constraints=1)) is None
+
+
+@needs_kernels
+def test_a_time_beyond_the_last_one_is_refused():
+    *model, _, rank_tol = _start(np.random.default_rng(0), times=2)
+    with pytest.raises(ValueError, match="will not do"):
+        import_module("gpebo_cli.kernels._compiled").reference(*model, 2, rank_tol)
 
 
 @needs_kernels
@@ -418,6 +442,10 @@ def test_decays_are_accurate_to_the_last_digits():
     )[:, 0, 0]
     mean = np.array([1 - x / 2 + x**2 / 6 if x < 1e-4 else -np.expm1(-x) / x for x in gains[:, 0]])
     np.testing.assert_allclose(eta, 1.0 - mean, rtol=1e-9, atol=2e-16)
+    left = kernels.laws.stepped_law(  # e^{−x} of what it is about at the start, and nothing else
+        np.ones(1), zero, zero, zero, np.zeros(1, dtype=np.intp), np.ones(1), np.ones(1), one, gains
+    )[:, 0, 0]
+    np.testing.assert_allclose(left, np.exp(-gains[:, 0]), rtol=1e-12)
 
 
 def test_the_norm_of_numbers_whose_squares_vanish_or_overflow():

@@ -98,6 +98,7 @@ GOOD = {"name": "r", "unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": ["
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"unknowns": {}}, "unknowns is missing"),
+    ({"unknowns": 3}, "unknowns must map names to values"),
     ({"psi": [["u", "u"]]}, "psi[0] must be a list with an entry for each of the 1 unknowns (a)"),
     ({"psi": []}, "psi must be a list"),
     ({"Y": ["u", "u"]}, "Y has 2 entries and psi has 1 rows"),
