@@ -57,7 +57,7 @@ def without(*names: str) -> Iterator[None]:
 
 def workloads() -> dict[str, Callable[[], object]]:
     """The circuit, published problems, their text read anew, many gains, long horizons, ladders."""
-    from benchmarks import circuit, growth, problems
+    from benchmarks import circuit, growth, ladders, problems
     from gpebo_cli import run
 
     published = [problems.ours(problem)(1e-9) for problem in problems.problems()]
@@ -79,6 +79,7 @@ def workloads() -> dict[str, Callable[[], object]]:
         "1,000 s": growth.experiment(1_000.0),
         "ladder, n = 25": growth.chain(25, varying=True),
         "ladder, n = 101": growth.chain(101, varying=False),
+        "stiff ladder, n = 41": ladders.simulation(41, "stiff", varying=True),
         "200,000 gains": growth.experiment(gains=200_000),
         "20,000 s": growth.experiment(20_000.0),
     }

@@ -99,6 +99,15 @@ def plant(given: Ladder, start: Array, *, varying: bool) -> DescriptorSystem:
     })
 
 
+def simulation(n: int, kind: str, *, varying: bool) -> Callable[[], Any]:
+    """One simulation, with two capacitors loaded."""
+    start = np.zeros(n)
+    start[1:3] = 1.0
+    system = plant(ladder(n, kind), start, varying=varying)
+    settings = TimeSettings(horizon=HORIZON, samples=101), SolverSettings(tol=TOL)
+    return lambda: simulate(as_new(system), *settings)
+
+
 def by_hand(given: Ladder, start: Array, *, varying: bool, method: str, rtol: float) -> Any:
     """What one would write instead, of the plant alone."""
     M: Any = csr_matrix(given.M) if method != "DOP853" else given.M
