@@ -17,7 +17,7 @@ import yaml
 from factories import make_result
 from PIL import Image
 
-from gpebo_cli.cli import figures
+from gpebo_cli.cli import app, figures
 from gpebo_cli.configs import configuration
 from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
@@ -430,6 +430,7 @@ def test_wrong_words(words: list[str], message: str) -> None:
         figures.main(words)
 
 
-def test_help(capsys: pytest.CaptureFixture[str]) -> None:
-    assert figures.main(["--help"]) == 0
+def test_help(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["gpebo", "figures", "--help"])
+    assert app.main() == 0
     assert capsys.readouterr().out.startswith("usage: gpebo figures")

@@ -50,7 +50,7 @@ def from_netlist(
     text, file = fspath(netlist), f"netlist {name}"
     if "\n" not in text:
         text, file = read_text(text, _MAX_TEXT), text
-    return circuit_from_netlist(text, name, file, measure, unknown).draft
+    return circuit_from_netlist(text, name, file, measure, unknown)[0]
 
 
 def from_file(

@@ -50,19 +50,11 @@ class Topology:
         return f"index {self.index} by topology ({why}{note})"
 
 
-@dataclass(frozen=True)
-class Circuit:
-    """A plant from a netlist, with what its topology says."""
-
-    draft: PlantDraft
-    topology: Topology
-
-
 def circuit_from_netlist(
     text: str, name: str, file: str = "netlist", measure: str | Iterable[str] | None = None,
     unknown: str | Iterable[str] | None = None,
-) -> Circuit:
-    """The descriptor system of a netlist.
+) -> tuple[PlantDraft, Topology]:
+    """The descriptor system of a netlist, and what its topology says.
 
     Args:
         text: the netlist.
@@ -84,7 +76,7 @@ def circuit_from_netlist(
         builder.output(output)
     draft.make_unknown(builder.source(word) for word in split_names(unknown))
     draft.comments.append(str(topology))
-    return Circuit(draft, topology)
+    return draft, topology
 
 
 def examine(netlist: Netlist, file: str) -> Topology:
