@@ -35,6 +35,7 @@ def found(text, start=0.0, stop=20.0):
     texts(), st.integers(0, 3), st.floats(-1, 1), st.sampled_from([1e-9, 1e-3, 0.1, 1.0]),
     st.booleans(),
 )  # fmt: skip
+@example("1/t", 0, -0.5, 0.5, False)  # ends at the pole
 def test_bounds_hold_for_all_times_of_a_cell(line, order, start, width, decided):
     """With jumps decided in the cell's middle, or none decided and values only."""
     tape = tape_of(line)

@@ -176,7 +176,7 @@ def _eliminated(rng, times=19, q=1, growth=3e2, **options):
     return *model, *inputs, *_pivots(model), 4, growth, 1e-13
 
 
-def _in_frame(rng, times=11, n=4, m=1, q=2, r=2, d=2, constant=()):
+def _in_frame(rng, times=11, n=4, m=1, q=2, r=2, d=2, constant=(), outside=0.0):
     def varying(name, rows, columns):
         return rng.normal(size=(1 if name in constant else times, rows, columns))
 
@@ -184,6 +184,7 @@ def _in_frame(rng, times=11, n=4, m=1, q=2, r=2, d=2, constant=()):
     E = varying("E", n, n)
     E[:, d:] = E[:, :, d:] = 0.0
     E[:, :d, :d] += 3.0 * np.eye(d)
+    E[:, -1, 0] = outside
     return (
         E, varying("A", n, n), varying("B", n, m), varying("F", n, q), varying("C", r, n),
         2.0 ** rng.integers(-2, 3, size=n), rng.uniform(1, 2, size=r), axes[:, :d], axes[:, :d],
@@ -206,6 +207,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("observer", "in_frame", partial(_in_frame, times=1)),
     ("observer", "in_frame", partial(_in_frame, constant=("E", "A", "B", "F", "C"))),
     ("observer", "in_frame", partial(_in_frame, m=0, q=0, constant=("A", "C"))),
+    ("observer", "in_frame", partial(_in_frame, n=6, r=3, outside=0.1)),
     ("observer", "regression_signals", _regression),
     ("observer", "regression_signals", partial(_regression, q=0, one=True)),
     ("structure", "reference", _start),
@@ -420,6 +422,18 @@ def test_a_time_beyond_the_last_one_is_refused():
     *model, _, rank_tol = _start(np.random.default_rng(0), times=2)
     with pytest.raises(ValueError, match="will not do"):
         import_module("gpebo_cli.kernels._compiled").reference(*model, 2, rank_tol)
+    element, weights, values = _samples(np.random.default_rng(0), k=6)
+    element[-1] = 6
+    with pytest.raises(ValueError, match="will not do"):
+        kernels.signals.sample(element, weights, values)
+
+
+@needs_kernels
+def test_a_chain_says_how_far_it_is_finite():
+    maps, *others = _maps(np.random.default_rng(0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        one, other = both("elements", "chain", (1e200 * maps, *others))
+    assert one[1] == other[1] == 1
 
 
 @needs_kernels
