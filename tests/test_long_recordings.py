@@ -154,6 +154,17 @@ def test_a_rate_that_is_wrong_by_a_twentieth_is_noticed_and_the_right_one_is_not
     assert "is not white" in said[1]
 
 
+def test_noise_in_the_matrices_is_named():
+    """The motor's currents stand in A and F: the plant is right, and the residual is not white."""
+    made = run("motor", observer="none", time={"horizon": 0.2, "samples": 201})
+    data = {"t": made.t, "vd": made["vd"], "vq": made["vq"]}
+    rng = np.random.default_rng(0)
+    data |= {name: made[name] + 0.02 * rng.standard_normal(201) for name in ("yd", "yq")}
+    said = run("motor", data=data, estimator="least_squares").verdict
+    assert "is not white" in said
+    assert "which noise of yd, yq in the matrices does; or it suggests" in said
+
+
 def test_an_output_that_is_used_up_for_a_state_is_no_residual():
     """The circuit's iv is y less il: rounding is left, in which no pattern means anything."""
     made = run("circuit", observer="none", time={"samples": 401})

@@ -665,6 +665,9 @@ FOUND = {
         {"t": "stamp", "V": "V (kV)", "y": "y"},
         {"separator": "\t", "time_unit": "datetime", "scale": {"V": 1e3}, "missing": 1},
     ),
+    "signs for gaps": (
+        "t,V,y\n0,1,2\n1,-,3\n2,3,NaN\n3,4,5\n", {"t": "t", "V": "V", "y": "y"}, {"missing": 2}
+    ),
     "by elimination": ("zeit,a,y\n0,1,2\n1,2,3\n", {"t": "zeit", "V": "a", "y": "y"}, {}),
 }
 
@@ -709,6 +712,7 @@ def test_what_is_guessed_runs_as_it_stands(tmp_path):
         (["lab.csv", "--plant", "circut"], "did you mean circuit?"),
         (["none.csv", "--plant", "circuit"], "none.csv cannot be read"),
         (["one.csv", "--plant", "circuit"], "the same number of cells"),
+        (["lab.mat", "--plant", "circuit"], "data.file=lab.mat reads it"),
     ],
 )
 def test_what_cannot_be_looked_at_is_one_line(tmp_path, words, part):
@@ -725,6 +729,13 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     found = guess(str(path), shipped("circuit"))
     assert found.lacking == ["V", "y"]
     assert any("no column was found for V" in doubt for doubt in found.doubts)
+
+
+def test_numbers_that_stand_for_gaps_are_said(tmp_path):
+    path = tmp_path / "lab.csv"
+    path.write_text("t,V,y\n0,1,9999\n1,999,2\n2,3,9999\n")
+    doubts = guess(str(path), shipped("circuit")).doubts
+    assert doubts == ["2 cells are 9999: if that means a gap, leave them empty"]
 
 
 @pytest.mark.parametrize(("written", "unit", "factor"), [

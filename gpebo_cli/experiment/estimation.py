@@ -670,7 +670,9 @@ def _explained(
     correlation = np.array([
         ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
     ])
+    names = frozenset[str]().union(*system.coefficients.signals.values())
     return replace(
-        fit, correlation=correlation, lag=stride * step, noisy_matrices=system.depends_on_outputs,
+        fit, correlation=correlation, lag=stride * step,
+        in_matrices=tuple(name for name in system.outputs if name in names),
         band=1.96 / np.sqrt(count * seen.sum()),
     )

@@ -159,7 +159,7 @@ class Fit:
     correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
     lag: float = np.nan  # seconds
     band: float = np.nan  # 95 % of the correlations of white noise are within
-    noisy_matrices: bool = False  # they follow measured outputs, whose noise is then no error of Y
+    in_matrices: tuple[str, ...] = ()  # outputs, whose noise there is no error of Y
     ratio: float | None = None  # of the residual to what the sensors' noise makes of it, √χ²/dof
 
     @property

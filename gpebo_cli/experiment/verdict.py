@@ -84,10 +84,11 @@ def _explains(fit: Fit, case: int) -> str:
         return f": the estimates explain the data up to white noise{noise}"
     if fit.white:
         return f": the residual is white{noise}, which suggests a noisier sensor than was said"
+    names = ", ".join(fit.in_matrices)
     return (
         f": the residual{noise and noise + ','} is not white (its correlation is "
         f"{np.abs(fit.correlation).max():.2f}), which "
-        f"{'noise in the matrices does; or it ' if fit.noisy_matrices else ''}suggests {why}"
+        f"{f'noise of {names} in the matrices does; or it ' if names else ''}suggests {why}"
     )
 
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 import csv
 import difflib
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.recordings.table import TIME, check_text, read_file
+from gpebo_cli.recordings.table import MISSING, TIME, check_text, read_file
 
 _SEPARATORS = (",", ";", "\t", " ")
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6}
@@ -23,6 +24,7 @@ _UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "minut
           "h": "h", "hours": "h"}
 _RATES = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _LOOKED_AT = 50  # rows below the header
+_NINES = re.compile(r"-?9{3,}[.,]?[09]*")  # what loggers write where they have nothing
 
 
 @dataclass
@@ -58,6 +60,11 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
     Raises:
         ConfigError: it cannot be read, is no text, or has no two columns.
     """
+    if path.endswith((".mat", ".parquet")):
+        raise ConfigError(
+            f"{path}: there is nothing to guess in tables with types; data.file={path} reads it, "
+            "and data.columns says what its signals are called there"
+        )
     content = read_file(path)
     check_text(path, content)
     lines = content.decode("utf-8-sig").rstrip().splitlines()
@@ -75,7 +82,11 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
     _find_signals(header, cells, system, found)
     taken = [header.index(name) for name in found.columns.values()]
     every = csv.reader(lines[1:], delimiter=found.separator)
-    found.missing = sum(not row[k].strip() for row in every for k in taken if k < len(row))
+    read = [row[k].strip() for row in every for k in taken if k < len(row)]
+    found.missing = sum(cell.lower() in MISSING for cell in read)
+    for cell, count in Counter(filter(_NINES.fullmatch, read)).items():
+        if count > 1:
+            found.doubts.append(f"{count} cells are {cell}: if that means a gap, leave them empty")
     unused = [name for name in header if name not in found.columns.values()]
     if unused:
         found.doubts.append(f"not read: {', '.join(unused)}")

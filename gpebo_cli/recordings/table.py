@@ -36,7 +36,7 @@ _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 _WORDS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}  # as data.separator
 # ASCII digits only: Python would read １.５, 1_0 and what stands beside a no-break space, too.
 _NUMBER = r"[ \t]*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[ \t]*"
-_MISSING = ("", "nan", "na", "n/a", "null", "none")  # where data.missing allows it
+MISSING = ("", "-", "nan", "na", "n/a", "null", "none")  # where data.missing allows it
 _BLANK = b" \t\r"
 _PIECE = 1 << 16  # rows that are text at the same time
 _MOST_BYTES, _MOST_CELLS = 500_000_000, 25_000_000
@@ -266,7 +266,7 @@ class RowReader:
 
     def _value(self, where: str, cell: str, *, first: bool) -> float:
         policy = self._data.missing
-        if cell.strip(" \t").lower() in _MISSING:
+        if cell.strip(" \t").lower() in MISSING:
             if policy == "drop" or (policy != "refuse" and not first):
                 return math.nan
             if not cell.strip(" \t"):
@@ -280,9 +280,10 @@ class RowReader:
                 raise ConfigError(f"{where}: {shown(cell)} is not {_DATE}")
             return float(value)
         if self._number.fullmatch(cell) is None:
-            text = cell.strip(" \t").lower().lstrip("+-")
-            what = "a finite number" if text in ("nan", "inf", "infinity") else "a number"
-            gap = text in _MISSING and not first
+            text = cell.strip(" \t").lower()
+            finite = text.lstrip("+-") in ("nan", "inf", "infinity")
+            what = "a finite number" if finite else "a number"
+            gap = text in MISSING and not first
             raise ConfigError(
                 f"{where}: {shown(cell)} is not {what}"
                 + ("; data.missing says what to do with a gap" if gap else "")
