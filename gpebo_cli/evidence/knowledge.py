@@ -93,7 +93,8 @@ class Knowledge:
         V, spectrum, level = self.vectors[-1], self.eigenvalues[-1], self.level[-1]
         normalised = (V * np.maximum(spectrum, 0.0)) @ V.T
         chosen = np.flatnonzero(self.parameters[-1]).tolist()
-        for j in np.flatnonzero(~self.parameters[-1]).tolist():
+        seen = normalised.diagonal() >= level  # no eigenvalue is above what is on the diagonal
+        for j in np.flatnonzero(~self.parameters[-1] & seen).tolist():
             more = [*chosen, j]
             if np.linalg.eigvalsh(normalised[np.ix_(more, more)])[0] >= level[more].max():
                 chosen = more
