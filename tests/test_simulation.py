@@ -124,6 +124,16 @@ def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
         simulate(singular, TimeSettings(horizon=1.0), SOLVER)
 
 
+def test_a_rank_drop_is_found_beside_a_fast_rate():
+    """Where the derivative array tells nothing clear, it is differentiated once at a time."""
+    singular = plant(
+        states=["a", "b", "c"], inputs={"u": "sin(t)"}, E=np.diag([1, 1, 0]).tolist(),
+        A=[[-1e5, 1, 0.3], [0.2, -1, 1], [0, "t - 0.3712", 0]], B=[[1]] * 3, initial_state=[0] * 3,
+    )
+    with pytest.raises(ModelError, match=r"a rank changes near t = 0\.3712;"):
+        simulate(singular, TimeSettings(horizon=2.0), SOLVER)
+
+
 def test_a_rank_drop_between_two_breakpoints_that_no_other_probe_sees_is_found():
     """The longest piece in which no probe would be otherwise; E is 0 in it."""
     k = int(np.argmax(np.diff(_PLACES)))
