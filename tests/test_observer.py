@@ -10,7 +10,7 @@ from gpebo_cli import run as experiment
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
-from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
 from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -171,6 +171,14 @@ def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
     R, P = o.residual, o.projector
     np.testing.assert_allclose(R @ R, R, atol=1e-13)
     np.testing.assert_allclose(R @ o.algebraic @ (np.eye(4) - P), 0, atol=1e-13)
+
+
+def test_the_weakest_singular_value_is_found_among_bounds_of_it():
+    H = np.random.default_rng(0).normal(size=(40, 5, 3))
+    H[:, :, 0] *= np.linspace(1.0, 3.0, 40)[:, None]
+    smallest = 1.0 / np.linalg.norm(H, 2, axis=(1, 2))
+    value, place = weakest(1.0 / np.linalg.norm(H, axis=(1, 2)), H)
+    assert (value, place) == (pytest.approx(smallest.min()), smallest.argmin())
 
 
 def test_rotating_kernel_with_unknown_parameter():
