@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.numerics.collocation import solve, solve_constant
+from gpebo_cli.numerics.collocation import merged, solve, solve_constant
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
@@ -282,3 +282,15 @@ def test_elements_of_different_lengths_in_any_order_with_constant_matrices(lengt
     exact = 0.5 * (np.cos(edges) + np.sin(edges)) + 0.5 * np.exp(-edges)
     np.testing.assert_allclose(found(edges[:-1])[:, 0, 0], exact[:-1], rtol=1e-12)
     np.testing.assert_allclose(found.final[0, 0], exact[-1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_was_constant_before_a_cut_need_not_be_so_after_it(turned):
+    """Matrices of kept elements may be one for all points, and those of fresh ones many."""
+    one, many = np.full((1, 1, 2), 3.0), np.arange(2 * 4 * 2.0).reshape(2, 4, 2)
+    kept = np.array([-1, 0, -1])
+    (found,) = merged([many if turned else one], [one if turned else many], 2, kept)
+    assert found.shape == (3, 4, 2)
+    constant, other = ([0, 2], [1]) if turned else ([1], [0, 2])
+    assert (found[constant] == 3.0).all()
+    assert (found[other] == many[[0]] if turned else found[other] == many).all()

@@ -198,8 +198,9 @@ def merged(
     def whole(one: Array, other: Array) -> Array:
         if one.shape[:2] == other.shape[:2] == (1, 1):
             return one
+        points = max(one.shape[1], other.shape[1])
         both = [
-            x if len(x) == count else np.broadcast_to(x, (count, *x.shape[1:]))
+            np.broadcast_to(x, (count, points, *x.shape[2:]))
             for x, count in ((one, size), (other, numbers[-1]))
         ]
         return np.concatenate(both).take(place, axis=0)

@@ -521,6 +521,7 @@ def joined(parts: Sequence[Extension]) -> Extension:
             **{name: together(name) for name in _OVER_TIME},
             Y_scale=max(each.Y_scale for each in found),
             column_scale=np.max([each.column_scale for each in found], axis=0),
+            moving=np.max([each.moving for each in found], axis=0),
         ),
         np.concatenate([part.scale for part in parts]),
         parts[-1].units,

@@ -32,6 +32,7 @@ class Assembled:
     column_scale: Array  # (p,) and of the columns of ψ: each has the unit of its parameter
     elimination: Array  # (N, n, n_b) and
     injectivity: Array  # (N,) as in ``ObserverMatrices``
+    moving: Array  # (n, p) sizes of the gain of w = P x, which the eliminated part may cancel
 
     def kinds(self) -> Iterator[tuple[Array, float]]:
         """Everything the mesh has to resolve, with the size below which it is rounding.
@@ -47,6 +48,7 @@ class Assembled:
         if self.Y_scale > 0.0:  # a state that no parameter has part in is no signal to resolve
             own = largest_over_time(self.offset) / self.Y_scale
             states = np.maximum(states, 1e-3 * own)
+        states = np.maximum(states, 1e-3 * (self.moving / columns).max(axis=1, initial=0.0))
         yield Y, 1e-3 * self.Y_scale
         yield psi, 1e-3
         yield self.offset, 0.0
@@ -90,7 +92,8 @@ def regression_signals(
         sizes = np.maximum(sizes, (np.abs(algebraic) @ np.abs(z)).max(axis=(0, 1), initial=0.0))
         nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= _VANISHING * sizes[1:]
         psi = np.where(nothing, 0.0, psi)
-    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity)
+    moving = np.abs(basis) @ largest_over_time(z[:, :, 1:])
+    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity, moving)
 
 
 def resolved(
