@@ -145,7 +145,7 @@ def chain(
 
 def carried_errors(
     values: Array, to_legendre: Array, powers: Array, last: Array, particular: Array, noise: Array,
-    signs: Array, h: Array, level: float, end: float, chance: float, same: float,
+    signs: Array, h: Array, level: float, end: float, chance: float, same: float, *,
     renew: Callable[[Array, Array], Array] | None = None,
 ) -> tuple[Array, Array]:
     """How far errors of elements may be carried, and what else counts of the solution.
@@ -204,10 +204,9 @@ def carried_errors(
             ends[k] = error = last[k if len(last) > 1 else 0] @ error + added[k]
         squares = np.square(ends).reshape(K, n, 2, S, columns).sum(axis=3)
         rates = noise[..., :n] / h[: len(noise), None, None]
-        factors = np.empty((K, 1, 2, 1))
-        factors[:, 0, :, 0] = np.arange(2, K + 2)[:, None]
-        if not (np.abs(rates - rates[0]) <= same * rates[0]).all():
-            np.minimum(factors[:, :, 1], chance, out=factors[:, :, 1])
+        constant = (np.abs(rates - rates[0]) <= same * rates[0]).all()
+        most_of = np.array([np.inf, np.inf if constant else chance])[:, None]
+        factors = np.minimum(np.arange(2.0, K + 2.0)[:, None, None, None], most_of)
         np.sqrt(squares * (factors / S)).sum(axis=2, out=carried)
         return carried, most.max(axis=1)
 

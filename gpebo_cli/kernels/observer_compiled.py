@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from gpebo_cli.kernels import _compiled, observer_numpy
 from gpebo_cli.kernels.arrays import Array
 
 _SMALL = 24  # states, up to which NumPy's calls cost more than plain loops
 
 
-def in_frame(
-    E: Array, A: Array, B: Array, F: Array, C: Array, rows: Array, scale: Array, domain: Array,
-    range_: Array, kernel: Array, equations: Array,
-) -> tuple[Array, ...]:
+def in_frame(*arguments: Array) -> tuple[Array, ...]:
     """In C."""
-    arguments = E, A, B, F, C, rows, scale, domain, range_, kernel, equations
+    E, A, B, F, C, rows, scale, *_, kernel, equations = arguments
     if len(rows) > _SMALL or len(equations) + len(scale) < kernel.shape[1]:
         return observer_numpy.in_frame(*arguments)
     of_A = max(len(A), len(C))
@@ -23,13 +22,7 @@ def in_frame(
     return found
 
 
-def regression_signals(
-    z: Array, q: int, basis: Array, algebraic: Array, g_y: Array, G: Array, range_: Array,
-    elimination: Array,
-) -> tuple[Array, Array, Array, Array, Array]:
+def regression_signals(z: Array, q: int, basis: Array, *equations: Array) -> Any:
     """In C."""
-    small = len(basis) <= _SMALL
-    found: tuple[Array, Array, Array, Array, Array] = (
-        _compiled if small else observer_numpy
-    ).regression_signals(z, q, basis, algebraic, g_y, G, range_, elimination)
-    return found
+    either = _compiled if len(basis) <= _SMALL else observer_numpy
+    return either.regression_signals(z, q, basis, *equations)

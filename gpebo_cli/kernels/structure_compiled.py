@@ -2,59 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from gpebo_cli.kernels import _compiled, structure_numpy
 from gpebo_cli.kernels.arrays import Array, IntArray
 
 _SMALL = 32  # rows of M; beyond it LAPACK's blocks are worth its calls
 
 
-def levels(
-    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, rank_tol: float,
-    constraints: int,
-) -> tuple[Array, Array]:
-    """In C, unless singular values and elimination do not see the same rank."""
-    arguments = E, A, rows, columns, time, orders, rank_tol, constraints
-    found: tuple[Array, Array] | None = None
-    if orders * len(rows) <= _SMALL:
-        found = _compiled.levels(*arguments)
-    return structure_numpy.levels(*arguments) if found is None else found
+def _for_small(name: str, *, declines: bool = False) -> Callable[..., Any]:
+    """A function in C up to this size, unless it ``declines`` for numbers that are not for it."""
+    compiled = getattr(_compiled, name)
+
+    def either(E: Array, A: Array, rows: Array, *more: Any) -> Any:  # columns, time, orders, …
+        small = more[2] * len(rows) <= _SMALL
+        found = compiled(E, A, rows, *more) if small else None
+        if found is None and (declines or not small):
+            return getattr(structure_numpy, name)(E, A, rows, *more)
+        return found
+
+    return either
+
+
+# Singular values and elimination need not see the same rank.
+levels, _reference = (_for_small(name, declines=True) for name in ("levels", "reference"))
+bounds, eliminated = map(_for_small, ("bounds", "eliminated"))
 
 
 def reference(
-    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, place: int,
-    rank_tol: float,
+    E: Array, A: Array, rows: Array, *more: Any
 ) -> tuple[int, Array, IntArray, IntArray, Array]:
-    """In C, unless singular values and elimination do not see the same rank."""
-    arguments = E, A, rows, columns, time, orders, place, rank_tol
-    found = _compiled.reference(*arguments) if orders * len(rows) <= _SMALL else None
-    if found is None:
-        return structure_numpy.reference(*arguments)
-    count, smallest, first, second, Z1 = found
+    """As the others; what C returns is put into the same form."""
+    count, smallest, first, second, Z1 = _reference(E, A, rows, *more)
+    if isinstance(count, int):
+        return count, smallest, first, second, Z1
     a = int(count[0])
     return a, smallest, first, second, Z1[: max(0, len(rows) - a)].T.copy()
-
-
-def bounds(
-    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int,
-    pivot_rows: IntArray, pivot_columns: IntArray, rank: int, Z1: Array,
-) -> tuple[Array, Array, Array]:
-    """In C."""
-    small = orders * len(rows) <= _SMALL
-    found: tuple[Array, Array, Array] = (_compiled if small else structure_numpy).bounds(
-        E, A, rows, columns, time, orders, pivot_rows, pivot_columns, rank, Z1
-    )
-    return found
-
-
-def eliminated(
-    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, B: Array, F: Array,
-    u: Array, theta: Array, pivot_rows: IntArray, pivot_columns: IntArray, rank: int, Z1: Array,
-    every: int, growth: float, residual: float,
-) -> tuple[Array, ...] | None:
-    """In C; None where the elimination fails is the answer of both."""
-    small = orders * len(rows) <= _SMALL
-    found: tuple[Array, ...] | None = (_compiled if small else structure_numpy).eliminated(
-        E, A, rows, columns, time, orders, B, F, u, theta, pivot_rows, pivot_columns, rank, Z1,
-        every, growth, residual,
-    )
-    return found

@@ -62,7 +62,7 @@ def estimated_errors(
     carried, largest = elements.carried_errors(
         values, rule.to_legendre, _to_next(rule), last, particular, noise,
         _signs(len(values), len(problem.start)), mesh.steps, LEVEL, END, _CHANCE**2, _SAME,
-        None if renewal is None else renewal.error,
+        renew=None if renewal is None else renewal.error,
     )
     if np.any(problem.uncertain):
         of_start = np.zeros((len(values), 1, *last.shape[1:]))

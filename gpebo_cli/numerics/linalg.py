@@ -14,7 +14,6 @@ from gpebo_cli.kernels import signals
 from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray
 
-_TINY = float(np.finfo(float).tiny)
 _CANCELLED = 1e-13  # of the terms of an entry: what is left is rounding
 
 
@@ -58,11 +57,6 @@ def exact_product(left: Array, right: Array) -> Array:
     """
     size = largest_over_time(left).max(axis=1, initial=0.0)[:, None]
     return without_rounding(left @ right, size * ((left != 0.0) @ np.abs(right)))
-
-
-def frobenius_norm(matrix: Array) -> Array:
-    """Frobenius norms (N,) of matrices (N, i, j), at least the smallest positive number."""
-    return np.asarray(np.sqrt(np.einsum("nij,nij->n", matrix, matrix)) + _TINY)
 
 
 def inverse_or_none(whole: Array) -> tuple[Array, BoolArray]:

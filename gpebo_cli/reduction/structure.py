@@ -15,7 +15,7 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
-from gpebo_cli.kernels.structure_numpy import relative_singular_values, scaled
+from gpebo_cli.kernels.structure_numpy import frobenius_norm, relative_singular_values, scaled
 from gpebo_cli.model.descriptor import (
     Array,
     Coefficients,
@@ -23,7 +23,7 @@ from gpebo_cli.model.descriptor import (
     IntArray,
     distinct,
 )
-from gpebo_cli.numerics.linalg import frobenius_norm, inverse_or_none, transpose
+from gpebo_cli.numerics.linalg import inverse_or_none, transpose
 from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, initial_edges
 from gpebo_cli.reduction.derivative_array import Scaling, balance, who
 from gpebo_cli.reduction.stages import Stages, UnclearError, in_stages

@@ -118,7 +118,7 @@ def _simulate_linear(
     happened: dict[float, tuple[Array, Jump]] = {}
     restarts: dict[float, Callable[[Array], Array]] = {}
     for cut in map(float, cuts):
-        restarts[cut] = _restart(system, structure, cut, _width(mesh.edges, cut), happened)
+        restarts[cut] = _restart(system, structure, cut, mesh.edges, happened)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         return _equations(strangeness_free_form(system, structure, t, inside))
@@ -270,16 +270,13 @@ def _check_start(system: DescriptorSystem, x0: Array) -> None:
         )
 
 
-def _width(edges: Array, cut: float) -> float:
-    """How far from a jump to look at the functions on either side of it."""
-    k = int(np.searchsorted(edges, cut))
-    return 1e-3 * float(min(edges[k + 1] - edges[k], edges[k] - edges[k - 1]))
-
-
 def _restart(
-    system: DescriptorSystem, structure: Structure, t: float, width: float,
+    system: DescriptorSystem, structure: Structure, t: float, edges: Array,
     happened: dict[float, tuple[Array, Jump]],
 ) -> Callable[[Array], Array]:
+    k = int(np.searchsorted(edges, t))
+    width = 1e-3 * float(min(edges[k + 1] - edges[k], edges[k] - edges[k - 1]))  # where to look
+
     def restart(before: Array) -> Array:
         what = jump(system, structure, t, width, before[:, 0])
         happened[t] = (before[:, 0].copy(), what)
