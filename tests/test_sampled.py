@@ -246,7 +246,7 @@ def test_least_squares_at_samples_is_a_batch_solution(hold):
     prior = np.sqrt(f0 * np.exp(-beta * block.t[-1]))
     left = np.concatenate([rows[..., :3].reshape(-1, 3), prior * np.eye(3)])
     right = np.concatenate([rows[..., 3].ravel(), prior * np.full(3, 0.7)])
-    np.testing.assert_allclose(estimate, np.linalg.lstsq(left, right)[0], rtol=1e-11)
+    np.testing.assert_allclose(estimate, np.linalg.lstsq(left, right, rcond=None)[0], rtol=1e-11)
 
 
 def test_the_square_root_form_survives_what_normal_equations_do_not():

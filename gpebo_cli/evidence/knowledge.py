@@ -156,7 +156,7 @@ def smallest_at_most(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-
     v = np.linalg.eigh(normalised[-1])[1][:, :1]
     seen = np.flatnonzero(bounds > 0.0)
     with suppress(np.linalg.LinAlgError):
-        bounds[seen] = 1.0 / np.linalg.norm(np.linalg.solve(normalised[seen], v), axis=(1, 2))
+        bounds[seen] = 1.0 / np.linalg.norm(np.linalg.solve(normalised[seen], v[None]), axis=(1, 2))
     return np.asarray(bounds)
 
 

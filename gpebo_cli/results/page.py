@@ -107,7 +107,7 @@ def case_table(named: Sequence[tuple[str, dict[str, float]]]) -> list[list[str]]
     gains = list(dict.fromkeys(key for _, row in named for key in row if not is_metric(key)))
     several = any(name for name, _ in named)
     # Gains that are the same everywhere tell nothing; those of other estimators are not theirs.
-    shown = [g for g in gains if len({row.get(g) for _, row in named}) > 1] or gains[:1]
+    shown = [g for g in gains if len({row.get(g) for _, row in named}) > 1] or gains
     # Without the truth nothing is known of errors, nor from when on they are small.
     known = [
         key for key in _METRICS
