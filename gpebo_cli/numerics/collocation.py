@@ -177,33 +177,28 @@ def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray) -> _ElementMaps
     before, after = (
         (maps.homogeneous, maps.particular, maps.noise, *maps.extras) for maps in (old, new)
     )
-    homogeneous, particular, noise, *extras = merged(before, after, len(old.particular), kept)
+    homogeneous, particular, noise, *extras = merged(before, after, kept)
     return _ElementMaps(homogeneous, particular, noise, tuple(extras))
 
 
-def merged(
-    before: Sequence[Array], after: Sequence[Array], size: int, kept: IntArray
-) -> list[Array]:
+def merged(before: Sequence[Array], after: Sequence[Array], kept: IntArray) -> list[Array]:
     """Of all elements of a mesh, from those of the mesh before and of the fresh ones.
 
     Args:
         before: of the elements before (K, s, ...) each, or (1, 1, ...) where all have the same.
         after: of the fresh elements, in the same way.
-        size: number of elements before, K.
         kept: for each element which one before it is, −1 for a fresh one (K',).
     """
-    numbers = (kept < 0).cumsum()
-    place = np.where(kept < 0, size - 1 + numbers, kept)
+    fresh = kept < 0
 
     def whole(one: Array, other: Array) -> Array:
         if one.shape[:2] == other.shape[:2] == (1, 1):
             return one
-        points = max(one.shape[1], other.shape[1])
-        both = [
-            np.broadcast_to(x, (count, points, *x.shape[2:]))
-            for x, count in ((one, size), (other, numbers[-1]))
-        ]
-        return np.concatenate(both).take(place, axis=0)
+        found = one.take(kept, axis=0, mode="clip")  # one copy: long horizons have gigabytes
+        if found.shape[1] < other.shape[1]:
+            found = found.repeat(other.shape[1], axis=1)
+        found[fresh] = other
+        return found
 
     return [whole(one, other) for one, other in zip(before, after, strict=True)]
 

@@ -231,7 +231,7 @@ def solve_dense(
             old, new = (before[1].within(A), before[2]), (A.entries, f)
             entries, f, *more = merged(
                 [*(at_points(x, K, s) for x in old), *before[3]],
-                [*(at_points(x, count, s) for x in new), *extras], K, kept,
+                [*(at_points(x, count, s) for x in new), *extras], kept,
             )
             A = A._replace(entries=entries.reshape(-1, *entries.shape[2:]))
             f, extras = f.reshape(-1, *f.shape[2:]), tuple(more)
