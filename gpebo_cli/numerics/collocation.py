@@ -30,7 +30,7 @@ from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import estimated_errors, least_sizes
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
-from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, unresolved_kinds
+from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, equal_lengths, unresolved_kinds
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
@@ -39,7 +39,6 @@ _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _MODEST = 1e100  # values up to here may be multiplied with each other
-_EQUAL = 1e-11  # relative difference of lengths that is rounding
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.
 np.empty(_CHUNK // 4)
@@ -331,22 +330,6 @@ def _with_instants(noise: Array, solution: Trajectory, cuts: Array) -> Array:
         slopes[after, 0] - slopes[after - 1, -1]
     )
     return found
-
-
-def equal_lengths(h: Array) -> tuple[IntArray, Array]:
-    """Group (K,) of each length, and the group's mean in its place.
-
-    Lengths that differ by rounding only count as equal. One of them for all would be wrong each
-    time in the same direction, and over many elements that adds up; what their mean is wrong by
-    adds up to nothing. Groups are numbered as they first appear.
-    """
-    group = np.zeros(len(h), dtype=np.intp)
-    if h.max(initial=0.0) - h.min(initial=np.inf) > _EQUAL * h.max(initial=0.0):
-        order = np.argsort(h, kind="stable")
-        group[order] = np.append(0, np.cumsum(np.diff(h[order]) > _EQUAL * h.max()))
-        first = np.unique(group, return_index=True)[1]
-        group = np.argsort(np.argsort(first))[group]
-    return group, np.asarray((np.bincount(group, weights=h) / np.bincount(group))[group])
 
 
 def decoupled_maps(

@@ -30,6 +30,7 @@ _KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
 _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
 _JOINED = (8, 4, 2)  # as many elements become one
 _MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
+_EQUAL = 1e-11  # relative difference of lengths that is rounding
 _TINY = float(np.finfo(np.float64).tiny)
 _WINDOW = 1 << 12  # elements of a long mesh that are solved together
 
@@ -277,16 +278,34 @@ class Trajectory:
         shape = self.values.shape[2:]
         rates = np.broadcast_to(np.asarray(rate, dtype=np.float64), shape).ravel()
         at_start = np.zeros(len(rates)) if start is None else start.ravel()
-        values, own = _flat(self.values), np.arange(mesh.size)
+        values, (group, steps) = _flat(self.values), equal_lengths(mesh.steps)
         filtered = np.empty(values.shape)
         for one in sorted({*rates.tolist()}):
             some = (rates == one).nonzero()[0]
-            maps = elements.element_maps(
-                rule.differentiation, mesh.steps, None, np.full((1, 1, 1), -one),
-                (one * values[..., some]).reshape(-1, 1, len(some)), None, None, own, len(own),
+            own, forced = elements.element_maps(
+                rule.differentiation, steps, None, np.full((1, 1, 1), -one),
+                (one * values[..., some]).reshape(-1, 1, len(some)), None, None,
+                group, int(group.max()) + 1,
             )
-            filtered[..., some] = elements.chain(*maps, at_start[None, some])[0][:, :, 0]
+            found = elements.chain(own[group], forced, at_start[None, some])[0]
+            filtered[..., some] = found[:, :, 0]
         return Trajectory(mesh, filtered.reshape(self.values.shape))
+
+
+def equal_lengths(h: Array) -> tuple[IntArray, Array]:
+    """Group (K,) of each length, and the group's mean in its place.
+
+    Lengths that differ by rounding only count as equal. One of them for all would be wrong each
+    time in the same direction, and over many elements that adds up; what their mean is wrong by
+    adds up to nothing. Groups are numbered as they first appear.
+    """
+    group = np.zeros(len(h), dtype=np.intp)
+    if h.max(initial=0.0) - h.min(initial=np.inf) > _EQUAL * h.max(initial=0.0):
+        order = np.argsort(h, kind="stable")
+        group[order] = np.append(0, np.cumsum(np.diff(h[order]) > _EQUAL * h.max()))
+        first = np.unique(group, return_index=True)[1]
+        group = np.argsort(np.argsort(first))[group]
+    return group, np.asarray((np.bincount(group, weights=h) / np.bincount(group))[group])
 
 
 def _flat(values: Array) -> Array:

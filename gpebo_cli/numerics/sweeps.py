@@ -24,14 +24,13 @@ from gpebo_cli.numerics.collocation import (
     at_points,
     decoupled,
     decoupled_maps,
-    equal_lengths,
     merged,
     unresolved_signals,
 )
 from gpebo_cli.numerics.elimination import Eliminated, StiffError
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.linalg import largest_within
-from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, legendre_tail
+from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, equal_lengths, legendre_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
