@@ -33,7 +33,7 @@ WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hun
 _TINY = float(np.finfo(float).tiny)
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
-_AROUND = np.concatenate([-(0.0625 ** np.arange(5.0)), [0.0], 0.0625 ** np.arange(4.0, -1.0, -1.0)])
+_AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -219,7 +219,7 @@ def _first_time(
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
     Each round looks where the polynomial through the four nearest points, t of the level, points,
-    else the secant, and at distances around it that fall by sixteens.
+    else the secant, and at distances around it that fall by fours.
 
     Args:
         gram: G (p, p), perhaps with further columns.
