@@ -133,15 +133,15 @@ def _drawn(rng, index):
     return plant, dict(zip([*states, *unknowns], (part < 1e-7).tolist(), strict=True)), clear
 
 
-def run_system(plant):
-    """The run of a plant, as it comes."""
+def run_system(plant, horizon=HORIZON, **observer):
+    """The run of a plant, as it comes or with an observer's settings."""
     from gpebo_cli.experiment.pipeline import run_experiment
     from gpebo_cli.model.plant import plant_from_mapping
     from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 
     return run_experiment(Settings(
-        {}, {"name": "ls_drem", "f0": 1e-9}, TimeSettings(0.0, HORIZON, 31),
-        SolverSettings(max_elements=3000), {"name": "gpebo"},
+        {}, {"name": "ls_drem", "f0": 1e-9}, TimeSettings(0.0, horizon, 31),
+        SolverSettings(max_elements=3000), {"name": "gpebo", **observer},
     ), plant_from_mapping(plant))
 
 

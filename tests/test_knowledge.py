@@ -38,6 +38,18 @@ def test_what_is_estimable_is_what_the_observability_matrix_says(seed):
     assert largest_error(result) < 1e-6
 
 
+@pytest.mark.parametrize("settings", [{}, {"sample_time": 0.01, "hold": "linear"}])
+@pytest.mark.parametrize(
+    ("seed", "horizon", "told"), [(14, 3, 0), (14, 8, 0), (3029, 3, 0), (9, 3, 6)]
+)
+def test_states_that_are_rounding_of_a_grown_extension_are_not_told(seed, horizon, told, settings):
+    """Φ of 4e7: 1e-6 of a direction that the data leave open is more than the whole state."""
+    plant, _ = random_system(seed)
+    result = run_system(plant, float(horizon), form="given", **settings)
+    assert sum(result.estimable[name] is not None for name in plant["states"]) == told
+    assert largest_error(result) < 1e-2  # lines between samples have an error of 3e-3
+
+
 def test_unknowns_that_only_their_sum_is_told_of_do_not_spoil_the_rest():
     """Recovery and death of an epidemic, and the recovered, whom nobody counts."""
     plant = {

@@ -19,11 +19,13 @@ from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import symmetric_eigenvalues
 
+LARGE = 1e3  # of Φ: above it, states may be differences of terms that leave nothing of them
 _UNRESOLVED = 10.0  # tolerances of the terms of a column of ψ: what is smaller says nothing
 _SINGULAR = 1e-12  # eigenvalues of N below this are rounding of products of float64 numbers
 _SEEN = 1e-6  # part in the kernel of N beyond which a direction is not known
 _NOISE = 1e-12  # of a column of a gain in the states' own units: beyond what extensions are good to
 _MIXED = 1e-14  # over an eigenvalue of N: how far its vector may turn into the kernel's
+_LOST = 1e-3  # of a state: a larger error leaves nothing of it that one would call known
 _TINY = 1e-100  # squares of its reciprocal are numbers
 
 
@@ -118,6 +120,29 @@ class Knowledge:
         scaled = gain[len(gain) - len(kernel) :] / self.sizes[:, None, :]
         size = _row_norms(scaled)
         return np.asarray(_row_norms(scaled @ kernel) <= slack[:, None] * size)
+
+    def resolved(self, h: Array, offset: Array, gain: Array) -> BoolArray:
+        """Of which states (n,) x = offset + gain η something is left beside errors, at the end.
+
+        Where Φ has grown, states are small differences of large terms: neither what the kernel of N
+        leaves open, nor rounding, may then amount to more than a thousandth of them.
+
+        Args:
+            h: ∫ψᵀY at the end (p,).
+            offset: at all times (N, n).
+            gain: the same (N, n, p), NaN for a state that nothing is known of.
+        """
+        V, spectrum, clear = self.vectors[-1], self.eigenvalues[-1], self.clarity[-1] >= 1.0
+        root = np.sqrt(spectrum[clear])
+        seen = V[:, clear].T @ (h / self.sizes[-1]) / root  # its norm is that of Y
+        z = V[:, clear] @ (seen / root)
+        row = gain[-1] / self.sizes[-1]
+        error = np.linalg.norm(row @ V[:, ~clear], axis=1) * np.linalg.norm(z) + _NOISE * (
+            np.linalg.norm(row @ V[:, clear] / root, axis=1) * np.linalg.norm(seen)
+            + np.abs(row) @ np.abs(z)
+        )
+        x = offset + gain @ (z / self.sizes[-1])
+        return np.asarray(error <= _LOST * np.abs(x).max(axis=0))
 
 
 def _row_norms(matrices: Array) -> Array:

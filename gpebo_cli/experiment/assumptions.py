@@ -15,7 +15,7 @@ import numpy as np
 
 from gpebo_cli.errors import GpeboError, ModelError
 from gpebo_cli.evidence.excitation import Excitation, assess, estimable
-from gpebo_cli.evidence.knowledge import Knowledge
+from gpebo_cli.evidence.knowledge import LARGE, Knowledge
 from gpebo_cli.evidence.uncertainty import of_least_squares
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.findings import Assumption
@@ -166,7 +166,14 @@ def visible(
     """From what is known at the last M of the times t (N,) to which states are known, (M, n)."""
     state_map = observation.state_map
     if isinstance(state_map, AffineStateMap) and observation.names is None:
-        return partial(Knowledge.states, gain=state_map.gain(t), units=state_map.units)
+        gain = state_map.gain(t)
+        if observation.growth is None or observation.growth < LARGE:
+            return partial(Knowledge.states, gain=gain, units=state_map.units)
+        regression, offset = observation.regression, state_map.offset(t)
+        h = regression.gram.final[:, regression.p]
+        return lambda known: (
+            known.states(gain, state_map.units) & known.resolved(h, offset, gain)
+        )
     # What it needs of the parameters is not known: all of them.
     given = np.array([name not in observation.unseen for name in states], dtype=bool)
     return lambda known: known.parameters.all(axis=1, keepdims=True) & given

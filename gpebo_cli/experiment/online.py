@@ -13,7 +13,7 @@ import numpy as np
 from gpebo_cli import estimators, observers
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.evidence.excitation import WELL, Excitation, excitation
-from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
+from gpebo_cli.evidence.knowledge import LARGE, Knowledge, knowledge_of_roots
 from gpebo_cli.evidence.uncertainty import SampledDeviations
 from gpebo_cli.experiment.result import Fit
 from gpebo_cli.experiment.uncertainty import MOST_CASES
@@ -176,12 +176,15 @@ class Online:
                 block.errors, made.errors(), block.regression, gain, roots[:, 0]
             )
         eigenvalues = sigma[:, ::-1] ** 2
+        seen = known.states(gain if gain.ndim == 3 else gain[0], block.units)
+        if block.fit is None and (self.growth or 0.0) >= LARGE:
+            root = roots[-1, 0]
+            seen &= known.resolved(root[:, :p].T @ root[:, p], block.offset, gain)
         self._final = made.parameters[:, -1].copy()
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
-            block.regression, made.parameters, states, made.delta, eigenvalues, known,
-            known.states(gain if gain.ndim == 3 else gain[0], block.units), block.extension,
-            std, level,
+            block.regression, made.parameters, states, made.delta, eigenvalues, known, seen,
+            block.extension, std, level,
         )
 
     def truth(self, extension: Array) -> observers.Truth:
