@@ -28,6 +28,7 @@ from gpebo_cli.observers.kalman_bucy import filter_model, noise_model
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.results.report import estimate_table
 from gpebo_cli.settings import (
     NoiseSettings,
     Settings,
@@ -298,3 +299,16 @@ def test_nothing_to_filter_is_one_line():
     with pytest.raises(ConfigError, match="nothing for observer=kalman_bucy to filter"):
         api_run(plant, observer="kalman_bucy", time={"horizon": 1})
     assert api_run(plant, observer="gpebo", time={"horizon": 1}).details.metrics is not None
+
+
+def test_the_table_does_not_ask_since_when_a_moving_parameter_is_known():
+    """The filter's w_<state> is a state: it stands at no value, and its state has the evidence."""
+    made = api_run("descriptor", observer="none", time={"horizon": 5.0, "samples": 101})
+    result = api_run(
+        "descriptor", data={"t": made.t, "u": made["u"], "y": made["y"]}, observer="kalman_bucy",
+        noise={"name": "gaussian", "outputs": 0.01},
+    )
+    lines = {line.split()[0]: line for line in estimate_table(result.details) if line.split()}
+    assert "from" in lines["theta1"]
+    assert "from" not in lines["w_x1"]
+    assert not lines["w_x1"].rstrip().endswith("no")

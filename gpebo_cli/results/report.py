@@ -112,7 +112,8 @@ def estimate_table(result: RunResult) -> list[str]:
     rows = [["", "estimate", "± std", "unit", f"within {near} of the end since", "estimable"]]
     for name, told in estimates_at_end(result, case).items():
         value, std, from_when = told["value"], told["std"], result.estimable.get(name)
-        estimable = "no" if from_when is None else f"from {from_when:.4g} s"
+        lasts = name in result.estimable  # the filter's w_<state> move as states do
+        estimable = "" if not lasts else "no" if from_when is None else f"from {from_when:.4g} s"
         if not math.isfinite(value):
             why = "left out" if name in result.left_out else "not determined"
             rows.append([name, why, "", told["unit"] or "", "", estimable])
@@ -121,7 +122,7 @@ def estimate_table(result: RunResult) -> list[str]:
         first = int(len(away) - np.argmax(away[::-1])) if away.any() else 0
         known = standing.get(name)
         when = estimation.t[first] if known is None else estimation.t[0] + known[case]
-        since = f"{when:.4g} s" if name in estimation.names else ""
+        since = f"{when:.4g} s" if lasts and name in estimation.names else ""
         deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
         shown = f"{value:.6g}"
         if estimation.still[case] and name in estimation.names:
