@@ -207,7 +207,6 @@ def test_schur_form_of_the_differentiation_matrix(stages):
 @pytest.mark.parametrize("copies", [1, 20])
 def test_many_samples_are_those_of_few(copies, monkeypatch):
     """Of many columns by elements, several at once."""
-    monkeypatch.setattr("gpebo_cli.numerics.mesh._CHUNK", 80_000)
     mesh = initial_mesh(0.5, 4.5, [1.3], 12, radau_rule(9))
     signal = Trajectory(mesh, np.tile(smooth_signal(mesh).values, copies))
     t = np.linspace(0.5, 4.5, 4001)
@@ -289,7 +288,7 @@ def test_what_was_constant_before_a_cut_need_not_be_so_after_it(turned):
     """Matrices of kept elements may be one for all points, and those of fresh ones many."""
     one, many = np.full((1, 1, 2), 3.0), np.arange(2 * 4 * 2.0).reshape(2, 4, 2)
     kept = np.array([-1, 0, -1])
-    (found,) = merged([many if turned else one], [one if turned else many], 2, kept)
+    (found,) = merged([many if turned else one], [one if turned else many], kept)
     assert found.shape == (3, 4, 2)
     constant, other = ([0, 2], [1]) if turned else ([1], [0, 2])
     assert (found[constant] == 3.0).all()
