@@ -13,7 +13,7 @@ import pytest
 from plants import shipped
 
 from gpebo_cli import run
-from gpebo_cli.experiment.assumptions import check
+from gpebo_cli.experiment.assumptions import check, warnings
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import Settings
 
@@ -148,3 +148,13 @@ def test_nothing_to_estimate_is_exciting_and_gives_the_states():
         np.testing.assert_allclose(
             details.estimation.states[0], details.simulation.states, atol=1e-12
         )
+
+
+@pytest.mark.parametrize(("error", "count"), [(1e-9, 0), (2.0, 1)])
+def test_an_observer_that_its_own_errors_spoil_says_so(error, count):
+    """An estimate of the error is never larger than the signals without a word."""
+    class Spoilt:
+        assumptions, growth, growth_rate, error_estimate = (), None, None, error
+
+    assert len(warnings(Spoilt())) == count
+    assert all("2.0e+00 of their size" in line for line in warnings(Spoilt()))

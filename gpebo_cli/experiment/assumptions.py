@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # that is made of what is here
     from gpebo_cli.experiment.online import Online
 
 _EVERY_POINT = 16  # states, up to which a pencil is looked at where all is decided
+_SPOILT = 1e-3  # of the observer's signals: a larger error is worth a warning
 _GROWTH = 1e6  # of Φ: above it, the state loses six digits of what the parameters know
 
 
@@ -309,12 +310,18 @@ def of_observation(
 def warnings(observation: Observed) -> tuple[str, ...]:
     """What does not stop a run and spoils its result, one line each.
 
-    Assumption 1 that fails on the form chosen, and Φ that grows too far.
+    Assumption 1 that fails on the form chosen, signals that errors spoil, and Φ that grows too far.
     """
     found = tuple(
         str(a.evidence["because"]) for a in observation.assumptions
         if not a.holds and "because" in a.evidence
     )
+    if observation.error_estimate > _SPOILT:
+        text = (
+            f"errors of the observer's signals grow to {observation.error_estimate:.1e} of their "
+            "size: estimates are no better; use a shorter time.horizon, or another observer.form"
+        )
+        found = (*found, text)
     growth, rate = observation.growth, observation.growth_rate
     if growth is None or rate is None or growth < _GROWTH:
         return found
