@@ -62,9 +62,9 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(name, ho
 
 
 @pytest.mark.parametrize(("plant", "horizon"), [("battery", 60.0), ("motor", 0.1)])
-@pytest.mark.parametrize("estimator", ["mre", "least_squares"])
+@pytest.mark.parametrize("estimator", ["mre", "gradient"])
 def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monkeypatch):
-    """Where matrices follow signals: the same numbers, and an error estimate of the same size."""
+    """Laws of vectors where matrices follow signals: the numbers are the same."""
     made = run(plant, observer="none", time={"horizon": horizon, "samples": 151})
     names = [*made.inputs, *made.outputs]
     rng = np.random.default_rng(0)
@@ -81,8 +81,6 @@ def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monke
     )
     size = np.abs(whole).max(axis=0)
     np.testing.assert_allclose(windows / size, whole / size, rtol=0.0, atol=1e-8)
-    found = [each.regression.error_estimate for each in results]
-    assert found[0] / 10 < found[1] < 10 * found[0]
 
 
 @pytest.mark.parametrize(("plant", "horizon", "count", "estimator"), [

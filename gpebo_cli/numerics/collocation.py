@@ -54,7 +54,6 @@ class LinearSolution:
     errors: Array  # (n, columns) of each component of X relative to its largest value
     lost: float | None  # from when on a component's error exceeds the component
     extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each, or (1, 1, ...)
-    uncertain: float | Array = 0.0  # (n, columns) estimated errors at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +113,13 @@ def solve(
     noise = maps.noise
     if restarts:
         noise = _with_instants(noise, Trajectory(mesh, values), np.array(list(restarts)))
-    errors, lost, last = estimated_errors(
+    errors, lost = estimated_errors(
         problem, mesh, maps.homogeneous[:, -1], maps.particular[:, -1], noise, values
     )
     estimate = max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0)))
     return LinearSolution(
         Trajectory(mesh, values), estimate, rounds, errors,
-        None if lost == mesh.size else float(mesh.edges[lost + 1]), maps.extras, last,
+        None if lost == mesh.size else float(mesh.edges[lost + 1]), maps.extras,
     )
 
 

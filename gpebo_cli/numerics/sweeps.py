@@ -193,12 +193,11 @@ def solve(
         )
     except StiffError:
         return None
-    errors, lost, last = _errors(march, problem, mesh, units, found)
+    errors, lost = _errors(march, problem, mesh, units, found)
     return LinearSolution(
         found.trajectory,
         max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), rounds, errors,
         None if lost == mesh.size else float(mesh.edges[lost + 1]), found.extras,
-        last / np.sqrt(mesh.size + 1.0),  # which counts it as often as there are elements
     )
 
 
@@ -392,7 +391,7 @@ def _errors(
     # As in numerics.errors; and what sweeps have not finished.
     added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * sizes
     added += EPS * (END * found.made_of + found.moved)
-    start = EPS * np.abs(values[0, 0]) + problem.uncertain
+    start = EPS * np.abs(values[0, 0])
     noise = np.zeros((n, columns))
     if points > 4:
         last = np.abs(rule.to_legendre[-4:] @ flat)

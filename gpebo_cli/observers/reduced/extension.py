@@ -285,7 +285,6 @@ def reduced_system(
     try:
         used, first, note = choose_form(
             system, t, inside, at, signals.derivatives, solver, form, weights, units,
-            piecewise=in_part and len(mesh.windows()) > 1,
         )
     except NotObservableError as error:
         used = as_given(system, t, inside, at, signals.derivatives)
@@ -321,7 +320,7 @@ def _beginning(
 def choose_form(
     system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
     derivatives: InputDerivatives | None, solver: SolverSettings, form: str,
-    weights: ByName | None, units: Units | None = None, *, piecewise: bool = False,
+    weights: ByName | None, units: Units | None = None,
 ) -> tuple[EquationForm, ObserverMatrices, str]:
     """The form of the equations, its matrices at the times t (N,), and why it is this one.
 
@@ -335,8 +334,6 @@ def choose_form(
         form: given, strangeness_free or auto.
         weights: of the outputs, ``observer.weights``.
         units: as for :func:`reduced_system`.
-        piecewise: the matrices are looked at piece by piece, and those of the first times are
-            enough, unless E moves.
 
     Raises:
         ModelError: rank of E not constant, Assumption 1 violated, not uniquely solvable.
@@ -349,18 +346,9 @@ def choose_form(
     scale = output_scale(weights, system)
 
     def matrices(chosen: EquationForm) -> ObserverMatrices:
-        def at(part: slice, like: ObserverMatrices | None = None) -> ObserverMatrices:
-            return observer_matrices(
-                chosen, t[part], inside[part], solver.rank_tol, like, output_scale=scale,
-                signals=None if signals is None else signals[part],
-            )
-
-        if not piecewise or chosen.structure or "E" not in system.coefficients.constant:
-            return at(slice(None))
-        first = at(slice(_AT_ONCE))
-        for k in range(_AT_ONCE, len(t), _AT_ONCE):
-            at(slice(k, k + _AT_ONCE), first)
-        return first
+        return observer_matrices(
+            chosen, t, inside, solver.rank_tol, output_scale=scale, signals=signals
+        )
 
     note, given = "", as_given(system, t, inside, signals, derivatives)
     given = given if units is None else replace(given, units=units)
@@ -423,8 +411,6 @@ class Extension:
 def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     """Integrate [ξ_a | ξ_b | Φ] from ``start`` (k, 1 + q + n_a) over ``mesh``, refined.
 
-    A long mesh is taken window by window, so that little is held beside the result.
-
     Raises:
         ModelError: rank of E not constant, Assumption 1 violated.
         SolverError: the tolerance cannot be reached, or the extension grows beyond all bounds.
@@ -475,28 +461,23 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
     on_axes &= basis.shape[1] == reduced.rank  # else what is eliminated is taken from them
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
-    known, signals, found = None, reduced.signals, list[Extension]()
+    known, signals = None, reduced.signals
     limits: dict[str, Any] = {"tol": solver.tol, "max_elements": solver.max_elements}
-    for window in mesh.windows():
-        if window is signals.mesh and reduced.injection is None and solver.name != "ivp":
-            u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
-            points, inside = _over_time(mesh.points), _over_time(mesh.inside)
-            known = equations(reduced.first, reduced.form.driving(points, inside, u), y)
-        swept = sweeps.solve_dense(problem, window, **limits, known=known) if large else None
-        if swept is not None:
-            solution = swept
-        elif solver.name == "ivp":
-            solution = ivp.solve(problem, window, **limits)
-        else:
-            known, large = None if large else known, False
-            solution = solve(problem, window, **limits, known=known)
-        own = _in_units(solution, units)
-        found.append(_assembled(reduced, own, latest[0], as_found=swept is not None))
-        problem = replace(
-            problem, start=solution.trajectory.final, uncertain=solution.uncertain
-        )
-    whole = joined(found)
-    return replace(whole, scale=np.maximum.accumulate(whole.scale, axis=0))
+    if mesh is signals.mesh and reduced.injection is None and solver.name != "ivp":
+        u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
+        points, inside = _over_time(mesh.points), _over_time(mesh.inside)
+        known = equations(reduced.first, reduced.form.driving(points, inside, u), y)
+    swept = sweeps.solve_dense(problem, mesh, **limits, known=known) if large else None
+    if swept is not None:
+        solution = swept
+    elif solver.name == "ivp":
+        solution = ivp.solve(problem, mesh, **limits)
+    else:
+        known, large = None if large else known, False
+        solution = solve(problem, mesh, **limits, known=known)
+    return _assembled(
+        reduced, _in_units(solution, units), latest[0], as_found=swept is not None
+    )
 
 
 def joined(parts: Sequence[Extension]) -> Extension:
