@@ -109,7 +109,7 @@ class Gpebo:
         found: Observation | SolverError
         known = everything = (True, system.q + system.n)
         # Where Assumption 1 fails at one time no mesh resolves it: the other form comes soon.
-        few = max(_TRIED, 10 * signals.mesh.size)
+        few = max(_TRIED, 100 * signals.mesh.size)
         first = replace(solver, max_elements=min(solver.max_elements, few))
         try:
             found = self._on("auto", system, signals, first)
