@@ -62,7 +62,7 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(name, ho
 
 
 @pytest.mark.parametrize(("plant", "horizon"), [("battery", 60.0), ("motor", 0.1)])
-@pytest.mark.parametrize("estimator", ["mre"])
+@pytest.mark.parametrize("estimator", ["mre", "gradient"])
 def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monkeypatch):
     """Laws of vectors where matrices follow signals: the numbers are the same."""
     made = run(plant, observer="none", time={"horizon": horizon, "samples": 151})

@@ -36,9 +36,9 @@ def test_numbers_may_be_text(value):
 
 @pytest.mark.parametrize(("value", "expected"), [(7, 7), (7.0, 7), ("7", 7), ("1e3", 1000)])
 def test_whole_numbers_may_be_written_as_floats(value, expected):
-    stages = read(SolverSettings, {"stages": value}, "solver").stages
-    assert stages == expected
-    assert type(stages) is int
+    found = read(SolverSettings, {"max_elements": value}, "solver").max_elements
+    assert found == expected
+    assert type(found) is int
 
 
 def test_large_integers_are_not_rounded():

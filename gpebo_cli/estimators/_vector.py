@@ -46,17 +46,22 @@ class VectorLaw:
         """
         signals = self.M.values, self.N.values, with_realisations(self.M.values, self.b.values)
         first, eta, found = 0, start, list[Trajectory]()
+        sizes: float | Array = self.floor  # so far: later, η̂ and ν may have decayed
         for window in self.M.mesh.windows():
             part = slice(first, first + window.size)
             packed = np.concatenate([values[part] for values in signals], axis=-1)
-            found.append(self._over(Trajectory(window, packed), gains, eta))
+            solution = self._over(Trajectory(window, packed), gains, eta, sizes)
+            sizes = np.maximum(sizes, np.abs(solution.values).max(axis=(0, 1)))
+            found.append(Trajectory(solution.mesh, solution.values[:, :, : len(start)]))
             first, eta = part.stop, found[-1].final
         edges = np.unique(np.concatenate([each.mesh.edges for each in found]))
         mesh = Mesh(edges, self.M.mesh.rule)
         return Trajectory(mesh, np.concatenate([each.values for each in found]))
 
-    def _over(self, packed: Trajectory, gains: Array, start: Array) -> Trajectory:
-        """:meth:`solve` for [M | N | b] over a window, from η̂ (p,) or (p, c)."""
+    def _over(
+        self, packed: Trajectory, gains: Array, start: Array, sizes: float | Array
+    ) -> Trajectory:
+        """(η̂, ν) for [M | N | b] over a window, from η̂ (p,) or (p, c); rounding is below sizes."""
         p, k = len(start), self.b.values.shape[2]
         c = packed.values.shape[-1] - 2 * p
         E = np.zeros((1, p + k, p + k))
@@ -79,13 +84,11 @@ class VectorLaw:
         start = np.broadcast_to(start.reshape(p, -1), (p, c))
         residual = first[:, 2 * p :] - first[:, p : 2 * p] @ start
         starts = np.concatenate([start, residual])
-        problem = LinearProblem(coefficients, starts, name="estimator", floor=self.floor)
-        solution = solve(
+        problem = LinearProblem(coefficients, starts, name="estimator", floor=sizes)
+        return solve(
             problem, packed.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
             restarts=_residual_restarts(packed, p),
-        )
-        trajectory = solution.trajectory
-        return Trajectory(trajectory.mesh, trajectory.values[:, :, :p])
+        ).trajectory
 
 
 def _residual_restarts(packed: Trajectory, p: int) -> dict[float, Callable[[Array], Array]]:

@@ -22,6 +22,7 @@ def _for_small(name: str, *, declines: bool = False) -> Callable[..., Any]:
             return getattr(structure_numpy, name)(E, A, rows, *more)
         return found
 
+    either.__doc__ = f"{name}: in C for small arrays."
     return either
 
 

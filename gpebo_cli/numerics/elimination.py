@@ -26,6 +26,7 @@ class StiffError(Exception):
 class Factors(NamedTuple):
     """What elimination does to the right-hand side of an element, see ``elements.substituted``."""
 
+    # Target, source and block of each step, (S,)
     steps: tuple[IntArray, IntArray, IntArray]
     full: Array  # (G, F, s, s)
     diagonal: Array  # (G, T, s)
