@@ -8,6 +8,7 @@ follow one after the other only when the right-hand sides are known.
 
 from __future__ import annotations
 
+from hashlib import blake2b
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from gpebo_cli.model.descriptor import Array, IntArray
 
 _SMALL = 1e-280  # terms below it have lost digits
 _FILL = 4  # blocks of size s × s per state that elimination may couple; with more A is not sparse
+
 
 class StiffError(Exception):
     """Sweeps do not converge, or elimination fills what is sparse."""
@@ -36,7 +38,7 @@ class Eliminated:
     """As ``elements.sweeps``, without sweeps; factors of the last elements are kept."""
 
     def __init__(self) -> None:
-        self._known = dict[int, int]()
+        self._known = dict[bytes, int]()  # where the factors of each matrix are, by its digest
         self._factors: Factors | None = None
 
     def __call__(
@@ -50,9 +52,9 @@ class Eliminated:
             entries = entries.reshape(K, s + 1, -1)[:, 1:]
         else:
             entries = np.broadcast_to(entries, (K, s, entries.shape[1]))
-        pattern = rows.tobytes(), columns.tobytes()
+        pattern = rows.tobytes() + columns.tobytes()
         keys = [
-            hash((*pattern, f"{step:.12e}", each.tobytes()))
+            blake2b(pattern + f"{step:.12e}".encode() + each.tobytes()).digest()
             for step, each in zip(h.tolist(), entries, strict=True)
         ]
         fresh = {key: k for k, key in enumerate(keys) if key not in self._known}
