@@ -13,7 +13,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, build
-from gpebo_cli.recordings.hold import held, on_mesh, recording_mesh
+from gpebo_cli.recordings.hold import held, recording_mesh
 from gpebo_cli.settings import SolverSettings
 from tests.plants import shipped
 
@@ -33,7 +33,7 @@ def rough(system, hold, rows=700, horizon=4.0):
     t = np.sort(np.append(rng.uniform(0.0, horizon, rows - 2), [0.0, horizon]))
     values = rng.standard_normal((rows, system.m + system.r)) + np.sin(t)[:, None]
     mesh = recording_mesh(t, values, hold, (0.0, horizon), system.coefficients, 1e-10)
-    both = on_mesh(held(t, values, hold), mesh).values
+    both = mesh.along(held(t, values, hold)).values
     signals = (Trajectory(mesh, part) for part in np.split(both, [system.m], axis=2))
     return Measurements(*signals)
 

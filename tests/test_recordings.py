@@ -27,7 +27,7 @@ from gpebo_cli.model import archive
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.recordings.guess import _factor, guess
-from gpebo_cli.recordings.hold import edges, held, on_mesh, recording_mesh
+from gpebo_cli.recordings.hold import edges, held, recording_mesh
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import LineReader, read_table
 from gpebo_cli.settings import (
@@ -173,7 +173,7 @@ def test_smooth_samples_share_elements_and_rough_ones_do_not():
         assert (mesh.size < 500) == few
         signal = held(t, values, "cubic")
         inner = np.linspace(0.1, 19.9, 997)
-        assert np.abs(on_mesh(signal, mesh)(inner) - signal(inner, inner)).max() < 1e-10
+        assert np.abs(mesh.along(signal)(inner) - signal(inner, inner)).max() < 1e-10
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
@@ -182,7 +182,7 @@ def test_a_held_signal_is_exact_on_its_mesh_and_edges_are_where_it_bends(hold):
     t = np.array([0.0, 0.3, 0.5, 1.7, 2.0, 2.5])
     values = np.array([[1.0], [1.0], [2.0], [3.0], [3.0], [0.0]])
     mesh = recording_mesh(t, values, hold, (0.1, 2.4), source, 1e-9)
-    trajectory = on_mesh(held(t, values, hold), mesh)
+    trajectory = mesh.along(held(t, values, hold))
     at = np.linspace(0.11, 2.39, 101)
     expected = (
         values[np.searchsorted(t, at, side="right") - 1, 0]

@@ -96,6 +96,6 @@ def averaged(regression: LinearRegression, delay: float, settle: float) -> Traje
     psi, Y = regression.psi(t, inside), regression.Y(t, inside)
     both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
     product = lagged(regression, delay, t, inside) @ both
-    whole = Trajectory(mesh, product.reshape(*mesh.points.shape, *product.shape[1:])).integral()
+    whole = mesh.trajectory(product).integral()
     span = (settle + mesh.points - edges[0])[..., None, None]
     return Trajectory(mesh, whole.values / span)

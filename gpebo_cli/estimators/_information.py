@@ -199,10 +199,8 @@ def _bounded(
     longest = 0.25 / beta0
     parts = np.maximum(1, np.ceil(mesh.steps / longest)).astype(np.intp)
     if (parts > 1).any():
-        finer, _ = mesh.split(parts)
-        values = outer(finer.points.ravel(), finer.inside.ravel())
-        outer = Trajectory(finer, values.reshape(*finer.points.shape, *outer.values.shape[2:]))
-        mesh = finer
+        mesh, _ = mesh.split(parts)
+        outer = mesh.along(outer)
     R, p = mesh.rule.integration, regression.p
     gram, memory = np.empty_like(outer.values), np.empty(outer.values.shape[:2])
     G, z = np.zeros(outer.values.shape[2:]), 1.0

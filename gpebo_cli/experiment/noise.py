@@ -161,7 +161,7 @@ def measure(signals: Signals, settings: NoiseSettings, levels: NoiseLevels) -> S
         return signals
     grid = noise_grid(signals.mesh, settings)
     mesh = grid.mesh
-    true = Signals(*(on_mesh(s, mesh) for s in (signals.inputs, signals.outputs, signals.states)))
+    true = Signals(*map(mesh.along, (signals.inputs, signals.outputs, signals.states)))
     of_outputs, of_inputs = draw_errors(true.outputs, grid, levels, settings.seed)
     return Signals(
         Trajectory(mesh, true.inputs.values + between(of_inputs, grid, settings.shape)),
@@ -179,12 +179,6 @@ def noise_grid(mesh: Mesh, settings: NoiseSettings) -> SampledMesh:
         level = (_RESOLVED * factorial(degree) / 2.0) ** (1.0 / degree)
         parts = max(1, ceil(pi / (4.0 * level)))
     return sampled_mesh(mesh, settings.sample_time, parts)
-
-
-def on_mesh(signal: Trajectory, mesh: Mesh) -> Trajectory:
-    """The same signal (K, s + 1, …) on a mesh that has all edges of its own."""
-    values = signal(mesh.points.ravel(), mesh.inside.ravel())
-    return Trajectory(mesh, values.reshape(*mesh.points.shape, *signal.values.shape[2:]))
 
 
 def draw_errors(

@@ -22,7 +22,6 @@ from gpebo_cli.experiment.noise import (
     draw_errors,
     measure,
     noise_grid,
-    on_mesh,
     sampled_mesh,
 )
 from gpebo_cli.experiment.pace import Pace
@@ -152,7 +151,7 @@ def _added(
     regression = observation.regression
     mesh = regression.mesh
     samples = noise_grid(signals.mesh, settings)
-    outputs = on_mesh(signals.outputs, samples.mesh)
+    outputs = samples.mesh.along(signals.outputs)
     grid = sampled_mesh(mesh, settings.sample_time)  # every instant is an edge of it already
     first = draw_errors(outputs, samples, levels, settings.seed)
     batch = max(1, _NUMBERS // regression.Y.values.size)

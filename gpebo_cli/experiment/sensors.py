@@ -18,7 +18,6 @@ from gpebo_cli.model.descriptor import Array, Coefficients, CoefficientSource, D
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, build
 from gpebo_cli.observers.reduced.extension import extend, reduced_system
-from gpebo_cli.observers.reduced.regression import on_mesh
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
@@ -115,14 +114,14 @@ class _Rows:
         extension = extend(reduced, reduced.mesh, reduced.start())
         mesh, final, n = extension.mesh, extension.assembled, system.n
         psi = final.psi[:, :, None, :]
-        square = on_mesh(mesh, np.swapaxes(psi, 2, 3) @ psi)  # of every row
+        square = mesh.trajectory(np.swapaxes(psi, 2, 3) @ psi)  # of every row
         start, stop = mesh.edges[[0, -1]]
         whole = square.integral().final
         self._gram, self._more = whole[:-n].sum(axis=0), whole[-n:]
         self._terms = extension.scale[-1:]
         self._elapsed = np.array([stop - start])
         self._parameters = (*system.unknowns, *reduced.names)
-        self._gain = on_mesh(mesh, final.gain)(np.linspace(start, stop, _TIMES))
+        self._gain = mesh.trajectory(final.gain)(np.linspace(start, stop, _TIMES))
         self._units = reduced.form.units.states
         self._common = self._known(range(n)).sizes[0]
 

@@ -187,8 +187,7 @@ def _joined(signals: Sequence[Trajectory], shifts: Sequence[float]) -> Trajector
         mesh = Mesh(signal.mesh.edges, rule)
         own = signal.values
         if signal.mesh.rule.stages != rule.stages:
-            flat = signal(mesh.points.ravel(), mesh.inside.ravel())
-            own = flat.reshape(*mesh.points.shape, *own.shape[2:])
+            own = mesh.along(signal).values
         values.append(own)
         edges.append(mesh.edges + by if not edges else (mesh.edges + by)[1:])
     return Trajectory(Mesh(np.concatenate(edges), rule), np.concatenate(values))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from itertools import pairwise
@@ -75,6 +75,14 @@ class Mesh:
         inside[:, 0] += _INSIDE * self.steps
         inside[:, -1] -= _INSIDE * self.steps
         return points, inside
+
+    def trajectory(self, flat: Array) -> Trajectory:
+        """The signal with these values (K (s + 1), …), one point after the other."""
+        return Trajectory(self, flat.reshape(*self.points.shape, *flat.shape[1:]))
+
+    def along(self, signal: Callable[[Array, Array], Array]) -> Trajectory:
+        """A signal, (N, …) at times (N,) and where jumps are decided, at all points."""
+        return self.trajectory(signal(self.points.ravel(), self.inside.ravel()))
 
     def windows(self) -> list[Mesh]:
         """This mesh, or the pieces of a long one that are solved one after the other."""

@@ -148,9 +148,9 @@ def log_norm(Phi: Array) -> float:
     return float(np.log(max(sigma.max(initial=0.0 if Phi.size else 1.0), np.finfo(float).tiny)))
 
 
-def largest_entry(values: Array, first: int = 0) -> float:
-    """Size of the largest entry of values (…, columns), in the columns from ``first`` on."""
-    return float(np.abs(values[..., first:]).max(initial=0.0))
+def largest_entry(values: Array) -> float:
+    """Size of the largest entry."""
+    return float(np.abs(values).max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -314,28 +314,25 @@ def _unknown_input_observer(
     L = _gain(settings, c, dc, b.N, t, inside)
     M, from_y, forcing = unknown_input_matrices(c, dc, b.N, f_b, L)
 
-    def on_mesh(values: Array) -> Trajectory:
-        return Trajectory(mesh, values.reshape(*mesh.points.shape, *values.shape[1:]))
-
     size = np.abs(b.C).max(axis=(0, 2))
     third = None
     if (seen := _apart_from_zero(b.C[:, :, n_a + 2], size)).any():
         j = int(np.argmax(seen))
         row = np.concatenate([b.C[:, j, : n_a + 2], y[:, j : j + 1]], axis=1)
-        third = on_mesh(row / b.C[:, j, n_a + 2 : n_a + 3])
+        third = mesh.trajectory(row / b.C[:, j, n_a + 2 : n_a + 3])
     return UnknownInputObserver(
         mesh=mesh,
-        M=on_mesh(M),
-        from_y=on_mesh(from_y),
-        forcing=on_mesh(forcing),
-        G2=on_mesh(1.0 / c[:, 1]),
-        y=on_mesh(y[:, ell]),
-        C_a=on_mesh(b.C[:, ell, :n_a]),
-        algebraic=on_mesh(np.stack([-f_b[:, 0], c[:, 0] * f_b[:, 0] / c[:, 1]], axis=1)),
+        M=mesh.trajectory(M),
+        from_y=mesh.trajectory(from_y),
+        forcing=mesh.trajectory(forcing),
+        G2=mesh.trajectory(1.0 / c[:, 1]),
+        y=mesh.trajectory(y[:, ell]),
+        C_a=mesh.trajectory(b.C[:, ell, :n_a]),
+        algebraic=mesh.trajectory(np.stack([-f_b[:, 0], c[:, 0] * f_b[:, 0] / c[:, 1]], axis=1)),
         third=third,
         start=_start(settings),
         names=(system.states[n_a], system.states[n_a + 1]),
-        assumptions=_assumptions(system, b.N, c, on_mesh(M), ell),
+        assumptions=_assumptions(system, b.N, c, mesh.trajectory(M), ell),
     )
 
 

@@ -312,7 +312,7 @@ def _initial_covariance(P0: ByName, names: tuple[str, ...], known: ReducedSystem
     q, dual = known.system.q, known.first.split.dual
     inside = np.zeros((len(names), len(names)))
     inside[:q, :q], inside[q:, :q] = np.eye(q), dual @ known.begin.from_unknowns
-    inside[q:, q:] = dual @ known.initial_basis @ known.begin.dual @ known.basis
+    inside[q:, q:] = dual @ known.begin.basis @ known.begin.dual @ known.basis
     return np.asarray((inside * variances) @ inside.T)
 
 

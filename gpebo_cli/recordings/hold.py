@@ -13,12 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource
-from gpebo_cli.numerics.mesh import (
-    Mesh,
-    Trajectory,
-    legendre_tail,
-    signal_scale,
-)
+from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 
 # (times (N,), where it is decided which samples they are between (N,)) -> values (N, c)
@@ -51,12 +46,6 @@ def held(t: Array, values: Array, hold: str) -> Held:
         return np.asarray(values[k] + (at - t[k])[:, None] * slope[k])
 
     return line
-
-
-def on_mesh(signal: Held, mesh: Mesh) -> Trajectory:
-    """A held signal at the points of a mesh that resolves it."""
-    values = signal(mesh.points.ravel(), mesh.inside.ravel())
-    return Trajectory(mesh, values.reshape(*mesh.points.shape, values.shape[1]))
 
 
 def edges(t: Array, cuts: Array) -> Array:

@@ -11,7 +11,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.recordings.hold import held, on_mesh, recording_mesh
+from gpebo_cli.recordings.hold import held, recording_mesh
 from gpebo_cli.recordings.table import Samples, Table, read_table
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
@@ -72,7 +72,7 @@ def load(
     m = system.m
     values = np.concatenate([samples.inputs, samples.outputs], axis=1)
     mesh = recording_mesh(samples.t, values, data.hold, span, system.coefficients, tol)
-    both = on_mesh(held(samples.t, values, data.hold), mesh).values
+    both = mesh.along(held(samples.t, values, data.hold)).values
     return Recording(
         table=table,
         hold=data.hold,
@@ -113,5 +113,5 @@ def _states(samples: Samples, span: tuple[float, float], *, smooth: bool) -> Tra
     values = np.full((*mesh.points.shape, states.shape[1]), np.nan)
     if known.any():
         signal = held(t, states[:, known], "cubic" if smooth else "linear")
-        values[..., known] = on_mesh(signal, mesh).values
+        values[..., known] = mesh.along(signal).values
     return Trajectory(mesh, values)

@@ -73,4 +73,4 @@ def filtered(
     both = np.concatenate(
         [omega(t, inside).reshape(-1, p, p), rhs.values.reshape(-1, p, 1)], axis=2
     )
-    return Trajectory(rhs.mesh, both.reshape(*rhs.mesh.points.shape, p, p + 1))
+    return rhs.mesh.trajectory(both)

@@ -352,9 +352,7 @@ def simulation_of(
         zero = Trajectory(mesh, np.zeros((*mesh.points.shape, given.rows)))
         regression, _ = given.on(signals, zero, solver.tol, solver.max_elements)
         mesh, outputs = regression.mesh, regression.psi.values @ system.theta
-        signals = Trajectory(mesh, signals(mesh.points.ravel(), mesh.inside.ravel()).reshape(
-            *mesh.points.shape, system.m
-        ))
+        signals = mesh.along(signals)
     theta = np.broadcast_to(system.initial_state, (*mesh.points.shape, system.n))
     return Simulation(
         Signals(signals, Trajectory(mesh, outputs), Trajectory(mesh, theta)), without_equations(),

@@ -65,6 +65,11 @@ class Start(NamedTuple):
     offset: Array  # (n,)
     from_unknowns: Array  # (n, q)
 
+    def extension(self, dual: Array, xi_a: Array) -> Array:
+        """[ξ_a | ξ_b | Φ] = dual [ξ_a | from_unknowns | V], for dual (k, n), (k, 1 + q + d)."""
+        whole = np.concatenate([xi_a[:, None], self.from_unknowns, self.basis], axis=1)
+        return np.asarray(dual @ whole)
+
 
 def start_at(
     form: EquationForm, o: ObserverMatrices, driving: Array, y: Array
@@ -178,11 +183,6 @@ class ReducedSystem:
         return self.form.system
 
     @property
-    def initial_basis(self) -> Array:
-        """V1 (n, d)."""
-        return self.begin.basis
-
-    @property
     def names(self) -> tuple[str, ...]:
         """Names of e₀'s components, (d,)."""
         return self.begin.names
@@ -205,13 +205,7 @@ class ReducedSystem:
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of w's coordinates, (k,)."""
-        states = self.system.states
-        if self.basis.shape[1] > self.rank:
-            return states
-        units = self.form.units.states
-        own = self.first.split.projector[0] * units / units[:, None]
-        _, _, names = initial_basis(own, self.rank, states, units)
-        return tuple(name.removeprefix("e0_") for name in names)
+        return self.first.split.coordinates(self.system.states, self.form.units.states)
 
     def matrices(self, t: Array, inside: Array) -> ObserverMatrices:
         """The matrices at the times t (N,), with output injection."""
@@ -231,20 +225,14 @@ class ReducedSystem:
         t, t_in = np.array([time]), np.array([inside])
         return start_at(self.form, self.matrices(t, t_in), *self.driving(t, t_in))
 
-    def start(self, begin: Start | None = None, xi_a: Array | None = None) -> Array:
-        """[ξ_a | ξ_b | Φ] = [ξ_a | from_unknowns | V] for ξ_a (n,), shape (k, 1 + q + d).
-
-        By default that of the start, with ξ_a = offset + V ξ_a0.
-        """
-        begin = self.begin if begin is None else begin
-        xi_a = self.xi_a if xi_a is None else xi_a
-        whole = np.concatenate([xi_a[:, None], begin.from_unknowns, begin.basis], axis=1)
-        return np.asarray(self.first.split.dual @ whole)
+    def start(self) -> Array:
+        """[ξ_a | ξ_b | Φ] at the start, (k, 1 + q + d)."""
+        return self.begin.extension(self.first.split.dual, self.xi_a)
 
     @property
     def xi_a(self) -> Array:
         """ξ_a at the start, (n,)."""
-        return np.asarray(self.begin.offset + self.initial_basis @ self.xi_a0)
+        return np.asarray(self.begin.offset + self.begin.basis @ self.xi_a0)
 
 
 def reduced_system(
@@ -510,7 +498,7 @@ def joined(parts: Sequence[Extension]) -> Extension:
 
 
 def _assembled(
-    reduced: ReducedSystem, solution: LinearSolution, found: Assembled, *, as_found: bool = False
+    reduced: ReducedSystem, solution: LinearSolution, found: Assembled, *, as_found: bool
 ) -> Extension:
     """What was found on the mesh, :func:`resolved` but for ``as_found``, and sizes of its terms.
 
@@ -578,22 +566,24 @@ def assumptions(
     left = None if frame is None else frame.remaining
     rank = reduced.rank + (0 if left is None else left.given_up.shape[1])
     of = "smallest_singular_value" + ("" if reduced.lost is None else "_of_the_rest")
+    evidence = {of: smallest, "at": float(mesh.points.ravel()[where])}
+    return needed(reduced.form, reduced.note, rank, evidence, holds=reduced.lost is None)
+
+
+def needed(
+    form: EquationForm, note: str, rank: int, injective: Mapping[str, float], *, holds: bool = True
+) -> tuple[Assumption, ...]:
+    """Rank of E and Assumption 1, and which form of the equations is used, and why."""
+    used: dict[str, float | int | str | None] = {
+        **injective, "form": "given" if form.structure is None else "strangeness_free",
+        **({"because": note.removeprefix("; ")} if note else {}),
+    }
     return (
         Assumption(
-            "Rank of E", "rank E(t) is constant", True,
-            {"rank": rank, "states": reduced.system.n},
+            "Rank of E", "rank E(t) is constant", True, {"rank": rank, "states": form.system.n}
         ),
         Assumption(
-            "Assumption 1",
-            "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
-            reduced.lost is None,
-            {of: smallest, "at": float(mesh.points.ravel()[where]),
-             **form_used(reduced.form, reduced.note)},
+            "Assumption 1", "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
+            holds, used,
         ),
     )
-
-
-def form_used(form: EquationForm, note: str) -> dict[str, float | int | str | None]:
-    """Which form of the equations is used, and why, as evidence."""
-    name = "given" if form.structure is None else "strangeness_free"
-    return {"form": name, **({"because": note.removeprefix("; ")} if note else {})}

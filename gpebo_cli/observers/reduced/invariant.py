@@ -17,7 +17,6 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import ByName
 from gpebo_cli.observers.reduced.extension import choose_form
-from gpebo_cli.observers.reduced.split import initial_basis
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import SolverSettings
 
@@ -65,15 +64,11 @@ def invariant_observer(
         )
     K = o.elimination[0] @ o.range[0].T
     basis: Array = o.split.basis
-    names = system.states
-    if basis.shape[1] == o.split.rank:
-        units = used.units.states
-        own = o.split.projector[0] * units / units[:, None]
-        names = initial_basis(own, o.split.rank, system.states, units)[2]
+    names = o.split.coordinates(system.states, used.units.states)
     return Invariant(
         o.dynamics[0],
         np.concatenate([o.from_signals[0], o.from_unknowns[0]], axis=1),
         basis - K @ o.on_basis[0],
         -K @ np.concatenate([o.g_signals[0], o.G[0]], axis=1),
-        tuple(f"w_{name.removeprefix('e0_')}" for name in names),
+        tuple(f"w_{name}" for name in names),
     )

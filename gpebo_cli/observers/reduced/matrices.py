@@ -14,6 +14,7 @@ from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import (
     exact_product,
+    largest_over_time,
     orthonormal_complement,
     symmetric_eigenvalues,
     transpose,
@@ -25,7 +26,6 @@ from gpebo_cli.observers.reduced.split import (
     Split,
     axes_frame,
     constant_split,
-    entry_sizes,
     fits,
     split_by_svd,
     split_in_frame,
@@ -155,7 +155,7 @@ def observer_matrices(
         scale = (np.ones(system.r) if output_scale is None else output_scale) / units.outputs
     plain = model.hidden is None and {"D", "H"} <= system.coefficients.zero
     known = like.split.frame if frame is None and like is not None else frame
-    frame = axes_frame(entry_sizes(model.E)) if like is None and frame is None else known
+    frame = axes_frame(largest_over_time(model.E)) if like is None and frame is None else known
     found = None
     if plain and frame is not None and frame.remaining is None:
         found = _in_frame(model, units.equations, scale, frame, rank_tol)

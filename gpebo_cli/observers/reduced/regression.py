@@ -11,7 +11,6 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time, orthonormal_complement, transpose
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.reduction.form import EquationForm
 
@@ -135,7 +134,3 @@ def term_sizes(
     projected = np.abs(orthonormal_complement(equations.range)) @ seen
     return terms, np.maximum(projected, _ROUNDING * seen).max(axis=1)
 
-
-def on_mesh(mesh: Mesh, signal: Array) -> Trajectory:
-    """A signal (K (s + 1), …) at the points of a mesh, as values (K, s + 1, …)."""
-    return Trajectory(mesh, signal.reshape(*mesh.points.shape, *signal.shape[1:]))

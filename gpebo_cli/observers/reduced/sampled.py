@@ -26,7 +26,7 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import ByName
 from gpebo_cli.observers._observation import InitialError, SampledBlock, largest_entry
-from gpebo_cli.observers.reduced.extension import begin_at, choose_form, form_used, start_at
+from gpebo_cli.observers.reduced.extension import begin_at, choose_form, needed, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import regression_signals, resolved, term_sizes
 from gpebo_cli.observers.reduced.response import error_system
@@ -94,17 +94,8 @@ class SampledObserver:
 
     def assumptions(self, reached: SampledState) -> tuple[Assumption, ...]:
         """What the observer needed so far, with its evidence."""
-        return (
-            Assumption(
-                "Rank of E", "rank E(t) is constant", True,
-                {"rank": self.like.split.rank, "states": self.system.n},
-            ),
-            Assumption(
-                "Assumption 1", "impulse observability: [ΠA; C] is injective on the kernel of E(t)",
-                True, {"smallest_singular_value_at_least": reached.injectivity,
-                       **form_used(self.form, self.note)},
-            ),
-        )
+        evidence = {"smallest_singular_value_at_least": reached.injectivity}
+        return needed(self.form, self.note, self.like.split.rank, evidence)
 
     def truth(self, extension: Array) -> InitialError:
         """What the parameters are, from [ξ_a | ξ_b | Φ] (K, k, 1 + p) at the times to be asked."""
@@ -250,10 +241,8 @@ def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
 def sampled_observer(
     system: DescriptorSystem, solver: SolverSettings, hold: str, start: float, sample: Array,
     derivatives: InputDerivatives | None, *,
-    xi_a0: Mapping[str, float] | list[float] | None = None,
-    weights: ByName | None = None,
-    regression: str = "projected",
-    form: str = "auto",
+    xi_a0: Mapping[str, float] | list[float] | None, weights: ByName | None, regression: str,
+    form: str,
 ) -> SampledObserver:
     """The observer in discrete time, whose first sample is at ``start``.
 
@@ -282,11 +271,10 @@ def sampled_observer(
     m = system.m
     begin = start_at(used, first, used.driving(t, t, sample[None, :m]), sample[None, m:])
     xi = begin_at(xi_a0, system, used.units.states, first, begin)
-    xi_a = begin.offset + begin.basis @ xi
-    whole = np.concatenate([xi_a[:, None], begin.from_unknowns, begin.basis], axis=1)
     return SampledObserver(
         form=used, solver=solver, hold=hold, regression=regression, like=first,
-        start=first.split.dual @ whole, initial_dual=begin.dual, xi_a0=xi,
+        start=begin.extension(first.split.dual, begin.offset + begin.basis @ xi),
+        initial_dual=begin.dual, xi_a0=xi,
         parameters=(*system.unknowns, *begin.names), note=note,
     )
 

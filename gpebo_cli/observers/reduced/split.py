@@ -42,6 +42,14 @@ class Split:
     projector: Array  # (N, n, n) P
     frame: Frame | None  # None where kernel or range turn
 
+    def coordinates(self, states: tuple[str, ...], units: Array) -> tuple[str, ...]:
+        """Names of w's coordinates z, (k,), from those of the states and their units (n,)."""
+        if self.basis.shape[1] > self.rank:
+            return states
+        own = self.projector[0] * units / units[:, None]
+        names = initial_basis(own, self.rank, states, units)[2]
+        return tuple(name.removeprefix("e0_") for name in names)
+
 
 @dataclass(frozen=True, eq=False)
 class Remaining:
@@ -70,11 +78,6 @@ class Frame:
         return np.asarray(self.domain @ self.dual)
 
 
-def entry_sizes(E: Array) -> Array:
-    """Largest size of each entry of E (N, n, n) over the times, (n, n)."""
-    return largest_over_time(E)
-
-
 def axes_frame(entries: Array) -> Frame | None:
     """Coordinate axes where E has columns and rows that are exactly zero.
 
@@ -100,7 +103,7 @@ def constant_split(
     Coordinate axes where columns and rows are exactly zero; else from the singular vectors at the
     first time. The states have units (n,).
     """
-    frame = axes_frame(entry_sizes(E))
+    frame = axes_frame(largest_over_time(E))
     if frame is not None:
         split = split_in_frame(E, frame, units, rank_tol)
         if split is not None:

@@ -22,7 +22,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._observation import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions
-from gpebo_cli.observers.reduced.regression import Assembled, on_mesh, regression_signals
+from gpebo_cli.observers.reduced.regression import Assembled, regression_signals
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
 
@@ -90,14 +90,15 @@ class CurrentCoordinates:
         fastest = float(np.linalg.eigvals(A_0).real.min(initial=0.0))
         return Observation(
             regression=LinearRegression(
-                Y=on_mesh(mesh, final.Y[:, kept]),
-                psi=on_mesh(mesh, final.psi[:, kept]),
+                Y=mesh.trajectory(final.Y[:, kept]),
+                psi=mesh.trajectory(final.psi[:, kept]),
                 parameters=(*system.unknowns, *(f"w_{label}" for label in reduced.labels)),
                 scale=final.column_scale,
-                dynamics=Dynamics(on_mesh(mesh, A), on_mesh(mesh, b), -2.0 * fastest),
+                dynamics=Dynamics(mesh.trajectory(A), mesh.trajectory(b), -2.0 * fastest),
             ),
             state_map=AffineStateMap(
-                on_mesh(mesh, final.offset), on_mesh(mesh, final.gain), reduced.form.units.states
+                mesh.trajectory(final.offset), mesh.trajectory(final.gain),
+                reduced.form.units.states,
             ),
             truth=CurrentState(reduced),
             error_estimate=error,

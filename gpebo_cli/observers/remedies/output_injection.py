@@ -129,7 +129,7 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
             V=np.broadcast_to(np.eye(rows), (len(t), rows, rows)),
         ), ()
 
-    V = dual @ reduced.initial_basis
+    V = dual @ reduced.begin.basis
     V = V * units_along(V, reduced.units)
     S0 = kappa * V @ V.T
     S = run_filter(

@@ -8,7 +8,6 @@ import numpy as np
 
 from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions, extend
-from gpebo_cli.observers.reduced.regression import on_mesh
 from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices, respond
 from gpebo_cli.regression.linear import LinearRegression
 
@@ -37,13 +36,13 @@ class Plain:
         errors = None if noisy_matrices(reduced) else errors_of(reduced, kept)
         return Observation(
             regression=LinearRegression(
-                Y=on_mesh(mesh, final.Y if all_kept else final.Y[:, kept]),
-                psi=on_mesh(mesh, final.psi if all_kept else final.psi[:, kept]),
+                Y=mesh.trajectory(final.Y if all_kept else final.Y[:, kept]),
+                psi=mesh.trajectory(final.psi if all_kept else final.psi[:, kept]),
                 parameters=(*system.unknowns, *reduced.names),
                 scale=extension.scale,
             ),
             state_map=AffineStateMap(
-                on_mesh(mesh, final.offset), on_mesh(mesh, final.gain),
+                mesh.trajectory(final.offset), mesh.trajectory(final.gain),
                 reduced.form.units.states,
             ),
             truth=InitialError(

@@ -41,7 +41,6 @@ from gpebo_cli.observers.reduced.extension import (
     extend,
     joined,
 )
-from gpebo_cli.observers.reduced.regression import on_mesh
 from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices
 from gpebo_cli.observers.reduced.split import comparable
 from gpebo_cli.regression.linear import LinearRegression, outer_products
@@ -86,7 +85,8 @@ class Resets:
         known = ExtensionState(np.zeros((p, p + 1)), 0.0)
         for first, last in pairwise(cuts):
             piece = Mesh(mesh.edges[first : last + 1], mesh.rule) if len(times) else mesh
-            begun = reduced.start(starts[-1].begin, starts[-1].xi_a)
+            start = starts[-1]
+            begun = start.begin.extension(reduced.first.split.dual, start.xi_a)
             extensions.append(extend(reduced, piece, begun))
             if last == mesh.size:
                 break
@@ -143,7 +143,7 @@ class SegmentErrors:
 def _learned(extension: Extension, known: ExtensionState) -> ExtensionState:
     """[G | h] at the end of a segment."""
     a = extension.assembled
-    own = on_mesh(extension.mesh, outer_products(a.psi, a.Y)).integral().final
+    own = extension.mesh.trajectory(outer_products(a.psi, a.Y)).integral().final
     return ExtensionState(known.values + own, max(known.level, largest(own)))
 
 
@@ -177,14 +177,14 @@ def _joined(
     growth, logarithms = zip(*(e.growth(system.q) for e in extensions), strict=True)
     return Observation(
         regression=LinearRegression(
-            Y=on_mesh(mesh, whole.Y[:, kept]),
-            psi=on_mesh(mesh, whole.psi[:, kept]),
+            Y=mesh.trajectory(whole.Y[:, kept]),
+            psi=mesh.trajectory(whole.psi[:, kept]),
             parameters=(*system.unknowns, *reduced.names),
             scale=segments.scale,
             resets=tuple(resets),
         ),
         state_map=AffineStateMap(
-            on_mesh(mesh, whole.offset), on_mesh(mesh, whole.gain), reduced.form.units.states
+            mesh.trajectory(whole.offset), mesh.trajectory(whole.gain), reduced.form.units.states
         ),
         truth=SegmentErrors(
             tuple(starts), reduced.first.split.dual, reduced.units,
@@ -248,7 +248,7 @@ def growth_times(reduced: ReducedSystem) -> Array:
         )
     finer = solution.trajectory
     last = np.searchsorted(finer.mesh.edges, mesh.edges[1:]) - 1  # its last part, of each element
-    Phi = comparable(reduced.first.split.dual @ reduced.initial_basis, units)
+    Phi = comparable(reduced.first.split.dual @ reduced.begin.basis, units)
     times = []
     for k, step in enumerate(finer.values[last, -1]):
         step = step * units / units[:, None]  # noqa: PLW2901
