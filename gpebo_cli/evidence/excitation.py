@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -17,11 +16,10 @@ from gpebo_cli.evidence.knowledge import (
     knowledge,
     least_share,
     smallest_and_margin,
-    smallest_at_most,
 )
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
-from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest, symmetric_eigenvalues
 from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
 from gpebo_cli.regression.linear import LinearRegression
@@ -33,7 +31,7 @@ WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hun
 _TINY = float(np.finfo(float).tiny)
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
-_AROUND = np.concatenate([-(0.25 ** np.arange(10.0)), [0.0], 0.25 ** np.arange(9.0, -1.0, -1.0)])
+_AROUND = np.concatenate([-(16.0 ** -np.arange(6.0)), [0.0], 16.0 ** np.arange(-5.0, 1.0)])
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -116,11 +114,17 @@ def assess(
             level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
-    def hopeless(at: Array, matrices: Array) -> BoolArray:
-        """Where ψ is surely not exciting yet."""
-        if rho is not None or not enough:
-            return np.zeros(len(at), dtype=bool)
-        return smallest_at_most(matrices, *evidence.beside(at)) < enough
+    def hopeless() -> BoolArray:
+        """Elements (K,) where ψ is surely not exciting yet.
+
+        G grows: inside, λ_min(N) is at most that at the end times the largest growth of a G_jj.
+        """
+        if rho is not None or not enough or regression.dynamics is not None:
+            return np.zeros(len(ends), dtype=bool)
+        first, last = np.einsum("ksjj->skj", gram.values[:, [0, -1], :, :p])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            growth = np.divide(last, first, out=np.ones_like(last), where=last > 0.0)
+            return np.asarray(smallest * growth.max(axis=1, initial=1.0) < enough)
 
     # What is looked at later must not keep what is known of this regression by now.
     later = replace(evidence, regression=replace(regression))
@@ -214,34 +218,28 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 
 def _first_time(
     gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array],
-    hopeless: Callable[[Array, Array], BoolArray],
+    hopeless: Callable[[], BoolArray],
 ) -> float | None:
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
     Each round looks where the polynomial through the four nearest points, t of the level, points,
-    else the secant, and at distances around it that fall by fours.
+    else the secant, and at distances around it that fall by sixteens.
 
     Args:
         gram: G (p, p), perhaps with further columns.
         edges: right ends of its elements (K,).
         reached: of times (M,) and G there.
-        hopeless: where it is surely negative, of the same.
+        hopeless: elements (K,) in which it is surely negative.
     """
     mesh = gram.mesh
     ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
     if len(ends) == 0:
         return None
 
-    def within(elements: IntArray, of: Callable[[Array, Array], Any]) -> Any:
-        """At the points of some elements, (M, s + 1)."""
-        t, G = mesh.points[elements], gram.values[elements]
-        return of(t.ravel(), G.reshape(t.size, *G.shape[2:])).reshape(t.shape)
-
     # Up to the first element at whose end it is reached.
-    some = np.arange(ends[0] + 1)
-    if len(some) > 1:
-        some = some[np.append(~within(some[:-1], hopeless).all(axis=1), True)]
-    levels = within(some, reached)
+    some = np.append(np.flatnonzero(~hopeless()[: ends[0]]), ends[0])
+    t, G = mesh.points[some], gram.values[some]
+    levels = reached(t.ravel(), G.reshape(t.size, *G.shape[2:])).reshape(t.shape)
     first = int(np.argmax((levels >= 0.0).any(axis=1)))
     k = int(some[first])
     points, level = mesh.points[k], levels[first]

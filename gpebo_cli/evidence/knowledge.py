@@ -9,7 +9,6 @@ no such size: its parameter is not seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -172,17 +171,6 @@ def smallest_and_margin(
     spectrum = symmetric_eigenvalues(normalised)
     smallest = np.maximum(spectrum.min(axis=1, initial=1.0), 0.0)
     return smallest, np.asarray(smallest / level.max(axis=1, initial=_SINGULAR))
-
-
-def smallest_at_most(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Array:
-    """Bounds (M,) of ``smallest``, at less expense: 1/‖N⁻¹v‖ for the last one's weakest v."""
-    normalised, _, _ = _normalised(gram, terms, elapsed, tol)
-    bounds = np.einsum("mjj->mj", normalised).min(axis=1, initial=1.0)
-    v = np.linalg.eigh(normalised[-1])[1][:, :1]
-    seen = np.flatnonzero(bounds > 0.0)
-    with suppress(np.linalg.LinAlgError):
-        bounds[seen] = 1.0 / np.linalg.norm(np.linalg.solve(normalised[seen], v[None]), axis=(1, 2))
-    return np.asarray(bounds)
 
 
 def least_share(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Array:

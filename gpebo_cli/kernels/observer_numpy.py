@@ -92,11 +92,13 @@ def in_frame(
     )
 
 
-def _axes(columns: Array) -> IntArray | None:
+def _axes(columns: Array) -> IntArray | slice | None:
     """Which coordinate axes columns (n, d) are, None where they are something else."""
     if np.count_nonzero(columns) != columns.shape[1] or not (columns.sum(axis=0) == 1.0).all():
         return None
-    return np.asarray(columns.argmax(axis=0))
+    axes = columns.argmax(axis=0)
+    one_by_one = len(axes) > 0 and (np.diff(axes) == 1).all()  # then nothing is copied
+    return slice(axes[0], axes[-1] + 1) if one_by_one else axes
 
 
 def _across(matrix: Array, columns: Array) -> Array:
