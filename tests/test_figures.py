@@ -26,6 +26,7 @@ from gpebo_cli.results.figures import FIGURES, draw
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.series import blocks
+from gpebo_cli.settings import OutputSettings
 
 CIRCUIT_FIGURES = {
     "regressor",
@@ -295,6 +296,16 @@ def test_small_errors_are_visible_and_zeros_are_not_drawn() -> None:
     assert high >= 1.0
     drawn = np.asarray(axes.get_lines()[0].get_ydata())
     assert np.isnan(drawn[100])
+
+
+@pytest.mark.parametrize("name", [None, "ggplot", "dark_background", "seaborn-v0_8-talk"])
+def test_a_legend_is_within_its_figure_in_every_style(name: str | None) -> None:
+    curve = style.Curve(np.arange(3.0), np.arange(3.0), "drem", style.line(0))
+    figure = style.compose([style.Panel("x", (curve,), legend=True)], OutputSettings(style=name))
+    [legend] = [axes.get_legend() for axes in figure.axes]
+    box = legend.get_window_extent()
+    assert box.y1 <= figure.bbox.y1 + 1.0
+    assert not legend.get_frame_on()
 
 
 def test_thinned_estimates_are_compared_at_their_own_times() -> None:

@@ -65,9 +65,6 @@ RC: dict[str, Any] = {
     "ytick.major.pad": 2.0,
     "legend.fontsize": TEXT,
     "legend.title_fontsize": TEXT,
-    "legend.frameon": False,
-    "legend.borderpad": 0.0,
-    "legend.borderaxespad": 0.2,
     "legend.labelspacing": 0.25,
     "legend.handlelength": 2.4,
     "legend.handletextpad": 0.5,
@@ -78,8 +75,12 @@ RC: dict[str, Any] = {
     "path.simplify_threshold": 0.111,
     "agg.path.chunksize": 20000,
 }
-# These hold in every style: journals refuse Type 3 fonts, and the ids in an SVG file do not vary.
-_ALWAYS: dict[str, Any] = {"text.usetex": False, "pdf.fonttype": 42, "svg.hashsalt": "gpebo"}
+# These hold in every style: journals refuse Type 3 fonts, the ids in an SVG file do not vary, and
+# the room that is kept for a legend is that of its lines.
+_ALWAYS: dict[str, Any] = {
+    "text.usetex": False, "pdf.fonttype": 42, "svg.hashsalt": "gpebo",
+    "legend.frameon": False, "legend.borderpad": 0.0, "legend.borderaxespad": 0.2,
+}
 
 
 @contextmanager
