@@ -61,8 +61,8 @@ def is_metric(name: str) -> bool:
 def measure_squares(
     t: Array, of_parameters: Array | None, last_parameters: Array, of_states: Array | None,
     last_states: Array, last: Array | None = None,
-) -> Metrics:
-    """Metrics from squared norms (G, M) and from errors at the end, (G, p) and (G, n).
+) -> Array:
+    """The five of ``NAMES`` (5, G) from squared norms (G, M) and errors at the end, (G, p), (G, n).
 
     ``last`` (G, 2) are the times, as indices, at which norms were above their levels last, where
     these are known. NaN where the norms are None. Norms are of quantities in units of their own
@@ -78,7 +78,7 @@ def measure_squares(
         out[1] = settling_time(t, of_states, SETTLED**2, last=known)
         out[4] = time_rms(t, of_states)
         out[3] = np.abs(last_states).max(axis=1)
-    return Metrics(*out)
+    return out
 
 
 def levels(first: Array, size: Array) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli import estimators, kernels
+from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.evidence.excitation import (
     WINDOWS,
@@ -19,15 +19,8 @@ from gpebo_cli.evidence.excitation import (
 )
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
-from gpebo_cli.evidence.metrics import (
-    SETTLED,
-    Metrics,
-    levels,
-    measure_squares,
-    settled,
-    settling_times,
-    standing_since,
-)
+from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
 from gpebo_cli.experiment.memory import check_samples
@@ -43,23 +36,15 @@ from gpebo_cli.experiment.uncertainty import (
     sampled_deviations,
     standard_deviations,
 )
-from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers import Measurements, Observation, Observer, Sampling, StateMap
+from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
 from gpebo_cli.observers._observation import AffineStateMap
-from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals
 
 _SAMPLES_AT_ONCE = 2048
-_LAGS = 20  # of the residual's autocorrelation
 _PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
-_SILENT = 1e-9  # of an output: a residual below that is rounding
-_LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
-_STILL = 1e-9  # of the same: an estimate that moved by less than that was not moved by data
 _BATCH = 1 << 21  # numbers held at once while cases are evaluated: beyond it calls cost little
 
 # name of a stage of the run -> what measures it
@@ -155,8 +140,8 @@ def continuous(
                 estimation = replace(
                     estimation, parameters_std=deviations, states_std=of_states
                 )
-                metrics = _standing(estimation, metrics, reduced.state_map, columns, system)
-    fit = _fit(observation, estimation, system, source) if source.recording else None
+                metrics = accuracy.standing(estimation, metrics, reduced.state_map, columns, system)
+    fit = accuracy.fit_of(observation, estimation, system, source) if source.recording else None
     if fit is not None and settings.uncertainty and not levels.silent:
         fit = replace(fit, ratio=residual_ratio(observation, source, settings.noise, levels))
     noise = None
@@ -233,16 +218,16 @@ def at_samples(
                 made = made.with_some(few, columns)
         truth = online.truth(made.extension)(t, source.theta(t), source.states)
         x = source.states(t)
-        parameters = made.parameters * _told(made.known.parameters[-1])
-        states = made.states * _told(made.seen[-1])
-        numbers = _numbers(
-            t, parameters - truth, states - x, _sizes(truth, online.natural_sizes, x),
-            _judged(source, truth.shape[1]),
-        )
+        parameters = made.parameters * accuracy.told(made.known.parameters[-1])
+        states = made.states * accuracy.told(made.seen[-1])
+        sizes = accuracy.sizes_of(truth, online.natural_sizes, x)
+        metrics = accuracy.metrics_of(accuracy.numbers_of(
+            t, parameters - truth, states - x, sizes, accuracy.judged_of(source, truth.shape[1])
+        ), online.parameters, system)
     chosen = kept_samples(1, len(t), settings.time.samples)
     kept = chosen[kept_samples(len(by.cases), len(chosen), settings.output.max_rows)]
     p = parameters.shape[2]
-    still = _still(parameters, by.requirement, online.natural_sizes)
+    still = accuracy.still(parameters, by.requirement, online.natural_sizes)
     std = None if made.std is None or made.level is None else made.std[:, kept] * made.level[-1]
     if std is not None:
         told = np.concatenate([parameters, states], axis=2)[:, kept]
@@ -263,17 +248,20 @@ def at_samples(
     )
     with stage("excitation"):
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
-        level = sampled_window_level(made.regression, window)[chosen]
-        excitation = online.excitation(made, chosen, level, window)
-    metrics = _metrics(numbers, online.parameters, system)
+        excitation = online.excitation(
+            made, chosen, sampled_window_level(made.regression, window)[chosen], window
+        )
     times = estimable(
         excitation.known, excitation.t, online.parameters, system.states, made.seen[chosen]
     )
+    rows = made.regression.rows[1 + chosen]
     return Estimated(
         online,
-        _shown(made.regression, chosen, online),
+        RegressionResult(
+            t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
+        ),
         excitation, estimation,
-        _standing(estimation, metrics, None, np.arange(len(online.parameters)), system),
+        accuracy.standing(estimation, metrics, None, np.arange(len(online.parameters)), system),
         by.fit() if source.recording else None,
         times, _never(times),
         note=online.note
@@ -283,14 +271,6 @@ def at_samples(
 
 def _never(times: Mapping[str, float | None]) -> list[str]:
     return [name for name, since in times.items() if since is None]
-
-
-def _shown(regression: SampledRegression, chosen: IntArray, online: Online) -> RegressionResult:
-    """The regression at some of the samples, for the tables."""
-    rows, p = regression.rows[1:][chosen], regression.p
-    return RegressionResult(
-        regression.t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
-    )
 
 
 def _held(samples: Sampling, metrics: Metrics) -> str:
@@ -305,30 +285,6 @@ def _held(samples: Sampling, metrics: Metrics) -> str:
             "observer.sample_time, and faster with observer.hold=linear"
         )
     return "; the error of straight lines between samples falls with observer.sample_time squared"
-
-
-def _standing(
-    estimation: EstimationResult, metrics: Metrics, state_map: StateMap | None, columns: IntArray,
-    system: DescriptorSystem,
-) -> Metrics:
-    """With the times from which on estimates are within ±2σ of what the final ones say.
-
-    A state is compared with what the final parameters make of the same signals, whose noise is then
-    in both.
-    """
-    t, eta = estimation.t, estimation.parameters
-    if estimation.parameters_std is None or estimation.states_std is None:
-        return metrics
-    times = [standing_since(t, eta, eta[:, -1:], estimation.parameters_std[:, -1])]
-    names: Sequence[str] = estimation.names
-    if isinstance(state_map, AffineStateMap):
-        away = np.nan_to_num(eta - eta[:, -1:])[..., columns]
-        of_x = np.einsum("mnp,gmp->gmn", state_map.gain(t), away)
-        times.append(standing_since(t, of_x, 0.0 * of_x[:, :1], estimation.states_std[:, -1]))
-        names = [*names, *system.states]
-    return replace(
-        metrics, seconds_to_settled=dict(zip(names, np.hstack(times).T, strict=True))
-    )
 
 
 def _estimate(
@@ -375,11 +331,11 @@ def _estimate(
     requirement = estimates.requirement
     if observation.bounds:
         estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
-    told = _told(determined), _told(seen)
-    natural = _natural_sizes(regression, p)
-    sizes = _sizes(truth, natural, x)
-    evaluate = _evaluation(
-        state_map, grid, truth * told[0], x * told[1], sizes, _judged(source, p), chosen,
+    told = accuracy.told(determined), accuracy.told(seen)
+    natural = accuracy.natural_sizes(regression, p)
+    sizes = accuracy.sizes_of(truth, natural, x)
+    evaluate = accuracy.evaluation(
+        state_map, grid, truth * told[0], x * told[1], sizes, accuracy.judged_of(source, p), chosen,
         each=each,
     )
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
@@ -412,9 +368,9 @@ def _estimate(
         requirement=requirement,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
         explaining=explaining,
-        still=_still(parameters, requirement, natural),
+        still=accuracy.still(parameters, requirement, natural),
     )
-    return estimator, result, _metrics(numbers, observation.parameters, system)
+    return estimator, result, accuracy.metrics_of(numbers, observation.parameters, system)
 
 
 def _estimates(
@@ -448,231 +404,3 @@ def _reduced(observation: Observation, columns: IntArray) -> tuple[Observation, 
     return replace(
         observation, regression=regression, state_map=replace(state_map, gain=gain)
     ), columns
-
-
-def _natural_sizes(regression: LinearRegression, p: int) -> Array:
-    """√(∫Y²/∫ψ_j²) (p,): the size of a parameter that alone would explain Y; zeros for others."""
-    energy = np.einsum("jj->j", regression.gram.final[:, : regression.p])
-    if len(energy) != p:
-        return np.zeros(p)
-    square = Trajectory(regression.mesh, (regression.Y.values**2).sum(axis=-1)).integral().final
-    return np.asarray(np.sqrt(np.divide(square, energy, out=np.zeros(p), where=energy > 0.0)))
-
-
-def _still(parameters: Array, requirement: Requirement, natural: Array) -> BoolArray:
-    """Which cases (G,) of η̂ (G, M, p) are where they began, for want of what is required.
-
-    Noise did not move them either, and a deviation of zero would claim that nothing is uncertain.
-    """
-    if requirement.holds or not len(natural):
-        return np.zeros(len(parameters), dtype=bool)
-    return np.asarray(~(np.ptp(parameters, axis=1) > _STILL * natural).any(axis=1))
-
-
-def _sizes(truth: Array, natural: Array, x: Array) -> tuple[Array, Array]:
-    """Sizes of the parameters (p,) and states (n,): by these, errors of all kinds are compared."""
-    with np.errstate(invalid="ignore"):
-        of_eta, of_x = largest_over_time(truth), largest_over_time(x)
-        for size, values in ((of_eta, truth), (of_x, x)):
-            unknown = np.isnan(size)
-            size[unknown] = np.fmax.reduce(np.abs(values[:, unknown]), axis=0)
-        # A parameter that is zero has no size but that with which it would explain Y.
-        return np.where(of_eta > _LEAST * natural, of_eta, np.fmax(of_eta, natural)), of_x
-
-
-def _judged(source: Source, p: int) -> BoolArray:
-    judged = np.zeros(p, dtype=bool)
-    judged[source.judged] = True
-    return judged
-
-
-def _weights(sizes: Array, counted: BoolArray) -> Array:
-    """1/size², and 0 for what does not count or has no size."""
-    counted = counted & (sizes > 0.0)
-    return np.divide(1.0, sizes**2, out=np.zeros(len(sizes)), where=counted)
-
-
-def _told(determined: BoolArray) -> Array:
-    """Factors (c,) that make NaN of what is not determined.
-
-    Where nothing is, there is nothing to tell apart, and what an estimator does then is shown.
-    """
-    return np.where(determined | ~determined.any(), 1.0, np.nan)
-
-
-def _numbers(
-    t: Array, of_eta: Array, of_x: Array, sizes: tuple[Array, Array], judged: BoolArray
-) -> Array:
-    """What ``Metrics`` are made of, (5 + p + n, g), of errors (g, M, p) and (g, M, n)."""
-    seen, known = judged & ~np.isnan(of_eta[0, -1]), ~np.isnan(of_x[0, -1])
-    squares = [
-        np.einsum("gmj,j->gm", error[..., some] ** 2, _weights(size, some)[some])
-        for error, size, some in ((of_eta, sizes[0], seen), (of_x, sizes[1], known))
-    ]
-    times = [settling_times(t, of_eta, sizes[0]), settling_times(t, of_x, sizes[1])]
-    times[0][:, ~judged] = np.nan
-    of_all = _of_all(t, squares, of_eta[:, -1], of_x[:, -1], judged)
-    return np.concatenate([of_all, times[0].T, times[1].T])
-
-
-def _of_all(
-    t: Array, squares: Sequence[Array], of_eta: Array, of_x: Array, judged: BoolArray,
-    last: Array | None = None,
-) -> Array:
-    """The first five of them from squared norms (g, M) and errors at the end (g, p) and (g, n).
-
-    ``last`` as in :func:`measure_squares`.
-    """
-    seen, known = judged & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
-    metrics = measure_squares(
-        t, squares[0] if seen.any() or not judged.any() else None, of_eta[:, seen],
-        squares[1] if known.any() else None, of_x[:, known], last,
-    )
-    return np.array([getattr(metrics, name) for name in METRICS])
-
-
-def _metrics(numbers: Array, parameters: Sequence[str], system: DescriptorSystem) -> Metrics:
-    """From (5, g), or (5 + p + n, g) with the time of each quantity."""
-    names = [*parameters, *system.states]
-    each = dict(zip(names, numbers[5:], strict=True)) if len(numbers) > len(METRICS) else {}
-    return replace(Metrics(*numbers[: len(METRICS)]), seconds_to_1pct=each)
-
-
-# η̂ (g, M, p) on the grid -> the numbers that ``Metrics`` are made of (c, g), and η̂ (g, k, p) and
-# x̂ (g, k, n) at the samples that are kept
-_Evaluation = Callable[[Array], tuple[Array, Array, Array]]
-
-
-def _evaluation(
-    state_map: StateMap, grid: Array, truth: Array, x: Array, sizes: tuple[Array, Array],
-    judged: BoolArray, chosen: IntArray, *, each: bool,
-) -> _Evaluation:
-    """How a batch of cases is measured on the grid (M,) against η (M, p) and x (M, n)."""
-    if not isinstance(state_map, AffineStateMap):
-        reconstruct = state_map.at(grid)
-
-        def evaluate(eta: Array) -> tuple[Array, Array, Array]:
-            x_hat = reconstruct(eta)
-            numbers = _numbers(grid, eta - truth, x_hat - x, sizes, judged)
-            return numbers, eta[:, chosen], x_hat[:, chosen]
-
-        return evaluate
-    sampler = state_map.offset.mesh.sampler(grid)
-    offset, gain = sampler(state_map.offset.values), sampler(state_map.gain.values)
-    size, p = np.concatenate(sizes), truth.shape[1]
-    offset_kept, gain_kept = offset[chosen], np.swapaxes(gain[chosen], 1, 2)
-
-    def errors(eta: Array, at: IntArray) -> Array:
-        """Of η̂ and x̂ (g, p + n) at one time for each quantity of each case, indices ``at``."""
-        place = len(grid) * np.arange(len(eta))[:, None] + at  # in all cases, one after the other
-        j, m, i = np.arange(p), at[:, p:], np.arange(at.shape[1] - p)
-        of_eta = eta.ravel().take(place[:, :p] * p + j) - truth[at[:, :p], j]
-        flat = eta.reshape(eta.shape[0] * eta.shape[1], p)  # spelled out: p may be 0
-        gains = gain.reshape(len(gain) * len(i), p).take(m * len(i) + i, axis=0)
-        seen = np.einsum("gip,gip->gi", gains, flat.take(place[:, p:], axis=0))
-        return np.concatenate([of_eta, offset[m, i] + seen - x[m, i]], axis=1)
-
-    def errors_at(eta: Array, k: int) -> list[Array]:
-        """Of η̂ (g, p) and x̂ (g, n) at one time."""
-        return [eta[:, k] - truth[k], offset[k] + eta[:, k] @ gain[k].T - x[k]]
-
-    def evaluate_affine(eta: Array) -> tuple[Array, Array, Array]:
-        """The norms, with x̂ only where it is needed: on the grid its errors are numbers."""
-        eta = np.asarray(eta, dtype=np.float64)
-        of_eta, of_x = errors_at(eta, -1)
-        in_eta = _weights(sizes[0], judged & ~np.isnan(of_eta[0]))
-        in_x = _weights(sizes[1], ~np.isnan(of_x[0]))
-        level = None
-        if each:
-            level = levels(np.concatenate(errors_at(eta, 0), axis=1), size)
-        *squares, last, of_norms = kernels.laws.squared_errors(
-            eta, truth, in_eta, offset, gain, x, in_x, level, SETTLED**2
-        )
-        numbers = _of_all(grid, squares, of_eta, of_x, judged, of_norms)
-        if level is not None:
-            k = np.clip(last, 0, max(len(grid) - 2, 0)).astype(np.intp)
-            after = np.minimum(k + 1, len(grid) - 1)
-            times = settled(grid, last, np.abs(errors(eta, k)), np.abs(errors(eta, after)), level)
-            times[np.isnan(np.hstack([of_eta, of_x]))] = np.nan
-            times[:, :p][:, ~judged] = np.nan
-            numbers = np.concatenate([numbers, times.T])
-        kept = eta.take(chosen, axis=1)
-        x_hat = np.empty((len(eta), *offset_kept.shape))  # a product per time serves all cases
-        np.matmul(kept.swapaxes(0, 1), gain_kept, out=x_hat.swapaxes(0, 1))
-        x_hat += offset_kept
-        return numbers, kept, x_hat
-
-    return evaluate_affine
-
-
-def _fit(
-    observation: Observation, estimation: EstimationResult, system: DescriptorSystem,
-    source: Source,
-) -> Fit | None:
-    """Root mean squares over time of Y − ψη̂ with the final estimates, and of Y; the fitted ŷ."""
-    regression = observation.regression
-    final = estimation.explaining
-    if final is None or estimation.names != regression.parameters:
-        return None
-    duration = float(regression.mesh.edges[-1] - regression.mesh.edges[0])
-
-    def rms(eta: Array) -> float:
-        return float(np.sqrt(regression.misfit(eta) / duration))
-
-    fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)))
-    if regression.resets or regression.dynamics is not None:
-        return fit
-    return _explained(
-        fit, final[fit.best], observation.state_map, system, source,
-        every=regression.factor is None and not source.pieces,
-    )
-
-
-def _explained(
-    fit: Fit, eta: Array, state_map: StateMap, system: DescriptorSystem, source: Source, *,
-    every: bool,
-) -> Fit:
-    """With ŷ = C x̂ + D u + H θ̂ of the final estimates η̂ (p,), and how white y − ŷ is.
-
-    That is looked at at ``every`` sample, or at the output times if x̂ is known there only.
-    """
-    t, recording = source.t, source.recording
-    if recording is None or len(state_map.times):
-        return fit
-
-    def outputs(t: Array, own_t: Array, u: Array, y: Array) -> Array:
-        x = state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
-        c = system.coefficients.taylor(own_t, 0, signals=np.hstack([u, y])[None])
-        terms = (c.C, x), (c.D, u), (c.H, np.tile(eta[: system.q], (len(t), 1)))
-        return np.asarray(sum(
-            np.matmul(matrix[0], signal[..., None])[..., 0] for matrix, signal in terms
-        ))
-
-    u, y = recording.inputs, recording.outputs
-    fitted = outputs(t, t if source.own_t is None else source.own_t, u, y)
-    fit = replace(fit, outputs=fitted)
-    samples = source.inputs.mesh.edges
-    if every and len(samples) > len(t):
-        u, y = source.inputs(samples), source.outputs(samples)
-        t, fitted = samples, outputs(samples, samples, u, y)
-    # Two samples apart: between samples the signals are interpolated and no noise is white.
-    apart = 2.0 * (recording.last - recording.first) / max(recording.rows - 1, 1)
-    step = float(t[-1] - t[0]) / (len(t) - 1)
-    stride = 1 if t is samples else max(1, int(np.ceil(apart / step)))
-    residual = (y - fitted)[::stride]
-    residual = residual - residual.mean(axis=0)
-    power = (residual**2).sum(axis=0)
-    # What an output is used up for leaves rounding, which is no noise.
-    count, seen = len(residual), power > _SILENT**2 * (y[::stride] ** 2).sum(axis=0)
-    lags = range(1, min(_LAGS, count // 4) + 1)
-    if not seen.any() or not lags:
-        return fit
-    correlation = np.array([
-        ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
-    ])
-    names = frozenset[str]().union(*system.coefficients.signals.values())
-    return replace(
-        fit, correlation=correlation, lag=stride * step,
-        in_matrices=tuple(name for name in system.outputs if name in names),
-        band=1.96 / np.sqrt(count * seen.sum()),
-    )
