@@ -16,7 +16,6 @@ from gpebo_cli.experiment.noise import (
     draw_errors,
     noise_grid,
     noise_levels,
-    on_mesh,
     sampled_mesh,
 )
 from gpebo_cli.experiment.seeds import _columns
@@ -79,7 +78,7 @@ def errors_over_seeds(
     if source.true is None or observation.errors is None:
         raise ValueError("the observer cannot tell how it responds to noise")
     samples = noise_grid(source.true.mesh, noise)
-    outputs = on_mesh(source.true.outputs, samples.mesh)
+    outputs = samples.mesh.along(source.true.outputs)
     grid = sampled_mesh(mesh, SAMPLE_TIME)
     rows, n = regression.psi.values.shape[2], system.n
     gain = observation.state_map.gain(t)  # type: ignore[attr-defined]
