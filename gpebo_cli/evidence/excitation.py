@@ -31,7 +31,8 @@ WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hun
 _TINY = float(np.finfo(float).tiny)
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
-_AROUND = np.concatenate([-(16.0 ** -np.arange(6.0)), [0.0], 16.0 ** np.arange(-5.0, 1.0)])
+_STEPS = 0.25 ** np.array([0.0, 1.0, 2.0, 4.0, 6.0, 9.0])
+_AROUND = np.concatenate([-_STEPS, [0.0], _STEPS[::-1]])
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -223,7 +224,7 @@ def _first_time(
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
     Each round looks where the polynomial through the four nearest points, t of the level, points,
-    else the secant, and at distances around it that fall by sixteens.
+    else the secant, and at distances around it that fall by powers of four.
 
     Args:
         gram: G (p, p), perhaps with further columns.
@@ -244,10 +245,14 @@ def _first_time(
     k = int(some[first])
     points, level = mesh.points[k], levels[first]
     piece = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
+    start, horizon = float(mesh.edges[0]), float(mesh.edges[-1] - mesh.edges[0])
+    at_once = np.minimum(start + _AT_ONCE * horizon, mesh.edges[k + 1 : k + 2])
+    if k == 0 and reached(at_once, piece(at_once)) >= 0.0:
+        return start
     for _ in range(_ROUNDS):
         j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
         low, high = float(points[max(j - 1, 0)]), float(points[j])
-        if high - low <= _SAME_TIME * max(abs(high), mesh.edges[-1] - mesh.edges[0]):
+        if high - low <= _SAME_TIME * max(abs(high), horizon):
             break
         share = level[j - 1] / (level[j - 1] - level[j])
         guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
@@ -258,8 +263,7 @@ def _first_time(
         points = points[np.append(True, points[1:] > points[:-1])]
         level = reached(points, piece(points))
         level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
-    start, stop = float(mesh.edges[0]), float(mesh.edges[-1])
-    return high if high - start > _AT_ONCE * (stop - start) else start
+    return high if high > at_once[0] else start
 
 
 def _where_zero(levels: list[float], t: list[float]) -> float:

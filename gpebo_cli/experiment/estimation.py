@@ -40,6 +40,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntAr
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
 from gpebo_cli.observers._observation import AffineStateMap
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals
 
@@ -122,9 +123,15 @@ def continuous(
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
     note = observation.note
-    if settings.uncertainty and observation.estimator is None:
+    if settings.uncertainty and observation.estimator is None and (
+        source.recording or not levels.silent
+    ):
         with stage("uncertainty"):
-            reduced, columns = _reduced(observation, known.independent)
+            some, columns = _about(observation, known.independent)
+            reduced, state_map = replace(observation, regression=some), observation.state_map
+            if len(columns) < regression.p and isinstance(state_map, AffineStateMap):
+                gain = Trajectory(state_map.gain.mesh, state_map.gain.values[..., columns])
+                reduced = replace(reduced, state_map=replace(state_map, gain=gain))
             found = standard_deviations(
                 reduced, estimator, source, settings.noise, levels, estimation.t,
                 estimation.states,
@@ -377,30 +384,27 @@ def _estimates(
     estimator: estimators.Estimator, observation: Observation, grid: Array, columns: IntArray
 ) -> tuple[estimators.Estimates, IntArray]:
     """The estimates of some of the parameters, and of which: all, where settings are one each."""
-    reduced, columns = _reduced(observation, columns)
+    some, columns = _about(observation, columns)
     try:
-        return estimators.estimate(estimator, reduced.regression, grid), columns
+        return estimators.estimate(estimator, some, grid), columns
     except ConfigError:
-        if reduced is observation:
+        if some is observation.regression:
             raise
         # As many numbers in its settings as parameters.
         whole = observation.regression
         return estimators.estimate(estimator, whole, grid), np.arange(whole.p)
 
 
-def _reduced(observation: Observation, columns: IntArray) -> tuple[Observation, IntArray]:
-    """The observation about some of the parameters, the others being zero, and about which."""
-    whole, state_map = observation.regression, observation.state_map
+def _about(observation: Observation, columns: IntArray) -> tuple[LinearRegression, IntArray]:
+    """The regression about some of the parameters, the others being zero, and about which."""
+    whole = observation.regression
     plain = not whole.resets and whole.dynamics is None and observation.names is None
-    if len(columns) in (0, whole.p) or not plain or not isinstance(state_map, AffineStateMap):
-        return observation, np.arange(whole.p)
-    regression = replace(
+    plain &= isinstance(observation.state_map, AffineStateMap)
+    if len(columns) in (0, whole.p) or not plain:
+        return whole, np.arange(whole.p)
+    return replace(
         whole, psi=Trajectory(whole.mesh, whole.psi.values[..., columns]),
         parameters=tuple(whole.parameters[j] for j in columns),
         factor=None if whole.factor is None else whole.factor[:, [*columns, whole.p]],
         scale=np.broadcast_to(whole.scale, (whole.mesh.size, whole.p))[:, columns],
-    )
-    gain = Trajectory(state_map.gain.mesh, state_map.gain.values[..., columns])
-    return replace(
-        observation, regression=regression, state_map=replace(state_map, gain=gain)
     ), columns

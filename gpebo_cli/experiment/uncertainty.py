@@ -85,14 +85,14 @@ def standard_deviations(
 ) -> tuple[Array, Array] | str:
     """Deviations of parameters (G, M, p) and ``states`` (G, M, n) at t (M,), or why there are none.
 
-    No reason is given, and none is needed, of a simulation without noise and where there is nothing
-    to estimate. Rounding to steps q counts as noise of variance q²/12. Of a recording without
-    levels, the one level that all outputs share is that of the residual.
+    No reason is given, and none is needed, where there is nothing to estimate. Rounding to steps q
+    counts as noise of variance q²/12. Of a recording without levels, the one level that all outputs
+    share is that of the residual.
     """
     state_map, errors, regression = (
         observation.state_map, observation.errors, observation.regression
     )
-    if (levels.silent and not source.recording) or not regression.p:
+    if not regression.p:
         return ""
     if errors is None or not isinstance(state_map, Differentiable):
         return (

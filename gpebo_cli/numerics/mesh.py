@@ -268,8 +268,8 @@ class Trajectory:
         """The values continue from the elements before, or from each left end."""
         rule, mesh, flat = self.mesh.rule, self.mesh, _flat(self.values)
         out = np.zeros(flat.shape)
-        np.matmul(rule.integration, flat[:, 1:], out=out[:, 1:])
-        out *= mesh.steps[:, None, None]
+        weights = mesh.steps[:, None, None] * rule.integration
+        np.matmul(weights, flat[:, 1:], out=out[:, 1:])
         if on:
             out[1:] += out[:-1, -1].cumsum(axis=0)[:, None]
         return Trajectory(mesh, out.reshape(self.values.shape))

@@ -150,7 +150,7 @@ def log_norm(Phi: Array) -> float:
 
 def largest_entry(values: Array) -> float:
     """Size of the largest entry."""
-    return float(np.abs(values).max(initial=0.0))
+    return float(max(values.max(initial=0.0), -values.min(initial=0.0)))  # without a copy
 
 
 @dataclass(frozen=True, eq=False)

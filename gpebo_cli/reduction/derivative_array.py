@@ -30,7 +30,7 @@ from gpebo_cli.model.descriptor import (
 )
 from gpebo_cli.numerics.linalg import largest_over_time
 
-_KEPT = 40  # states, up to which what the pattern of E and A alone decides is kept
+_KEPT = 64  # states, up to which what the pattern of E and A alone decides is kept
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 _ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
 _OPEN = 1e-11  # added to squares of sparse terms: directions that they leave open come to nothing

@@ -91,7 +91,7 @@ def regression_signals(
         sizes = np.maximum(sizes, (np.abs(algebraic) @ np.abs(z)).max(axis=(0, 1), initial=0.0))
         nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= _VANISHING * sizes[1:]
         psi = np.where(nothing, 0.0, psi)
-    moving = np.abs(basis) @ largest_over_time(z[:, :, 1:])
+    moving = np.abs(basis) @ largest_over_time(z)[:, 1:]
     return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity, moving)
 
 
