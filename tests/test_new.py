@@ -16,6 +16,8 @@ from gpebo_cli.cli.check import _ADVICE
 from gpebo_cli.cli.new import files
 from gpebo_cli.model.plant import KEYS
 
+PYTEST = f"{shlex.quote(sys.executable)} -m pytest -q -W error -p no:xdist"
+
 
 def test_it_runs_as_it_stands_with_the_defaults_and_converges(tmp_path):
     done = gpebo("new", "plant", "tank", cwd=tmp_path)
@@ -44,7 +46,7 @@ def test_it_can_be_written_elsewhere(tmp_path):
 def test_an_observer_passes_its_test(tmp_path):
     done = gpebo("new", "observer", "mine_too", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "3 passed" in shell(f"{shlex.quote(sys.executable)} -m pytest -q -p no:xdist", tmp_path)
+    assert "3 passed" in shell(PYTEST, tmp_path)
     entry = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]["entry-points"]
     assert entry == {"gpebo.observers": {"mine_too": "mine_too:MineToo"}}
 
@@ -56,7 +58,7 @@ def test_an_estimator_passes_its_test_and_is_found_once_it_is_installed(tmp_path
     assert written == [
         "two_words.py", "estimator/two_words.yaml", "test_two_words.py", "pyproject.toml",
     ]
-    assert "3 passed" in shell(f"{shlex.quote(sys.executable)} -m pytest -q -p no:xdist", tmp_path)
+    assert "3 passed" in shell(PYTEST, tmp_path)
     assert "class TwoWords(GainEstimator)" in (tmp_path / "two_words.py").read_text()
     entry = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]["entry-points"]
     assert entry == {"gpebo.estimators": {"two_words": "two_words:TwoWords"}}

@@ -28,7 +28,8 @@ def test_one_constant_parameter() -> None:
 
 
 def test_the_settings_file_says_what_the_class_says() -> None:
-    settings = yaml.safe_load(Path(__file__).with_name("estimator").joinpath("mine.yaml").open())
+    file = Path(__file__).parent / "estimator" / "mine.yaml"
+    settings = yaml.safe_load(file.read_text("utf-8"))
     del settings["name"], settings["title"]
     assert {key: float(value) for key, value in settings.items()} == {
         field.name: field.default for field in fields(Mine)

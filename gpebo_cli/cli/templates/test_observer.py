@@ -43,6 +43,7 @@ def test_other_plants_are_refused() -> None:
 
 
 def test_the_settings_file_says_what_the_class_says() -> None:
-    settings = yaml.safe_load(Path(__file__).with_name("observer").joinpath("mine.yaml").open())
+    file = Path(__file__).parent / "observer" / "mine.yaml"
+    settings = yaml.safe_load(file.read_text("utf-8"))
     del settings["name"], settings["title"]
     assert settings == {field.name: field.default for field in fields(Mine)}
