@@ -17,7 +17,7 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers import Measurements, observe
+from gpebo_cli.observers import Measurements, gpebo, observe
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -334,6 +334,25 @@ def test_check_says_which_form_and_why():
     assert "as given Assumption 1" in str(found.evidence["because"])
     (found,) = [a for a in check("circuit") if a.name == "Assumption 1"]
     assert found.evidence["form"] == "given"
+
+
+def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(monkeypatch):
+    """What its rounding leaves is not resolved with all elements; that costs minutes."""
+    given, asked = gpebo.reduced_system, []
+
+    def noted(system, signals, solver, **settings):
+        asked.append((settings["form"], solver.max_elements))
+        return given(system, signals, solver, **settings)
+
+    monkeypatch.setattr(gpebo, "reduced_system", noted)
+    growing = {
+        "name": "growing", "states": ["a", "b"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[3, 1], [1, 1]], "B": [[1], [1]], "C": [[0, 1]],
+        "initial_state": [1, -1],
+    }
+    run(growing, time={"horizon": 10})
+    assert [form for form, _ in asked] == ["auto", "strangeness_free"]
+    assert asked[1][1] < 0.1 * SOLVER.max_elements
 
 
 def test_feedthrough_bias_of_a_sensor_and_a_known_term():

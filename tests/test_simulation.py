@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from gpebo_cli import ConfigError, GpeboError, run
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.reduction.structure import _PLACES
+from gpebo_cli.reduction import structure
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -124,6 +124,25 @@ def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
         simulate(singular, TimeSettings(horizon=1.0), SOLVER)
 
 
+@pytest.mark.parametrize("bottom", [2e-10, 0.0])
+def test_singular_values_that_are_small_everywhere_are_followed_to_the_bottom(bottom):
+    """Of many hidden constraints in units far apart they are 5e-8 at most: 2e-10 is no zero."""
+
+    def values(t):
+        return np.stack([np.ones_like(t), bottom + 1e-7 * np.abs(t - 0.3712), np.ones_like(t)], -1)
+
+    def lines(t, _, column, which):
+        return values(t).reshape(-1, structure._DIP_POINTS, 3)[which, :, column]
+
+    t = np.linspace(0.0, 1.0, 65)
+    arguments = plant(states=["a"], E=[[1]], A=[["sin(t)"]], initial_state=[1]), t, values(t)
+    if bottom:
+        assert not structure._follow_dips(*arguments, 0, 1e-10, lines)
+    else:
+        with pytest.raises(ModelError, match=r"rank of the constraints changes at t = 0\.371"):
+            structure._follow_dips(*arguments, 0, 1e-10, lines)
+
+
 def test_a_rank_drop_is_found_beside_a_fast_rate():
     """Where the derivative array tells nothing clear, it is differentiated once at a time."""
     singular = plant(
@@ -136,8 +155,9 @@ def test_a_rank_drop_is_found_beside_a_fast_rate():
 
 def test_a_rank_drop_between_two_breakpoints_that_no_other_probe_sees_is_found():
     """The longest piece in which no probe would be otherwise; E is 0 in it."""
-    k = int(np.argmax(np.diff(_PLACES)))
-    a, b = (_PLACES[k] + share * (_PLACES[k + 1] - _PLACES[k]) for share in (0.05, 0.95))
+    places = structure._PLACES
+    k = int(np.argmax(np.diff(places)))
+    a, b = (places[k] + share * (places[k + 1] - places[k]) for share in (0.05, 0.95))
     off = f"step(t - {float(a)}) - step(t - {float(b)})"
     singular = plant(states=["x"], E=[[f"1 - ({off})"]], A=[[-1]], initial_state=[1])
     with pytest.raises(ModelError, match=r"from 7 at t = 0\.001 to 6 at t = "):

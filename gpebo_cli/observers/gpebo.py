@@ -108,21 +108,25 @@ class Gpebo:
             return self._on(self.form, *arguments)
         found: Observation | SolverError
         known = everything = (True, system.q + system.n)
-        # Where Assumption 1 fails at one time no mesh resolves it: the other form comes soon.
-        few = max(_TRIED, 100 * signals.mesh.size)
-        first = replace(solver, max_elements=min(solver.max_elements, few))
+
+        def few(elements: int) -> SolverSettings:
+            return replace(solver, max_elements=min(solver.max_elements, max(_TRIED, elements)))
+
+        # No mesh resolves Assumption 1 failing at one time, or the other form's large rounding.
         try:
-            found = self._on("auto", system, signals, first)
+            found = self._on("auto", system, signals, few(100 * signals.mesh.size))
+            limits = few(4 * found.regression.mesh.size)
             if not found.note and not _same_on_both_forms(found, system, signals):
                 known = _told(found, system, solver)
             why = "which determines more than the equations as given"
             if not known[0]:
                 why = "which tells with more digits what the equations as given tell, or more"
         except SolverError as error:
-            found, why, known = error, "for as given its signals are not resolved", (False, -1)
+            found, known, limits = error, (False, -1), solver
+            why = "for as given its signals are not resolved"
         if known < everything and signals.mesh.size < _LONG:
             try:
-                other = self._on("strangeness_free", *arguments, _NOTE.format(why))
+                other = self._on("strangeness_free", system, signals, limits, _NOTE.format(why))
                 if _told(other, system, solver) > known:
                     return other
             except GpeboError:  # the form does not exist, or not for these signals

@@ -468,7 +468,7 @@ def _follow_dips(
     names = ("derivative array", "constraints", "differential part")
     column, k = np.array(dips, dtype=np.intp).reshape(-1, 2).T
     left, right = t[np.maximum(k - 1, 0)], t[np.minimum(k + 1, len(t) - 1)]
-    lowest = smallest[k, column]
+    lowest, zero = smallest[k, column], np.maximum(rank_tol, 1e-9 * smallest.max(axis=0))
     for _ in range(_DIP_ROUNDS):
         if not len(column):
             break
@@ -485,7 +485,7 @@ def _follow_dips(
         before, after = np.maximum(best - 1, 0), np.minimum(best + 1, _DIP_POINTS - 1)
         value = values[dip, best]
         lowest = np.minimum(lowest, value)
-        lost = lowest <= max(rank_tol, 1e-9)
+        lost = lowest <= zero[column]
         if lost.any():
             i = int(np.argmax(lost))
             where = grid[which[i], best[i]]
