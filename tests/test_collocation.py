@@ -205,7 +205,7 @@ def test_schur_form_of_the_differentiation_matrix(stages):
 
 
 @pytest.mark.parametrize("copies", [1, 20])
-def test_many_samples_are_those_of_few(copies, monkeypatch):
+def test_many_samples_are_those_of_few(copies):
     """Of many columns by elements, several at once."""
     mesh = initial_mesh(0.5, 4.5, [1.3], 12, radau_rule(9))
     signal = Trajectory(mesh, np.tile(smooth_signal(mesh).values, copies))

@@ -50,6 +50,13 @@ def largest_over_time(values: Array, axes: int = 1) -> Array:
     return signals.largest(values.reshape(1, prod(values.shape[:axes]), prod(shape))).reshape(shape)
 
 
+def taylor_product(a: Array, b: Array) -> Array:
+    """Of matrices of Taylor coefficients (orders, N or 1, ·, ·), to the orders that both have."""
+    return np.array([
+        sum(a[j] @ b[k - j] for j in range(k + 1)) for k in range(min(len(a), len(b)))
+    ])
+
+
 def exact_product(left: Array, right: Array) -> Array:
     """left @ right (N, i, k), for matrices (N or 1, i, j) and (N or 1, j, k), without rounding.
 

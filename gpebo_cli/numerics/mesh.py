@@ -333,7 +333,7 @@ def unresolved(values: Array, rule: RadauRule, floor: float | Array = 0.0) -> Ar
     Args:
         values: at the points (K, s + 1, c).
         rule: the mesh's rule.
-        floor: size below which a signal of this kind is rounding, see :func:`signal_scale`; or
+        floor: size below which a signal of this kind is rounding; or
             sizes (c,) that the components count as having where they are smaller: then all of them
             are compared in units of their own size.
 
@@ -384,14 +384,14 @@ def _scale_so_far(values: Array, counts: IntArray) -> Array:
     return np.asarray(np.maximum(size, np.maximum(level, _TINY).repeat(counts, axis=0)))
 
 
-def signal_scale(values: Array, floor: float = 0.0) -> Array:
+def signal_scale(values: Array) -> Array:
     """Size of each component over the mesh (c,).
 
-    A component more than three orders below the largest one, or below ``floor``, is measured
-    against that: rounding in the large ones reaches it.
+    A component more than three orders below the largest one is measured against that: rounding in
+    the large ones reaches it.
     """
     size = largest_over_time(values, 2)
-    return np.asarray(np.maximum(size, max(SHARE * float(size.max(initial=0.0)), floor, _TINY)))
+    return np.asarray(np.maximum(size, max(SHARE * float(size.max(initial=0.0)), _TINY)))
 
 
 def initial_mesh(start: float, stop: float, breakpoints: Sequence[float] | Array,

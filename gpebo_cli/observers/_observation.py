@@ -30,16 +30,16 @@ class StateMap(Protocol):
 
     @property
     def times(self) -> Array:
-        """Times at which the map needs the estimates, besides those asked for; perhaps none."""
-        ...
+        """Times at which the map needs the estimates, besides those asked for; by default none."""
+        return np.zeros(0)
 
     def at(self, t: Array) -> Reconstruction:
         """The map at the times t (M,), ascending, ``times`` among them."""
         ...
 
-    def checks(self, t: Array, states: Array) -> Mapping[str, Array]:
+    def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002
         """The same states by another way, by column name (g, M) each, from x̂ (g, M, n)."""
-        ...
+        return {}
 
 
 @runtime_checkable
@@ -52,17 +52,12 @@ class Differentiable(StateMap, Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class AffineStateMap:
+class AffineStateMap(StateMap):
     """x = offset + gain η at every time."""
 
     offset: Trajectory  # (n,)
     gain: Trajectory  # (n, p)
     units: Array | None = None  # (n,) of the states, in which rounding is of one size, if known
-
-    @property
-    def times(self) -> Array:
-        """No further times are needed."""
-        return np.zeros(0)
 
     def at(self, t: Array) -> Reconstruction:
         """Sample offset and gain at the times t (M,) once for all cases."""
@@ -78,10 +73,6 @@ class AffineStateMap:
         """The gain at the times t (M,) for every case of x̂ (g, M, n)."""
         gain = self.gain(t)
         return np.broadcast_to(gain, (len(states), *gain.shape))
-
-    def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
-        """No columns, whatever x̂ (g, M, n) is."""
-        return {}
 
 
 class Truth(Protocol):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -76,7 +75,6 @@ class Given:
             respond=None if errors is None else lambda _u, of_outputs: of_outputs,
         )
 
-
     def sampling(self) -> Sampling | None:
         """The samples that ``sample_time`` asks for."""
         return None if self.sample_time is None else Sampling(self.sample_time, self.hold)
@@ -94,16 +92,11 @@ class Given:
 
 
 @dataclass(frozen=True, eq=False)
-class FittedMap:
+class FittedMap(StateMap):
     """θ̂ of η̂ = S(θ̂), see :mod:`gpebo_cli.regression.parametrisation`."""
 
     parametrisation: Parametrisation
     regression: LinearRegression
-
-    @property
-    def times(self) -> Array:
-        """No further times are needed."""
-        return np.zeros(0)
 
     def gains(self, t: Array, states: Array) -> Array:
         """∂θ̂/∂η̂ (g, M, q, k) at the times t (M,) and estimates θ̂ (g, M, q)."""
@@ -118,10 +111,6 @@ class FittedMap:
             return np.array([self.parametrisation.fitted(of_case, weight) for of_case in eta])
 
         return fitted
-
-    def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
-        """No columns, whatever θ̂ (g, M, q) is."""
-        return {}
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import numpy as np
 
 from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import taylor_product, transpose
 
 _EPS = float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
@@ -98,7 +98,7 @@ def in_stages(
         X = R.copy()
         for k in range(1, len(X)):
             X[k] -= sum(X[k - j] @ P[j] for j in range(1, k + 1))
-        A_z, f_z = (below - _product(X, above) for above, below in parts[1:])
+        A_z, f_z = (below - taylor_product(X, above) for above, below in parts[1:])
         Uz, size, _ = np.linalg.svd(A_z[0], full_matrices=False)
         require(size[:, -1] > _CLEAR * _EPS * np.linalg.norm(W2 @ A[0], axis=(1, 2)))
         Wz = transpose(Uz / size[:, None, :])
@@ -139,8 +139,8 @@ def _rounding(
     """
     w1, w2, wz, v, x = squares
     (e_r, e_z), *wrong = ((w1 @ y, w2 @ y) for y in rounding)
-    of_z = [wz @ (below + _product(x, above)) for above, below in wrong]
-    of_x = wz @ _product(e_z @ v + _product(x, e_r @ v), residual)
+    of_z = [wz @ (below + taylor_product(x, above)) for above, below in wrong]
+    of_x = wz @ taylor_product(e_z @ v + taylor_product(x, e_r @ v), residual)
     of_z[0] = of_z[0] + of_x[: len(of_z[0])]
     return of_z, [_stacked(e_r, of_z[0]), *(
         _stacked(above[:-1], _slope(z, power=2)) for (above, _), z in zip(wrong, of_z, strict=True)
@@ -150,13 +150,6 @@ def _rounding(
 def _some(values: Array, every: int, axis: int = 0) -> Array:
     """Values at every so many times, along an axis of times or of one."""
     return values[(slice(None),) * axis + (slice(0, None, every),)]
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Product of matrices of Taylor coefficients (orders, N or 1, ·, ·)."""
-    return np.array([
-        sum(a[j] @ b[k - j] for j in range(k + 1)) for k in range(min(len(a), len(b)))
-    ])
 
 
 def _slope(a: Array, power: int = 1) -> Array:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.radau import RadauRule
 
@@ -136,12 +137,7 @@ def _right_side(c: Coefficients, known: Coefficients, x: Array) -> Array:
 
 def _product(a: Array, b: Array) -> Array:
     """Taylor coefficients of a product of matrices (K + 1, N, i, j) and (K + 1, N, j[, k])."""
-    matrices = b if b.ndim == a.ndim else b[..., None]
-    out = np.zeros((*a.shape[:-1], matrices.shape[-1]))
-    for k in range(len(a)):
-        for i in range(k + 1):
-            out[k] += a[i] @ matrices[k - i]
-    return out if b.ndim == a.ndim else out[..., 0]
+    return taylor_product(a, b) if b.ndim == a.ndim else taylor_product(a, b[..., None])[..., 0]
 
 
 @lru_cache(maxsize=16)

@@ -415,10 +415,8 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     plain = bool((units == 1.0).all())
 
     def equations(o: ObserverMatrices, v: Array, y: Array) -> LinearEquation:
-        f, g_y = _driven(o, v, y, 1 + q if large else columns)
-        seen = AlgebraicEquations(
-            o.on_basis, g_y, o.G, o.range, o.elimination, o.injectivity
-        )
+        measured = np.concatenate([v, y], axis=1)[:, :, None]
+        f, seen = o.forcing(measured, 1 + q if large else columns), o.equations(measured)
         if plain:
             return LinearEquation(None, o.dynamics, f, seen)
         A = o.dynamics * of_rows / of_rows[:, None]
@@ -541,15 +539,6 @@ def _in_units(solution: LinearSolution, units: Array) -> LinearSolution:
     if (units == 1.0).all():
         return solution
     return replace(solution, trajectory=Trajectory(found.mesh, found.values * units))
-
-
-def _driven(o: ObserverMatrices, v: Array, y: Array, columns: int) -> tuple[Array, Array]:
-    """[b_0 | D_0 | 0], shape (N, k, columns), and g_y (N, e + r), of v (N, ·) and y (N, r)."""
-    signals = np.concatenate([v, y], axis=1)[:, :, None]
-    f = np.zeros((len(v), o.dynamics.shape[1], columns))
-    f[:, :, :1] = o.from_signals @ signals
-    f[:, :, 1 : 1 + o.from_unknowns.shape[2]] = o.from_unknowns
-    return f, (o.g_signals @ signals)[:, :, 0]
 
 
 def _over_time(signal: Array) -> Array:

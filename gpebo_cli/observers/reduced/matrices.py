@@ -108,6 +108,13 @@ class ObserverMatrices:
             self.on_basis, g_y, self.G, self.range, self.elimination, self.injectivity
         )
 
+    def forcing(self, signals: Array, columns: int) -> Array:
+        """[b_0 | D_0 | 0] with the signals [v; y], (N, v + r, 1), shape (N, k, columns)."""
+        f = np.zeros((len(signals), self.dynamics.shape[1], columns))
+        f[:, :, :1] = self.from_signals @ signals
+        f[:, :, 1 : 1 + self.from_unknowns.shape[2]] = self.from_unknowns
+        return f
+
     def injected(self, gain: Array) -> ObserverMatrices:
         """The equations of w with gain · (𝒜 w + g_y + G θ) added to w', for a gain (N, k, e + r).
 

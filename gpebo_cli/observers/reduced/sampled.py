@@ -133,9 +133,7 @@ class SampledObserver:
 
         def coefficients(at: Array, inside: Array) -> LinearEquation:
             o, driving = self._matrices(at, inside, signal(at, inside))
-            f = np.zeros((len(at), *self.start.shape))
-            f[:, :, :1] = o.from_signals @ driving
-            f[:, :, 1 : 1 + self.system.q] = o.from_unknowns
+            f = o.forcing(driving, self.start.shape[1])
             noise = (o.dynamics, o.of_noise(o.from_signals, self.system.m)) if self.errors else ()
             return LinearEquation(None, o.dynamics, f, noise)
 
