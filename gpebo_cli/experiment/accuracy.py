@@ -195,8 +195,8 @@ def standing(
 ) -> Metrics:
     """With the times from which on estimates are within ±2σ of what the final ones say.
 
-    A state is compared with what the final parameters make of the same signals, whose noise is then
-    in both.
+    The state map takes the parameters ``columns`` (k,). A state is compared with what the final
+    parameters make of the same signals, whose noise is then in both.
     """
     t, eta = estimation.t, estimation.parameters
     if estimation.parameters_std is None or estimation.states_std is None:

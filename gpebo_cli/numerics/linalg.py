@@ -51,7 +51,7 @@ def largest_over_time(values: Array, axes: int = 1) -> Array:
 
 
 def taylor_product(a: Array, b: Array) -> Array:
-    """Of matrices of Taylor coefficients (orders, N or 1, ·, ·), to the orders that both have."""
+    """Of matrices of Taylor coefficients (K + 1, N or 1, i, j), to the orders that both have."""
     return np.array([
         sum(a[j] @ b[k - j] for j in range(k + 1)) for k in range(min(len(a), len(b)))
     ])

@@ -77,7 +77,7 @@ class Mesh:
         return points, inside
 
     def trajectory(self, flat: Array) -> Trajectory:
-        """The signal with these values (K (s + 1), …), one point after the other."""
+        """The signal (K, s + 1, …) with these values, one point after the other."""
         return Trajectory(self, flat.reshape(*self.points.shape, *flat.shape[1:]))
 
     def along(self, signal: Callable[[Array, Array], Array]) -> Trajectory:

@@ -140,7 +140,7 @@ def log_norm(Phi: Array) -> float:
 
 
 def largest_entry(values: Array) -> float:
-    """Size of the largest entry."""
+    """Size of the largest entry of values (…, columns)."""
     return float(max(values.max(initial=0.0), -values.min(initial=0.0)))  # without a copy
 
 
