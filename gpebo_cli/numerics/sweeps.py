@@ -180,8 +180,9 @@ def solve(
         values, change = _swept(
             _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {}
         )
-        made_of, moved = _terms(A, f, mesh, values)
-        found = _Found(A, Trajectory(mesh, values), change, made_of, moved, extras)
+        sizes = largest_within(values)
+        made_of, moved = _terms(A, f, mesh, values, sizes)
+        found = _Found(A, Trajectory(mesh, values), sizes, change, made_of, moved, extras)
         return found, unresolved_signals(
             problem, mesh.rule, values, extras, made_of.max(axis=0), tol
         )
@@ -250,6 +251,7 @@ class _Found(NamedTuple):
 
     A: Sparse
     trajectory: Trajectory  # (d, c)
+    sizes: Array  # (K, d, c) the largest in each element
     change: Array  # (K,) the last in each element, relative
     made_of: Array  # (K, d, c) sizes of what right ends are the sum of
     moved: Array  # (K, d, c) what rounding of the equation's terms moves
@@ -358,11 +360,12 @@ def _onward(mesh: Mesh) -> Array:
     return mesh.rule.interpolation(places.ravel()).reshape(*places.shape, -1)
 
 
-def _terms(A: Sparse, f: Array, mesh: Mesh, values: Array) -> tuple[Array, Array]:
+def _terms(
+    A: Sparse, f: Array, mesh: Mesh, values: Array, sizes: Array
+) -> tuple[Array, Array]:
     """What right ends are made of, and what rounding of the equation's terms moves, (K, d, c)."""
     K, points, n, _ = values.shape
     h, late = mesh.steps[:, None, None], np.abs(mesh.edges[1:, None, None])
-    sizes = largest_within(values)
     within = A.product(A.sizes(mesh), sizes)
     moved = np.zeros_like(within)
     if len(A.entries) > 1:
@@ -385,7 +388,7 @@ def _errors(
     """
     A, values, rule = found.A, found.trajectory.values, mesh.rule
     K, points, n, columns = values.shape
-    sizes = largest_within(values)
+    sizes = found.sizes
     size, flat = np.maximum(sizes, _TINY), values.reshape(K, points, n * columns)
     tail = legendre_tail(flat, rule, size.reshape(K, -1)).reshape(sizes.shape)
     # As in numerics.errors; and what sweeps have not finished.
