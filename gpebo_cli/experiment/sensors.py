@@ -120,7 +120,7 @@ class _Rows:
         self._gram, self._more = whole[:-n].sum(axis=0), whole[-n:]
         self._terms = extension.scale[-1:]
         self._elapsed = np.array([stop - start])
-        self._parameters = (*system.unknowns, *reduced.names)
+        self._parameters = (*system.unknowns, *reduced.begin.names)
         self._gain = mesh.trajectory(final.gain)(np.linspace(start, stop, _TIMES))
         self._units = reduced.form.units.states
         self._common = self._known(range(n)).sizes[0]

@@ -329,7 +329,7 @@ def _uniform_observability(
     scale = np.where(scale > 0, scale, scale.max(initial=0.0) or 1.0)
     M = scale[:, None] * (inside @ windows.gramians @ inside) * scale
     values = np.linalg.eigvalsh(M)
-    rank = q + len(known.names)
+    rank = q + len(known.begin.names)
     smallest = np.maximum(values[:, n - rank], 0.0)
     k = int(np.argmin(smallest))
     level, at, window = float(smallest[k]), float(windows.starts[k]), windows.window

@@ -122,9 +122,7 @@ def _window(
             break
         work += 1.0 if full else np.log(_LOOSE) / np.log(solver.tol)
         values = found.values
-        moved = values - guess.mesh.sampler(found.mesh.points.ravel(), found.mesh.inside.ravel())(
-            guess.values
-        ).reshape(values.shape)
+        moved = values - found.mesh.along(guess).values
         change = float((np.abs(moved).max(axis=(0, 1)) / signal_scale(values)).max())
         # Each change is about the square of the one before times a constant.
         growth = max(1.0, change / before**2) if np.isfinite(before) and before > 0 else np.inf

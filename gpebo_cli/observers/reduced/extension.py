@@ -183,11 +183,6 @@ class ReducedSystem:
         return self.form.system
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of e₀'s components, (d,)."""
-        return self.begin.names
-
-    @property
     def basis(self) -> Array:
         """Coordinates in which w is integrated, (n, k): n_a of them, or n if the kernel rotates."""
         return self.first.split.basis

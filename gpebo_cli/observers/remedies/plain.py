@@ -38,7 +38,7 @@ class Plain:
             regression=LinearRegression(
                 Y=mesh.trajectory(final.Y if all_kept else final.Y[:, kept]),
                 psi=mesh.trajectory(final.psi if all_kept else final.psi[:, kept]),
-                parameters=(*system.unknowns, *reduced.names),
+                parameters=(*system.unknowns, *reduced.begin.names),
                 scale=extension.scale,
             ),
             state_map=AffineStateMap(

@@ -78,7 +78,7 @@ class Resets:
         """
         mesh, times = _with_edges(reduced.mesh, reset_times(reduced, self))
         cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
-        p = reduced.system.q + len(reduced.names)
+        p = reduced.system.q + len(reduced.begin.names)
         starts = [_Start(float(mesh.edges[0]), reduced.begin, reduced.xi_a)]
         extensions: list[Extension] = []
         resets: list[Reset] = []
@@ -179,7 +179,7 @@ def _joined(
         regression=LinearRegression(
             Y=mesh.trajectory(whole.Y[:, kept]),
             psi=mesh.trajectory(whole.psi[:, kept]),
-            parameters=(*system.unknowns, *reduced.names),
+            parameters=(*system.unknowns, *reduced.begin.names),
             scale=segments.scale,
             resets=tuple(resets),
         ),
