@@ -11,7 +11,7 @@ import pytest
 from plants import DATA, seen
 
 from gpebo_cli import run
-from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.errors import ConfigError, GpeboError, ModelError
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.functions import Names, system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
@@ -245,3 +245,21 @@ def test_noise_of_an_input_that_stands_in_the_matrices_has_no_linear_response(de
     noise = SignalNoise(np.array([deviation]), np.ones(1), 0.01)
     found = observe(system, replace(seen(signals), noise=noise), SolverSettings())
     assert (found.errors is not None) == stated
+
+
+def test_what_is_found_along_one_recording_is_not_believed_along_another():
+    """A rank of the same plant, in the same process, that the measured signal decides."""
+    plant = plant_from_mapping({
+        "name": "along", "states": ["x", "z"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, "y"]], "B": [[1], [0]], "C": [[0, 1]],
+        "initial_state": {"x": 1, "z": 1},
+    })
+    t = np.linspace(0.0, 2.0, 201)
+    observer = {"name": "gpebo", "form": "strangeness_free"}
+
+    def recorded(y):
+        return run(plant, data={"t": t, "u": np.sin(t), "y": y}, observer=observer)
+
+    recorded(1.0 + 0.1 * t)
+    with pytest.raises(ModelError, match="the rank of the differential part changes at t = 1 "):
+        recorded(1.0 - t)

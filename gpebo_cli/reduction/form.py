@@ -303,6 +303,7 @@ class _Along:
 
     def __init__(self, form: EquationForm, t: Array, signals: Array) -> None:
         self._form, self._t, self._signals = form, t, signals
+        self.kept: dict[object, object] = {}  # what is found out along these signals is theirs
 
     def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:
         """The matrices at the times t (N,), with signals interpolated between the known ones."""
