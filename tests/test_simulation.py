@@ -463,3 +463,19 @@ def test_numbers_whose_products_overflow_are_named(said):
 def test_settings_out_of_all_proportion_are_named(said, settings):
     with pytest.raises(GpeboError, match=re.escape(said)):
         run("circuit", **settings)
+
+
+@pytest.mark.parametrize(
+    ("rate", "solver", "why"),
+    [
+        ("500*(t-10)", "collocation", r"rounding errors are larger than a state from t = 1\d\.\d"),
+        ("20*(t-10)", "collocation", r"rounding errors are larger than a state from t = 18\.4"),
+        ("200", "collocation", r"not finite from t = 3\.5\d+ on: it grows beyond all numbers"),
+        ("-1.0e5*cos(t)", "ivp", r"near t = 0\.0\d+ the plant p takes more steps"),
+    ],
+)
+def test_growth_is_refused_with_its_time_and_its_reason(rate, solver, why):
+    """A flow that decays to e^-25000 and comes back is lost; one that only grows is too large."""
+    system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state={"x": 1})
+    with pytest.raises(GpeboError, match=why):
+        simulate(system, TimeSettings(horizon=20.0), SolverSettings(name=solver))

@@ -28,7 +28,7 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements
 from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.errors import estimated_errors, least_sizes
+from gpebo_cli.numerics.errors import estimated_errors, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, equal_lengths, unresolved_kinds
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
@@ -106,10 +106,7 @@ def solve(
         evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name
     )
     if whole < mesh.size:
-        raise SolverError(
-            f"the solution of the {problem.name} is not finite from t = {mesh.edges[whole]:.6g} "
-            "on: it grows beyond all numbers; is a sign wrong? Else shorten time.horizon"
-        )
+        raise _not_finite(problem, mesh, maps, values, float(mesh.edges[whole]))
     noise = maps.noise
     if restarts:
         noise = _with_instants(noise, Trajectory(mesh, values), np.array(list(restarts)))
@@ -123,6 +120,32 @@ def solve(
     )
 
 
+def _not_finite(
+    problem: LinearProblem, mesh: Mesh, maps: _ElementMaps, values: Array, since: float
+) -> SolverError:
+    """Why a solution is not finite: it grows, or what rounding left of something small does."""
+    count = _modest(values)
+    if count:
+        part = slice(count)
+        _, lost = estimated_errors(
+            problem, Mesh(mesh.edges[: count + 1], mesh.rule), maps.homogeneous[part, -1],
+            maps.particular[part, -1], maps.noise[part], values[part],
+        )
+        if lost < count:
+            return nothing_left(problem.name, float(mesh.edges[lost + 1]))
+    return SolverError(
+        f"the solution of the {problem.name} is not finite from t = {since:.6g} on: it grows "
+        "beyond all numbers; is a sign wrong? Else shorten time.horizon"
+    )
+
+
+def _modest(values: Array) -> int:
+    """How many elements in front have values (K, ...) that may be multiplied with each other."""
+    with np.errstate(invalid="ignore"):
+        modest = (np.abs(values) < _MODEST).all(axis=(1, 2, 3))
+    return len(values) if modest.all() else int(np.argmin(modest))
+
+
 def _tail_of_numbers(
     problem: LinearProblem, mesh: Mesh, values: Array, maps: _ElementMaps, whole: int, tol: float
 ) -> Array:
@@ -133,10 +156,7 @@ def _tail_of_numbers(
     Elements that are too long may seem to grow, and many of them multiply to anything: those in
     front are resolved first.
     """
-    count = mesh.size
-    if whole < mesh.size:
-        with np.errstate(invalid="ignore"):
-            count = int(np.argmin((np.abs(values) < _MODEST).all(axis=(1, 2, 3))))
+    count = mesh.size if whole == mesh.size else _modest(values)
     tail = np.zeros(mesh.size)
     if count:
         part = slice(count)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import SHARE, Mesh, used_coefficients
@@ -58,12 +59,21 @@ def estimated_errors(
         values: the solution.
     """
     rule, renewal = mesh.rule, problem.renewal
+    noise[:, :, values.shape[2] :] += _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
     carried, largest = elements.carried_errors(
         values, rule.to_legendre, _to_next(rule), last, particular, noise,
         _signs(len(values), len(problem.start)), mesh.steps, LEVEL, END, _CHANCE**2, _SAME,
         renew=None if renewal is None else renewal.error,
     )
     return judged_errors(problem, carried, *largest)
+
+
+def nothing_left(name: str, t: float) -> SolverError:
+    """What is said where errors have grown larger than what they are errors of, at the time t."""
+    return SolverError(
+        f"the {name} grows so that rounding errors are larger than a state from t = {t:.6g} on, "
+        "and no digit of it is known; shorten time.horizon"
+    )
 
 
 @lru_cache(maxsize=16)

@@ -7,9 +7,9 @@ strangeness-free equations). It exists to check the engine, and is selected by `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from itertools import pairwise
+from itertools import count, pairwise
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from gpebo_cli.reduction.derivative_array import forcing
 from gpebo_cli.reduction.structure import Structure
 
 _MAX_ROUNDS = 12
+_LOOK, _MOST = 2000, 200_000  # evaluations: after the first it is known whether more are needed
 
 
 def underlying_ode(
@@ -135,9 +136,17 @@ def _sample(
             state = restarts[float(left)](state)
         margin = 1e-9 * (right - left)
 
+
         def derivative(
-            t: float, x: Array, low: float = left + margin, high: float = right - margin
+            t: float, x: Array, low: float = left + margin, high: float = right - margin,
+            calls: Iterator[int] = count(1),  # noqa: B008 - one for each piece is what is meant
         ) -> Array:
+            called = next(calls)
+            if called > _LOOK and called * (high - low) > _MOST * (t - low):
+                raise SolverError(
+                    f"solver=ivp: near t = {t:.6g} the {problem.name} takes more steps than an "
+                    "explicit method can make; use solver=collocation"
+                )
             c = problem.coefficients(np.array([t]), np.array([min(max(t, low), high)]))
             return np.asarray((c.A[0] @ x.reshape(shape) + c.f[0]).ravel())
 
@@ -148,7 +157,10 @@ def _sample(
             rtol=tol, atol=tol * 1e-2 * float(np.abs(state).max(initial=1e-3)),
         )
         if not solution.success:
-            raise SolverError(f"solver=ivp: the {problem.name} failed: {solution.message}")
+            reached = solution.t[-1] if len(solution.t) else left
+            raise SolverError(
+                f"solver=ivp: the {problem.name} failed after t = {reached:.6g}: {solution.message}"
+            )
         piece = solution.y.T[where].reshape(last - first, mesh.points.shape[1], *shape)
         values[first:last] = piece
         state = piece[-1, -1]

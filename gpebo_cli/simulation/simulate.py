@@ -17,7 +17,7 @@ from gpebo_cli.model.descriptor import (
     distinct,
 )
 from gpebo_cli.numerics.collocation import LinearSolution, solve
-from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes
+from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
 from gpebo_cli.numerics.mesh import (
     FIRST_ELEMENTS,
@@ -66,11 +66,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         if simulation is None:
             simulation = _simulate_linear(system, time, solver)
         if simulation.lost is not None:
-            raise SolverError(
-                f"the plant {system.name} grows so that rounding errors are larger than a state "
-                f"from t = {simulation.lost:.6g} on, and no digit of it is known; shorten "
-                "time.horizon"
-            )
+            raise nothing_left(f"plant {system.name}", simulation.lost)
         return simulation
     last: list[Simulation] = []
 
