@@ -197,6 +197,7 @@ WRONG = [
     (["run", "figures=[nope]"], "nope"),
     (["run", "figures.width=wide"], "figures.width: expected column or page"),
     (["run", "figures.dpi=9"], "figures.dpi: expected 30 to 1200"),
+    (["run", "figures.fromats=[png]"], "figures.fromats: no such key; figures has formats, width"),
     (["run", "plant.title=${oc.env:HOME}"], "plant.title: ${…} is not allowed"),
     (["run", "--multrun"], "did you mean --multirun?"),
     (["run", "--multirun=3"], "--multirun takes no value"),

@@ -12,7 +12,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from gpebo_cli.configs.locations import GROUPS, PRIMARY, choices, conf_folder
+from gpebo_cli.configs.locations import GROUPS, LOOK, PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.schema import nearest, shown, unknown
 
@@ -144,8 +144,7 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
             if key in _SWEEP_WORDS:
                 sweep[key] = text
             else:
-                # `figures` says which ones; how they look stands beside how much is written.
-                overrides.append(re.sub(r"^(\+*)figures\.(?=\w+=)", r"\1output.", word))
+                overrides.append(_stored(word))
             continue
         given, equals, value = word.partition("=")
         flag = _SWITCHES.get(given) or _WITH_VALUE.get(given) or _LONG.get(given)
@@ -195,6 +194,20 @@ def _check_questions(switches: Collection[str], values: Mapping[str, str]) -> No
     for flag in ("--resolve", "--package"):
         if (flag in switches or flag in values) and "--cfg" not in values:
             raise ConfigError(f"{flag} is for what --cfg prints; add --cfg job")
+
+
+def _stored(word: str) -> str:
+    """``figures.dpi=300`` where it is stored: ``figures`` itself is a list of names.
+
+    Raises:
+        ConfigError: figures have no such key.
+    """
+    match = re.match(r"\+*figures\.([^=]*)=", word)
+    if match is None:
+        return word
+    if match[1] not in LOOK:
+        raise unknown(f"figures.{match[1]}: no such key", match[1], LOOK, "figures has")
+    return word.replace("figures.", "output.", 1)
 
 
 def _with_data(overrides: list[str], config_name: str) -> list[str]:

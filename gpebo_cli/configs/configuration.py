@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from gpebo_cli.configs.locations import LOOK
 from gpebo_cli.configs.text import dump
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.schema import convert, read, shown, unknown
@@ -128,10 +128,9 @@ def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:
             )
         figures = words[figures]
     chosen = convert(figures, bool | list[str], "figures")
-    try:
-        built = read(OutputSettings, {**section, "figures": chosen}, "output")
-    except ConfigError as error:
-        raise ConfigError(_as_written(str(error))) from error
+    # First those that messages have another name for.
+    read(OutputSettings, {key: section[key] for key in LOOK if key in section}, "figures")
+    built = read(OutputSettings, {**section, "figures": chosen}, "output")
     low, high = _INCHES
     if isinstance(built.width, float) and not low <= built.width <= high:
         raise ConfigError(
@@ -141,11 +140,6 @@ def _output(config: Mapping[str, Any], *, draw: bool) -> OutputSettings:
     if not built.formats:
         raise ConfigError("figures.formats: expected some of png, pdf and svg, got an empty list")
     return built
-
-
-def _as_written(message: str) -> str:
-    """A message about the look of figures with the key that the help has for it."""
-    return re.sub(r"^output\.(?=(formats|width|dpi|style|error)\b)", "figures.", message)
 
 
 REPEATS = "Repeats the run: gpebo run --config-dir <this folder> --config-name config"

@@ -29,7 +29,6 @@ _LAUNCHER = "launcher"  # our own group, of which others cannot bring files
 
 _HEADER = re.compile(r"\s*#\s*@package\s+(\S+)")
 _CHOICE = re.compile(rf"(?:(?:optional|override)\s+)*/?({'|'.join(GROUPS)}|(?:hydra/)?launcher)")
-_LOGGING = re.compile(r"override /?hydra/(job|hydra)_logging")  # as older config.yaml files have it
 _NAME = re.compile(r"[\w -]+(\.[\w -]+)*(/[\w -]+(\.[\w -]+)*)*")
 _SWEPT = re.compile(rf"(?:{'|'.join((*GROUPS, *KEYS))})(?:\.[\w-]+)*")
 _SWEEPER_KEYS = ("params", "max_batch_size", "fail_fast")
@@ -100,7 +99,7 @@ def shipped(inside: str) -> dict[str, Any]:
 @cache
 def _shipped(inside: str) -> dict[str, Any]:
     path = os.path.join(conf_folder(), f"{inside}.yaml")
-    return _mapping(path, parse(read_text(path, _MAX_BYTES), path, None))
+    return _mapping(path, parse(read_text(path, _MAX_BYTES), path, ours=True))
 
 
 def _mapping(path: str, content: object) -> dict[str, Any]:
@@ -111,7 +110,7 @@ def _mapping(path: str, content: object) -> dict[str, Any]:
 
 def _checked(real: str, path: str, inside: str) -> dict[str, Any]:
     text = read_text(real, _MAX_BYTES)
-    content = _mapping(path, parse(text, path, _our_patterns()))
+    content = _mapping(path, parse(text, path))
     where = package(inside)
     _refuse_headers(path, text, allowed=where == GLOBAL)
     if where != GLOBAL:
@@ -120,13 +119,6 @@ def _checked(real: str, path: str, inside: str) -> dict[str, Any]:
         return content
     recipe = _recipe(path, content)
     return recipe if "/" in inside else _primary(recipe)
-
-
-@cache
-def _our_patterns() -> frozenset[str]:
-    """Names of folders with ``${now:…}``; a ``config.yaml`` of an older version repeats them."""
-    hydra = _shipped(PRIMARY)["hydra"]
-    return frozenset([*hydra["run"].values(), *hydra["sweep"].values()])
 
 
 def _refuse_headers(path: str, text: str, *, allowed: bool) -> None:
@@ -164,8 +156,6 @@ def _choices(path: str, defaults: object) -> Iterator[Any]:
             continue
         pair = list(entry.items()) if isinstance(entry, dict) else []
         key, name = pair[0] if len(pair) == 1 else ("", None)
-        if _LOGGING.fullmatch(key) and name == "none":
-            continue
         named = name is None or (isinstance(name, str) and _NAME.fullmatch(name))
         if not (named and _CHOICE.fullmatch(key)):
             raise ConfigError(
@@ -179,11 +169,7 @@ def _hydra(path: str, section: object) -> dict[str, Any]:
     """What a file may say of Hydra: that it sweeps, and over what."""
     if not isinstance(section, dict):
         raise ConfigError(f"{path}: hydra must be a mapping, got {shown(section)}")
-    ours = shipped(PRIMARY)["hydra"]
-    allowed: dict[str, Any] = {}
     for key, value in section.items():
-        if key in ours and value == ours[key]:  # written by gpebo, before it left this away
-            continue
         sweeper = value if key == "sweeper" and isinstance(value, dict) else {}
         excess = [name for name in sweeper if name not in _SWEEPER_KEYS]
         if excess or (key != "mode" and not sweeper):
@@ -198,8 +184,7 @@ def _hydra(path: str, section: object) -> dict[str, Any]:
                 raise ConfigError(
                     f"{path}: hydra.sweeper.params: {shown(f'{name}={values}')} cannot be swept"
                 )
-        allowed[key] = value
-    return allowed
+    return section
 
 
 def _primary(recipe: Mapping[str, Any]) -> dict[str, Any]:

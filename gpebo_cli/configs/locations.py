@@ -9,6 +9,9 @@ GROUPS = ("plant", "regression", "data", "observer", "estimator", "solver", "noi
 DATA_GROUPS = ("plant", "data", "observer", "estimator", "solver", "noise")
 """Groups whose files are values only; an experiment may choose from groups and set anything."""
 
+LOOK = ("formats", "width", "dpi", "style", "error")
+"""Keys of ``output`` that are ``figures.…`` for a person; ``figures`` alone says which ones."""
+
 PRIMARY = "gpebo"
 """The primary configuration, conf/gpebo.yaml; another name than a run's own config.yaml."""
 

@@ -21,20 +21,19 @@ _MAX_ENTRIES = 200_000  # aliases expanded; OmegaConf builds some 20,000 a secon
 _Parser: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml is 10 times as fast
 
 
-def parse(text: str, path: str, interpolations: frozenset[str] | None = frozenset()) -> Any:
+def parse(text: str, path: str, *, ours: bool = False) -> Any:
     """The plain data in a YAML text.
 
     Args:
         text: the content of a file.
         path: its name, for messages.
-        interpolations: values with ``${``, which OmegaConf would replace, that may stand in it;
-            None: any.
+        ours: whether it comes with gpebo: then ``${``, which OmegaConf replaces, may stand in it.
 
     Raises:
         ConfigError: it is not YAML, or more than data.
     """
     try:
-        return _Builder(path, interpolations).build(text)
+        return _Builder(path, ours=ours).build(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = path if mark is None else f"{path}, line {mark.line + 1}"
@@ -43,9 +42,9 @@ def parse(text: str, path: str, interpolations: frozenset[str] | None = frozense
 
 
 class _Builder:
-    def __init__(self, path: str, interpolations: frozenset[str] | None) -> None:
+    def __init__(self, path: str, *, ours: bool) -> None:
         self._path = path
-        self._interpolations = interpolations
+        self._ours = ours
         self._documents: list[Any] = []
         # Collections that are open: what is in them, anchor, entries before, key of the next value.
         self._open: list[list[Any]] = []
@@ -118,8 +117,7 @@ class _Builder:
 
     def _scalar(self, event: yaml.ScalarEvent) -> Any:
         text = event.value
-        allowed = self._interpolations
-        if "${" in text and allowed is not None and text not in allowed:
+        if "${" in text and not self._ours:
             self._refuse(event, "${…} is not allowed; write the value")
         if not event.implicit[0]:  # quoted, or a block
             return text
