@@ -61,7 +61,7 @@ def main(words: list[str]) -> int:
         section = gallery.write_recipe(folder / recipe.name, recipe, figures, formats)
         sections.append(section)
         if not options.quiet:
-            sys.stdout.write(f"{recipe.name}: {len(section.pictures)} figures\n")
+            sys.stdout.write(f"{recipe.name}: {section.pictures} figures\n")
         if update is not None:
             gallery.write_references(Path(update), recipe.name, figures)
         if check is not None:

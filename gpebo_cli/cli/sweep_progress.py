@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from gpebo_cli.cli.progress import display
+from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.sweep_folder import RESULT, JobRecord, Plan, job_folder, read_record
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 _LOOKS = 2.0  # a second
 _ROWS = 12  # of jobs that ended last
 _METRICS = ("seconds_to_1pct_parameters", "final_error_states")
-_HEADINGS = ("parameters to 1 % (s)", "final error, states")
+_HEADINGS = (f"{METRICS[_METRICS[0]]} (s)", METRICS[_METRICS[1]])
 
 
 class Watch:

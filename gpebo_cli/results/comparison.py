@@ -11,29 +11,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.finished import Case, read_errors, span
+from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line
-from gpebo_cli.results.symbols import number_text, symbol
+from gpebo_cli.results.symbols import number_text, symbol, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Value = str | float
 
-SORT = METRICS[0]
+SORT = next(iter(METRICS))
 _MOST_CURVES = len(style.LINES)  # more do not stay apart
 _MIN_POINTS = 3  # fewer are not a curve
 _MOST_MAPS = 8
-_METRIC_LABELS = {
-    "seconds_to_1pct_parameters": "parameters to 1 % (s)",
-    "seconds_to_1pct_states": "states to 1 % (s)",
-    "final_error_parameters": "final error, parameters",
-    "final_error_states": "final error, states",
-    "rms_error_states": "RMS error, states",
-}
 
 
 def row(case: Case) -> dict[str, Value]:
@@ -169,7 +162,7 @@ def metric_panels(cases: Sequence[Case], name: str) -> list[Panel]:
             first = not panels
             panels.append(
                 Panel(
-                    _METRIC_LABELS[metric], tuple(curves), log=True, axis=axis,
+                    _label(metric), tuple(curves), log=True, axis=axis,
                     legend=first and len(curves) > 1,
                 )
             )
@@ -224,9 +217,13 @@ def _heat_map(
         bar.set_ticks([])
         bar.ax.yaxis.set_ticks(ends, [f"{value:.2g}" for value in ends])
         bar.ax.yaxis.minorticks_off()
-        title = _METRIC_LABELS[metric] + (f"; {label}" if label else "")
+        title = _label(metric) + (f"; {label}" if label else "")
         axes.set_title("\n".join(textwrap.wrap(title, 48)), fontsize=style.TEXT, loc="left")
     return figure
+
+
+def _label(metric: str) -> str:
+    return with_unit(METRICS[metric], "s" if metric.startswith("seconds") else "")
 
 
 def _chosen(case: Case) -> dict[str, Value]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpebo_cli.experiment.result import RunResult
-from gpebo_cli.results import circuit
+from gpebo_cli.results import circuit, html
 from gpebo_cli.results.figures import describe, overlay
 from gpebo_cli.results.files import make_folder, remove_files, write_text
 from gpebo_cli.results.names import FORMATS
-from gpebo_cli.results.page import Picture, Section, case_table
+from gpebo_cli.results.page import Section, case_table
 from gpebo_cli.results.report import case_rows
 from gpebo_cli.results.series import blocks, csv_text, differences, reference_text
 from gpebo_cli.results.studies import CAPTIONS, REFERENCE, STUDIES, Study, heading, stem
@@ -66,15 +67,16 @@ def write_recipe(
         write_text(folder / f"{stem(name)}.csv", csv_text(blocks(panels)))
         pictures.append(_save(folder, name, compose(panels), study, _alt(name, panels), formats))
     runs = recipe.runs
-    return Section(
-        name=recipe.name,
-        title=recipe.title,
-        reference=recipe.reference,
-        note=study.note,
-        verdicts=tuple(run.verdict for run in runs.values()) if len(runs) == 1 else (),
-        table=case_table([(name, row) for name, run in runs.items() for row in case_rows(run)]),
-        pictures=tuple(pictures),
-    )
+    verdicts = [f"{_sentence(run.verdict)}." for run in runs.values()] if len(runs) == 1 else []
+    words = "".join(map(html.paragraph, (recipe.reference, study.note, *verdicts)))
+    cases = case_table([(name, row) for name, run in runs.items() for row in case_rows(run)])
+    drawn = f'<div class="figures">\n{"".join(pictures)}</div>\n'
+    name, title = escape(recipe.name), escape(_sentence(recipe.title))
+    return Section(name, title, words + html.table(cases) + drawn, len(pictures))
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def lacks_circuit(names: Sequence[str]) -> bool:
@@ -108,18 +110,19 @@ def check_references(
 
 def _save(
     folder: Path, name: str, figure: Figure, study: Study, alt: str, formats: Sequence[str]
-) -> Picture:
+) -> str:
+    """Write a picture; how the page shows it, with links to its files."""
     for suffix in formats:
         save(figure, folder / f"{stem(name)}.{suffix}")
+    base = escape(f"{folder.name}/{stem(name)}")
+    links = ", ".join(f'<a href="{base}.{s}">{s.upper()}</a>' for s in ("csv", *formats))
     width, height = figure.canvas.get_width_height()
-    return Picture(
-        stem=stem(name),
-        heading=heading(name, study),
-        text=CAPTIONS[name].text,
-        alt=alt,
-        size=(width, height),
-        formats=tuple(formats),
-    )
+    text = escape(CAPTIONS[name].text.rstrip("."))
+    return f"""<figure>
+<img src="{base}.png" width="{width}" height="{height}" alt="{escape(alt)}">
+<figcaption><b>{heading(name, study)}:</b> {text}. {links}</figcaption>
+</figure>
+"""
 
 
 def _alt(name: str, panels: Sequence[Panel]) -> str:

@@ -7,14 +7,14 @@ FIGURE_NAMES = (
 )
 """Every figure of a run, a function of that name in ``results/figures.py``, in this order."""
 
-METRICS = (
-    "seconds_to_1pct_parameters",
-    "seconds_to_1pct_states",
-    "final_error_parameters",
-    "final_error_states",
-    "rms_error_states",
-)
-"""What is measured of every case, the fields of :class:`gpebo_cli.experiment.result.Metrics`."""
+METRICS = {
+    "seconds_to_1pct_parameters": "parameters to 1 %",
+    "seconds_to_1pct_states": "states to 1 %",
+    "final_error_parameters": "final error, parameters",
+    "final_error_states": "final error, states",
+    "rms_error_states": "RMS error, states",
+}
+"""What is measured of every case, in words: :class:`gpebo_cli.evidence.metrics.Metrics`."""
 
 FORMATS = ("png", "pdf", "svg")
 """Formats of the files of figures."""

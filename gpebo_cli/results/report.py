@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpebo_cli.evidence.metrics import STANDING
+from gpebo_cli.results.names import METRICS
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import NoiseStatistics, RunResult
@@ -43,12 +44,6 @@ def loud_lines(result: RunResult) -> list[str]:
     ]
 
 
-_HEADINGS = {
-    "seconds_to_1pct_parameters": "parameters to 1 %",
-    "seconds_to_1pct_states": "states to 1 %",
-    "final_error_parameters": "final error, parameters",
-    "final_error_states": "final error, states",
-}
 # Times, and the errors that are not numbers where the truth is not known.
 _TIMES = {
     "seconds_to_1pct_parameters": "final_error_parameters",
@@ -66,7 +61,7 @@ def case_table(result: RunResult) -> list[str]:
         return []
     gains = list(cases[0])
     settled = [name for name in rows[0] if name.startswith(STANDING)]
-    headings = dict(_HEADINGS)
+    headings = dict(list(METRICS.items())[:4])
     if any(math.isfinite(rows[0][name]) for name in settled):  # noise decides the time to 1 %
         for name in _TIMES:
             del headings[name]
