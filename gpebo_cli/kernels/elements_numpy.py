@@ -14,6 +14,7 @@ _EPS, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 def element_maps(
     D: Array, h: Array, E: Array | None, A: Array, f: Array, basis: Array | None,
     offset: Array | None, group: IntArray, groups: int,
+    solve: Callable[..., Array] | None = None,
 ) -> tuple[Array, Array]:
     """X at the nodes of each element = homogeneous X(left end) + particular.
 
@@ -32,6 +33,7 @@ def element_maps(
         offset: p (P or 1, n, c), None without T.
         group: of each element (K,), 0 … groups − 1.
         groups: how many there are, K where each element has a system of its own.
+        solve: what takes the place of :func:`solve_blocks`.
 
     Returns:
         homogeneous (groups, s, n, n) and particular (K, s, n, c).
@@ -39,56 +41,51 @@ def element_maps(
     Raises:
         LinAlgError: a system is singular.
     """
-    k, s = len(h), len(D)
+    k, s, columns = len(h), len(D), f.shape[2]
     d, n = A.shape[1:]
-    columns = f.shape[2]
-    first = slice(None) if groups == k else np.unique(group, return_index=True)[1]
-    step = h[first]
-    E_first = None if E is None else at_nodes(E, k, s)[first]
-    A_first = at_nodes(A, k, s)[first]
-    T_first = None if basis is None else at_nodes(basis, k, s)[first]
-    D_over_h = D / step[:, None, None]  # (groups, s, s)
-    start = D_over_h.sum(axis=2)[..., None, None]  # (D𝟙)_i / h
-    if E_first is None:
-        system = np.zeros((groups, s, d, s, d))
-        diagonal = np.arange(d)
-        system[:, :, diagonal, :, diagonal] = D_over_h
-        from_left = np.broadcast_to(start * np.eye(n), (groups, s, n, n))
-    else:
-        coupling = E_first[:, :, :, None, :]
-        if T_first is not None:
-            together = np.swapaxes(T_first, 1, 2).reshape(groups, n, s * d)
-            coupling = (E_first.reshape(groups, s * d, n) @ together).reshape(groups, s, d, s, d)
-            A_first = A_first @ T_first
-        system = coupling * D_over_h[:, :, None, :, None]
-        from_left = start * E_first
-    stage = np.arange(s)
-    system[:, stage, :, stage, :] -= np.swapaxes(A_first, 0, 1)
-    forcing = forcing_at_nodes(D, h, E, A, f, offset)
-    most = int(np.bincount(group, minlength=groups).max(initial=1))
-    right = np.zeros((groups, s, d, n + most * columns))
-    right[..., :n] = from_left
-    place = np.zeros(k, dtype=np.intp)  # of each element among those of its group
-    if groups == k:
-        right[..., n:] = forcing
-    else:
-        for g in range(groups):
-            same = np.flatnonzero(group == g)
-            place[same] = np.arange(len(same))
-            sides = np.moveaxis(forcing[same], 0, 2).reshape(s, d, len(same) * columns)
-            right[g, :, :, n : n + len(same) * columns] = sides
-    solved = np.asarray(np.linalg.solve(
-        system.reshape(groups, s * d, s * d), right.reshape(groups, s * d, n + most * columns)
-    ), dtype=np.float64).reshape(right.shape)
-    if T_first is not None:
-        solved = T_first @ solved
-    particular = solved[..., n:]
-    if groups < k:
-        apart = np.moveaxis(particular.reshape(groups, s, n, most, columns), 3, 1)
-        particular = apart[group, place]
+    forcing, identity = forcing_at_nodes(D, h, E, A, f, offset), np.eye(n)[None]
+    E_, A_ = (at_nodes(identity if x is None else x, k, s) for x in (E, A))
+    T_ = None if basis is None else at_nodes(basis, k, s)
+    start = D.sum(axis=1)[:, None, None]
+    homogeneous, particular = np.empty((groups, s, n, n)), np.empty((k, s, n, columns))
+    ends = np.bincount(group, minlength=groups).cumsum()
+    for g, same in enumerate(np.split(np.argsort(group, kind="stable"), ends[:-1])):
+        first = same[0]
+        step, T = float(h[first]), None if T_ is None else T_[first]
+        right = np.empty((s, d, n + len(same) * columns))
+        right[:, :, :n] = start / step * E_[first]
+        right[:, :, n:] = np.moveaxis(forcing[same], 0, 2).reshape(s, d, len(same) * columns)
+        solved = (solve or solve_blocks)(D, step, E_[first], A_[first], T, right)
+        solved = solved if T is None else T @ solved
+        homogeneous[g] = solved[:, :, :n]
+        particular[same] = np.moveaxis(
+            solved[:, :, n:].reshape(s, n, len(same), columns), 2, 0
+        )
     if offset is not None:
-        particular = particular + at_nodes(offset, k, s)
-    return np.ascontiguousarray(solved[..., :n]), np.ascontiguousarray(particular)
+        particular += at_nodes(offset, k, s)
+    return homogeneous, particular
+
+
+def solve_blocks(
+    D: Array, h: float, E: Array, A: Array, T: Array | None, right: Array
+) -> Array:
+    """z (s, d, c) of (D_ij/h E_i T_j − δ_ij A_i T_i) z_j = right (s, d, c).
+
+    Args:
+        D: (s, s).
+        h: length of the element.
+        E: at the nodes (s, d, n).
+        A: likewise.
+        T: (s, n, d), None for the identity.
+        right: see above.
+    """
+    s, d, columns = right.shape
+    coupling = E[:, :, None] if T is None else np.tensordot(E, T, axes=(2, 1))
+    system = coupling * (D / h)[:, None, :, None]
+    stage = np.arange(s)
+    system[stage, :, stage] -= A if T is None else A @ T
+    z = np.linalg.solve(system.reshape(s * d, s * d), right.reshape(s * d, columns))
+    return np.asarray(z, dtype=np.float64).reshape(right.shape)
 
 
 def at_nodes(values: Array, k: int, s: int) -> Array:

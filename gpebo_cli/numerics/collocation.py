@@ -20,13 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, pairwise
 
 import numpy as np
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.kernels import elements
-from gpebo_cli.kernels.elements_numpy import at_nodes, forcing_at_nodes
+from gpebo_cli.kernels import elements, elements_numpy
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import estimated_errors, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
@@ -295,7 +295,7 @@ def _solve_elements(
     if _is_constant(c):
         group, h = equal_lengths(h)
     groups = int(group.max(initial=-1)) + 1
-    solve = elements.element_maps
+    solve: Callable[..., tuple[Array, Array]] = elements.element_maps
     if _is_constant(c) and s * c.A.shape[1] > _DIRECT:
         solve = decoupled_maps
     try:
@@ -351,32 +351,14 @@ def _with_instants(noise: Array, solution: Trajectory, cuts: Array) -> Array:
     return found
 
 
-def decoupled_maps(
-    D: Array, h: Array, E: Array | None, A: Array, f: Array, basis: Array | None,
-    offset: Array | None, group: IntArray, groups: int,
-) -> tuple[Array, Array]:
-    """As ``elements.element_maps`` for constant E, A (1, d, n) and T: stages are decoupled."""
-    k, s, columns = len(h), len(D), f.shape[2]
-    d, n = A.shape[1:]
-    forcing = forcing_at_nodes(D, h, E, A, f, offset)
-    E_, A_ = np.eye(n) if E is None else E[0], A[0]
-    T = np.eye(n) if basis is None else basis[0]
-    start = D.sum(axis=1)[:, None, None]
-    homogeneous, particular = np.empty((groups, s, n, n)), np.empty((k, s, n, columns))
-    for g in range(groups):
-        same = np.flatnonzero(group == g)
-        step = h[same[0]]
-        right = np.empty((s, d, n + len(same) * columns))
-        right[:, :, :n] = start / step * E_
-        right[:, :, n:] = np.moveaxis(forcing[same], 0, 2).reshape(s, d, len(same) * columns)
-        solved = T @ solve_constant(s, step, E_ @ T, A_ @ T, right)
-        homogeneous[g] = solved[:, :, :n]
-        particular[same] = np.moveaxis(
-            solved[:, :, n:].reshape(s, n, len(same), columns), 2, 0
-        )
-    if offset is not None:
-        particular += at_nodes(offset, k, s)
-    return homogeneous, particular
+def _by_stages(D: Array, h: float, E: Array, A: Array, T: Array | None, right: Array) -> Array:
+    """As ``elements_numpy.solve_blocks`` for constant E, A and T."""
+    E, A = (E[0], A[0]) if T is None else (E[0] @ T[0], A[0] @ T[0])
+    return solve_constant(len(D), h, E, A, right)
+
+
+decoupled_maps = partial(elements_numpy.element_maps, solve=_by_stages)
+"""As ``elements.element_maps`` for constant E, A and T: stages are decoupled."""
 
 
 def solve_constant(s: int, step: float, E: Array, A: Array, right: Array) -> Array:
