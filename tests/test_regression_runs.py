@@ -159,6 +159,30 @@ def test_arrays_by_name_and_what_can_be_checked():
     assert all(a.holds for a in check(regression=measured, data=arrays))
     constant = {**SINE, "signals": {"s": "1"}, "psi": [["s", 1]]}
     assert [a.name for a in check(regression=constant) if not a.holds] == ["Assumption 2"]
+    with pytest.raises(ConfigError, match=r"s is null, a column of a recording; give data\.file"):
+        run(regression=measured)
+    with pytest.raises(ConfigError, match=r"t \(1001,\), s \(1001,\), y \(7,\)"):
+        run(regression=measured, data={**arrays, "y": np.zeros(7)})
+    with pytest.raises(ConfigError, match="has no outputs; noise of the signals is noise.inputs"):
+        run(regression=measured, data=arrays, noise={"name": "gaussian", "outputs": 0.1})
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.2])
+def test_a_measured_Y_is_compared_with_the_fitted_one(wrong):
+    t, level = np.linspace(0.0, 20.0, 801), 0.05
+    noise = level * np.random.default_rng(5).standard_normal(len(t))
+    given = {**SINE, "signals": {"s": None}, "psi": [["s", 1]]}
+    data = {"t": t, "s": np.sin(t), "Y_1": 2 * np.sin(t) - 1 + wrong * np.sin(3 * t) + noise}
+    found = run(regression=given, data=data, estimator="least_squares",
+                noise={"name": "gaussian", "outputs": level, "sample_time": t[1]})
+    fit = found.details.fit
+    fitted = np.interp(found.t, t, 2 * np.sin(t) - 1)[:, None]
+    np.testing.assert_allclose(fit.outputs, fitted, atol=4 * level / np.sqrt(len(t) / 3))
+    assert fit.white is (wrong == 0.0)
+    assert ("explain the data up to white noise" in found.verdict) is (wrong == 0.0)
+    assert "fit" in found.figures
+    if not wrong:
+        assert fit.ratio == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("estimator", ["drem", "annihilator", "instrumental", "power"])

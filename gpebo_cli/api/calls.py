@@ -8,6 +8,8 @@ from dataclasses import fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, cast, overload
 
+import numpy as np
+
 from gpebo_cli import observers
 from gpebo_cli.api.choice import choose, plain, primary
 from gpebo_cli.api.result import Result
@@ -273,12 +275,20 @@ def _shipped(name: str) -> DescriptorSystem:
 
 
 def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
-    """``data`` as the group has it: a path, a frame, arrays by name, or a mapping with one."""
+    """``data`` as the group has it: a path, a frame, arrays by name, or a mapping with one.
+
+    Raises:
+        ConfigError: arrays that are no columns of one table.
+    """
     if isinstance(data, Mapping):
         if "t" in data:
             from pandas import DataFrame  # a third of a second to import
 
-            return {"name": "csv", "frame": DataFrame(dict(data))}
+            try:
+                return {"name": "csv", "frame": DataFrame(dict(data))}
+            except ValueError as error:
+                sizes = ", ".join(f"{name} {np.shape(column)}" for name, column in data.items())
+                raise ConfigError(f"data: arrays of the shapes {sizes}: {error}") from error
         return {"name": "csv", **data}
     if data is None or (isinstance(data, str) and data == "none"):
         return data

@@ -231,24 +231,27 @@ def fit_of(
     if regression.resets or regression.dynamics is not None:
         return fit
     return _explained(
-        fit, final[fit.best], observation.state_map, system, source,
+        fit, final[fit.best], observation, system, source,
         every=regression.factor is None and not source.pieces,
     )
 
 
 def _explained(
-    fit: Fit, eta: Array, state_map: StateMap, system: DescriptorSystem, source: Source, *,
+    fit: Fit, eta: Array, observation: Observation, system: DescriptorSystem, source: Source, *,
     every: bool,
 ) -> Fit:
-    """With ŷ = C x̂ + D u + H θ̂ of the final estimates η̂ (p,), and how white y − ŷ is.
+    """With ŷ of the final estimates η̂ (p,), and how white y − ŷ is.
 
-    That is looked at at ``every`` sample, or at the output times if x̂ is known there only.
+    ŷ is C x̂ + D u + H θ̂ of a plant, and ψη̂ of a regression whose Y is measured. Whiteness is
+    looked at at ``every`` sample, or at the output times if x̂ is known there only.
     """
-    t, recording = source.t, source.recording
+    t, recording, state_map = source.t, source.recording, observation.state_map
     if recording is None or len(state_map.times):
         return fit
 
     def outputs(t: Array, own_t: Array, u: Array, y: Array) -> Array:
+        if system.regression is not None:
+            return np.asarray(observation.regression.psi(t) @ eta)[:, : system.r]
         x = state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
         c = system.coefficients.taylor(own_t, 0, signals=np.hstack([u, y])[None])
         terms = (c.C, x), (c.D, u), (c.H, np.tile(eta[: system.q], (len(t), 1)))

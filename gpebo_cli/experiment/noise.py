@@ -66,8 +66,8 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
     """The levels by output and input of a plant, checked.
 
     Raises:
-        ConfigError: a negative level, a list of the wrong length, an unknown name, or a sample
-            time or seed that cannot be.
+        ConfigError: a negative level, a list of the wrong length, an unknown name, a level of
+            outputs that a regression does not have, or a sample time or seed that cannot be.
     """
     if not (np.isfinite(settings.sample_time) and settings.sample_time > 0):
         raise ConfigError(
@@ -76,6 +76,11 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
     if settings.seed < 0:
         raise ConfigError(f"noise.seed: expected 0 or more, got {settings.seed}")
     outputs, inputs = system.outputs, system.inputs
+    if settings.outputs and not outputs and system.regression is not None:
+        raise ConfigError(
+            f"noise.outputs: regression {system.name} makes Y of its signals and has no outputs; "
+            "noise of the signals is noise.inputs"
+        )
     return NoiseLevels(
         per_name(settings.outputs, outputs, "output", "noise.outputs", absent=0.0),
         per_name(settings.inputs, inputs, "input", "noise.inputs", absent=0.0),

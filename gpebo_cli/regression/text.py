@@ -79,6 +79,7 @@ class TextRegression:
     operators: tuple[Operator, ...]
     psi: Tape  # rows · p outputs
     Y: Tape | None  # rows outputs
+    recorded: tuple[str, ...]  # signals that are no functions of time
     parametrisation: Parametrisation | None = None  # θ are the system's states then
 
     @property
@@ -233,6 +234,7 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         raise ConfigError(f"{where}: signals must map names to expressions, such as {{u: sin(t)}}")
     psi_rows, right = _list(mapping, "psi", where), mapping.get("Y")
     count = len(psi_rows)
+    recorded = tuple(name for name, value in signals.items() if value is None)
     signals = {name: 0 if value is None else value for name, value in signals.items()}
     parametrisation, own = _parametrisation(mapping, len(signals), count, where)
     system = plant_from_mapping(
@@ -269,7 +271,8 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         if len(texts) != count:
             raise ConfigError(f"{where}: Y has {len(texts)} entries and psi has {count} rows")
         Y = record([read(value, f"Y[{i}]") for i, value in enumerate(texts)])
-    return TextRegression(system, tuple(operators.found.values()), record(psi), Y, parametrisation)
+    found = tuple(operators.found.values())
+    return TextRegression(system, found, record(psi), Y, recorded, parametrisation)
 
 
 def _parametrisation(
@@ -316,8 +319,8 @@ def system_from_mapping(mapping: Mapping[str, object], source: str = "") -> Desc
     Raises:
         ConfigError: whatever is wrong in it.
     """
-    key = "signals" if "psi" in mapping else "inputs"
-    inputs, found = tables(mapping.get(key), f"plant {mapping.get('name')}: {key}", source)
+    kind, key = ("regression", "signals") if "psi" in mapping else ("plant", "inputs")
+    inputs, found = tables(mapping.get(key), f"{kind} {mapping.get('name')}: {key}", source)
     mapping = {**mapping, key: inputs} if found else mapping
     if key == "inputs":
         return driven(plant_from_mapping(mapping, source), found)
@@ -339,13 +342,18 @@ def simulation_of(
     """The plant's solution; of a regression its signals, with Y = ψθ where the text has none.
 
     Raises:
-        ConfigError: a signal without a finite value; names it and the time.
+        ConfigError: a signal without a finite value, or one that has to be recorded.
         ModelError: the plant cannot be simulated.
         SolverError: the tolerance cannot be reached.
     """
     given = system.regression
     if not isinstance(given, TextRegression):
         return simulate(system, time, solver)
+    if given.recorded:
+        raise ConfigError(
+            f"regression {system.name}: signals.{given.recorded[0]} is null, a column of a "
+            "recording; give data.file, or a function of t"
+        )
     signals = signals_of_time(system, time, solver)
     mesh, outputs = signals.mesh, np.zeros((*signals.mesh.points.shape, 0))
     if given.Y is None:
