@@ -60,10 +60,11 @@ def test_states_are_those_of_the_reference(name):
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_unknowns_and_start_are_found_with_nothing_tuned(name):
     given = problem(name)
-    found = run(
-        given["plant"], estimator="ls_drem", time={"horizon": given["judge_until"], "samples": 11}
-    )
+    until = given["judge_until"]
+    found = run(given["plant"], estimator="ls_drem", time={"horizon": until, "samples": 11})
     assert of(found, plant_from_mapping(given["plant"])) < 1e-9
+    expected = given["check"][str(until)]["lambda_min"]  # of the same regressor, by DOP853
+    assert found.excitation.lambda_min == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -163,7 +163,7 @@ def test_arrays_by_name_and_what_can_be_checked():
         run(regression=measured)
     with pytest.raises(ConfigError, match=r"t \(1001,\), s \(1001,\), y \(7,\)"):
         run(regression=measured, data={**arrays, "y": np.zeros(7)})
-    with pytest.raises(ConfigError, match="has no outputs; noise of the signals is noise.inputs"):
+    with pytest.raises(ConfigError, match="has no outputs; noise of the signals is noise"):
         run(regression=measured, data=arrays, noise={"name": "gaussian", "outputs": 0.1})
 
 

@@ -243,6 +243,9 @@ def test_the_residual_is_compared_with_the_noise_that_is_given(tmp_path):
     assert "explain the data up to white noise" in told[0][1]
     assert "noisier sensor" in told[1][1]
     assert "is not white" in told[2][1] or told[2][0] > 1.2
+    silent = run("descriptor", time={"samples": 401}).to_pandas("signals").reset_index()
+    found = run("descriptor", data=silent, noise={**noise, "outputs": 0.1})
+    assert "the residual is far below the noise" in found.verdict  # though it is not white
 
 
 WRONG = {

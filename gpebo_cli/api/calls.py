@@ -287,7 +287,8 @@ def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
             try:
                 return {"name": "csv", "frame": DataFrame(dict(data))}
             except ValueError as error:
-                sizes = ", ".join(f"{name} {np.shape(column)}" for name, column in data.items())
+                columns = cast("Mapping[str, Any]", data).items()
+                sizes = ", ".join(f"{name} {np.shape(column)}" for name, column in columns)
                 raise ConfigError(f"data: arrays of the shapes {sizes}: {error}") from error
         return {"name": "csv", **data}
     if data is None or (isinstance(data, str) and data == "none"):

@@ -123,7 +123,7 @@ class Online:
         self.parameters = names if columns is None else tuple(names[j] for j in columns)
         self._recursion = estimators.able(
             estimator, estimators.Recursive,
-            "observer.sample_time needs an estimator that works at samples",
+            "observer.sample_time and streams need an estimator that works at samples",
         ).recursive(self.parameters)
         self._gram = InformationRoot(len(self.parameters), np.zeros(1))
         self._tol = max(settings.solver.tol, TOLERANCE)

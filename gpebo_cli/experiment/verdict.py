@@ -14,6 +14,7 @@ from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
+_LESS = 0.1  # of the sensors' noise: less than that says nothing against the model
 _FEW = 4.0  # the same where integrals of noise are all that is left: few independent numbers
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
 _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that says so
@@ -80,6 +81,8 @@ def _explains(fit: Fit, case: int) -> str:
         return noise + (f", which suggests {why}" if fit.ratio > _FEW else "")
     if fit.residual[case] <= _EXACT * fit.size:
         return ": the estimates explain the data"
+    if fit.ratio is not None and fit.ratio < _LESS:
+        return f": the residual is far below the noise{noise}"
     if fit.white and (fit.ratio is None or fit.ratio < _MORE):
         return f": the estimates explain the data up to white noise{noise}"
     if fit.white:
