@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from plants import reference, seen, shipped
 from regressions import ETA, adjugate, fading, integrate, regression, three
 
+import gpebo_cli
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
@@ -718,3 +719,22 @@ def test_a_gain_that_nobody_set_is_raised_where_it_is_too_small(slower, expected
     assert found.cases[0]["gamma"] == pytest.approx(least, rel=0.05)
     assert found.requirement.holds
     np.testing.assert_allclose(found.parameters[0, -1, 0], 2.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05, "hold": "linear"}])
+def test_estimates_that_are_not_what_the_data_say_are_told(observer):
+    """From 1e5, e^-6 of which is left: 1 % of the start, as was required, and far from the truth.
+
+    A gain that does leaves no warning, and an estimator that lacks what it needs says that.
+    """
+    def warned(**estimator):
+        chosen = {"name": "gpebo", **observer}
+        result = gpebo_cli.run("descriptor", estimator=estimator, observer=chosen)
+        return result.details.warnings, result.details.estimation.requirement.holds
+
+    slow = {"gamma": 0.5, "f0": 0.01, "initial": 1e5}
+    (warning,), holds = warned(name="ls_drem", **slow)
+    assert holds
+    assert "theta1, theta2, e0_x1, e0_x2, x1, x2, x3 are up to" in warning
+    assert warned(name="ls_drem", **slow | {"gamma": 10.0}) == ((), True)
+    assert warned(name="least_squares", f0=0.01, initial=1e5) == ((), False)

@@ -26,11 +26,14 @@ from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Observation, StateMap
 from gpebo_cli.observers._observation import AffineStateMap
-from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.linear import LinearRegression, least_squares
 
 _LAGS = 20  # of the residual's autocorrelation
 _SILENT = 1e-9  # of an output: a residual below that is rounding
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
+_ASTRAY = 0.02  # of a quantity's size: estimates that differ by more are different
+_WORSE = 3.0  # times the residual of least squares: more than that is not the noise of the data
+_TINY = float(np.finfo(float).tiny)
 _STILL = 1e-9  # of the same: an estimate that moved by less than that was not moved by data
 
 
@@ -187,6 +190,50 @@ def evaluation(
         return numbers, kept, x_hat
 
     return evaluate_affine
+
+
+def astray(
+    root: Array, final: Array, states: Callable[[Array], Array], quantities: Sequence[str],
+    sizes: Array, determined: BoolArray, columns: IntArray,
+) -> tuple[str, ...]:
+    """A warning of final estimates that are not what least squares makes of the same data.
+
+    Gains and rounding can do that. There is none if the estimates explain the data nearly as well,
+    because noise makes such a difference too.
+
+    Args:
+        root: R (k, p + 1) with |R [−η; 1]|² = ∫‖Y − ψη‖².
+        final: η̂ of all cases at the end (G, p).
+        states: from parameters (g, p) to x̂ at the end (g, n).
+        quantities: names of parameters and states (p + n,).
+        sizes: of these (p + n,).
+        determined: which of them are.
+        columns: the parameters that are estimated (k,), the others being zero.
+    """
+    final, eta = final[np.isfinite(final).all(axis=1)], np.zeros(final.shape[1])
+    if not len(final) or not len(columns):
+        return ()
+    eta[columns] = least_squares(root[:, [*columns, -1]])
+    least = np.linalg.norm(root @ np.append(-eta, 1.0))
+    more = np.linalg.norm((final - eta) @ root[:, :-1].T, axis=1)
+    best = int(np.argmin(more))
+    if more[best] <= _WORSE * least:
+        return ()
+    both = np.stack([final[best], eta])
+    one, other = np.hstack([both, states(both)])
+    away = np.abs(one - other) / np.maximum(np.fmax(sizes, np.abs(other)), _TINY)
+    far = determined & (away > _ASTRAY)
+    if not far.any():
+        return ()
+    names = ", ".join(name for name, is_far in zip(quantities, far, strict=True) if is_far)
+    size = np.linalg.norm(root[:, -1])
+    text = (
+        f"estimates.csv: at the end {names} are up to {away[far].max():.2g} of their size away "
+        f"from least squares over the same data, which leaves {least / size:.1g} of Y and they "
+        f"{np.hypot(least, more[best]) / size:.1g}: the estimator has lost digits or is not done; "
+        "use estimator=least_squares or other gains"
+    )
+    return (text,)
 
 
 def standing(

@@ -252,6 +252,11 @@ def at_samples(
         parameters_std=None if std is None else std[..., :p],
         states_std=None if std is None else std[..., p:],
         still=still,
+        warnings=accuracy.astray(
+            online.root, made.parameters[:, -1], online.last_states,
+            [*online.parameters, *system.states], np.concatenate(sizes),
+            np.append(made.known.parameters[-1], made.seen[-1]), columns,
+        ) if by.requirement.holds else (),
     )
     with stage("excitation"):
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
@@ -375,9 +380,23 @@ def _estimate(
         requirement=requirement,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
         explaining=explaining,
+        warnings=accuracy.astray(
+            regression.root, explaining, lambda eta: state_map.at(t[-1:])(eta[:, None])[:, 0],
+            [*regression.parameters, *system.states], np.concatenate(sizes),
+            np.append(determined, seen), columns,
+        ) if requirement.holds and about_own and _settles(observation) else (),
         still=accuracy.still(parameters, requirement, natural),
     )
     return estimator, result, accuracy.metrics_of(numbers, observation.parameters, system)
+
+
+def _settles(observation: Observation) -> bool:
+    """Whether there is one η (p,) without bounds for all of the data, and one Y."""
+    regression = observation.regression
+    return not (
+        regression.resets or regression.dynamics or regression.parametrisation
+        or regression.realisations or observation.bounds
+    )
 
 
 def _estimates(

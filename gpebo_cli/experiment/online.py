@@ -130,7 +130,8 @@ class Online:
         self._rho = settings.excitation.rho
         self.start = start
         self._state: observers.Reached | None = None
-        self._root = np.zeros((len(self.parameters) + 1,) * 2)  # S of all data
+        # S of all data: |S[−η; 1]|² = ∫‖Y − ψη‖²
+        self.root = np.zeros((len(self.parameters) + 1,) * 2)
         self._final = np.zeros((len(self.cases), len(self.parameters)))
         # When parameters could first be told apart, and when well.
         self._t_c: list[float | None] = [None, None]
@@ -153,7 +154,7 @@ class Online:
             block = block.about(self._columns)
         made = self._recursion.update(block.regression)
         roots, _ = self._gram.update(block.regression)
-        self._root, self.count = roots[-1, 0], self.count + len(t)
+        self.root, self.count = roots[-1, 0], self.count + len(t)
         p = len(self.parameters)
         S = roots[:, 0, :p, :p]
         sigma: Array = np.linalg.svd(S, compute_uv=False).astype(np.float64)
@@ -177,6 +178,7 @@ class Online:
             )
         eigenvalues = sigma[:, ::-1] ** 2
         seen = known.states(gain if gain.ndim == 3 else gain[0], block.units)
+        self._last = block.offset[-1], block.gain[-1], block.fit
         if block.fit is None and (self.growth or 0.0) >= LARGE:
             root = roots[-1, 0]
             seen &= known.resolved(root[:, :p].T @ root[:, p], block.offset, gain)
@@ -194,6 +196,13 @@ class Online:
             extension: [ξ_a | ξ_b | Φ] at the samples it will be asked about, (K, n_w, 1 + q + n_a).
         """
         return self._observer.truth(extension)
+
+    def last_states(self, eta: Array) -> Array:
+        """x̂ (g, n) at the newest sample that parameters η (g, p) say."""
+        (offset, gain, fit), S = self._last, self.root[:, :-1]
+        if fit is not None:
+            return fit(eta[:, None], (S.T @ S)[None])[0][:, 0]
+        return np.asarray(offset + eta @ gain.T)
 
     @property
     def requirement(self) -> Requirement:
@@ -253,14 +262,14 @@ class Online:
     @property
     def natural_sizes(self) -> Array:
         """√(∫Y²/∫ψ_j²) so far, (p,): the size of a parameter that alone would explain Y."""
-        size = np.linalg.norm(self._root, axis=0)
+        size = np.linalg.norm(self.root, axis=0)
         return np.asarray(np.divide(
             size[-1], size[:-1], out=np.zeros(len(size) - 1), where=size[:-1] > 0.0
         ))
 
     def fit(self) -> Fit:
         """How the last estimates explain all data, from S alone: |Y − ψη̂|² = |S[−η̂; 1]|²."""
-        final, root = self._final, self._root
+        final, root = self._final, self.root
         duration = max(self.reached.t - self.start, float(np.finfo(float).tiny))
         vectors = np.concatenate([-final, np.ones((len(final), 1))], axis=1)
         residual = np.linalg.norm(vectors @ root.T, axis=1) / np.sqrt(duration)

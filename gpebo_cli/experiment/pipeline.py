@@ -146,7 +146,7 @@ def _experiment(
         if samples is None
         else at_samples(settings, system, source, levels, samples, estimator, stage)
     )
-    warned = warnings(found.observed)
+    warned = (*warnings(found.observed), *found.estimation.warnings)
     told = verdict(
         found.excitation, found.estimation.cases, found.estimation.requirement, found.metrics,
         found.fit, found.unknown, found.left_out, found.estimation.active,

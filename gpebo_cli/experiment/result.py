@@ -128,6 +128,7 @@ class EstimationResult:
     states_std: Array | None = None  # (G, M, n)
     active: Mapping[int, tuple[ActiveBound, ...]] = field(default_factory=dict)  # bounds, by case
     explaining: Array | None = None  # (G, p) at the end; one value of many where not determined
+    warnings: tuple[str, ...] = ()  # what spoils the estimates though enough was there
 
     @cached_property
     def gains(self) -> dict[str, Array]:

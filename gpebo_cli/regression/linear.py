@@ -104,23 +104,23 @@ class LinearRegression:
                 known = ExtensionState(pieces[-1][-1, -1], level).after(reset).values
         return Trajectory(self.mesh, np.concatenate(pieces))
 
+    @cached_property
+    def root(self) -> Array:
+        """R (k, p + 1) with |R [−η; 1]|² = ∫‖Y − ψη‖²; of one realisation, without resets."""
+        if self.factor is not None:
+            return self.factor
+        mesh = self.mesh
+        weights = np.sqrt(mesh.steps[:, None] * mesh.rule.integration[-1])[..., None, None]
+        both = weights * np.concatenate([self.psi.values, self.Y.values[..., None]], axis=3)[:, 1:]
+        return np.asarray(np.linalg.qr(both.reshape(-1, self.p + 1), mode="r"))
+
     def misfit(self, eta: Array) -> float:
         """∫‖Y − ψη‖² for parameters η (p,)."""
-        if self.factor is not None:
-            return float(((self.factor @ np.append(-eta, 1.0)) ** 2).sum())
-        residual = self.Y.values - self.psi.values @ eta
-        square = Trajectory(self.mesh, (residual**2).sum(axis=-1)).integral()
-        return max(float(square.final), 0.0)
+        return float(((self.root @ np.append(-eta, 1.0)) ** 2).sum())
 
     def least_squares(self) -> Array:
         """η̂ (p,) that makes ∫‖Y − ψη̂‖² least; the smallest one where many do. Without resets."""
-        mesh = self.mesh
-        weights = np.sqrt(mesh.steps[:, None] * mesh.rule.integration[-1])[..., None, None]
-        rows = (weights * self.psi.values[:, 1:]).reshape(-1, self.p)
-        right = (weights[..., 0] * self.Y.values[:, 1:]).ravel()
-        size = np.linalg.norm(rows, axis=0)
-        size = np.where(size > 0.0, size, 1.0)
-        return np.asarray(np.linalg.lstsq(rows / size, right, rcond=_SINGULAR)[0] / size)
+        return least_squares(self.root)
 
     @cached_property
     def segments(self) -> tuple[LinearRegression, ...]:
@@ -140,6 +140,13 @@ class LinearRegression:
                 floor=floor,
             ))
         return tuple(out)
+
+
+def least_squares(root: Array) -> Array:
+    """η̂ (p,) that makes |R [−η̂; 1]| least, R (k, p + 1); the smallest one where many do."""
+    size = np.linalg.norm(root[:, :-1], axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    return np.asarray(np.linalg.lstsq(root[:, :-1] / size, root[:, -1], rcond=_SINGULAR)[0] / size)
 
 
 def outer_products(psi: Array, Y: Array) -> Array:
