@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gpebo_cli.evidence.knowledge import Knowledge
+from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
@@ -341,21 +342,12 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
         A: (K, s, d, d) at the nodes.
         B: (K, s, d, c).
     """
-    rule, s = mesh.rule, mesh.rule.stages
-    h = steps[:, None, None, None]
-    count, (d, signals) = len(h), B.shape[-2:]
-    eye, nodes = np.eye(d), np.arange(s)
-    operator = np.broadcast_to(
-        np.einsum("ij,kl->ikjl", rule.differentiation, eye), (count, s, d, s, d)
-    ).copy()
-    operator[:, nodes, :, nodes, :] -= np.swapaxes(h * A, 0, 1)
-    right = np.empty((count, s, d, d + signals))
-    right[..., :d] = rule.differentiation.sum(axis=1)[:, None, None] * eye
-    right[..., d:] = h * B
-    solved = np.linalg.solve(
-        operator.reshape(count, s * d, s * d), right.reshape(count, s * d, d + signals)
-    )
-    return np.asarray(solved.reshape(right.shape))
+    K = len(steps)
+    # At the left ends nothing is looked at.
+    A, B = (np.concatenate([x[:, :1], x], axis=1).reshape(-1, *x.shape[2:]) for x in (A, B))
+    return np.concatenate(elements.element_maps(
+        mesh.rule.differentiation, steps, None, A, B, None, None, np.arange(K), K
+    ), axis=3)
 
 
 def error_steps(mesh: Mesh, times: Array, hold: str, A: Array, B: Array) -> Array:

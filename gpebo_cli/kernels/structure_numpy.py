@@ -68,16 +68,8 @@ def levels(
 
     These are the smallest of M, Â2 and E T2 that count, relative to the size of their factors;
     infinite where there is none, and not determined where there are more constraints than states.
-
-    Args:
-        E: with the five that follow, the model.
-        A: see above.
-        rows: see above.
-        columns: see above.
-        time: see above.
-        orders: see above.
-        rank_tol: singular values below this, relative, are zero.
-        constraints: how many of M belong to constraints, whatever they are; −1: as many as are 0.
+    Singular values below ``rank_tol``, relative, are zero; so many as ``constraints`` says belong
+    to constraints, whatever they are; −1: as many as are zero.
     """
     e, a = scaled(E, A, rows, columns, time, orders)
     n = E.shape[2]
@@ -266,24 +258,9 @@ def eliminated(
 ) -> tuple[Array, ...] | None:
     """E1 x' = A1 x + f1 and 0 = Â2 x + f2 in the model's own states, at N times.
 
-    Args:
-        E: with the five that follow, the model.
-        A: see above.
-        rows: see above.
-        columns: see above.
-        time: see above.
-        orders: see above.
-        B: of f = B u + F θ, (orders, N or 1, n, m).
-        F: coefficients of F, (orders, N or 1, n, q).
-        u: coefficients of u, (orders, N or 1, m).
-        theta: coefficients of θ, (orders, N or 1, q).
-        pivot_rows: as in :func:`bounds`, with the three that follow.
-        pivot_columns: likewise.
-        rank: likewise.
-        Z1: likewise.
-        every: at every how many times the amplification is looked at.
-        growth: of the elimination, at most.
-        residual: of M22, relative, at most.
+    With the coefficients of f = B u + F θ, B (orders, N or 1, n, m), F (…, n, q), u (…, m) and θ
+    (…, q), and the pivots of :func:`bounds`. The amplification is looked at at ``every`` so many
+    times; ``growth`` of the elimination and its relative ``residual`` in M22 are limits.
 
     Returns:
         E1, A1 (N, d, n), f1 (N, d), Â2 (N, a, n), f2 (N, a), T (N, n, d) and offset (N, n) of the
