@@ -28,7 +28,7 @@ from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
 WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hundredfold
-_TINY = float(np.finfo(float).tiny)
+_TINY, _EPS = float(np.finfo(float).tiny), float(np.finfo(float).eps)
 _ROUNDS, _SAME_TIME = 30, 1e-12
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
 _STEPS = 0.25 ** np.array([0.0, 1.0, 2.0, 4.0, 6.0, 9.0])
@@ -116,20 +116,22 @@ def assess(
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
     def hopeless() -> BoolArray:
-        """Elements (K,) where ψ is surely not exciting yet.
+        """Points (K, s + 1) where ψ is surely not exciting yet.
 
         G grows: inside, λ_min(N) is at most that at the end times the largest growth of a G_jj.
         """
         if rho is not None or not enough or regression.dynamics is not None:
-            return np.zeros(len(ends), dtype=bool)
-        first, last = np.einsum("ksjj->skj", gram.values[:, [0, -1], :, :p])
+            return np.zeros(gram.mesh.points.shape, dtype=bool)
+        before = np.einsum("ksjj->ksj", gram.values[..., :p])
+        last = np.broadcast_to(before[:, -1:], before.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
-            growth = np.divide(last, first, out=np.ones_like(last), where=last > 0.0)
-            return np.asarray(smallest * growth.max(axis=1, initial=1.0) < enough)
+            growth = np.divide(last, before, out=np.ones_like(before), where=last > 0.0)
+            return np.asarray(smallest[:, None] * growth.max(axis=2, initial=1.0) < enough)
 
     # What is looked at later must not keep what is known of this regression by now.
     later = replace(evidence, regression=replace(regression))
-    final, t_c = evidence.known(t[-1:]), _first_time(gram, ends, reached, hopeless)
+    doubt = p * _EPS / (enough or 1.0)  # that rounding of G leaves in the level
+    final, t_c = evidence.known(t[-1:]), _first_time(gram, ends, reached, hopeless, doubt)
     # From when on parameters are well determined a run says in any case.
     said = t_c is not None and (final.share >= WELL).all()
     return excitation(
@@ -219,7 +221,7 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 
 def _first_time(
     gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array],
-    hopeless: Callable[[], BoolArray],
+    hopeless: Callable[[], BoolArray], doubt: float,
 ) -> float | None:
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
@@ -230,7 +232,8 @@ def _first_time(
         gram: G (p, p), perhaps with further columns.
         edges: right ends of its elements (K,).
         reached: of times (M,) and G there.
-        hopeless: elements (K,) in which it is surely negative.
+        hopeless: points (K, s + 1) at which it is surely negative.
+        doubt: a difference of it that is rounding.
     """
     mesh = gram.mesh
     ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
@@ -238,12 +241,11 @@ def _first_time(
         return None
 
     # Up to the first element at whose end it is reached.
-    some = np.append(np.flatnonzero(~hopeless()[: ends[0]]), ends[0])
-    t, G = mesh.points[some], gram.values[some]
-    levels = reached(t.ravel(), G.reshape(t.size, *G.shape[2:])).reshape(t.shape)
-    first = int(np.argmax((levels >= 0.0).any(axis=1)))
-    k = int(some[first])
-    points, level = mesh.points[k], levels[first]
+    levels, looked_at = np.full(mesh.points.shape, np.log(_TINY)), ~hopeless()
+    looked_at[ends[0]], looked_at[ends[0] + 1 :] = True, False
+    levels[looked_at] = reached(mesh.points[looked_at], gram.values[looked_at])
+    k = int(np.argmax((levels >= 0.0).any(axis=1)))
+    points, level = mesh.points[k], levels[k]
     piece = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
     start, horizon = float(mesh.edges[0]), float(mesh.edges[-1] - mesh.edges[0])
     at_once = np.minimum(start + _AT_ONCE * horizon, mesh.edges[k + 1 : k + 2])
@@ -252,7 +254,7 @@ def _first_time(
     for _ in range(_ROUNDS):
         j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
         low, high = float(points[max(j - 1, 0)]), float(points[j])
-        if high - low <= _SAME_TIME * max(abs(high), horizon):
+        if high - low <= _SAME_TIME * max(abs(high), horizon) or 0.0 <= level[j] <= doubt:
             break
         share = level[j - 1] / (level[j - 1] - level[j])
         guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)

@@ -154,8 +154,11 @@ def regression_signals(
     else:
         offset = np.zeros((len(z), len(basis)))
         gain = np.zeros((len(z), len(basis), z.shape[2] - 1))
-        offset[:, axes], gain[:, axes] = z[:, :, 0], z[:, :, 1:]
-        np.negative(gain[:, :, q:], out=gain[:, :, q:])  # in place: another copy is as large
+        offset[:, axes] = z[:, :, 0]
+        if isinstance(axes, slice):  # at once: another copy is as large
+            np.multiply(z[:, :, 1:], -signs[1:], out=gain[:, axes])
+        else:
+            gain[:, axes] = z[:, :, 1:] * -signs[1:]
     given = elimination.any(axis=(0, 2))
     through = elimination[:, given] @ seen
     offset[:, given] -= through[:, :, 0]

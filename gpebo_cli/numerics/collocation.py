@@ -30,7 +30,14 @@ from gpebo_cli.kernels import elements, elements_numpy
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import estimated_errors, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
-from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, equal_lengths, unresolved_kinds
+from gpebo_cli.numerics.mesh import (
+    Kind,
+    Looked,
+    Mesh,
+    Trajectory,
+    equal_lengths,
+    unresolved_kinds,
+)
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
@@ -175,7 +182,7 @@ def _tail_of_numbers(
 
 def unresolved_signals(
     problem: LinearProblem, rule: RadauRule, values: Array, extras: tuple[Array, ...],
-    made_of: Array, tol: float,
+    made_of: Array, tol: float, looked: Looked | None = None,
 ) -> Array:
     """:func:`unresolved_kinds` over the solution and everything computed from it, shape (K,).
 
@@ -185,7 +192,7 @@ def unresolved_signals(
     size, points, n, columns = values.shape
     further = () if problem.monitor is None else problem.monitor(values, extras)
     if problem.told:
-        return unresolved_kinds(further, rule)
+        return unresolved_kinds(further, rule, looked)
     least = least_sizes(problem, made_of, tol).reshape(n * columns)
     own: Kind = (values.reshape(size, points, n * columns), least)
     return unresolved_kinds(chain([own], further), rule)

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from itertools import pairwise
 from math import prod
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
 
-from gpebo_cli.kernels import elements, signals
+from gpebo_cli.kernels import elements, signals, signals_numpy
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.linalg import largest_over_time
+from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.radau import RadauRule
 
 # Functions that jump are decided this far (relative to the element) inside its ends, so that both
@@ -36,7 +37,33 @@ _WINDOW = 1 << 12  # elements of a long mesh that are solved together
 
 
 # Point values (K, s + 1, c) of signals of one kind, and what is small among them: ``unresolved``.
-Kind = tuple[Array, float | Array]
+# Or None for the solution itself, measured in units (c,).
+Kind = tuple[Any, float | Array]
+
+
+class Looked(NamedTuple):
+    """What is seen of point values (K, s + 1, c) of signals, looking at them once."""
+
+    sizes: Array  # (K, c) the largest in each element
+    last: Array  # (K, up to 4, c) sizes of the last Legendre coefficients
+
+    @classmethod
+    def at(cls, values: Array, rule: RadauRule) -> Looked:
+        """At values (K, s + 1, …)."""
+        flat = _flat(values)
+        last = np.matmul(rule.to_legendre[-_COEFFICIENTS:], flat)
+        return cls(largest_within(flat), np.abs(last, out=last))
+
+    def unresolved(self, rule: RadauRule, units: Array | float) -> Array:
+        """As :func:`unresolved` of these signals in units (c,), without a floor."""
+        last = self.last[:, -used_coefficients(rule) :] / units
+        return signals_numpy.tails_of(
+            self.sizes / units, last, len(rule.points), _FOOT, SHARE, 0.0, None
+        )
+
+    def tail(self, rule: RadauRule, scale: Array) -> Array:
+        """:func:`legendre_tail` of these signals, beside a scale (K, c)."""
+        return _predicted(self.last[:, -used_coefficients(rule) :], rule, scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,9 +373,15 @@ def unresolved(values: Array, rule: RadauRule, floor: float | Array = 0.0) -> Ar
     )
 
 
-def unresolved_kinds(kinds: Iterable[Kind], rule: RadauRule) -> Array:
+def unresolved_kinds(
+    kinds: Iterable[Kind], rule: RadauRule, solution: Looked | None = None
+) -> Array:
     """:func:`unresolved` of signals of several kinds (values, floor), the worst; shape (K,)."""
-    return np.asarray(reduce(np.maximum, (unresolved(kind[0], rule, kind[1]) for kind in kinds)))
+    return np.asarray(reduce(np.maximum, (
+        unresolved(values, rule, floor) if values is not None
+        else solution.unresolved(rule, floor)  # type: ignore[union-attr]
+        for values, floor in kinds
+    )))
 
 
 def used_coefficients(rule: RadauRule) -> int:
@@ -364,12 +397,18 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     accident, two of them where the signal is odd or even.
     """
     # Of degrees s + 1 − used … s:
-    last = np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values))
+    return _predicted(
+        np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values)), rule, scale
+    )
+
+
+def _predicted(last: Array, rule: RadauRule, scale: Array) -> Array:
+    """:func:`legendre_tail` (K, c) from the sizes of the last coefficients (K, used, c)."""
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
     s, used = rule.stages, len(last[0])
     to_next = (s + 1.0) / np.arange(s + 1 - used, s + 1)  # (ρ^j)^this = ρ^(s + 1)
-    predicted = size * np.minimum(last / size, 1.0) ** to_next[:, None]
-    return np.asarray(predicted.max(axis=1))
+    predicted = np.minimum(last / size, 1.0) ** to_next[:, None]
+    return np.asarray(size[:, 0] * predicted.max(axis=1))
 
 
 def _scale_so_far(values: Array, counts: IntArray) -> Array:

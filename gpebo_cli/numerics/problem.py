@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from gpebo_cli.model.descriptor import Array
 
@@ -30,7 +30,7 @@ class LinearEquation(NamedTuple):
 
 
 # (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind
-Monitor = Callable[[Array, tuple[Array, ...]], Iterable[tuple[Array, float | Array]]]
+Monitor = Callable[[Array, tuple[Array, ...]], Iterable[tuple[Any, float | Array]]]
 
 
 class Renewal(Protocol):

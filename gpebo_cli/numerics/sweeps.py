@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,14 +23,12 @@ from gpebo_cli.numerics.collocation import (
     LinearSolution,
     at_points,
     decoupled,
-    decoupled_maps,
     merged,
     unresolved_signals,
 )
 from gpebo_cli.numerics.elimination import Eliminated, StiffError
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
-from gpebo_cli.numerics.linalg import largest_within
-from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, equal_lengths, legendre_tail
+from gpebo_cli.numerics.mesh import SHARE, Looked, Mesh, Trajectory, equal_lengths
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
@@ -43,6 +41,7 @@ _BEYOND = 1.5  # lengths of elements, up to which polynomials are a beginning fo
 _ROUGH = 0.02  # to which errors are carried
 _LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
+_WORTH = 0.5  # columns times that share, from which on it is multiplied as if it were
 _TINY = float(np.finfo(float).tiny)
 _FEW_COLUMNS = 4  # whose errors are carried one by one
 _MANY_COLUMNS = 8  # from which on maps of elements that are alike cost less than sweeps, and
@@ -101,7 +100,8 @@ class Sparse(NamedTuple):
 
     def product(self, entries: Array, x: Array) -> Array:
         """Products (K, d, c) of matrices with these entries (K or 1, e) and x (K, d, c)."""
-        if len(entries) == 1 and len(self.columns) > _DENSE * x.shape[1] ** 2:
+        share = len(self.columns) / max(x.shape[1], 1) ** 2
+        if share > (_DENSE if len(entries) == 1 else 1.0) or x.shape[2] * share > _WORTH:
             return self._replace(entries=entries).full() @ x
         terms = entries[:, :, None] * x[:, self.columns]
         full = np.diff(self.rows) > 0
@@ -180,11 +180,12 @@ def solve(
         values, change = _swept(
             _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {}
         )
-        sizes = largest_within(values)
+        looked = Looked.at(values, mesh.rule)
+        sizes = looked.sizes.reshape(mesh.size, *values.shape[2:])
         made_of, moved = _terms(A, f, mesh, values, sizes)
-        found = _Found(A, Trajectory(mesh, values), sizes, change, made_of, moved, extras)
+        found = _Found(A, Trajectory(mesh, values), looked, sizes, change, made_of, moved, extras)
         return found, unresolved_signals(
-            problem, mesh.rule, values, extras, made_of.max(axis=0), tol
+            problem, mesh.rule, values, extras, made_of.max(axis=0), tol, looked
         )
 
     try:
@@ -251,6 +252,7 @@ class _Found(NamedTuple):
 
     A: Sparse
     trajectory: Trajectory  # (d, c)
+    looked: Looked
     sizes: Array  # (K, d, c) the largest in each element
     change: Array  # (K,) the last in each element, relative
     made_of: Array  # (K, d, c) sizes of what right ends are the sum of
@@ -260,24 +262,31 @@ class _Found(NamedTuple):
 
 def _mapped(
     R: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array,
-    kicks: Array | None, _onward: Array, start: Array, *_: object,
+    kicks: None, onward: Array, start: Array, weights: Array, tol: float, *limits: Any,
 ) -> tuple[Array, Array]:
     """As ``elements.sweeps`` for one constant A and many columns, by maps of elements."""
-    s, (d, c) = len(R), start.shape
-    first = slice(0, f.shape[2])
+    s, (d, c), first = len(R), start.shape, f.shape[2]
     group, h = equal_lengths(h)
-    D = np.asarray(np.linalg.inv(R), dtype=np.float64)
-    full = Sparse(rows, columns, entries).full()
-    maps, forced = decoupled_maps(
-        D, h, None, full, f, None, None, group, int(group.max()) + 1
-    )
-    values, state = np.empty((len(h), s + 1, d, c)), start
+    fixed = rows, columns, entries
+    values, changes = np.empty((len(h), s + 1, d, c)), np.zeros(len(h))
+    if first:
+        values[..., :first], changes = elements.sweeps(
+            R, h, *fixed, f, kicks, onward, start[:, :first], weights, tol, *limits
+        )
+    maps = []
+    for k in np.unique(group, return_index=True)[1]:
+        own, change = elements.sweeps(
+            R, h[k : k + 1], *fixed, np.zeros((1, d, 0)), kicks, onward[:1], np.eye(d), weights,
+            8.0 * EPS, *limits,
+        )
+        maps.append(own[0, 1:].reshape(s * d, d))
+        changes = np.maximum(changes, change)
+    state = start[:, first:]
     for k, X in enumerate(values):
-        X[0] = state
-        np.matmul(maps[group[k]], state, out=X[1:])
-        X[1:, :, first] += forced[k]
-        state = X[-1] if kicks is None else X[-1] + kicks[k]
-    return values, np.zeros(len(h))
+        X[0, :, first:] = state
+        np.matmul(maps[group[k]], state, out=X[1:].reshape(s * d, c)[:, first:])
+        state = X[-1, :, first:]
+    return values, changes
 
 
 class _Solved:
@@ -389,15 +398,14 @@ def _errors(
     A, values, rule = found.A, found.trajectory.values, mesh.rule
     K, points, n, columns = values.shape
     sizes = found.sizes
-    size, flat = np.maximum(sizes, _TINY), values.reshape(K, points, n * columns)
-    tail = legendre_tail(flat, rule, size.reshape(K, -1)).reshape(sizes.shape)
+    size, last = np.maximum(sizes, _TINY), found.looked.last
+    tail = found.looked.tail(rule, size.reshape(K, -1)).reshape(sizes.shape)
     # As in numerics.errors; and what sweeps have not finished.
     added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * sizes
     added += EPS * (END * found.made_of + found.moved)
     start = EPS * np.abs(values[0, 0])
     noise = np.zeros((n, columns))
     if points > 4:
-        last = np.abs(rule.to_legendre[-4:] @ flat)
         before, after = last[:, :2].max(axis=1), last[:, 2:].max(axis=1)
         noise = np.where(after >= LEVEL * before, after, 0.0).max(axis=0).reshape(n, columns)
     if columns > _FEW_COLUMNS:

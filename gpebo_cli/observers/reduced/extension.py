@@ -15,7 +15,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.linalg import exact_product, largest_over_time
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import (
     ByName,
@@ -422,7 +422,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
 
     latest: list[Assembled] = []
 
-    def monitor(values: Array, extras: tuple[Array, ...]) -> Iterator[tuple[Array, float]]:
+    def monitor(values: Array, extras: tuple[Array, ...]) -> Iterator[Kind]:
         """Everything to resolve; SolverError if the extension is beyond all bounds."""
         if largest_entry(values) > _LARGEST:
             raise SolverError(
@@ -433,14 +433,17 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         z, *seen = map(_over_time, (values if plain else values * units, *extras))
         assembled = regression_signals(z, q, basis, AlgebraicEquations(*seen))
         latest[:] = [assembled]
-        return (
-            (signal.reshape(*values.shape[:2], -1), floor) for signal, floor in assembled.kinds()
-        )
+        for signal, floor in assembled.kinds(axes if large else None):
+            if signal is not None:
+                yield signal.reshape(*values.shape[:2], -1), floor
+            else:
+                yield None, np.insert(floor / units[:, 1:], 0, np.inf, axis=1).ravel()
 
     name = f"observer of plant {system.name}"
     # Along axes offset and gain are these components, each compared with its own state's size.
     on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
     on_axes &= basis.shape[1] == reduced.rank  # else what is eliminated is taken from them
+    axes = basis if on_axes and large and (basis.max(axis=0) == 1.0).all() else None
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
     known, signals = None, reduced.signals
     limits: dict[str, Any] = {"tol": solver.tol, "max_elements": solver.max_elements}

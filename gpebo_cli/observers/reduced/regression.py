@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time, orthonormal_complement, transpose
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.reduction.form import EquationForm
@@ -33,17 +34,28 @@ class Assembled:
     injectivity: Array  # (N,) as in ``ObserverMatrices``
     moving: Array  # (n, p) sizes of the gain of w = P x, which the eliminated part may cancel
 
-    def kinds(self) -> Iterator[tuple[Array, float]]:
+    def kinds(self, basis: Array | None = None) -> Iterator[tuple[Any, Any]]:
         """Everything the mesh has to resolve, with the size below which it is rounding.
 
         They come one after the other, because all signals of a long recording take much memory.
+        States that are coordinates of z along a ``basis`` of axes are not copied: instead of their
+        gain None comes, with the units (k, p) that z without ξ_a is to be measured in.
         """
         columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
         rows, Y, psi = self._rows, self.Y, self.psi
         if len(rows) < Y.shape[1]:
             Y, psi = Y[:, rows], psi[:, rows]
         psi = psi / np.tile(columns, (psi.shape[1], 1))
-        states = (largest_over_time(self.gain) / columns).max(axis=1, initial=0.0)
+        others: BoolArray = np.ones(len(self.moving), dtype=bool)
+        if basis is not None:
+            others[:] = self.elimination.any(axis=(0, 2)) | ~basis.any(axis=1)
+            if others.sum() > len(basis) - basis.shape[1]:
+                others[:] = True
+        gain, largest = self.gain, self.moving.copy()
+        if not others.all():
+            gain = gain[:, others]
+        largest[others] = largest_over_time(gain)
+        states = (largest / columns).max(axis=1, initial=0.0)
         if self.Y_scale > 0.0:  # a state that no parameter has part in is no signal to resolve
             own = largest_over_time(self.offset) / self.Y_scale
             states = np.maximum(states, 1e-3 * own)
@@ -51,7 +63,10 @@ class Assembled:
         yield Y, 1e-3 * self.Y_scale
         yield psi, 1e-3
         yield self.offset, 0.0
-        yield self.gain / (np.where(states > 0.0, states, 1.0)[:, None] * columns), 0.0
+        units = np.where(states > 0.0, states, 1.0)[:, None] * columns
+        yield gain / units[others], 0.0
+        if basis is not None and not others.all():
+            yield None, basis.T @ units
         # Of ψᵀψ the diagonal: a product of two columns that are resolved shows no more than theirs.
         yield (psi**2).sum(axis=1), 1e-3
         yield np.einsum("nrp,nr->np", psi, Y), 1e-3 * self.Y_scale
