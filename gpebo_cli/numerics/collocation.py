@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -31,11 +31,11 @@ from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import estimated_errors, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import (
-    Kind,
     Looked,
     Mesh,
     Trajectory,
     equal_lengths,
+    unresolved,
     unresolved_kinds,
 )
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
@@ -61,6 +61,7 @@ class LinearSolution:
     errors: Array  # (n, columns) of each component of X relative to its largest value
     lost: float | None  # from when on a component's error exceeds the component
     extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each, or (1, 1, ...)
+    uncertain: float | Array = 0.0  # (n, columns) estimated errors at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,13 +118,13 @@ def solve(
     noise = maps.noise
     if restarts:
         noise = _with_instants(noise, Trajectory(mesh, values), np.array(list(restarts)))
-    errors, lost = estimated_errors(
+    errors, lost, last = estimated_errors(
         problem, mesh, maps.homogeneous[:, -1], maps.particular[:, -1], noise, values
     )
     estimate = max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0)))
     return LinearSolution(
         Trajectory(mesh, values), estimate, rounds, errors,
-        None if lost == mesh.size else float(mesh.edges[lost + 1]), maps.extras,
+        None if lost == mesh.size else float(mesh.edges[lost + 1]), maps.extras, last,
     )
 
 
@@ -134,7 +135,7 @@ def _not_finite(
     count = _modest(values)
     if count:
         part = slice(count)
-        _, lost = estimated_errors(
+        _, lost, _ = estimated_errors(
             problem, Mesh(mesh.edges[: count + 1], mesh.rule), maps.homogeneous[part, -1],
             maps.particular[part, -1], maps.noise[part], values[part],
         )
@@ -190,12 +191,13 @@ def unresolved_signals(
     ``made_of`` (n, columns).
     """
     size, points, n, columns = values.shape
-    further = () if problem.monitor is None else problem.monitor(values, extras)
+    tail = np.zeros(size)
+    if problem.monitor is not None:  # it may show elements before these
+        tail = unresolved_kinds(problem.monitor(values, extras), rule, looked)[-size:]
     if problem.told:
-        return unresolved_kinds(further, rule, looked)
+        return tail
     least = least_sizes(problem, made_of, tol).reshape(n * columns)
-    own: Kind = (values.reshape(size, points, n * columns), least)
-    return unresolved_kinds(chain([own], further), rule)
+    return np.maximum(tail, unresolved(values.reshape(size, points, n * columns), rule, least))
 
 
 def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray) -> _ElementMaps:

@@ -42,6 +42,7 @@ class Errors(NamedTuple):
 
     relative: Array  # (n, columns) to the component's largest value
     lost: int  # first element at whose end a component is lost, or their number
+    last: Array  # (n, columns) of the right end, as it is
 
 
 def estimated_errors(
@@ -65,6 +66,11 @@ def estimated_errors(
         _signs(len(values), len(problem.start)), mesh.steps, LEVEL, END, _CHANCE**2, _SAME,
         renew=None if renewal is None else renewal.error,
     )
+    if np.any(problem.uncertain):
+        of_start = np.zeros((len(values), 1, *last.shape[1:]))
+        of_start = elements.chain(last[:, None], of_start, np.eye(values.shape[2]))[0][:, 1]
+        carried = np.sqrt(carried**2 + of_start**2 @ np.square(problem.uncertain))
+        largest[0] = carried.max(axis=0)
     return judged_errors(problem, carried, *largest)
 
 
@@ -108,7 +114,7 @@ def judged_errors(
         if not (largest < known).all():
             lost = int(np.argmin((carried < known).all(axis=(1, 2))))
         relative = np.where(total > 0.0, total / scale, 0.0)
-    return Errors(np.where(np.isfinite(relative), relative, np.inf), lost)
+    return Errors(np.where(np.isfinite(relative), relative, np.inf), lost, carried[-1])
 
 
 def _signs(K: int, n: int) -> Array:

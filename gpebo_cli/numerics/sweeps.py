@@ -195,7 +195,7 @@ def solve(
         )
     except StiffError:
         return None
-    errors, lost = _errors(march, problem, mesh, units, found)
+    errors, lost, _ = _errors(march, problem, mesh, units, found)
     return LinearSolution(
         found.trajectory,
         max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), rounds, errors,

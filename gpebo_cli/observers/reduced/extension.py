@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from gpebo_cli.observers.reduced.matrices import (
 )
 from gpebo_cli.observers.reduced.partial import untouched
 from gpebo_cli.observers.reduced.regression import (
+    OVER_TIME,
     Assembled,
     regression_signals,
     resolved,
@@ -48,7 +50,6 @@ from gpebo_cli.simulation import ivp
 
 _AT_ONCE = 1 << 15  # points: what is made of all of them at once is what takes the memory
 _SMALL = 8  # coordinates of w, up to which dense collocation is faster
-_OVER_TIME = ("Y", "psi", "offset", "gain", "elimination", "injectivity")  # of what is assembled
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 
 
@@ -268,6 +269,7 @@ def reduced_system(
     try:
         used, first, note = choose_form(
             system, t, inside, at, signals.derivatives, solver, form, weights, units,
+            piecewise=in_part and system.n <= _SMALL and len(mesh.windows()) > 1,
         )
     except NotObservableError as error:
         used = as_given(system, t, inside, at, signals.derivatives)
@@ -303,7 +305,7 @@ def _beginning(
 def choose_form(
     system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
     derivatives: InputDerivatives | None, solver: SolverSettings, form: str,
-    weights: ByName | None, units: Units | None = None,
+    weights: ByName | None, units: Units | None = None, *, piecewise: bool = False,
 ) -> tuple[EquationForm, ObserverMatrices, str]:
     """The form of the equations, its matrices at the times t (N,), and why it is this one.
 
@@ -317,6 +319,8 @@ def choose_form(
         form: given, strangeness_free or auto.
         weights: of the outputs, ``observer.weights``.
         units: as for :func:`reduced_system`.
+        piecewise: the matrices are looked at piece by piece, and those of the first times are
+            enough, unless E moves.
 
     Raises:
         ModelError: rank of E not constant, Assumption 1 violated, not uniquely solvable.
@@ -329,9 +333,18 @@ def choose_form(
     scale = output_scale(weights, system)
 
     def matrices(chosen: EquationForm) -> ObserverMatrices:
-        return observer_matrices(
-            chosen, t, inside, solver.rank_tol, output_scale=scale, signals=signals
-        )
+        def at(part: slice, like: ObserverMatrices | None = None) -> ObserverMatrices:
+            return observer_matrices(
+                chosen, t[part], inside[part], solver.rank_tol, like, output_scale=scale,
+                signals=None if signals is None else signals[part],
+            )
+
+        if not piecewise or chosen.structure or "E" not in system.coefficients.constant:
+            return at(slice(None))
+        first = at(slice(_AT_ONCE))
+        for k in range(_AT_ONCE, len(t), _AT_ONCE):
+            at(slice(k, k + _AT_ONCE), first)
+        return first
 
     note, given = "", as_given(system, t, inside, signals, derivatives)
     given = given if units is None else replace(given, units=units)
@@ -370,22 +383,24 @@ def _reason(error: NotObservableError) -> str:
 class Extension:
     """The dynamic extension on the mesh that resolves it and everything computed from it."""
 
-    solution: LinearSolution  # [ξ_a | ξ_b | Φ] (k, 1 + q + n_a)
+    trajectory: Trajectory  # [ξ_a | ξ_b | Φ] (k, 1 + q + n_a)
+    error_estimate: float  # relative to each signal's own size, the largest
     assembled: Assembled
     scale: Array  # (K, p) size of the terms of each column of ψ so far, element by element
     units: Array  # (k,) of the coordinates
+    weakest: tuple[float, float]  # smallest singular value behind Assumption 1, and its time
 
     @property
     def mesh(self) -> Mesh:
         """The mesh."""
-        return self.solution.trajectory.mesh
+        return self.trajectory.mesh
 
     def growth(self, q: int) -> tuple[float, float]:
         """Largest entry of Φ in comparable units, in which its columns start at size 1.
 
         And ln ‖Φ(end)‖₂, which is 0 at the start.
         """
-        values = self.solution.trajectory.values
+        values = self.trajectory.values
         some = np.stack([values[0, 0], largest_over_time(values, 2), values[-1, -1]])
         Phi = comparable(some[..., 1 + q :], self.units)
         return largest_entry(Phi), log_norm(Phi[-1])
@@ -420,76 +435,142 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         return equations(reduced.matrices(t, inside), *reduced.driving(t, inside))
 
-    latest: list[Assembled] = []
-
-    def monitor(values: Array, extras: tuple[Array, ...]) -> Iterator[Kind]:
-        """Everything to resolve; SolverError if the extension is beyond all bounds."""
-        if largest_entry(values) > _LARGEST:
-            raise SolverError(
-                f"the dynamic extension of plant {system.name} grows beyond {_LARGEST:.0e}: A_0 is "
-                "unstable; use observer.remedy=output_injection, reset or current_coordinates, or "
-                "a shorter time.horizon"
-            )
-        z, *seen = map(_over_time, (values if plain else values * units, *extras))
-        assembled = regression_signals(z, q, basis, AlgebraicEquations(*seen))
-        latest[:] = [assembled]
-        for signal, floor in assembled.kinds(axes if large else None):
-            if signal is not None:
-                yield signal.reshape(*values.shape[:2], -1), floor
-            else:
-                yield None, np.insert(floor / units[:, 1:], 0, np.inf, axis=1).ravel()
-
     name = f"observer of plant {system.name}"
     # Along axes offset and gain are these components, each compared with its own state's size.
     on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
     on_axes &= basis.shape[1] == reduced.rank  # else what is eliminated is taken from them
     axes = basis if on_axes and large and (basis.max(axis=0) == 1.0).all() else None
+    monitor = _Monitor(system, basis, units, axes)
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
     known, signals = None, reduced.signals
     limits: dict[str, Any] = {"tol": solver.tol, "max_elements": solver.max_elements}
-    if mesh is signals.mesh and reduced.injection is None and solver.name != "ivp":
+    windows = [mesh] if large or solver.name == "ivp" else mesh.windows()
+    if windows[0] is signals.mesh and reduced.injection is None and solver.name != "ivp":
         u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
         points, inside = _over_time(mesh.points), _over_time(mesh.inside)
         known = equations(reduced.first, reduced.form.driving(points, inside, u), y)
     swept = sweeps.solve_dense(problem, mesh, **limits, known=known) if large else None
     if swept is not None:
-        solution = swept
-    elif solver.name == "ivp":
-        solution = ivp.solve(problem, mesh, **limits)
-    else:
-        known, large = None if large else known, False
-        solution = solve(problem, mesh, **limits, known=known)
-    return _assembled(
-        reduced, _in_units(solution, units), latest[0], as_found=swept is not None
-    )
+        return _assembled(reduced, _in_units(swept, units), monitor.latest, as_found=True)
+    known, large, monitor.axes = None if large else known, False, None
+    if len(windows) > 1:
+        return joined(_over(windows, reduced, problem, monitor), mesh.size)
+    own = ivp.solve if solver.name == "ivp" else partial(solve, known=known)
+    solution = own(problem, mesh, **limits)
+    return _assembled(reduced, _in_units(solution, units), monitor.latest, as_found=False)
 
 
-def joined(parts: Sequence[Extension]) -> Extension:
-    """One extension of those on neighbouring meshes."""
-    if len(parts) == 1:
-        return parts[0]
-    edges = [part.mesh.edges[:-1] for part in parts[:-1]]
-    mesh = Mesh(np.concatenate([*edges, parts[-1].mesh.edges]), parts[-1].mesh.rule)
-    solutions, found = [part.solution for part in parts], [part.assembled for part in parts]
+class _Monitor:
+    """Everything made of [ξ_a | ξ_b | Φ] that a mesh has to resolve.
 
-    def together(name: str) -> Array:
-        values = [(getattr(each, name), len(each.Y)) for each in found]
-        return np.concatenate([np.broadcast_to(v, (N, *v.shape[1:])) for v, N in values])
+    In front of a window stand those elements of windows before where something was largest: what
+    has decayed is still measured by the size it had.
+    """
 
+    def __init__(
+        self, system: DescriptorSystem, basis: Array, units: Array, axes: Array | None
+    ) -> None:
+        """For coordinates along a basis (n, k), in units (k, 1 + p); axes as of ``kinds``."""
+        self._system, self._basis, self.units, self.axes = system, basis, units, axes
+        self._past: Sequence[Array] = ()
+        self._whole: Sequence[Array] = ()
+        self.latest: Assembled  # with what stands in front
+
+    def __call__(self, values: Array, extras: tuple[Array, ...]) -> Iterator[Kind]:
+        """All signals with their floors; SolverError if the extension is beyond all bounds."""
+        if largest_entry(values) > _LARGEST:
+            raise SolverError(
+                f"the dynamic extension of plant {self._system.name} grows beyond {_LARGEST:.0e}: "
+                "A_0 is unstable; use observer.remedy=output_injection, reset or "
+                "current_coordinates, or a shorter time.horizon"
+            )
+        plain = bool((self.units == 1.0).all())
+        self._whole = values if plain else values * self.units, *extras
+        if self._past:
+            self._whole = [
+                own if own.shape[:2] == (1, 1) else np.concatenate([before, own])
+                for before, own in zip(self._past, self._whole, strict=True)
+            ]
+        z, *seen = map(_over_time, self._whole)
+        self.latest = regression_signals(
+            z, self._system.q, self._basis, AlgebraicEquations(*seen)
+        )
+        for signal, floor in self.latest.kinds(self.axes):
+            if signal is not None:
+                yield signal.reshape(*self._whole[0].shape[:2], -1), floor
+            else:
+                yield None, np.insert(floor / self.units[:, 1:], 0, np.inf, axis=1).ravel()
+
+    def next_window(self, size: int) -> Assembled:
+        """What is made of the window of that size, which comes to stand before the next one."""
+        K, points = self._whole[0].shape[:2]
+        where = self.latest.largest_at(points)
+        self._past = [e if e.shape[:2] == (1, 1) else e[where] for e in self._whole]
+        return self.latest.after((K - size) * points)
+
+
+def _over(
+    windows: Iterable[Mesh], reduced: ReducedSystem, problem: LinearProblem, monitor: _Monitor
+) -> Iterator[Extension]:
+    """The extension on one window after the other, so that little is held beside the result."""
+    solver, units = reduced.solver, monitor.units
+    for window in windows:
+        solution = solve(problem, window, tol=solver.tol, max_elements=solver.max_elements)
+        values = solution.trajectory.values
+        problem = replace(
+            problem, start=values[-1, -1], uncertain=solution.uncertain,
+            floor=np.maximum(problem.floor, largest_over_time(values, 2)),
+        )
+        found = monitor.next_window(len(values))
+        yield _assembled(reduced, _in_units(solution, units), found, as_found=False)
+
+
+class _Growing:
+    """Arrays one after the other; what is not yet filled takes no memory."""
+
+    def __init__(self) -> None:
+        self._values, self._filled = np.zeros(0), 0
+
+    def add(self, values: Array, share: float) -> None:
+        """One more, which is about that share of all of them."""
+        last = self._filled + len(values)
+        if last > len(self._values):
+            room = np.empty((int(2 * last + 1.5 * len(values) / share), *values.shape[1:]))
+            if self._filled:
+                room[: self._filled] = self.values
+            self._values = room
+        self._values[self._filled : last], self._filled = values, last
+
+    @property
+    def values(self) -> Array:
+        """All of them."""
+        return self._values[: self._filled]
+
+
+def joined(parts: Iterable[Extension], elements: int) -> Extension:
+    """One extension of those on neighbouring meshes with about so many elements in all."""
+    whole, rest = defaultdict[str, _Growing](_Growing), list[tuple[Any, ...]]()
+    end = np.zeros(0)
+    for part in parts:
+        found, size = part.assembled, part.mesh.size
+        for name, values in {
+            "edges": part.mesh.edges[:-1], "scale": part.scale, "z": part.trajectory.values,
+            **{name: getattr(found, name) for name in OVER_TIME},
+        }.items():
+            whole[name].add(values, size / max(elements, size))
+        rest.append((part.error_estimate, part.weakest, found.Y_scale, found.column_scale,
+                     found.moving))
+        end, rule, units = part.mesh.edges[-1:], part.mesh.rule, part.units
+    errors, weak, of_Y, of_columns, moving = zip(*rest, strict=True)
+    over_time: dict[str, Any] = {name: whole[name].values for name in OVER_TIME}
+    mesh = Mesh(np.append(whole["edges"].values, end), rule)
     return Extension(
+        Trajectory(mesh, whole["z"].values), max(errors),
         replace(
-            solutions[-1], extras=(),
-            trajectory=Trajectory(mesh, np.concatenate([s.trajectory.values for s in solutions])),
-            error_estimate=max(solution.error_estimate for solution in solutions),
+            found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
+            moving=np.max(moving, axis=0),
         ),
-        Assembled(
-            **{name: together(name) for name in _OVER_TIME},
-            Y_scale=max(each.Y_scale for each in found),
-            column_scale=np.max([each.column_scale for each in found], axis=0),
-            moving=np.max([each.moving for each in found], axis=0),
-        ),
-        np.concatenate([part.scale for part in parts]),
-        parts[-1].units,
+        np.maximum.accumulate(whole["scale"].values, axis=0), units, min(weak),
     )
 
 
@@ -528,7 +609,12 @@ def _assembled(
         offset, gain = map(np.concatenate, states)
         found = replace(found, offset=offset, gain=gain)
     sizes = np.maximum.accumulate(np.concatenate(scale), axis=0)
-    return Extension(solution, found, sizes, reduced.units)
+    *_, elimination, injectivity = map(_over_time, solution.extras)
+    smallest, where = weakest(injectivity, elimination)
+    at = float(solution.trajectory.mesh.points.ravel()[where])
+    return Extension(
+        solution.trajectory, solution.error_estimate, found, sizes, reduced.units, (smallest, at)
+    )
 
 
 def _in_units(solution: LinearSolution, units: Array) -> LinearSolution:
@@ -544,16 +630,13 @@ def _over_time(signal: Array) -> Array:
     return signal.reshape(signal.shape[0] * signal.shape[1], *signal.shape[2:])
 
 
-def assumptions(
-    reduced: ReducedSystem, mesh: Mesh, found: Assembled
-) -> tuple[Assumption, ...]:
-    """Rank of E and Assumption 1, with their evidence at the points of the mesh."""
-    smallest, where = weakest(found.injectivity, found.elimination)
+def assumptions(reduced: ReducedSystem, weakest: tuple[float, float]) -> tuple[Assumption, ...]:
+    """Rank of E and Assumption 1, with their evidence: the ``weakest`` singular value, its time."""
     frame = reduced.first.split.frame
     left = None if frame is None else frame.remaining
     rank = reduced.rank + (0 if left is None else left.given_up.shape[1])
     of = "smallest_singular_value" + ("" if reduced.lost is None else "_of_the_rest")
-    evidence = {of: smallest, "at": float(mesh.points.ravel()[where])}
+    evidence = dict(zip((of, "at"), weakest, strict=True))
     return needed(reduced.form, reduced.note, rank, evidence, holds=reduced.lost is None)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ from gpebo_cli.reduction.form import EquationForm
 _ROUNDING = 1e-3  # of a projection, in terms of what is resolved
 _NOISE = 1e-11  # of the terms of a gain: beyond what extensions are resolved to
 _VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
+OVER_TIME = ("Y", "psi", "offset", "gain")  # of what is assembled
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +31,7 @@ class Assembled:
     gain: Array  # (N, n, p)
     Y_scale: float  # size of the terms of Y before they cancel
     column_scale: Array  # (p,) and of the columns of ψ: each has the unit of its parameter
-    elimination: Array  # (N, n, n_b) and
-    injectivity: Array  # (N,) as in ``ObserverMatrices``
+    eliminated: BoolArray  # (n,) states that take part in what is eliminated
     moving: Array  # (n, p) sizes of the gain of w = P x, which the eliminated part may cancel
 
     def kinds(self, basis: Array | None = None) -> Iterator[tuple[Any, Any]]:
@@ -48,7 +48,7 @@ class Assembled:
         psi = psi / np.tile(columns, (psi.shape[1], 1))
         others: BoolArray = np.ones(len(self.moving), dtype=bool)
         if basis is not None:
-            others[:] = self.elimination.any(axis=(0, 2)) | ~basis.any(axis=1)
+            others[:] = self.eliminated | ~basis.any(axis=1)
             if others.sum() > len(basis) - basis.shape[1]:
                 others[:] = True
         gain, largest = self.gain, self.moving.copy()
@@ -70,6 +70,17 @@ class Assembled:
         # Of ψᵀψ the diagonal: a product of two columns that are resolved shows no more than theirs.
         yield (psi**2).sum(axis=1), 1e-3
         yield np.einsum("nrp,nr->np", psi, Y), 1e-3 * self.Y_scale
+
+    def after(self, first: int) -> Assembled:
+        """The same without so many of the first times; sizes are still those of all of them."""
+        return replace(self, **{name: getattr(self, name)[first:] for name in OVER_TIME})
+
+    def largest_at(self, points: int) -> IntArray:
+        """Elements (W,) of so many points each in which one of the signals is largest."""
+        return np.unique(np.concatenate([
+            np.abs(signal).reshape(-1, points, signal[0].size).max(axis=1).argmax(axis=0)
+            for signal, _ in self.kinds()
+        ]))
 
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
@@ -98,7 +109,7 @@ def regression_signals(
         basis: B (n, k).
         equations: at the same times.
     """
-    algebraic, g_y, G, Q1, H, injectivity = equations
+    algebraic, g_y, G, Q1, H, _ = equations
     Y, psi, offset, gain, sizes = kernels.observer.regression_signals(
         z, q, basis, algebraic, g_y, G, Q1, H
     )
@@ -107,7 +118,8 @@ def regression_signals(
         nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= _VANISHING * sizes[1:]
         psi = np.where(nothing, 0.0, psi)
     moving = np.abs(basis) @ largest_over_time(z)[:, 1:]
-    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], H, injectivity, moving)
+    used = np.asarray(H.any(axis=(0, 2)))
+    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, moving)
 
 
 def resolved(

@@ -22,6 +22,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._observation import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions
+from gpebo_cli.observers.reduced.matrices import weakest
 from gpebo_cli.observers.reduced.regression import Assembled, regression_signals
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
@@ -59,7 +60,7 @@ class CurrentCoordinates:
         identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
         p = q + k
 
-        def assembled(t: Array, inside: Array) -> tuple[Assembled, Array, Array]:
+        def assembled(t: Array, inside: Array) -> tuple[Assembled, Array, Array, tuple[Array, ...]]:
             o = reduced.matrices(t, inside)
             signals = np.concatenate(reduced.driving(t, inside), axis=1)[:, :, None]
             A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
@@ -70,19 +71,20 @@ class CurrentCoordinates:
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
                 a = _with_kernel(a, np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n)), q)
-            return a, A, b
+            return a, A, b, (o.injectivity, o.elimination)
 
         def evaluate(
             mesh: Mesh
-        ) -> tuple[tuple[Assembled, Array, Array], list[tuple[Array, float]]]:
-            a, A, b = assembled(mesh.points.ravel(), mesh.inside.ravel())
+        ) -> tuple[tuple[Assembled, Array, Array, tuple[Array, ...]], list[tuple[Array, float]]]:
+            found = a, A, b, _ = assembled(mesh.points.ravel(), mesh.inside.ravel())
             kinds = (*a.kinds(), (A, 0.0), (b, 0.0))
-            return (a, A, b), [(v.reshape(*mesh.points.shape, -1), floor) for v, floor in kinds]
+            return found, [(v.reshape(*mesh.points.shape, -1), floor) for v, floor in kinds]
 
-        mesh, (final, A, b), error = resolve(
+        mesh, (final, A, b, injective), error = resolve(
             evaluate, reduced.mesh, tol=solver.tol, max_elements=solver.max_elements,
             name=f"observer of plant {system.name}",
         )
+        smallest, where = weakest(*injective)
         kept = final.kept_rows(system, reduced.regression)
         if rotates:
             kept = np.union1d(kept, np.arange(final.Y.shape[1] - n, final.Y.shape[1]))
@@ -102,7 +104,7 @@ class CurrentCoordinates:
             ),
             truth=CurrentState(reduced),
             error_estimate=error,
-            assumptions=assumptions(reduced, mesh, final),
+            assumptions=assumptions(reduced, (smallest, float(mesh.points.ravel()[where]))),
             growth=None,
             note=reduced.note,
         )

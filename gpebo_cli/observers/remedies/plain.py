@@ -47,10 +47,10 @@ class Plain:
             ),
             truth=InitialError(
                 reduced.begin.dual, reduced.xi_a0, reduced.first.split.dual,
-                extension.solution.trajectory, reduced.units,
+                extension.trajectory, reduced.units,
             ),
-            error_estimate=extension.solution.error_estimate,
-            assumptions=assumptions(reduced, mesh, final),
+            error_estimate=extension.error_estimate,
+            assumptions=assumptions(reduced, extension.weakest),
             growth=growth,
             growth_rate=logarithm / (stop - start),
             errors=errors,

@@ -152,7 +152,7 @@ def _restart(
 ) -> tuple[Reset, _Start]:
     """T and τ from [ξ_a | ξ_b | Φ] at the end, and where the next segment begins."""
     q, dual = reduced.system.q, begin.dual
-    end = reduced.basis @ extension.solution.trajectory.final
+    end = reduced.basis @ extension.trajectory.final
     xi_a, xi_b, Phi = end[:, 0], end[:, 1 : 1 + q], end[:, 1 + q :]
     eta = np.linalg.pinv(known.values[:, :-1], rcond=_KNOWN, hermitian=True) @ known.values[:, -1]
     reached = xi_a + xi_b @ eta[:q] - Phi @ eta[q:]
@@ -171,7 +171,7 @@ def _joined(
 ) -> Observation:
     """One regression and one state map over all segments."""
     system = reduced.system
-    segments = joined(extensions)
+    segments = joined(extensions, reduced.mesh.size)
     mesh, whole = segments.mesh, segments.assembled
     kept = whole.kept_rows(system, reduced.regression)
     growth, logarithms = zip(*(e.growth(system.q) for e in extensions), strict=True)
@@ -188,10 +188,10 @@ def _joined(
         ),
         truth=SegmentErrors(
             tuple(starts), reduced.first.split.dual, reduced.units,
-            segments.solution.trajectory,
+            segments.trajectory,
         ),
-        error_estimate=segments.solution.error_estimate,
-        assumptions=assumptions(reduced, mesh, whole),
+        error_estimate=segments.error_estimate,
+        assumptions=assumptions(reduced, segments.weakest),
         note=reduced.note,
         growth=max(growth),
         errors=None if noisy_matrices(reduced) else errors_of(reduced, kept),
