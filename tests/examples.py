@@ -20,13 +20,20 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 _SERVER = """
-import json, os, signal, socket, sys
+import contextlib, json, os, signal, socket, sys, tempfile
 import matplotlib.backends.backend_agg, matplotlib.figure, scipy.linalg, scipy.integrate, hydra
 import gpebo_cli.api.calls, gpebo_cli.cli.job, gpebo_cli.results.gallery, gpebo_cli.estimators
 from gpebo_cli.cli.app import main
 
+address = sys.argv[1]
+# One run with figures: what it fills, such as Matplotlib's fonts and formulas, its forks have.
+with (tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere,
+      contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere)):
+    sys.argv = ["gpebo", "run", "plant=circuit", f"hydra.run.dir={folder}"]
+    main()
+
 server = socket.socket(socket.AF_UNIX)
-server.bind(sys.argv[1])
+server.bind(address)
 server.listen()
 print("ready", flush=True)
 signal.signal(signal.SIGCHLD, signal.SIG_IGN)
