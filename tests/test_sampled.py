@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from plants import shipped
+from scipy.integrate import solve_ivp
 from test_cli import environment, gpebo
 from test_observer import ROTATING
 
@@ -25,6 +26,7 @@ from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.regression.text import regression_from_mapping
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -70,6 +72,8 @@ def regression(K=40, r=2, p=3, hold="zoh", steps=None):
         ("circuit", {"name": "exciting", "kappa": 1e8}),
         ("circuit", {"name": "gradient", "gamma": 5}),
         ("circuit", {"name": "mre", "gamma": 20}),
+        ("circuit", {"name": "instrumental", "gamma": 2e9}),
+        ("circuit", {"name": "annihilator", "gamma": 7e13}),
     ],
 )
 def test_estimates_converge_to_those_in_continuous_time(plant, estimator, hold, order):
@@ -172,7 +176,7 @@ def test_it_does_not_matter_how_samples_are_grouped():
     system = shipped("descriptor")
     t = np.cumsum(RNG.uniform(0.005, 0.05, 60))  # steps may vary
     u, y = signals(system, t)
-    able = ("fct", "power", "exciting", "gradient", "mre")
+    able = ("fct", "power", "exciting", "gradient", "mre", "instrumental", "annihilator")
     for name in ("ls_drem", "least_squares", "drem", *able):
         settings = Settings(plant={}, estimator={"name": name})
         whole = Online(settings, system, "linear", t[0], np.append(u[0], y[0])).feed(t, u, y)
@@ -335,16 +339,81 @@ def test_the_gradient_law_is_solved_exactly_over_each_sample(gain, hold):
     assert recursion.requirement.holds == (left <= 0.01)
 
 
+@pytest.mark.parametrize("perturbed", [None, ["b"]])
+def test_means_at_samples_are_sums_over_the_samples(perturbed):
+    block, delay, settle, gain = regression(K=50), 0.7, 0.4, 3.0
+    rows, t = block.rows[1:], block.t
+    settings = {"name": "instrumental", "delay": delay, "settle": settle, "gamma": gain}
+    if perturbed:
+        settings |= {"name": "annihilator", "perturbed": perturbed}
+    made = estimators.build(settings).recursive(["a", "b", "c"]).update(block)
+    eta, Z, expected = np.zeros(3), np.zeros((6, 4)), []
+    for k, now in enumerate(t):
+        before = np.zeros_like(rows[k][:, :3])
+        if now >= delay:
+            before = rows[np.flatnonzero(t <= now - delay)[-1]][:, :3]
+        since = min(max(now - delay, 0.0), block.steps[k])  # of the step, with the delayed ψ
+        lengths = np.repeat([block.steps[k], since], 3)[:, None]
+        Z += lengths * np.hstack([rows[k][:, :3], before]).T @ rows[k]
+        means = Z / (settle + now)
+        if perturbed:
+            kept = np.delete(means, 1, axis=0)
+            means = kept[:, :3].T @ kept
+        else:
+            means = means[3:]
+        delta = np.linalg.det(means[:, :3])
+        assert made.delta[0, k] == pytest.approx(delta, rel=1e-9, abs=1e-12)
+        if abs(delta) > 1e-12:
+            goal = np.linalg.solve(means[:, :3], means[:, 3])
+            eta = goal + np.exp(-gain * delta**2 * block.steps[k]) * (eta - goal)
+        expected.append(eta)
+    np.testing.assert_allclose(made.parameters[0], expected, atol=1e-9)
+
+
+MONOTONE = {
+    "name": "monotone", "unknowns": {"a": -2.0, "b": 8.0}, "box": {"a": [-3, 3], "b": [0.01, 9]},
+    "S": ["a", "sqrt(b)", "a + b"], "psi": [[1, 1, 1]],
+}
+
+
+@pytest.mark.parametrize("gain", [5.0, [1e2, 1e14]])
+def test_the_monotone_law_at_samples(gain):
+    """The flow of the law over each sample; with large gains the error never grows."""
+    S = regression_from_mapping(MONOTONE).parametrisation
+    block, truth = regression(K=25, steps=RNG.uniform(0.02, 0.05, 25)), np.array([-2.0, 8.0])
+    block.rows[..., 3] = block.rows[..., :3] @ S.values(truth[None])[0]
+    built = estimators.build({"name": "monotone", "gamma": gain, "lambda": 1.0})
+    recursion, (_, T, _, theta) = built.recursive(["e", "f", "g"]), built.law(S)
+    with pytest.raises(ConfigError, match="is for a regression with S"):
+        built.recursive(["e", "f", "g"]).update(block)
+    made = recursion.update(replace(block, parametrisation=S))
+    eta = made.parameters  # (a, √b, a + b), from which θ̂ is read off
+    found = np.stack([eta[..., 0], eta[..., 1] ** 2], axis=2)
+    assert (np.diff(np.linalg.norm(found - truth, axis=2), axis=1) <= 1e-9).all()
+    assert recursion.requirement.evidence["integral_delta_squared"] > 0.0
+    if gain == 5.0:
+        extended = KreisselmeierFilter(np.ones(3)).update(block)
+        for k, omega in enumerate(extended[..., :3]):
+            x = gain * np.linalg.det(omega) ** 2 * block.steps[k]
+            flow = solve_ivp(
+                lambda _, theta: T @ (S.values(truth[None]) - S.values(theta[None]))[0],
+                (0.0, x), theta, method="DOP853", rtol=1e-12, atol=1e-12,
+            )
+            theta = flow.y[:, -1]
+            np.testing.assert_allclose(found[0, k], theta, atol=1e-7)
+    else:
+        np.testing.assert_allclose(found[1, -1], truth, atol=1e-9)
+
+
 # What there is not ----------------------------------------------------------------------------
 
 
 NOT_ALONG_RESETS = ["exciting", "instrumental", "annihilator", "monotone"]
 
 
-@pytest.mark.parametrize("name", ["lion", "instrumental", "annihilator", "monotone"])
-def test_estimators_of_continuous_time_say_what_there_is(name):
-    with pytest.raises(ConfigError, match="these can: drem, exciting, fct, gradient, least_sq"):
-        estimators.able(estimators.build({"name": name}), estimators.Recursive, "samples")
+def test_estimators_of_continuous_time_say_what_there_is():
+    with pytest.raises(ConfigError, match="these can: annihilator, drem, exciting, fct, gradient"):
+        estimators.able(estimators.build({"name": "lion"}), estimators.Recursive, "samples")
 
 
 @pytest.mark.parametrize("name", NOT_ALONG_RESETS)

@@ -21,13 +21,22 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
 from gpebo_cli.estimators._extension import averaged, lagged
-from gpebo_cli.estimators._mixed import MixedEstimates, scalar_errors
+from gpebo_cli.estimators._mixed import MixedEstimates, sampled_requirement, scalar_errors
 from gpebo_cli.estimators._mixing import mix
+from gpebo_cli.estimators._recursive import (
+    Filter,
+    ScalarLaw,
+    inverse_sampled,
+    mix_sampled,
+)
+from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.samples import Past, SampledRegression, delayed
 from gpebo_cli.schema import number
 
 
@@ -46,14 +55,26 @@ class Instrumental(GainEstimator):
     delay: float = 0.5
     settle: float = 1.0
 
+    @property
+    def seconds(self) -> tuple[float, float]:
+        """The delay d and T₀.
+
+        Raises:
+            ConfigError: one of them is not positive.
+        """
+        return number(self.delay, "estimator.delay"), number(self.settle, "estimator.settle")
+
     def means(self, regression: LinearRegression) -> Trajectory:
-        """Means of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c).
+        """Means of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c)."""
+        return averaged(regression, *self.seconds)
+
+    def recursive(self, parameters: Sequence[str]) -> RecursiveInstrumental:
+        """The estimator at samples.
 
         Raises:
             ConfigError: the delay or T₀ is not positive.
         """
-        delay, settle = (number(getattr(self, k), f"estimator.{k}") for k in ("delay", "settle"))
-        return averaged(regression, delay, settle)
+        return RecursiveInstrumental(self, parameters)
 
     def left(self, means: Array, names: Sequence[str]) -> Array:  # noqa: ARG002
         """What makes p equations of the 2p means (N, 2p, p + c), (N or 1, p, 2p)."""
@@ -88,6 +109,57 @@ class Instrumental(GainEstimator):
             return scalar_errors(rates, into, delta, adjugate @ left, gain)
 
         return tuple(partial(at, gain) for gain in self.gains("gamma", names))
+
+
+class RecursiveInstrumental:
+    """The means at samples, with integrals as the hold has them; mixing, and the scalar law."""
+
+    def __init__(self, settings: Instrumental, parameters: Sequence[str]) -> None:
+        self._settings, self._names = settings, parameters
+        self._delay, self._span = settings.seconds  # T₀ + t − t₀
+        p = len(parameters)
+        self._sums = np.zeros((2 * p, p + 1))
+        self._past: Past | None = None
+        self._late: Array | None = None  # ψ(t − d) at the last sample
+        self._start: float | None = None
+        gains = settings.gains("gamma", parameters)
+        self._law = ScalarLaw(settings.start(parameters), gains, 1)
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each."""
+        t, p, rows = regression.t, regression.p, regression.rows
+        psi = rows[..., :p]
+        flat = psi[1:].reshape(len(t), -1)
+        past = (t[:1], flat[:1]) if self._past is None else self._past
+        late, self._past = delayed(past, t, flat, self._delay, regression.hold)
+        self._start = t[0] if self._start is None else self._start
+        old, new = regression.shares
+        since = t - self._delay - self._start  # ψ(t − d) sets in within a step
+        of_late = np.where((since >= 0.0) & (since < regression.steps), since, new)
+        old, new = old[:, None, None], np.repeat(np.stack([new, of_late], 1), p, axis=1)[..., None]
+        before = np.zeros_like(late[:1]) if self._late is None else self._late
+        self._late = late[-1:]
+        lags = np.concatenate([before, late]).reshape(psi.shape)
+        seen = transpose(np.concatenate([psi, lags], axis=-1))  # (K + 1, 2p, rows)
+        products = seen @ rows
+        sums = self._sums + np.cumsum(old * products[:-1] + new * products[1:], axis=0)
+        spans = np.append(self._span, self._span + np.cumsum(regression.steps))[:, None, None]
+        self._sums, self._span = sums[-1], float(spans[-1, 0, 0])
+        means = sums / spans[1:]
+        left = self._settings.left(means, self._names)
+        extended = left @ means
+
+        def behind() -> tuple[Sequence[Filter], Sequence[Array]]:
+            keep = spans[:-1] * np.eye(2 * p)
+            own = (each / spans[1:] for each in (keep, old * seen[:-1], new * seen[1:]))
+            return [Filter(*own)], [inverse_sampled(extended) @ left]
+
+        return self._law.update(regression, *mix_sampled(extended), behind)
+
+    @property
+    def requirement(self) -> Requirement:
+        """γ∫Δ² so far."""
+        return sampled_requirement(self._law, "Δ not in L2")
 
 
 ESTIMATOR = Instrumental

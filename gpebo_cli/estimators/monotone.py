@@ -11,7 +11,7 @@ arXiv:1509.02763, whose second part are such nonlinear regressions).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -21,19 +21,28 @@ from scipy.integrate import solve_ivp
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators._base import GainEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import energy_requirement, filter_rates
+from gpebo_cli.estimators._mixed import SampledMixing, energy_requirement, filter_rates
 from gpebo_cli.estimators._mixing import mix
+from gpebo_cli.estimators._recursive import between, over_steps
 from gpebo_cli.estimators._scalar import ScalarPath
+from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.parametrisation import Parametrisation
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import per_name, shown
 
 _TOLERANCE = 1e-11
+_NODES = 5  # of an implicit step at samples
+_ROUNDS = 12  # of Newton's method
+_STILL = 1e-12  # of the box: a change that is none
+_PARTS = 200  # of a step that Newton's method does not find as a whole
 
 Theta = Callable[[Array], Array]  # times (N,) -> θ̂ (N, c, q)
 
@@ -59,21 +68,31 @@ class Monotone(GainEstimator):
         """Verify T, extend and mix, for the times t (M,).
 
         Raises:
-            ConfigError: the regression has no S, or T does not fit it or does not make it monotone.
+            ConfigError: as :meth:`law`.
         """
-        S = regression.parametrisation
-        if S is None:
-            raise ConfigError("estimator=monotone is for a regression with S and box; it has none")
-        middle = 0.5 * (S.low + S.high)
-        T = np.linalg.pinv(S.jacobian(middle[None])[0]) if self.T is None else self._matrix(S)
-        start = middle
-        if self.initial is not None:
-            start = per_name(self.initial, S.names, "unknown", "estimator.initial", "finite")
         extended = kreisselmeier(regression, filter_rates(self.rates, regression.parameters))
         return MonotoneEstimates(
-            S, T, 0.5 * S.monotone(T), mix(extended, np.asarray(t), regression.floor), start,
+            *self.law(regression.parametrisation), mix(extended, np.asarray(t), regression.floor),
             self.gains("gamma", regression.parameters)[:, 0], regression.realisations,
         )
+
+    def recursive(self, parameters: Sequence[str]) -> RecursiveMonotone:
+        """The estimator at samples."""
+        return RecursiveMonotone(self, parameters)
+
+    def law(self, S: Parametrisation | None) -> tuple[Parametrisation, Array, float, Array]:
+        """S, T (q, k), μ, and θ̂ at the start (q,).
+
+        Raises:
+            ConfigError: the regression has no S, or T does not fit it or does not make it monotone.
+        """
+        if S is None:
+            raise ConfigError("estimator=monotone is for a regression with S and box; it has none")
+        start = 0.5 * (S.low + S.high)
+        T = np.linalg.pinv(S.jacobian(start[None])[0]) if self.T is None else self._matrix(S)
+        if self.initial is not None:
+            start = per_name(self.initial, S.names, "unknown", "estimator.initial", "finite")
+        return S, T, 0.5 * S.monotone(T), start
 
     def _matrix(self, S: Parametrisation) -> Array:
         shape = (len(S.names), len(S.tape.outputs))
@@ -111,8 +130,8 @@ class MonotoneEstimates:
     S: Parametrisation
     T: Array  # (q, k)
     mu: float  # μ
-    path: ScalarPath
     start: Array  # (q,)
+    path: ScalarPath
     gains: Array  # (g,)
     realisations: tuple[int, ...]
 
@@ -154,8 +173,91 @@ class MonotoneEstimates:
     @property
     def requirement(self) -> Requirement:
         """γμ∫Δ² over the horizon: the error has shrunk by its exponential."""
-        energy = float(self.path.energy_at_t[-1])
-        return energy_requirement("Δ not in L2", float(self.gains.min()), energy, DECAY / self.mu)
+        return _requirement(self.gains, float(self.path.energy_at_t[-1]), self.mu)
+
+
+def _requirement(gains: Array, energy: float, mu: float) -> Requirement:
+    return energy_requirement("Δ not in L2", float(gains.min()), energy, DECAY / mu)
+
+
+class RecursiveMonotone:
+    """The law over each sample, dθ̂/dx = T(η̄ − S(θ̂)) with x = γ∫Δ², by one step of Radau IIA.
+
+    The rule is B-stable (Hairer & Wanner, Solving ODEs II, IV.12): two solutions of a monotone law
+    never move apart, whatever x is. Up to x‖T∇S‖ = 1 a step is exact to some 1e-9.
+    """
+
+    def __init__(self, settings: Monotone, parameters: Sequence[str]) -> None:
+        self._settings = settings
+        self._mixing = SampledMixing(Drem(rates=settings.rates), parameters)
+        self._gains = settings.gains("gamma", parameters)[:, 0]
+        self._before = np.zeros((1, 1)), np.zeros((1, 1, len(parameters))), np.zeros((1, 1), bool)
+        self._theta: Array | None = None  # (g, q)
+        self._energy, self._mu = 0.0, 1.0
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        """Take K samples and give the estimates at each; nobody knows how errors go through.
+
+        Raises:
+            ConfigError: as :meth:`Monotone.law`.
+            SolverError: an implicit step has no solution that is found.
+        """
+        if self._theta is None:
+            S, T, self._mu, start = self._settings.law(regression.parametrisation)
+            self._S, self._T = S, T
+            self._theta = np.tile(start, (len(self._gains), 1))
+        delta, quotient, usable, _ = self._mixing.update(regression)
+        energy = np.where(usable, over_steps(regression, delta**2, self._before[0]), 0.0)[:, 0]
+        goal = between(regression, quotient, usable, *self._before[1:])[:, 0]
+        self._before = delta[-1:] ** 2, quotient[-1:], usable[-1:]
+        out = np.empty((len(energy), *self._theta.shape))
+        for k, x in enumerate(self._gains * energy[:, None]):
+            if energy[k] > 0.0:
+                self._theta = self._step(self._theta, x, goal[k] @ self._T.T)
+            out[k] = self._theta
+        self._energy += float(energy.sum())
+        eta = self._S.values(out.reshape(-1, out.shape[-1])).reshape(*out.shape[:2], -1)
+        return SampledEstimates(np.moveaxis(eta, 0, 1), delta.T)
+
+    def _step(self, theta: Array, x: Array, goal: Array) -> Array:
+        """θ̂ (g, q) after x (g,) towards T η̄ (q,); in parts, where Newton's method asks for it."""
+        done, part = 0.0, 1.0
+        for _ in range(_PARTS):
+            try:
+                theta = self._newton(theta, part * x, goal)
+            except (ConfigError, np.linalg.LinAlgError):  # it went where S has no value
+                part *= 0.5
+                continue
+            done += part
+            if done == 1.0:
+                return theta
+            part = min(2.0 * part, 1.0 - done)
+        raise SolverError("the monotone law cannot be followed at samples; lower its gain")
+
+    def _newton(self, theta: Array, x: Array, goal: Array) -> Array:
+        """θ̂ (g, q) after one implicit step.
+
+        Raises:
+            LinAlgError: Newton's method does not find it.
+        """
+        (g, q), R = theta.shape, radau_rule(_NODES).integration
+        rule, moved = R * x[:, None, None], np.zeros((g, _NODES, q))
+        for _ in range(_ROUNDS):
+            nodes = (theta[:, None] + moved).reshape(-1, q)
+            rest = (goal - self._S.values(nodes) @ self._T.T).reshape(moved.shape)
+            slope = (self._T @ self._S.jacobian(nodes)).reshape(g, _NODES, q, q)
+            matrix = np.einsum("gij,gjab->giajb", rule, slope).reshape(g, _NODES * q, -1)
+            wrong = (rule @ rest - moved).reshape(g, -1, 1)
+            change = np.linalg.solve(np.eye(_NODES * q) + matrix, wrong).reshape(moved.shape)
+            moved = moved + change
+            if (np.abs(change) <= _STILL * (self._S.high - self._S.low)).all():
+                return np.asarray(theta + moved[:, -1])
+        raise np.linalg.LinAlgError
+
+    @property
+    def requirement(self) -> Requirement:
+        """γμ∫Δ² so far."""
+        return _requirement(self._gains, self._energy, self._mu)
 
 
 ESTIMATOR = Monotone

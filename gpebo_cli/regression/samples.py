@@ -7,6 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.recordings.hold import held
+from gpebo_cli.regression.parametrisation import Parametrisation
+
+Past = tuple[Array, Array]  # times (N,) and values (N, c) of samples that a delay still needs
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +25,7 @@ class SampledRegression:
     steps: Array  # (K,) seconds since the sample before; 0 for the first of all
     rows: Array  # (K + 1, rows, p + 1) [ψ | Y], first that of the sample before (the first: itself)
     hold: str  # zoh or linear
+    parametrisation: Parametrisation | None = None
 
     @property
     def p(self) -> int:
@@ -40,3 +45,21 @@ class SampledRegression:
         if self.hold == "zoh":
             return np.asarray(new * self.rows[1:])
         return np.concatenate([old * self.rows[:-1], new * self.rows[1:]], axis=1)
+
+
+def delayed(past: Past, t: Array, x: Array, delay: float, hold: str) -> tuple[Array, Past]:
+    """x(t − d) (K, c) as the hold has it, zero before the first sample of all.
+
+    Args:
+        past: what the last call gave; at first the first sample alone.
+        t: times of the samples (K,).
+        x: the samples (K, c).
+        delay: d in seconds.
+        hold: zoh or linear.
+    """
+    new, at = t > past[0][-1], t - delay
+    times, values = np.append(past[0], t[new]), np.append(past[1], x[new], axis=0)
+    between = held(times, values, hold if len(times) > 1 else "zoh")
+    kept = max(int(np.searchsorted(times, at[-1], side="right")) - 1, 0)
+    out = np.where((at >= times[0])[:, None], between(at, at), 0.0)
+    return out, (times[kept:], values[kept:])

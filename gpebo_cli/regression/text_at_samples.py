@@ -14,8 +14,7 @@ import numpy as np
 from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import affine_scan
-from gpebo_cli.recordings.hold import held
-from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.regression.samples import SampledRegression, delayed
 from gpebo_cli.regression.text import Operator, TextRegression
 
 
@@ -33,7 +32,6 @@ class TextState:
     """Where the recursion stands, after a sample at ``t``."""
 
     t: float
-    start: float  # of the first sample of all
     operators: tuple[OperatorState, ...]
     row: Array  # (rows, p + 1) [ψ | Y]
     scale: Array  # (p,) largest entry of each column of ψ so far
@@ -61,14 +59,13 @@ def advance(
         ConfigError: an expression without a finite value; names it and the time.
     """
     count, m, p = len(t), signals.shape[1], text.system.q
-    start = float(t[0]) if state is None else state.start
     columns = np.zeros((1, count, m + len(text.operators)))
     columns[0, :, :m] = signals
     reached = []
     for k, operator in enumerate(text.operators):
         x = operator.argument.taylor(t, 0, t, columns)[0][:, 0]
         known = OperatorState(t[:1], x[:1]) if state is None else state.operators[k]
-        columns[0, :, m + k], after = _operate(operator, hold, known, t, x, start)
+        columns[0, :, m + k], after = _operate(operator, hold, known, t, x)
         reached.append(after)
     psi = text.psi.taylor(t, 0, t, columns)[0].reshape(count, text.rows, p)
     right = Y if text.Y is None else text.Y.taylor(t, 0, t, columns)[0]
@@ -78,25 +75,19 @@ def advance(
         scale = np.maximum(scale, state.scale)
     last, row = (t[0], rows[0]) if state is None else (state.t, state.row)
     regression = SampledRegression(
-        t, np.diff(t, prepend=last), np.concatenate([row[None], rows]), hold
+        t, np.diff(t, prepend=last), np.concatenate([row[None], rows]), hold, text.parametrisation
     )
-    return TextState(float(t[-1]), start, tuple(reached), rows[-1], scale[-1]), regression, scale
+    return TextState(float(t[-1]), tuple(reached), rows[-1], scale[-1]), regression, scale
 
 
 def _operate(
-    operator: Operator, hold: str, known: OperatorState, t: Array, x: Array, start: float
+    operator: Operator, hold: str, known: OperatorState, t: Array, x: Array
 ) -> tuple[Array, OperatorState]:
     """The operator's values (K,) at the samples, and its state after them."""
     if operator.name == "delay":
-        new = t > known.t[-1]
-        times, values = np.append(known.t, t[new]), np.append(known.x, x[new])
-        at = t - operator.number
-        if len(times) > 1:
-            delayed = held(times, values[:, None], hold)(at, at)[:, 0]
-        else:
-            delayed = np.repeat(values, len(at))
-        kept = max(int(np.searchsorted(times, at[-1], side="right")) - 1, 0)
-        return np.where(at >= start, delayed, 0.0), OperatorState(times[kept:], values[kept:])
+        past = known.t, known.x[:, None]
+        out, (times, values) = delayed(past, t, x[:, None], operator.number, hold)
+        return out[:, 0], OperatorState(times, values[:, 0])
     steps = np.diff(t, prepend=known.t[-1])
     before = np.append(known.x[-1], x[:-1])
     after = before if hold == "zoh" else x  # at both ends of the step to a sample
