@@ -27,6 +27,14 @@ def test_the_estimate_of_each_state_is_honest(family, seed):
     assert found.ratio < 10.0
 
 
+def test_rounding_of_eliminated_constraints_grows_in_the_estimate():
+    """Index 4, with a mode that grows by e^24: bounds alone were 50 times too small."""
+    number = list(FAMILIES).index("growing")
+    found = measure(FAMILIES["growing"](np.random.default_rng([number, 111])))
+    assert found.error > 1e-3
+    assert found.ratio < 3.0
+
+
 @pytest.mark.parametrize("family", ["smooth", "scaled"])
 def test_the_page_says_what_was_found(family):
     found = [measure(FAMILIES[family](np.random.default_rng([7, seed]))) for seed in range(2)]
@@ -81,6 +89,13 @@ def test_a_state_that_vanishes_and_returns_is_not_lost():
     """x' = 10⁴ (t − 10) x is 1 again at t = 20; e^{−5·10⁵} is no number."""
     with pytest.raises(SolverError, match=GROWS):
         simulate(scalar("1e4*(t - 10)"), TimeSettings(horizon=20.0), SolverSettings())
+
+
+def test_growth_is_lost_when_its_rounding_is_as_large_as_the_state():
+    """x' = (x − sin t)/2 + cos t is sin t beside 1e-17 e^{t/2}, and not what that has become."""
+    plant = scalar("0.5", 0.0, "cos(t) - 0.5*sin(t)")
+    with pytest.raises(SolverError, match=r"larger than a state from t = [567]\d\."):
+        simulate(plant, TimeSettings(horizon=200.0), SolverSettings())
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from gpebo_cli.numerics.radau import RadauRule
 EPS = float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
 _SIGNS = 3  # choices of them for each kind of error
-_CHANCE = 4.0  # by how much a sum of independent errors may exceed its root mean square
+CHANCE = 4.0  # by how much a sum of independent errors may exceed its root mean square
 END = 8.0  # units in the last place of what an end value is made of, lost in solving an element
 _VALUE = 32.0  # likewise of any value, which are not carried on
 _ROUNDING = 8.0  # units in the last place that cannot be resolved
@@ -63,7 +63,7 @@ def estimated_errors(
     noise[:, :, values.shape[2] :] += _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
     carried, largest = elements.carried_errors(
         values, rule.to_legendre, _to_next(rule), last, particular, noise,
-        _signs(len(values), len(problem.start)), mesh.steps, LEVEL, END, _CHANCE**2, _SAME,
+        _signs(len(values), len(problem.start)), mesh.steps, LEVEL, END, CHANCE**2, _SAME,
         renew=None if renewal is None else renewal.error,
     )
     if np.any(problem.uncertain):
@@ -71,7 +71,13 @@ def estimated_errors(
         of_start = elements.chain(last[:, None], of_start, np.eye(values.shape[2]))[0][:, 1]
         carried = np.sqrt(carried**2 + of_start**2 @ np.square(problem.uncertain))
         largest[0] = carried.max(axis=0)
-    return judged_errors(problem, carried, *largest)
+    errors = judged_errors(problem, carried, *largest)
+    if errors.lost == mesh.size:
+        return errors
+    # What has grown since is error, and nothing to compare with.
+    known = np.maximum.accumulate(np.abs(values[:, -1]), axis=0)
+    known = np.maximum(known, _FAINT * known.max(axis=(1, 2), keepdims=True))
+    return errors._replace(lost=int(np.argmin((carried < known).all(axis=(1, 2)))))
 
 
 def nothing_left(name: str, t: float) -> SolverError:

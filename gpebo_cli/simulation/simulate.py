@@ -46,6 +46,7 @@ from gpebo_cli.simulation.signals import Signals, Simulation
 
 _SHARES = np.linspace(0.0, 1.0, 9)  # of the horizon, where numbers may be too large
 _LOOKED_AT = 32  # times at which the mixing of states is looked at
+_MOST_ALIKE, _LOOKED_AT_FOR_GROWTH = 6000, 2000  # elements: more are cut only where it grows
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
 _TINY = float(np.finfo(float).tiny)
 
@@ -207,8 +208,10 @@ def _growth_resolved(
     n = structure.d + structure.a
     most = min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements)
     parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / SHORT)))
-    if parts.sum() > most:
+    if parts.sum() > min(most, _MOST_ALIKE):
         # Only where it grows.
+        length = (mesh.edges[-1] - mesh.edges[0]) / _LOOKED_AT_FOR_GROWTH
+        mesh, _ = mesh.split(np.ceil(mesh.steps / length).astype(np.intp))
         form = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel())
         rates = np.broadcast_to(growth_rates(form.E1, form.A1, form.basis), mesh.points.size)
         rates = rates.reshape(mesh.points.shape).max(axis=1)
