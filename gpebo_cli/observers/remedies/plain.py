@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation
-from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions, extend
+from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation, Truth
+from gpebo_cli.observers.reduced.extension import Extension, ReducedSystem, assumptions, extend
 from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices, respond
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import Reset
 
 
 @dataclass(frozen=True)
@@ -23,39 +24,54 @@ class Plain:
             ModelError: rank of E not constant, Assumption 1 violated.
             SolverError: the tolerance cannot be reached.
         """
-        system, q = reduced.system, reduced.system.q
         extension = extend(reduced, reduced.mesh, reduced.start())
-        mesh, final = extension.mesh, extension.assembled
         if reduced.lost is not None:
-            final.offset[:, reduced.lost] = final.gain[:, reduced.lost] = np.nan
-        kept = final.kept_rows(system, reduced.regression)
-        all_kept = len(kept) == final.Y.shape[1]
-        start, stop = reduced.signals.span
-        growth, logarithm = extension.growth(q)
-        # Along noisy signals the matrices change, too, and Y is not affine in the noise.
-        errors = None if noisy_matrices(reduced) else errors_of(reduced, kept)
-        return Observation(
-            regression=LinearRegression(
-                Y=mesh.trajectory(final.Y if all_kept else final.Y[:, kept]),
-                psi=mesh.trajectory(final.psi if all_kept else final.psi[:, kept]),
-                parameters=(*system.unknowns, *reduced.begin.names),
-                scale=extension.scale,
-            ),
-            state_map=AffineStateMap(
-                mesh.trajectory(final.offset), mesh.trajectory(final.gain),
-                reduced.form.units.states,
-            ),
-            truth=InitialError(
-                reduced.begin.dual, reduced.xi_a0, reduced.first.split.dual,
-                extension.trajectory, reduced.units,
-            ),
-            error_estimate=extension.error_estimate,
-            assumptions=assumptions(reduced, extension.weakest),
-            growth=growth,
-            growth_rate=logarithm / (stop - start),
-            errors=errors,
-            respond=None if errors is None else (
-                lambda e_u, e_y: respond(mesh, errors, len(kept), e_u, e_y)
-            ),
-            note=reduced.note if reduced.lost is None else "",  # a warning says it
+            for signal in (extension.assembled.offset, extension.assembled.gain):
+                signal[:, reduced.lost] = np.nan
+        truth = InitialError(
+            reduced.begin.dual, reduced.xi_a0, reduced.first.split.dual,
+            extension.trajectory, reduced.units,
         )
+        return observation(reduced, extension, *extension.growth(reduced.system.q), truth)
+
+
+def observation(
+    reduced: ReducedSystem, extension: Extension, growth: float, logarithm: float, truth: Truth,
+    resets: tuple[Reset, ...] = (),
+) -> Observation:
+    """What an extension gives, perhaps of several segments.
+
+    Args:
+        reduced: the reduced system.
+        extension: from start to end.
+        growth: largest entry of Φ, shape ().
+        logarithm: that of ‖Φ‖ over the horizon.
+        truth: what the parameters are.
+        resets: between the segments.
+    """
+    mesh, final = extension.mesh, extension.assembled
+    kept = final.kept_rows(reduced.system, reduced.regression)
+    some = slice(None) if len(kept) == final.Y.shape[1] else kept  # a slice copies nothing
+    start, stop = reduced.signals.span
+    # Along noisy signals the matrices change, too, and Y is not affine in the noise.
+    errors = None if noisy_matrices(reduced) else errors_of(reduced, kept)
+    return Observation(
+        regression=LinearRegression(
+            Y=mesh.trajectory(final.Y[:, some]), psi=mesh.trajectory(final.psi[:, some]),
+            parameters=(*reduced.system.unknowns, *reduced.begin.names),
+            scale=extension.scale, resets=resets,
+        ),
+        state_map=AffineStateMap(
+            mesh.trajectory(final.offset), mesh.trajectory(final.gain), reduced.form.units.states
+        ),
+        truth=truth,
+        error_estimate=extension.error_estimate,
+        assumptions=assumptions(reduced, extension.weakest),
+        growth=growth,
+        growth_rate=logarithm / (stop - start),
+        errors=errors,
+        respond=None if errors is None or resets else (
+            lambda e_u, e_y: respond(mesh, errors, len(kept), e_u, e_y)
+        ),
+        note=reduced.note if reduced.lost is None else "",  # a warning says it
+    )

@@ -28,7 +28,6 @@ from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._observation import (
-    AffineStateMap,
     Observation,
     error_of_extension,
     log_norm,
@@ -37,13 +36,12 @@ from gpebo_cli.observers.reduced.extension import (
     Extension,
     ReducedSystem,
     Start,
-    assumptions,
     extend,
     joined,
 )
-from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices
 from gpebo_cli.observers.reduced.split import comparable
-from gpebo_cli.regression.linear import LinearRegression, outer_products
+from gpebo_cli.observers.remedies.plain import observation
+from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
 _GROWTH = 100.0  # of Φ between resets: two digits
@@ -98,7 +96,12 @@ class Resets:
             known = known.after(reset)
             resets.append(reset)
             starts.append(start)
-        return _joined(reduced, starts, extensions, resets)
+        segments = joined(extensions, reduced.mesh.size)
+        growth, logarithms = zip(*(e.growth(reduced.system.q) for e in extensions), strict=True)
+        truth = SegmentErrors(
+            tuple(starts), reduced.first.split.dual, reduced.units, segments.trajectory
+        )
+        return observation(reduced, segments, max(growth), sum(logarithms), truth, tuple(resets))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,39 +167,6 @@ def _restart(
     floor = _FLOOR * max(float(np.abs(part).max(initial=0.0)) for part in (eta[:q], after))
     errors = np.concatenate([np.zeros((q, reduced.basis.shape[1])), dual @ reduced.basis])
     return Reset(time, transform, shift, floor, errors=errors), _Start(time, begin, after)
-
-
-def _joined(
-    reduced: ReducedSystem, starts: list[_Start], extensions: list[Extension], resets: list[Reset],
-) -> Observation:
-    """One regression and one state map over all segments."""
-    system = reduced.system
-    segments = joined(extensions, reduced.mesh.size)
-    mesh, whole = segments.mesh, segments.assembled
-    kept = whole.kept_rows(system, reduced.regression)
-    growth, logarithms = zip(*(e.growth(system.q) for e in extensions), strict=True)
-    return Observation(
-        regression=LinearRegression(
-            Y=mesh.trajectory(whole.Y[:, kept]),
-            psi=mesh.trajectory(whole.psi[:, kept]),
-            parameters=(*system.unknowns, *reduced.begin.names),
-            scale=segments.scale,
-            resets=tuple(resets),
-        ),
-        state_map=AffineStateMap(
-            mesh.trajectory(whole.offset), mesh.trajectory(whole.gain), reduced.form.units.states
-        ),
-        truth=SegmentErrors(
-            tuple(starts), reduced.first.split.dual, reduced.units,
-            segments.trajectory,
-        ),
-        error_estimate=segments.error_estimate,
-        assumptions=assumptions(reduced, segments.weakest),
-        note=reduced.note,
-        growth=max(growth),
-        errors=None if noisy_matrices(reduced) else errors_of(reduced, kept),
-        growth_rate=sum(logarithms) / float(mesh.edges[-1] - mesh.edges[0]),
-    )
 
 
 def reset_times(reduced: ReducedSystem, settings: Resets) -> Array:
