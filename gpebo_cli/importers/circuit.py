@@ -343,16 +343,17 @@ class _Builder:
             if node != GROUND:
                 self.draft.add(matrix, row, self._node[node], sign + text)
 
-    def _admittance(self, matrix: str, e: Element, text: str, sign: int = 1) -> None:
-        """A current text · (v_a − v_b) from node a to node b, in the balances of both."""
-        a, b = e.nodes[:2]
-        minus, plus = ("-", "") if sign > 0 else ("", "-")
-        for node, flow in ((a, plus), (b, minus)):
-            if node != GROUND:
-                for other, own in ((a, ""), (b, "-")):
-                    if other != GROUND:
-                        entry = "" if flow == own else "-"
-                        self.draft.add(matrix, self._row[node], self._node[other], entry + text)
+    def _admittance(
+        self, matrix: str, ends: Sequence[str], text: str, across: Sequence[str] = ()
+    ) -> None:
+        """text · (v_c − v_d) in the balance of node a, and text · (v_d − v_c) in that of b.
+
+        ``across`` are c and d, by default the ``ends`` a and b.
+        """
+        a, b = ends[:2]
+        c, d = across or (a, b)
+        self._between(matrix, self._row.get(a), c, d, text)
+        self._between(matrix, self._row.get(b), d, c, text)
 
     def _branch(self, nodes: tuple[str, str], column: str, factor: str = "") -> None:
         """A current that leaves its first node and enters its second."""
@@ -365,7 +366,7 @@ class _Builder:
         name, _ = self._value(e)
         column = self._current.get(e.name.lower())
         if column is None:
-            self._admittance("A", e, f"1/{name}", sign=-1)
+            self._admittance("A", e.nodes, f"1/{name}", e.nodes[::-1])
             return
         row = self._voltage_row(e, f"{e.name}: Ohm's law")
         self.draft.add("A", row, column, f"-{name}")
@@ -375,7 +376,7 @@ class _Builder:
         name, _ = self._value(e)
         column = self._current.get(e.name.lower())
         if column is None:
-            self._admittance("A", e, name, sign=-1)
+            self._admittance("A", e.nodes, name, e.nodes[::-1])
             return
         row = self.draft.equation(f"{e.name}: current of the switch, a conductance")
         self._between("A", row, e.nodes[0], e.nodes[1], name)
@@ -384,9 +385,9 @@ class _Builder:
 
     def _stamp_C(self, e: Element) -> None:
         name, varies = self._value(e)
-        self._admittance("E", e, name)
+        self._admittance("E", e.nodes, name)
         if varies:
-            self._admittance("A", e, f"d({name})", sign=-1)
+            self._admittance("A", e.nodes, f"d({name})", e.nodes[::-1])
 
     def _stamp_L(self, e: Element) -> None:
         name, varies = self._value(e)
@@ -442,10 +443,7 @@ class _Builder:
 
     def _stamp_G(self, e: Element) -> None:
         name, _ = self._value(e)
-        for node, out in ((e.nodes[0], True), (e.nodes[1], False)):
-            if node != GROUND:
-                a, b = (e.nodes[3], e.nodes[2]) if out else (e.nodes[2], e.nodes[3])
-                self._between("A", self._row[node], a, b, name)
+        self._admittance("A", e.nodes, name, (e.nodes[3], e.nodes[2]))
 
     def _stamp_F(self, e: Element) -> None:
         name, _ = self._value(e)
