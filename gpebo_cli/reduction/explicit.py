@@ -22,13 +22,12 @@ import numpy as np
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.model.entries import Entries, Places
 from gpebo_cli.model.expressions import jets
-from gpebo_cli.reduction.derivative_array import balance
+from gpebo_cli.reduction.derivative_array import Scaling, balance
 
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
 _SOUND = 0.1  # of the largest entry of its row, in units of the states
 _ROUNDING, _CLEAR = 1e-13, 1e-9  # of what an entry is the difference of: zero below, sure above
 _FILL = 40  # entries per equation; with more of them, a matrix is not sparse
-_BALANCING = 8  # rounds in which units are found
 _TINY = float(np.finfo(float).tiny)
 
 Row = dict[int, Array]
@@ -58,7 +57,7 @@ class Explicit:
     mu: int
     state_units: Array  # (n,)
     pivot: float  # the smallest one at any time, relative to its row
-    weights: Array | None = None  # (n,) see :func:`row_weights`
+    weights: Array  # (n,) see ``derivative_array.Scaling``
     known: float = 0.0  # sizes of what is known in the states
     loss: float = 1.0  # by how much elimination may have made rounding grow
 
@@ -296,61 +295,27 @@ class _Equations:
         return self.row(i).pop(k)
 
 
-def units_of(n: int, places: list[tuple[IntArray, ...]], sizes: list[Array]) -> Array:
-    """Units of the states (n,) in which entries of E and A are of comparable size, in their rows.
-
-    Args:
-        n: number of states and equations.
-        places: of the entries of E and A.
-        sizes: of those entries.
-    """
-    rows, columns, logs = [], [], []
-    for (i, j), size in zip(places, sizes, strict=True):
-        there = size > 0.0
-        rows.append(i[there])
-        columns.append(j[there])
-        logs.append(np.log(size[there]))
-    of_E = len(rows[0])
-    i, j, size = (np.concatenate(part) for part in (rows, columns, logs))
-    r, c = np.zeros(n), np.zeros(n)
-    in_row, in_column = (np.maximum(np.bincount(x, minlength=n), 1) for x in (i, j))
-    for _ in range(_BALANCING):
-        rest = size + c[j]
-        if 0 < of_E < len(size):
-            tau = (rest[:of_E] + r[i[:of_E]]).mean() - (rest[of_E:] + r[i[of_E:]]).mean()
-            rest[:of_E] -= tau
-        r = -np.bincount(i, rest, n) / in_row
-        rest += r[i]
-        c -= np.bincount(j, rest, n) / in_column
-    return np.asarray(np.exp(c - np.median(c)))
+def scaling_of(found: Entries, n: int) -> Scaling:
+    """:func:`balance` of the entries of n equations."""
+    dense = {name: np.zeros((1, 1, n, n)) for name in "EA"}
+    for name, whole in dense.items():
+        whole[0, 0][found.places[name]] = np.abs(getattr(found.values, name)[0]).max(axis=0)
+    return balance(found.values._replace(**dense))
 
 
-def row_weights(found: Entries) -> Array:
-    """Powers of ten (n,) by which rows of E are comparable, see ``Scaling.weights``."""
-    n = 1 + max(int(place.max(initial=0)) for name in "EA" for place in found.places[name])
-    dense = {}
-    for name in "EA":
-        dense[name] = np.zeros((1, 1, n, n))
-        dense[name][0, 0][found.places[name]] = np.abs(getattr(found.values, name)[0]).max(axis=0)
-    return balance(found.values._replace(**dense)).weights
-
-
-def explicit_form(found: Entries, n: int, f: Array) -> Explicit:
+def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
     """Eliminate.
 
     Args:
         found: the model at N times, to some order.
-        n: number of states.
+        scaling: of the model.
         f: Taylor coefficients (orders, N or 1, n) of what is known in the equations.
 
     Raises:
         MoreOrdersError: derivatives are needed of a higher order.
         UndecidedError: pivots do not decide the structure.
     """
-    units = units_of(
-        n, [found.places[name] for name in ("E", "A")],
-        [np.abs(getattr(found.values, name)[0]).max(axis=0) for name in ("E", "A")],
-    )
+    n, units = f.shape[2], scaling.columns
     known = np.ascontiguousarray(np.moveaxis(f, 2, 0))
     A = _Equations(found.values.A, found.places["A"], known, units)
     E = _Equations(found.values.E, found.places["E"], np.zeros((n, 1, 1)), units)
@@ -363,7 +328,7 @@ def explicit_form(found: Entries, n: int, f: Array) -> Explicit:
         states, *A.assembled(chosen, states), A.forcing(chosen),
         tuple((i, {k: a[0] for k, a in row.items()}, phi[0]) for i, row, phi in reversed(others)),
         tuple((i, {k: w[0] for k, w in row.items()}) for i, row in shifts), mu, units,
-        min(E.least, A.least),
+        min(E.least, A.least), scaling.weights,
     )
 
 

@@ -29,13 +29,14 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.consistency import Jump
 from gpebo_cli.reduction.constant import ConstantForm, constant_form
+from gpebo_cli.reduction.derivative_array import Scaling
 from gpebo_cli.reduction.explicit import (
     Explicit,
     MoreOrdersError,
     UndecidedError,
     explicit_form,
     product,
-    row_weights,
+    scaling_of,
 )
 from gpebo_cli.reduction.structure import Structure, analyse, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -83,7 +84,8 @@ class _Plant:
         self.system, self.most, self.order = system, most, 0
         self.found: Entries
         self.form: Explicit | ConstantForm
-        self.constant: ConstantForm | None = None  # what is the same at all times
+        self.constant: ConstantForm | None = None  # what is the same at all times, and
+        self.scaling: Scaling | None = None  # what nearly is
         self.at: Mesh | None = None  # of both, and
         self.eliminated = False  # whether ``form`` is of ``found``
 
@@ -121,7 +123,8 @@ class _Plant:
         may_be_full = n > _FULL and E.shape[1] == A.shape[1] == 1
         if self.constant is None and not (may_be_full and E.shape[2] > _ENTRIES * n):
             try:
-                return explicit_form(self.found, n, f)
+                self.scaling = self.scaling or scaling_of(self.found, n)
+                return explicit_form(self.found, self.scaling, f)
             except UndecidedError as error:
                 if isinstance(error, MoreOrdersError) or not may_be_full:
                     raise
@@ -306,7 +309,7 @@ def _start(plant: _Plant) -> tuple[Array, Array]:
     missed = differential(z)
     size = np.abs(form.sizes_from(np.abs(z)[:, None])[:, 0]).max(initial=0.0)
     if np.abs(missed).max(initial=0.0) > _ROUNDING * EPS * max(size, np.abs(x0).max(initial=0.0)):
-        weights = row_weights(plant.found) if form.weights is None else form.weights
+        weights = form.weights
         moves = np.array([weights * (differential(z + e) - missed) for e in np.eye(len(z))]).T
         z = z - np.linalg.lstsq(moves, weights * missed, rcond=None)[0]
     x = first.states_from(z[None, :, None])[0, :, 0]
