@@ -262,6 +262,13 @@ def test_a_folder_of_ones_own(tmp_path):
     result = run("mine", estimator="fast", config_dir=tmp_path, time={"samples": 11})
     assert result.cases[0]["gamma"] == 1e12
     assert load_plant("mine", tmp_path).source.endswith("mine.yaml")
+    (tmp_path / "plant" / "lab").mkdir()
+    (tmp_path / "plant" / "lab" / "other.yaml").write_text(MINE)
+    (tmp_path / "plant" / "loop").symlink_to(tmp_path / "plant")  # it is not followed
+    names = set(available("plant", tmp_path))
+    assert {"mine", "lab/other", "circuit", "published/hires"} < names
+    assert not any(name.startswith("loop") for name in names)
+    assert all(load_plant(name, tmp_path).states for name in names)
 
 
 def test_plants_and_regressions_in_folders_of_their_group_are_found():

@@ -135,7 +135,8 @@ def test_a_run_without_figures_imports_neither_tables_nor_drawing(tmp_path):
 def test_list_names_and_titles(tmp_path, mine):
     everything = gpebo("list", cwd=tmp_path)
     assert everything.returncode == 0
-    for word in ("plants", "circuit", "drem", "gpebo", "paper_circuit", "arXiv:2407.14373"):
+    words = ("plants", "circuit", "drem", "gpebo", "paper_circuit", "arXiv:2407", "published/sir")
+    for word in words:
         assert word in everything.stdout
     plants = gpebo("list", "plants", "--config-dir", mine, cwd=tmp_path)
     assert "mine" in plants.stdout
@@ -145,7 +146,7 @@ def test_list_names_and_titles(tmp_path, mine):
 
 def test_every_file_of_a_group_has_a_title():
     for group in ("plant", "observer", "estimator", "solver", "noise", "experiment"):
-        for path in (ROOT / "conf" / group).glob("*.yaml"):
+        for path in (ROOT / "conf" / group).resolve().rglob("*.yaml"):
             assert yaml.safe_load(path.read_text())["title"], path
 
 

@@ -51,7 +51,9 @@ def test_commands():
 def test_groups_and_their_values():
     assert {f"{group}=" for group in (*GROUPS, "launcher")} < set(names("run", ""))
     for group in GROUPS:
-        on_disk = {f"{group}={path.stem}" for path in (ROOT / "conf" / group).glob("*.yaml")}
+        home = (ROOT / "conf" / group).resolve()
+        files = (path.relative_to(home).with_suffix("") for path in home.rglob("*.yaml"))
+        on_disk = {f"{group}={path.as_posix()}" for path in files}
         assert set(names("run", f"{group}=")) == on_disk
     assert names("check", "plant=cir") == ["plant=circuit"]
     (line,) = candidates(["run", "plant=cir"], [])

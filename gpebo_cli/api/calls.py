@@ -206,10 +206,10 @@ def available(group: None = None, config_dir: Folder | None = None) -> dict[str,
 def available(
     group: str | None = None, config_dir: Folder | None = None
 ) -> list[str] | dict[str, list[str]]:
-    """Names that a group can have: ``plant``, ``observer``, ``estimator``, ``solver``, ….
+    """Names that a group can have, those in its folders included (``published/lorenz``).
 
     Args:
-        group: one of them; without it, the names of all groups by group.
+        group: ``plant``, ``observer``, ``estimator``, ``solver``, …; without it, all by group.
         config_dir: a folder of yours, with ``GROUP/NAME.yaml``.
 
     Raises:
@@ -221,13 +221,15 @@ def available(
         True
         >>> "drem" in available()["estimator"]
         True
+        >>> "published/lorenz" in available("experiment")
+        True
     """
     if group is None:
         return {name: available(name, config_dir) for name in GROUPS}
     if group not in GROUPS:
         raise unknown(f"available({shown(group)}): no such group", group, GROUPS)
     folders = [conf_folder(), *([] if config_dir is None else [os.fspath(config_dir)])]
-    return sorted({name for folder in folders for name in choices(folder, group)})
+    return sorted({name for folder in folders for name in choices(folder, group, inside=True)})
 
 
 def _configure(
@@ -264,7 +266,7 @@ def _configure(
 
 @cache
 def _shipped_plants() -> frozenset[str]:
-    return frozenset(choices(conf_folder(), "plant"))
+    return frozenset(choices(conf_folder(), "plant", inside=True))
 
 
 @cache

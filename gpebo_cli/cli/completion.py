@@ -219,7 +219,7 @@ def _values(key: str, word: str, folders: Sequence[str]) -> list[str]:
     taken = head.partition("=")[2].split(",")
     titles: dict[str, str] = {}
     for folder in folders:
-        for name in choices(folder, key):
+        for name in choices(folder, key, inside=True):
             if name not in taken:
                 path = os.path.join(folder, key, f"{name}.yaml")
                 titles.setdefault(f"{stem}{name}", described(path)[0])

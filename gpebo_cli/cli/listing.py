@@ -53,7 +53,7 @@ def _kind(word: str) -> str:
 def _lines(group: str, folders: list[str], indent: str) -> list[str]:
     entries: dict[str, str] = {}
     for folder in folders:
-        for name in choices(folder, group):
+        for name in choices(folder, group, inside=True):
             # The first folder wins, as it does in Hydra's search path.
             title, reference = described(os.path.join(folder, group, f"{name}.yaml"))
             entries.setdefault(name, f"{title} [{reference}]" if reference else title)

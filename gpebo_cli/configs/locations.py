@@ -27,10 +27,19 @@ def conf_folder() -> str:
     return shipped if os.path.isdir(shipped) else os.path.join(os.path.dirname(package), "conf")
 
 
-def choices(folder: str, group: str) -> list[str]:
-    """Names of the files of a group in ``folder``, sorted; none if there is no such group."""
+def choices(folder: str, group: str, *, inside: bool = False) -> list[str]:
+    """Names of the files of a group in ``folder``, sorted; none if there is no such group.
+
+    With ``inside`` those in folders of the group follow, such as ``published/lorenz``.
+    """
+    home = os.path.join(folder, group)
     try:
-        names = os.listdir(os.path.join(folder, group))
+        names = sorted(os.listdir(home))
     except (FileNotFoundError, NotADirectoryError):
         return []
-    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
+    found = [name.removesuffix(".yaml") for name in names if name.endswith(".yaml")]
+    for name in names if inside else ():
+        path = os.path.join(home, name)
+        if os.path.isdir(path) and not os.path.islink(path):
+            found += [f"{name}/{one}" for one in choices(home, name, inside=True)]
+    return found
