@@ -61,6 +61,14 @@ def test_the_result_says_that_nothing_bounds_functions_from_python():
     for system, bounded in ((circuit(), False), (shipped("circuit"), True)):
         found = simulate(system, TimeSettings(horizon=2.0), SOLVER)
         assert found.bounded is bounded
+    for observer in ("none", "gpebo"):
+        settings = Settings(
+            plant={}, observer={"name": observer}, estimator={"name": "drem"},
+            time=TimeSettings(horizon=2.0),
+        )
+        told = run_experiment(settings, circuit()).verdict
+        assert "nothing bounds what functions from Python (E, A, u) do between" in told
+        assert "nothing bounds" not in run_experiment(settings, shipped("circuit")).verdict
 
 
 def test_given_derivatives_are_used_instead_of_complex_times():

@@ -27,7 +27,7 @@ from gpebo_cli.experiment.pace import Pace, paced
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.uncertainty import sampled_deviations
-from gpebo_cli.experiment.verdict import simulation_note, verdict
+from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
@@ -133,10 +133,11 @@ def _experiment(
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
         source = several.joined_source([read(one, system, levels, samples) for one in each])
+    unbounded = functions_note(system)
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
         excitation=None, estimation=None, metrics=None, assumptions=source.assumptions,
-        timings=stage.seconds, verdict=source.verdict, recording=source.recording,
+        timings=stage.seconds, verdict=source.verdict + unbounded, recording=source.recording,
     )
     if observer is None or estimator is None:
         refuse_seeds(settings.noise)
@@ -159,7 +160,8 @@ def _experiment(
             *source.assumptions, *of_observation(found.observed, found.excitation, system)
         ),
         verdict="; ".join([
-            told + found.note + simulation_note(source.simulation, settings.solver.tol), *warned
+            told + found.note + simulation_note(source.simulation, settings.solver.tol) + unbounded,
+            *warned,
         ]),
         warnings=warned,
         # What the result is labelled with is what estimated.

@@ -11,7 +11,8 @@ from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment.result import ActiveBound, Fit, SimulationResult
 from gpebo_cli.findings import Requirement
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.functions import FunctionCoefficients
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model
@@ -115,6 +116,17 @@ def simulation_note(simulated: SimulationResult | None, tol: float) -> str:
             f"{simulated.error_estimate:.1e} of each state's size"
         )
     return told
+
+
+def functions_note(system: DescriptorSystem) -> str:
+    """What the last line of a run has to say of functions without bounds, from "; " on."""
+    source = system.coefficients
+    if not isinstance(source, FunctionCoefficients) or not source.functions:
+        return ""
+    return (
+        f"; nothing bounds what functions from Python ({', '.join(source.functions)}) do between "
+        "the times at which they are evaluated"
+    )
 
 
 def newton_note(simulated: SimulationResult) -> str:
