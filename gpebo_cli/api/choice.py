@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gpebo_cli.configs import files
+from gpebo_cli.configs import files, locations
 from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.registry import installed
@@ -22,16 +22,12 @@ from gpebo_cli.schema import nearest, shown
 _WHOLE = ("plant", "regression")  # a mapping or a file of these is all of it
 
 
+default = cache(locations.default)  # a run asks for every group
+
+
 def primary() -> dict[str, Any]:
     """The primary configuration, ``conf/gpebo.yaml``."""
     return files.shipped(PRIMARY)
-
-
-@cache
-def default(group: str) -> str:
-    """The file of ``group`` that is taken where nothing is chosen."""
-    entries = [entry for entry in primary()["defaults"] if isinstance(entry, Mapping)]
-    return str(next(entry[group] for entry in entries if group in entry))
 
 
 def choose(

@@ -11,11 +11,12 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 
 from gpebo_cli.cli.arguments import OPTIONS, VALUES
 from gpebo_cli.cli.listing import KINDS, described
 from gpebo_cli.cli.usage import HELP_OF
-from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder
+from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder, default, outline
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.results.names import FIGURE_NAMES, FORMATS, METRICS
 from gpebo_cli.schema import nearest, shown
@@ -235,49 +236,26 @@ def _keys(word: str, before: Sequence[str], folders: Sequence[str]) -> list[str]
     primary = os.path.join(conf_folder(), "gpebo.yaml")
     section, dot, _ = word.partition(".")
     if not dot:
-        top = [key for key in _read_keys(primary) if key not in (*_NOT_KEYS, "figures")]
+        top = [key for key in _outline(primary) if key not in (*_NOT_KEYS, "figures")]
         inside = [f"{name}." for name in (*_WITH_KEYS, *top)]
         return ["figures=", "resume=", "fail_fast=", "hydra.run.dir=", "hydra.sweep.dir=", *inside]
     if section == "hydra":
         return ["hydra.run.dir=", "hydra.sweep.dir="]
     if section in _WITH_KEYS:
         chosen = [w.partition("=")[2] for w in before if w.startswith(f"{section}=")]
-        name = chosen[-1] if chosen else _default(primary, section)
+        name = chosen[-1] if chosen else default(section)
         paths = [os.path.join(folder, section, f"{name}.yaml") for folder in folders]
-        keys = [key for path in paths for key in _read_keys(path) if key not in _NOT_KEYS]
+        keys = [key for path in paths for key in _outline(path) if key not in _NOT_KEYS]
     else:
-        keys = _read_keys(primary, section)
+        keys = _outline(primary, section)
     return [f"{section}.{key}=" for key in keys]
 
 
-def _default(primary: str, group: str) -> str:
-    """The file of ``group`` that the primary configuration chooses."""
-    return "".join(_read_keys(primary, "defaults", f"- {group}")[:1])
-
-
-def _read_keys(path: str, section: str = "", wanted: str = "") -> list[str]:
-    """Keys of a YAML file of ours, or of a section, in order; with ``wanted``, that key's value."""
-    try:
-        with open(path, encoding="utf-8", errors="replace") as stream:
-            lines = stream.read().splitlines()
-    except OSError:
-        return []
-    found = []
-    inside = not section
-    for line in lines:
-        text = line.strip()
-        key, colon, value = text.partition(":")
-        if not colon or text.startswith("#"):
-            continue
-        top = not line.startswith(" ")
-        if section and top:
-            inside = key == section
-        elif inside and top == (not section) and len(line) - len(line.lstrip()) <= 2:
-            if not wanted and key[0].isalpha():
-                found.append(key)
-            elif wanted and key == wanted:
-                found.append(value.partition("#")[0].strip())
-    return found
+def _outline(path: str, section: str = "") -> list[str]:
+    """Keys of a file of ours, or of a section, that are set by name."""
+    with suppress(OSError):
+        return [key for key in outline(path, section) if key[:1].isalpha()]
+    return []
 
 
 def _config_dir(words: Sequence[str]) -> list[str]:

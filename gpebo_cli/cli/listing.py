@@ -6,7 +6,7 @@ import os
 import sys
 
 from gpebo_cli.cli.options import CONFIG_DIR, parse
-from gpebo_cli.configs.locations import choices, conf_folder
+from gpebo_cli.configs.locations import choices, conf_folder, outline
 from gpebo_cli.errors import ConfigError
 
 KINDS = {
@@ -17,8 +17,6 @@ KINDS = {
     "noise": "noise",
     "experiments": "experiment",
 }
-
-_HEAD = 1 << 16  # characters of a file in which its title is looked for
 
 
 def main(words: list[str]) -> int:
@@ -62,24 +60,12 @@ def _lines(group: str, folders: list[str], indent: str) -> list[str]:
 
 
 def described(path: str) -> tuple[str, str]:
-    """Title and reference from the top level of a YAML file, empty where there is none.
-
-    Reads lines, not YAML: a parser takes longer to import than everything else here takes, and
-    a file that is hostile, or half-written, costs nothing.
-    """
-    found = {"title": "", "reference": ""}
+    """Title and reference from the top level of a YAML file, empty where there is none."""
     try:
-        if not os.path.isfile(path):  # a pipe would block
-            return "", ""
-        with open(path, encoding="utf-8", errors="replace") as stream:
-            lines = stream.read(_HEAD).splitlines()
+        found = outline(path)
     except OSError as error:
         return f"(cannot be read: {error.strerror})", ""
-    for line in lines:
-        key, colon, value = line.partition(":")
-        if colon and key in found and not found[key]:
-            found[key] = _scalar(value)
-    return found["title"], found["reference"]
+    return _scalar(found.get("title", "")), _scalar(found.get("reference", ""))
 
 
 def _scalar(text: str) -> str:

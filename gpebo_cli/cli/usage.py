@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gpebo_cli.configs.locations import GROUPS, choices, conf_folder
+from gpebo_cli.configs.locations import GROUPS, choices, conf_folder, default
 
 HELP = """\
 gpebo: adaptive state observers for linear time-varying descriptor systems
@@ -239,6 +239,7 @@ examples:
   gpebo run data.file=paper/signals.csv data.hold=cubic               # measured, not simulated
   gpebo run data.file=- estimator=ls_drem < paper/signals.csv         # a row out for each row in
 """
+_NOTES = {"experiment": "   (a recipe; none by default)"}
 
 
 def run_help() -> str:
@@ -247,8 +248,8 @@ def run_help() -> str:
     lines = []
     for group in GROUPS:
         names = choices(folder, group)
-        default = _DEFAULTS.get(group)
-        names.sort(key=lambda name: name != default)  # stable: the default first, rest by name
+        first = default(group)
+        names.sort(key=lambda name: name != first)  # stable: the default first, rest by name
         text = f"{' '.join(names)}{_NOTES.get(group, '')}"
         lines += _wrapped(f"  {group + '=':<12} ", text)
     return _RUN_HELP.format(groups="".join(lines))
@@ -262,15 +263,3 @@ def _wrapped(head: str, text: str) -> list[str]:
             lines.append(" " * len(head))
         lines[-1] += f"{word} "
     return [f"{line.rstrip()}\n" for line in lines]
-
-
-# As in conf/gpebo.yaml, which is not read: a YAML parser costs more than all the rest of this.
-_DEFAULTS = {
-    "plant": "circuit",
-    "data": "none",
-    "observer": "gpebo",
-    "estimator": "ls_drem",
-    "solver": "collocation",
-    "noise": "none",
-}
-_NOTES = {"experiment": "   (a recipe; none by default)"}

@@ -16,6 +16,9 @@ PRIMARY = "gpebo"
 """The primary configuration, conf/gpebo.yaml; another name than a run's own config.yaml."""
 
 
+_HEAD = 1 << 16  # characters of a file that :func:`outline` looks at
+
+
 def conf_folder() -> str:
     """The folder of configuration files: inside the installed package, else the checkout's.
 
@@ -43,3 +46,36 @@ def choices(folder: str, group: str, *, inside: bool = False) -> list[str]:
         if os.path.isdir(path) and not os.path.islink(path):
             found += [f"{name}/{one}" for one in choices(home, name, inside=True)]
     return found
+
+
+def outline(path: str, section: str = "") -> dict[str, str]:
+    """Keys of a YAML file, or of one of its sections, with the texts behind them on their lines.
+
+    Reads lines, not YAML: a parser takes longer to import than everything that needs this takes,
+    and a file that is hostile, or half-written, costs nothing. What is no file has no keys.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if not os.path.isfile(path):  # a pipe would block
+        return {}
+    with open(path, encoding="utf-8", errors="replace") as stream:
+        lines = stream.read(_HEAD).splitlines()
+    found: dict[str, str] = {}
+    inside = not section
+    for line in lines:
+        key, colon, value = line.strip().partition(":")
+        indent = len(line) - len(line.lstrip())
+        if not colon or key.startswith("#"):
+            continue
+        if section and not indent:
+            inside = key == section
+        elif inside and (0 < indent <= 2 if section else not indent):
+            found.setdefault(key, value)
+    return found
+
+
+def default(group: str) -> str:
+    """The file of ``group`` that the primary configuration chooses; nothing if it chooses none."""
+    chosen = outline(os.path.join(conf_folder(), f"{PRIMARY}.yaml"), "defaults")
+    return chosen.get(f"- {group}", "").partition("#")[0].strip()
