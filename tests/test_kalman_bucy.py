@@ -167,7 +167,8 @@ def test_converges_without_noise(name):
     assert estimation.names[: system.q] == tuple(system.unknowns)
     assert estimation.names[system.q].startswith("w_")
     # The covariance of what rotates with the kernel stays in its range.
-    assert np.isfinite(np.stack(list(estimation.checks.values()))).all()
+    stated = np.concatenate([estimation.parameters_std, estimation.states_std], axis=2)
+    assert np.isfinite(stated).all()
 
 
 def test_states_deviations_hold_the_errors_and_the_direct_noise():
@@ -178,10 +179,10 @@ def test_states_deviations_hold_the_errors_and_the_direct_noise():
     late = estimation.t > 5.0
     error = estimation.states[0] - result.simulation.states
     for i, name in enumerate(result.system.states):
-        stated = estimation.checks[f"{name}_std"][0]
+        stated = estimation.states_std[0, :, i]
         share = np.mean(np.abs(error[late, i]) < 2 * stated[late])
         assert share > 0.8, name
-    assert estimation.checks["iv_std"][0, -1] == pytest.approx(0.02, rel=0.05)
+    assert estimation.states_std[0, -1, -1] == pytest.approx(0.02, rel=0.05)
 
 
 def test_what_regularises_an_exact_measurement_is_reported():
@@ -237,7 +238,7 @@ def test_no_word_of_noise_is_noise_of_size_zero():
     for noise in (None, none):
         measured = replace(seen(signals), noise=noise)
         found = observe(system, measured, SOLVER, name="kalman_bucy")
-        deviations.append(np.hstack(found.state_map.spread.deviations(t)))
+        deviations.append(np.hstack(found.state_map.deviations(t)))
     np.testing.assert_array_equal(*deviations)
 
 

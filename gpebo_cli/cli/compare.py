@@ -39,12 +39,14 @@ def main(words: list[str]) -> int:
 
     from gpebo_cli.results import comparison
     from gpebo_cli.results.files import csv_text, make_folder, write_text
-    from gpebo_cli.results.names import METRICS
+    from gpebo_cli.results.names import ranking, shown_metrics
 
     cases = [case for name in arguments.words for case in _cases(name)]
     if not cases:
         raise GpeboError("nothing to compare: no run in these folders has estimated anything")
-    sort = arguments.values.get("--sort", comparison.SORT)
+    measured = [case.metrics for case in cases]
+    metrics, best = shown_metrics(measured), ranking(measured)
+    sort = arguments.values.get("--sort", best)
     known = comparison.names(cases)
     asked = [name.strip() for name in arguments.values.get("--columns", "").split(",")]
     asked = [name for name in asked if name]
@@ -55,7 +57,7 @@ def main(words: list[str]) -> int:
     rows = [comparison.row(case) for case in cases]
 
     several = [] if all(case.number == 0 for case in cases) else ["case"]
-    seen = ["run", *several, *comparison.varying(cases), *METRICS]
+    seen = ["run", *several, *comparison.varying(cases), *metrics]
     if sort not in seen:
         seen.insert(1, sort)
     seen, known = asked or seen, asked or known
@@ -76,8 +78,7 @@ def main(words: list[str]) -> int:
 
         folder = Path(arguments.values.get("--output") or _new_folder())
         make_folder(folder)
-        metric = sort if sort in METRICS else comparison.SORT
-        for name, figure in comparison.figures(cases, metric):
+        for name, figure in comparison.figures(cases, sort if sort in metrics else best):
             path = folder / f"{name}.png"
             save(figure, path)
             sys.stdout.write(f"{path}\n")

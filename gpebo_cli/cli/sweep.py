@@ -29,7 +29,7 @@ from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.results.files import make_folder, write_text
-from gpebo_cli.results.names import METRICS
+from gpebo_cli.results.names import shown_metrics
 from gpebo_cli.results.report import case_rows, columns
 from gpebo_cli.results.sweep_folder import (
     STOP,
@@ -328,7 +328,8 @@ def _print_table(records: Sequence[JobRecord], folder: Path, *, rows: bool) -> N
     lines = []
     if rows:
         cells = [[told(cell) for cell in row[:-1]] for row in table(records)]  # errors: below
-        seen = [k for k, name in enumerate(cells[0]) if name in METRICS or not is_metric(name)]
+        metrics = shown_metrics(case for record in records for case in record.cases or ())
+        seen = [k for k, name in enumerate(cells[0]) if name in metrics or not is_metric(name)]
         lines += columns([[row[k] for k in seen] for row in cells[: _SHOWN_ROWS + 1]])
         if len(cells) > _SHOWN_ROWS + 1:
             lines.append(f"… {len(cells) - _SHOWN_ROWS - 1} more")

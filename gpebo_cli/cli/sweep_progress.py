@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from gpebo_cli.cli.progress import display
-from gpebo_cli.results.names import METRICS
+from gpebo_cli.results.names import shown_metrics
 from gpebo_cli.results.sweep_folder import RESULT, JobRecord, Plan, job_folder, read_record
 
 if TYPE_CHECKING:
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 _LOOKS = 2.0  # a second
 _ROWS = 12  # of jobs that ended last
-_METRICS = ("seconds_to_1pct_parameters", "final_error_states")
-_HEADINGS = (f"{METRICS[_METRICS[0]]} (s)", METRICS[_METRICS[1]])
 
 
 class Watch:
@@ -73,10 +71,13 @@ def table(ended: Sequence[JobRecord], keys: Sequence[str]) -> Table:
     """The jobs that ended last: what varies, how long they took, how the first case went."""
     from rich.table import Table
 
-    found = Table("job", *keys, "status", "seconds", *_HEADINGS, box=None)
+    words = shown_metrics(record.cases[0] for record in ended if record.cases)
+    shown = (next(iter(words)), "final_error_states")
+    headings = (f"{words[shown[0]]} (s)", words[shown[1]])
+    found = Table("job", *keys, "status", "seconds", *headings, box=None)
     for record in ended[-_ROWS:]:
         first = (record.cases or [{}])[0]
-        numbers = [record.seconds, *(first.get(name) for name in _METRICS)]
+        numbers = [record.seconds, *(first.get(name) for name in shown)]
         found.add_row(
             str(record.job), *(told(record.overrides.get(key, "")) for key in keys), record.status,
             *("" if number is None else f"{number:.4g}" for number in numbers),

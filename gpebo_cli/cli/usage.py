@@ -70,7 +70,8 @@ sweep; of a sweep that is not finished, what is there. Gains, tolerances, whatev
 a positive number makes an axis. Of a folder of runs, outputs/runs for instance, all are taken.
 
 options:
-  --sort COLUMN       seconds_to_1pct_parameters by default; heat maps show it
+  --sort COLUMN       seconds_to_1pct_parameters by default, under noise rms_error_states;
+                      heat maps show it
   --reverse           largest first
   --columns A,B,…     these columns, in this order: gains, settings, metrics of all or of one
                       quantity (seconds_to_1pct_x), estimates at the end (x_hat, x_std)

@@ -1,6 +1,9 @@
 """How well a case did: one number per case from its errors over time.
 
 If e is the norm of an error, the settling time is the least T with e(t) ≤ e(0)/100 for all t ≥ T.
+Under noise it is chance when an error is small, and an estimate has settled where it is within ±2σ
+of what it is at the end from then on, σ being its deviation at the end (:func:`standing_since`;
+``experiment.accuracy.standing`` says how that is meant of what moves).
 The root mean square over time is √(∫e² dt / horizon).
 """
 
@@ -29,15 +32,14 @@ class Metrics:
     final_error_states: Array  # (G,) max abs
     rms_error_states: Array  # (G,)
     seconds_to_1pct: Mapping[str, Array] = field(default_factory=dict)  # of each quantity, (G,)
-    # With noise: from when on it is within ±2σ of what it is at the end; of each quantity, (G,).
-    seconds_to_settled: Mapping[str, Array] = field(default_factory=dict)
+    # Under noise the same of ±2σ, (G,) each, empty where no σ is known; None: there is no noise.
+    seconds_to_settled: Mapping[str, Array] | None = None
 
     @property
     def settled(self) -> Array:
         """When the last quantity has settled, (G,); NaN where that is not known of any."""
-        each = np.array([*self.seconds_to_settled.values(), 0.0 * self.final_error_states - np.inf])
-        last = np.where(np.isnan(each), -np.inf, each).max(axis=0)
-        return np.where(np.isfinite(last), last, np.nan)
+        each = (self.seconds_to_settled or {}).values()
+        return np.asarray(np.fmax.reduce([*each, np.full(len(self.final_error_states), np.nan)]))
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -45,12 +47,13 @@ class Metrics:
         return {
             **{name: getattr(self, name) for name in NAMES},
             **{f"{SECONDS}{name}": times for name, times in self.seconds_to_1pct.items()},
-            **{f"{STANDING}{name}": times for name, times in self.seconds_to_settled.items()},
+            **({} if self.seconds_to_settled is None else {STANDING: self.settled}),
+            **{f"{STANDING}_{k}": times for k, times in (self.seconds_to_settled or {}).items()},
         }
 
 
 NAMES = tuple([f.name for f in fields(Metrics)][:5])
-SECONDS, STANDING = "seconds_to_1pct_", "seconds_to_settled_"
+SECONDS, STANDING = "seconds_to_1pct_", "seconds_to_settled"
 
 
 def is_metric(name: str) -> bool:
@@ -100,18 +103,15 @@ def settling_times(t: Array, error: Array, size: Array) -> Array:
     return out
 
 
-def standing_since(t: Array, value: Array, final: Array, deviation: Array) -> Array:
-    """From when on c values (g, M, c) are within ±2σ of the final ones, (g, c), in seconds.
-
-    What is below a deviation is chance, and so is a small error at the end.
+def standing_since(t: Array, away: Array, deviation: Array) -> Array:
+    """From when on c estimates are within ±2σ of the final ones, (g, c), in seconds.
 
     Args:
         t: times (M,).
-        value: estimates.
-        final: what they are by the parameters at the end, (g, M, c) or (g, 1, c).
+        away: how far they are from what they are by the data up to the end, (g, M, c).
         deviation: σ at the end, (g, c), NaN where it is not known.
     """
-    away = np.abs(np.moveaxis(value - final, 2, 1))
+    away = np.abs(np.moveaxis(away, 2, 1))
     level = 2.0 * deviation
     since = settling_time(t, away.reshape(-1, len(t)), level=level.ravel()).reshape(level.shape)
     return np.where(np.isnan(level), np.nan, since)

@@ -18,7 +18,7 @@ from gpebo_cli.evidence.metrics import (
     settling_times,
     standing_since,
 )
-from gpebo_cli.experiment.result import EstimationResult, Fit
+from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
@@ -28,6 +28,7 @@ from gpebo_cli.observers import Observation, StateMap
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.regression.linear import LinearRegression, least_squares
 
+_LATE = 0.25  # of a run: its end, where a deviation swings
 _LAGS = 20  # of the residual's autocorrelation
 _SILENT = 1e-9  # of an output: a residual below that is rounding
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
@@ -237,27 +238,35 @@ def astray(
 
 
 def standing(
-    estimation: EstimationResult, metrics: Metrics, state_map: StateMap | None, columns: IntArray,
-    system: DescriptorSystem,
+    estimation: EstimationResult, metrics: Metrics, gains: Array | None, system: DescriptorSystem,
+    over_seeds: NoiseStatistics | None = None,
 ) -> Metrics:
-    """With the times from which on estimates are within ±2σ of what the final ones say.
+    """With the times from which on estimates are within ±2σ of what they are at the end.
 
-    The state map takes the parameters ``columns`` (k,). A state is compared with what the final
-    parameters make of the same signals, whose noise is then in both.
+    A state is compared with what the final parameters make of the same signals, whose noise is
+    then in both: ``gains`` (G, M, n, p) of x̂ = offset + gain η̂. None: the observer estimates the
+    state as it moves, by a filter; what it has still to learn has about the variance σ(t)² − σ².
+    A state's σ often swings, and the largest one of the last quarter counts. Where no deviations
+    are known, those of the parameters ``over_seeds`` serve.
     """
-    t, eta = estimation.t, estimation.parameters
-    if estimation.parameters_std is None or estimation.states_std is None:
-        return metrics
-    times = [standing_since(t, eta, eta[:, -1:], estimation.parameters_std[:, -1])]
-    names: Sequence[str] = estimation.names
-    if isinstance(state_map, AffineStateMap):
-        away = np.nan_to_num(eta - eta[:, -1:])[..., columns]
-        of_x = np.einsum("mnp,gmp->gmn", state_map.gain(t), away)
-        times.append(standing_since(t, of_x, 0.0 * of_x[:, :1], estimation.states_std[:, -1]))
-        names = [*names, *system.states]
-    return replace(
-        metrics, seconds_to_settled=dict(zip(names, np.hstack(times).T, strict=True))
-    )
+    eta, sigma, of_x = estimation.parameters, estimation.parameters_std, estimation.states_std
+    away, names = np.nan_to_num(eta - eta[:, -1:]), (*estimation.names, *system.states)
+    if sigma is not None and of_x is not None:
+        late = estimation.t >= estimation.t[-1] - _LATE * np.ptp(estimation.t)
+        moving = len(estimation.names) if gains is not None else system.q  # from there on
+        every = np.concatenate([sigma, of_x], axis=2)
+        at_end = np.hstack([every[:, -1, :moving], every[:, late, moving:].max(axis=1)])
+        away = np.concatenate([
+            away[..., :moving],
+            np.sqrt(np.maximum(every[..., moving:] ** 2 - at_end[:, None, moving:] ** 2, 0.0))
+            if gains is None else np.einsum("gmnp,gmp->gmn", gains, away),
+        ], axis=2)
+    elif over_seeds is not None:
+        at_end = over_seeds.deviation[:, : eta.shape[2]]
+    else:
+        return replace(metrics, seconds_to_settled={})
+    since = standing_since(estimation.t, away, at_end).T
+    return replace(metrics, seconds_to_settled=dict(zip(names, since, strict=False)))
 
 
 def fit_of(

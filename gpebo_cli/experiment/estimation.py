@@ -32,6 +32,7 @@ from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
 from gpebo_cli.experiment.uncertainty import (
+    none_at_samples,
     residual_ratio,
     sampled_deviations,
     standard_deviations,
@@ -39,7 +40,7 @@ from gpebo_cli.experiment.uncertainty import (
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
-from gpebo_cli.observers._observation import AffineStateMap
+from gpebo_cli.observers._observation import AffineStateMap, Differentiable, Filtering
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals
@@ -122,32 +123,14 @@ def continuous(
             estimator = estimator if observation.estimator else used
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
+    noisy = bool(source.recording) or not levels.silent
     note = observation.note
-    if settings.uncertainty and observation.estimator is None and (
-        source.recording or not levels.silent
-    ):
+    if noisy or observation.estimator is not None:
         with stage("uncertainty"):
-            some, columns = _about(observation, known.independent)
-            reduced, state_map = replace(observation, regression=some), observation.state_map
-            if len(columns) < regression.p and isinstance(state_map, AffineStateMap):
-                gain = Trajectory(state_map.gain.mesh, state_map.gain.values[..., columns])
-                reduced = replace(reduced, state_map=replace(state_map, gain=gain))
-            found = standard_deviations(
-                reduced, estimator, source, settings.noise, levels, estimation.t,
-                estimation.states,
+            estimation, why = _with_deviations(
+                settings, observation, estimator, source, levels, known, estimation
             )
-            if isinstance(found, str):
-                note += f"; no standard deviations: {found}" if found else ""
-            else:
-                deviations = np.full(estimation.parameters.shape, np.nan)
-                deviations[..., columns] = found[0]
-                deviations[np.isnan(estimation.parameters)] = np.nan
-                of_states = np.where(np.isnan(estimation.states), np.nan, found[1])
-                deviations[estimation.still] = of_states[estimation.still] = np.nan
-                estimation = replace(
-                    estimation, parameters_std=deviations, states_std=of_states
-                )
-                metrics = accuracy.standing(estimation, metrics, reduced.state_map, columns, system)
+        note += _no_deviations(why)
     fit = accuracy.fit_of(observation, estimation, system, source) if source.recording else None
     if fit is not None and settings.uncertainty and not levels.silent:
         fit = replace(fit, ratio=residual_ratio(observation, source, settings.noise, levels))
@@ -158,12 +141,49 @@ def continuous(
             noise = over_seeds(
                 observation, observe, source.true, theta, estimator, settings.noise, levels, pace
             )
+    if noisy:
+        metrics = accuracy.standing(
+            estimation, metrics, _gains(observation, estimation), system, noise
+        )
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
         fit, times, [name for name in unknown if name not in observation.unseen],
         observation.unseen, noise,
         observation.estimator is not None, note,
     )
+
+
+def _with_deviations(
+    settings: Settings, observation: Observation, estimator: estimators.Estimator, source: Source,
+    levels: NoiseLevels, known: Knowledge, estimation: EstimationResult,
+) -> tuple[EstimationResult, str]:
+    """With standard deviations, or why there are none (not, if nobody asked)."""
+    if isinstance(observation.state_map, Filtering):
+        of_eta, of_x = observation.state_map.deviations(estimation.t)
+        return replace(estimation, parameters_std=of_eta[None], states_std=of_x[None]), ""
+    if not settings.uncertainty or observation.estimator is not None:
+        return estimation, ""
+    some, columns = _about(observation, known.independent)
+    found = standard_deviations(
+        replace(observation, regression=some), estimator, source, settings.noise, levels,
+        estimation.t, estimation.states, columns,
+    )
+    if isinstance(found, str):
+        return estimation, found
+    deviations = np.full(estimation.parameters.shape, np.nan)
+    deviations[..., columns] = found[0]
+    deviations[np.isnan(estimation.parameters)] = np.nan
+    of_states = np.where(np.isnan(estimation.states), np.nan, found[1])
+    deviations[estimation.still] = of_states[estimation.still] = np.nan
+    return replace(estimation, parameters_std=deviations, states_std=of_states), ""
+
+
+def _gains(observation: Observation, estimation: EstimationResult) -> Array | None:
+    """∂x̂/∂η̂ (G, M, n, p) where deviations are known, and the state rests on constant η."""
+    state_map = observation.state_map
+    if estimation.states_std is None or not isinstance(state_map, Differentiable):
+        return None
+    return state_map.gains(estimation.t, estimation.states)
 
 
 def at_samples(
@@ -235,10 +255,9 @@ def at_samples(
     kept = chosen[kept_samples(len(by.cases), len(chosen), settings.output.max_rows)]
     p = parameters.shape[2]
     still = accuracy.still(parameters, by.requirement, online.natural_sizes)
-    std = None if made.std is None or made.level is None else made.std[:, kept] * made.level[-1]
-    if std is not None:
-        told = np.concatenate([parameters, states], axis=2)[:, kept]
-        std[np.isnan(told) | still[:, None, None]] = np.nan
+    told = np.concatenate([parameters, states], axis=2)[:, kept]
+    std, gains = made.at(kept, ~np.isnan(told) & ~still[:, None, None])
+    why = none_at_samples(len(by.cases)) if settings.uncertainty and p and std is None else ""
     estimation = EstimationResult(
         cases=by.cases,
         t=t[kept],
@@ -266,23 +285,26 @@ def at_samples(
     times = estimable(
         excitation.known, excitation.t, online.parameters, system.states, made.seen[chosen]
     )
-    rows = made.regression.rows[1 + chosen]
+    rows, noisy = made.regression.rows[1 + chosen], bool(source.recording) or not levels.silent
     return Estimated(
         online,
         RegressionResult(
             t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
         ),
         excitation, estimation,
-        accuracy.standing(estimation, metrics, None, np.arange(len(online.parameters)), system),
+        accuracy.standing(estimation, metrics, gains, system) if noisy else metrics,
         by.fit() if source.recording else None,
         times, _never(times),
-        note=online.note
-        + (_held(samples, metrics) if levels.silent and not source.recording else ""),
+        note=online.note + (_no_deviations(why) if noisy else _held(samples, metrics)),
     )
 
 
 def _never(times: Mapping[str, float | None]) -> list[str]:
     return [name for name, since in times.items() if since is None]
+
+
+def _no_deviations(why: str) -> str:
+    return f"; no standard deviations: {why}" if why else ""
 
 
 def _held(samples: Sampling, metrics: Metrics) -> str:

@@ -42,18 +42,33 @@ class OnlineEstimates:
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
     std: Array | None = None  # (G, K, p + n) deviations, to be multiplied by
     level: Array | None = None  # (K,) that of the noise so far, 1 where it is known
+    gain: Array | None = None  # ∂x̂/∂η̂ (K, n, p), or of each case (G, K, n, p), where std is
+
+    def at(self, kept: IntArray, told: BoolArray) -> tuple[Array | None, Array | None]:
+        """Deviations (G, M, p + n) at some samples (M,), NaN where not ``told``, and ∂x̂/∂η̂ there.
+
+        The latter has a shape (G, M, n, p).
+        """
+        if self.std is None or self.level is None or self.gain is None:
+            return None, None
+        std = np.where(told, self.std[:, kept] * self.level[-1], np.nan)
+        gain = self.gain[..., kept, :, :]
+        return std, np.broadcast_to(gain, (len(std), *gain.shape[-3:]))
 
     def with_some(self, few: OnlineEstimates, columns: IntArray) -> OnlineEstimates:
         """The same with the estimates of some of the parameters (k,), the others being zero."""
         wide = np.zeros_like(self.parameters)
         wide[..., columns] = few.parameters
-        std = few.std
-        if std is not None:
+        std, gain = few.std, few.gain
+        if std is not None and gain is not None:
             k, p = len(columns), wide.shape[2]
             std = np.zeros((*std.shape[:2], p + std.shape[2] - k))
             std[..., [*columns, *range(p, std.shape[2])]] = few.std
+            gain = np.zeros((*gain.shape[:-1], p))
+            gain[..., columns] = few.gain
         return replace(
-            self, parameters=wide, states=few.states, delta=few.delta, std=std, level=few.level
+            self, parameters=wide, states=few.states, delta=few.delta, std=std, level=few.level,
+            gain=gain,
         )
 
 
@@ -76,7 +91,7 @@ def joined(parts: Sequence[OnlineEstimates]) -> OnlineEstimates:
         np.concatenate([part.seen for part in parts]),
         np.concatenate([part.extension for part in parts]),
         *(_maybe([getattr(part, name) for part in parts], axis)
-          for name, axis in (("std", 1), ("level", 0))),
+          for name, axis in (("std", 1), ("level", 0), ("gain", -3))),
     )
 
 
@@ -186,7 +201,7 @@ class Online:
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
             block.regression, made.parameters, states, made.delta, eigenvalues, known, seen,
-            block.extension, std, level,
+            block.extension, std, level, None if std is None else gain,
         )
 
     def truth(self, extension: Array) -> observers.Truth:

@@ -17,7 +17,7 @@ from gpebo_cli.evidence.uncertainty import (
 )
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers._observation import Differentiable, Observation
 from gpebo_cli.regression.errors import ErrorsAt
@@ -27,6 +27,13 @@ from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.settings import NoiseSettings
 
 MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not of a measurement
+# Why there are no deviations.
+_MANY = f"each of {{}} cases would take a pass of its own, which up to {MOST_CASES} do"
+_NOT_SAID = "the estimator does not say what errors of Y do to it"
+_IN_MATRICES = (
+    "noise of the signals is in the matrices or differentiated, or this remedy cannot tell what it "
+    "does"
+)
 
 
 def sampled_deviations(
@@ -55,6 +62,11 @@ def sampled_deviations(
     return SampledDeviations(variances, number, relative=levels.silent)
 
 
+def none_at_samples(cases: int) -> str:
+    """Why an observer and an estimator at samples have no deviations."""
+    return _MANY.format(cases) if cases > MOST_CASES else f"{_IN_MATRICES}, or {_NOT_SAID}"
+
+
 def residual_ratio(
     observation: Observation, source: Source, noise: NoiseSettings, levels: NoiseLevels
 ) -> float | None:
@@ -81,9 +93,11 @@ def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
 
 def standard_deviations(
     observation: Observation, estimator: Estimator, source: Source, noise: NoiseSettings,
-    levels: NoiseLevels, t: Array, states: Array,
+    levels: NoiseLevels, t: Array, states: Array, columns: IntArray | slice = slice(None),
 ) -> tuple[Array, Array] | str:
     """Deviations of parameters (G, M, p) and ``states`` (G, M, n) at t (M,), or why there are none.
+
+    The regression may be about some ``columns`` of the parameters that the state map takes.
 
     No reason is given, and none is needed, where there is nothing to estimate. Rounding to steps q
     counts as noise of variance q²/12. Of a recording without levels, the one level that all outputs
@@ -95,18 +109,12 @@ def standard_deviations(
     if not regression.p:
         return ""
     if errors is None or not isinstance(state_map, Differentiable):
-        return (
-            "noise of the signals is in the matrices or differentiated, or this remedy cannot tell "
-            "what it does"
-        )
+        return _IN_MATRICES
     goes_on = isinstance(estimator, ResumableEstimator) or not regression.resets
     if not isinstance(estimator, Affine) or not goes_on:
-        return "the estimator does not say what errors of Y do to it"
+        return _NOT_SAID
     if len(estimator.cases) > MOST_CASES:
-        return (
-            f"each of {len(estimator.cases)} cases would take a pass of its own, which up to "
-            f"{MOST_CASES} do"
-        )
+        return _MANY.format(len(estimator.cases))
     edges = regression.mesh.edges
     instants = (
         source.inputs.mesh.edges[:-1] if source.recording
@@ -115,7 +123,7 @@ def standard_deviations(
     variances = _variances(noise, levels)
     if levels.silent:
         variances *= _level(errors, regression, instants, variances, observation.starts) ** 2
-    gains = state_map.gains(t, states)
+    gains = state_map.gains(t, states)[..., columns]
     if regression.resets and isinstance(estimator, ResumableEstimator):
         found = list(_over_resets(errors, estimator, regression, gains, instants, variances, t))
     else:

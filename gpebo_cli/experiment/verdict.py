@@ -47,12 +47,13 @@ def verdict(
     parts = [first, *(f"{why}: {', '.join(names)}" for why, names in without if names)]
     best = None if metrics is None else _best_case(metrics)
     if metrics is not None and best is not None:
-        if isfinite(metrics.settled[best]):  # under noise it is chance that an error is small now
-            reached = f"all within ±2σ of the end after {metrics.settled[best]:.4g} s"
-        else:
-            seconds = metrics.seconds_to_1pct_states[best]
-            reached = f"below 1 % after {seconds:.4g} s" if isfinite(seconds) else "never below 1 %"
-        parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end, {reached}")
+        seconds, reached = metrics.seconds_to_1pct_states[best], ", never below 1 %"
+        if metrics.seconds_to_settled is not None:  # noise: when an error is small is chance
+            seconds, reached = metrics.settled[best], ""
+        if isfinite(seconds):
+            near = "below 1 %" if reached else "all within ±2σ of the end"
+            reached = f", {near} after {seconds:.4g} s"
+        parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end{reached}")
     elif fit is not None:
         best = fit.best
     else:
@@ -138,13 +139,15 @@ def newton_note(simulated: SimulationResult) -> str:
 def _best_case(metrics: Metrics) -> int | None:
     """The first case below 1 % for good; if there is none, the one with the least final error.
 
-    By the final error alone, cases that have all converged would be told apart by rounding. None
-    where the error of no case is a number.
+    By the final error alone, cases that have all converged would be told apart by rounding. Under
+    noise both are chance, and the least error over the whole run counts. None where the error of no
+    case is a number.
     """
     least_error = _least(metrics.final_error_states)
     if least_error is None:
         return None
-    first = _least(metrics.seconds_to_1pct_states)
+    noisy = metrics.seconds_to_settled is not None
+    first = _least(metrics.rms_error_states if noisy else metrics.seconds_to_1pct_states)
     return least_error if first is None else first
 
 

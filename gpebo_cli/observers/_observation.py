@@ -51,6 +51,15 @@ class Differentiable(StateMap, Protocol):
         ...
 
 
+@runtime_checkable
+class Filtering(StateMap, Protocol):
+    """The map of an observer that estimates by itself and says how well."""
+
+    def deviations(self, t: Array) -> tuple[Array, Array]:
+        """Standard deviations at the times t (M,) of what is estimated (M, p) and of x̂ (M, n)."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class AffineStateMap(StateMap):
     """x = offset + gain η at every time."""

@@ -36,7 +36,12 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers._base import ByName, Measurements, SignalNoise
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
-from gpebo_cli.observers._observation import AffineStateMap, Observation, Reconstruction
+from gpebo_cli.observers._observation import (
+    AffineStateMap,
+    Filtering,
+    Observation,
+    Reconstruction,
+)
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
 from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
@@ -270,10 +275,11 @@ class KalmanBucy:
             max_elements=solver.max_elements,
         )
         observability = _uniform_observability(windows, P0, projector, known)
-        spread = Spread(filtered, AffineStateMap(offset, gain), direct, noise.variances)
         return Observation(
             regression=evidence.regression,
-            state_map=FilterStateMap(spread, system.states, names),
+            state_map=FilterStateMap(
+                filtered, AffineStateMap(offset, gain), direct, noise.variances
+            ),
             truth=CurrentState(known),
             error_estimate=max(evidence.error_estimate, filtered.error_estimate),
             assumptions=(
@@ -369,47 +375,31 @@ def _measurement_noise(
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
-    """What the filter's covariance means for the state."""
+class FilterStateMap(Filtering):
+    """x̂ = offset + gain ζ̂, and what the filter's covariance means for the state."""
 
     filtered: Filtered
-    state_map: AffineStateMap
+    affine: AffineStateMap
     direct: Trajectory  # (states, m + r)
     variances: Array  # (m + r,) of ν
-
-    def deviations(self, t: Array) -> tuple[Array, Array]:
-        """Standard deviations of ζ̂ (M, n) and of x̂ (M, states)."""
-        P, _ = self.filtered.at(t)
-        gain, direct = self.state_map.gain(t), self.direct(t)
-        of_state = np.einsum("mij,mjk,mik->mi", gain, P, gain)
-        of_state += direct**2 @ self.variances
-        own = np.einsum("mii->mi", P)
-        return np.sqrt(np.maximum(own, 0.0)), np.sqrt(np.maximum(of_state, 0.0))
-
-
-@dataclass(frozen=True, eq=False)
-class FilterStateMap:
-    """x̂ = offset + gain ζ̂, and the standard deviations that the filter states."""
-
-    spread: Spread
-    states: tuple[str, ...]
-    names: tuple[str, ...]
 
     @property
     def times(self) -> Array:
         """The points of the filter's mesh, because its errors depend on what it reached there."""
-        return np.unique(self.spread.filtered.mesh.points)
+        return np.unique(self.filtered.mesh.points)
 
     def at(self, t: Array) -> Reconstruction:
         """The affine map at the times t (M,), ascending."""
-        return self.spread.state_map.at(t)
+        return self.affine.at(t)
 
-    def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002  protocol
-        """Columns ``<name>_std``, (1, M) each, of what is estimated, then of the states."""
-        own, of_state = self.spread.deviations(t)
-        columns = {f"{name}_std": own[None, :, i] for i, name in enumerate(self.names)}
-        columns |= {f"{name}_std": of_state[None, :, i] for i, name in enumerate(self.states)}
-        return columns
+    def deviations(self, t: Array) -> tuple[Array, Array]:
+        """Standard deviations of ζ̂ (M, n) and of x̂ (M, states)."""
+        P, _ = self.filtered.at(t)
+        gain, direct = self.affine.gain(t), self.direct(t)
+        of_state = np.einsum("mij,mjk,mik->mi", gain, P, gain)
+        of_state += direct**2 @ self.variances
+        own = np.einsum("mii->mi", P)
+        return np.sqrt(np.maximum(own, 0.0)), np.sqrt(np.maximum(of_state, 0.0))
 
 
 @dataclass(frozen=True, eq=False)

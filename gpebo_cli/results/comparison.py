@@ -14,7 +14,7 @@ import numpy as np
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.finished import Case, read_errors, span
-from gpebo_cli.results.names import METRICS
+from gpebo_cli.results.names import METRICS, WORDS, ranking, shown_metrics
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line
 from gpebo_cli.results.symbols import number_text, symbol, with_unit
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 Value = str | float
 
-SORT = next(iter(METRICS))
 _MOST_CURVES = len(style.LINES)  # more do not stay apart
 _MIN_POINTS = 3  # fewer are not a curve
 _MOST_MAPS = 8
@@ -69,17 +68,18 @@ def ordered(cases: Sequence[Case], by: str, *, reverse: bool = False) -> list[Ca
     return [*present, *(c for c in cases if missing(c))]
 
 
-def figures(cases: Sequence[Case], metric: str) -> Iterator[tuple[str, Figure]]:
+def figures(cases: Sequence[Case], metric: str = "") -> Iterator[tuple[str, Figure]]:
     """Draw, one at a time: error curves, metrics over each number that varies, heat maps.
 
     Args:
         cases: in the order in which they matter: of many, the error curves of a few evenly
             spaced ones are drawn.
-        metric: what heat maps show.
+        metric: what heat maps show; empty: that by which cases are ranked.
 
     Raises:
         GpeboError: tables of a run are missing.
     """
+    metric = metric or ranking(case.metrics for case in cases)
     for suffix, members in _comparable(cases).items():
         yield f"errors{suffix}", compose(error_panels(members))
         # Sorted by name: the files are called the same however the cases are sorted.
@@ -151,11 +151,11 @@ def metric_panels(cases: Sequence[Case], name: str) -> list[Panel]:
         return []
     axis = Axis(name, symbol(name), log=True)
     panels: list[Panel] = []
-    for metric in METRICS:
+    for metric in shown_metrics(case.metrics for case in cases):
         curves = []
         for k, (label, members) in enumerate(groups.items()):
             x = np.array([_choice(case, name) for case in members])
-            y = np.array([case.metrics[metric] for case in members])
+            y = np.array([case.metrics.get(metric, np.nan) for case in members])
             order = np.argsort(x, kind="stable")
             curves.append(Curve(x[order], y[order], label, replace(line(k), dots=True)))
         if any(np.isfinite(c.y).any() and np.nanmax(c.y) > 0 for c in curves):
@@ -184,7 +184,7 @@ def heat_grid(
     values = np.full((len(y), len(x)), np.nan)
     for case in cases:
         j, k = (np.searchsorted(v, _choice(case, n)) for v, n in ((y, up), (x, across)))
-        values[j, k] = case.metrics[metric]
+        values[j, k] = case.metrics.get(metric, np.nan)
     return (x, y, values) if np.isfinite(values).any() else None
 
 
@@ -223,7 +223,7 @@ def _heat_map(
 
 
 def _label(metric: str) -> str:
-    return with_unit(METRICS[metric], "s" if metric.startswith("seconds") else "")
+    return with_unit(WORDS[metric], "s" if metric.startswith("seconds") else "")
 
 
 def _chosen(case: Case) -> dict[str, Value]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpebo_cli.errors import GpeboError
 from gpebo_cli.results import html
-from gpebo_cli.results.comparison import SORT, figures
+from gpebo_cli.results.comparison import figures
 from gpebo_cli.results.finished import Found, read_columns, read_summary
 from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.page import case_table
@@ -51,7 +51,7 @@ def _part(part: Found) -> str:
     cases = part.cases
     drawn = "".join(
         html.embedded_figure(file_content(figure, "png"), name)
-        for name, figure in (figures(cases, SORT) if cases else ())
+        for name, figure in (figures(cases) if cases else ())
     )
     heading = (
         f"<section>\n<h2>{escape(part.label)}</h2>\n{html.paragraph(count, 'verdict')}"

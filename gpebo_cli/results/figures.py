@@ -18,7 +18,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
-from gpebo_cli.results.names import FIGURE_NAMES
+from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
 from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
 from gpebo_cli.schema import shown, unknown
@@ -228,7 +228,10 @@ def delta(result: RunResult) -> list[Panel]:
 
 
 def gains(result: RunResult) -> list[Panel]:
-    """Final errors and seconds to 1 % over the one gain that varies, if at least three do."""
+    """Final errors and times over the one gain that varies, if at least three do.
+
+    Times are those to 1 %, and under noise those from which on all is within ±2σ of the end.
+    """
     estimation, metrics = result.estimation, result.metrics
     gain = _varying_gain(estimation) if estimation is not None else None
     if estimation is None or metrics is None or gain is None:
@@ -239,18 +242,24 @@ def gains(result: RunResult) -> list[Panel]:
     order = np.argsort(values, kind="stable")
     axis = Axis(gain, f"gain {symbol(gain)}", log=True)
 
-    def over_gain(kind: str) -> tuple[Curve, ...]:
-        return tuple(
-            Curve(values[order], getattr(metrics, f"{kind}_{of}")[order], of,
-                  replace(line(k), dots=len(order) <= MAX_DOTS))
-            for k, of in enumerate(("parameters", "states"))
-        )
+    def curve(metric: str, label: str, k: int) -> Curve:
+        y = metrics.columns[metric][order]
+        return Curve(values[order], y, label, replace(line(k), dots=len(order) <= MAX_DOTS))
 
+    def over_gain(kind: str) -> tuple[Curve, ...]:
+        of = ("parameters", "states")
+        return tuple(curve(f"{kind}_{each}", each, k) for k, each in enumerate(of))
+
+    times = [Panel("time to 1 %", over_gain("seconds_to_1pct"), "s", axis=axis)]
+    if metrics.seconds_to_settled is not None:
+        settled = curve(SETTLED, "all", 2)
+        known = bool(np.isfinite(settled.y).any())
+        times = [Panel("time to ±2σ", (settled,), "s", axis=axis)] if known else []
     size = max(_parameter_size(result), _state_size(result))
     # Seconds on a linear axis: they seldom span a decade, and a decade is all one could label.
     return _with_legend([
         Panel("final error", over_gain("final_error"), log=True, size=size, axis=axis),
-        Panel("time to 1 %", over_gain("seconds_to_1pct"), "s", axis=axis),
+        *times,
     ])
 
 
@@ -508,8 +517,7 @@ def _deviation(result: RunResult, name: str) -> Array | None:
     ):
         if name in names and found is not None:
             return found[0, :, names.index(name)]
-    stated = estimation.checks.get(f"{name}_std")
-    return None if stated is None else stated[0]
+    return None
 
 
 def _estimate(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.results.html import document, footer, paragraph
-from gpebo_cli.results.names import METRICS
+from gpebo_cli.results.names import known_by, shown_metrics
 from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.symbols import number_text, symbol
 
@@ -56,16 +56,16 @@ def case_table(named: Sequence[tuple[str, dict[str, float]]]) -> list[list[str]]
     # Gains that are the same everywhere tell nothing; those of other estimators are not theirs.
     shown = [g for g in gains if len({row.get(g) for _, row in named}) > 1] or gains
     # Without the truth nothing is known of errors, nor from when on they are small.
-    known = [
-        key for key in METRICS
-        if any(math.isfinite(row[f"final_error_{key.split('_')[-1]}"]) for _, row in named)
-    ]
-    head = [*(["estimator"] if several else []), *map(symbol, shown), *(METRICS[k] for k in known)]
+    known = {
+        key: words for key, words in shown_metrics([row for _, row in named]).items()
+        if any(math.isfinite(row.get(known_by(key), math.nan)) for _, row in named)
+    }
+    head = [*(["estimator"] if several else []), *map(symbol, shown), *known.values()]
     rows = [
         [
             *([name] if several else []),
             *(number_text(row[gain]) if gain in row else "" for gain in shown),
-            *(_metric(key, row[key]) for key in known),
+            *(_metric(key, row.get(key, math.nan)) for key in known),
         ]
         for name, row in named
     ]

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpebo_cli.evidence.metrics import STANDING
-from gpebo_cli.results.names import METRICS
+from gpebo_cli.results.names import SETTLED, known_by, shown_metrics
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import NoiseStatistics, RunResult
@@ -44,13 +43,6 @@ def loud_lines(result: RunResult) -> list[str]:
     ]
 
 
-# Times, and the errors that are not numbers where the truth is not known.
-_TIMES = {
-    "seconds_to_1pct_parameters": "final_error_parameters",
-    "seconds_to_1pct_states": "final_error_states",
-}
-
-
 def case_table(result: RunResult) -> list[str]:
     """The lines of a table with one row per case; the middle of a long one is left out."""
     cases = () if result.estimation is None else result.estimation.cases
@@ -60,18 +52,9 @@ def case_table(result: RunResult) -> list[str]:
     if not rows:
         return []
     gains = list(cases[0])
-    settled = [name for name in rows[0] if name.startswith(STANDING)]
-    headings = dict(list(METRICS.items())[:4])
-    if any(math.isfinite(rows[0][name]) for name in settled):  # noise decides the time to 1 %
-        for name in _TIMES:
-            del headings[name]
-        headings = {"settled": "within ±2σ of the end", **headings}
-    head = [*gains, *headings.values()]
-    rows = [
-        {**row, "settled": max((row[n] for n in settled if row[n] == row[n]), default=math.nan)}
-        for row in rows
-    ]
-    body = [[*(f"{row[g]:g}" for g in gains), *(_cell(n, row) for n in headings)] for row in rows]
+    shown = dict(list(shown_metrics(rows).items())[:-1])  # the last one is for comparisons
+    head = [*gains, *shown.values()]
+    body = [[*(f"{row[g]:g}" for g in gains), *(_cell(n, row) for n in shown)] for row in rows]
     lines = columns([head, *body])
     if not few:
         lines.insert(1 + half, f"… {count - 2 * half} more in cases.csv")
@@ -102,7 +85,7 @@ def estimate_table(result: RunResult) -> list[str]:
     case = result.fit.best if result.fit is not None else 0
     over_time = np.concatenate([estimation.states[case], estimation.parameters[case]], axis=1)
     names = [*result.system.states, *estimation.names]
-    standing = {} if result.metrics is None else result.metrics.seconds_to_settled
+    standing = (result.metrics and result.metrics.seconds_to_settled) or {}
     near = "±2σ" if standing else "1 %"
     rows = [["", "estimate", "± std", "unit", f"within {near} of the end since", "estimable"]]
     for name, told in estimates_at_end(result, case).items():
@@ -136,11 +119,11 @@ def columns(
 
 def _cell(name: str, row: Mapping[str, float]) -> str:
     value = row[name]
-    if name == "settled":
-        return f"after {value:.3f} s"
-    if math.isnan(row[_TIMES.get(name, name)]):
+    if math.isnan(row[known_by(name)]):
         return "unknown"
-    if name in _TIMES:
+    if name == SETTLED:
+        return f"after {value:.3f} s"
+    if name.startswith("seconds"):
         return f"{value:.3f} s" if math.isfinite(value) else "never"
     return f"{value:.2e}"
 

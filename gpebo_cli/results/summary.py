@@ -182,11 +182,9 @@ def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
     out = {}
     for names, values, deviations, truth in kinds:
         for i, name in enumerate(names):
-            stated = estimation.checks.get(f"{name}_std")  # of an observer that estimates itself
-            std = None if deviations is None else deviations[case, -1, i]
             out[name] = {
                 "value": values[case, -1, i],
-                "std": stated[case, -1] if std is None and stated is not None else std,
+                "std": None if deviations is None else deviations[case, -1, i],
                 "unit": units.get(name.removeprefix("e0_")),
                 "true": truth[i],
             }
