@@ -19,7 +19,6 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from gpebo_cli.errors import ConfigError, ModelError
-from gpebo_cli.kernels.structure_numpy import by_elimination, derivative_array, scaled
 from gpebo_cli.model.descriptor import (
     Array,
     BoolArray,
@@ -32,12 +31,8 @@ from gpebo_cli.model.matrix import listed
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.reduction.derivative_array import Units, units_at
-from gpebo_cli.reduction.strangeness_free import (
-    MAX_GROWTH,
-    by_singular_vectors,
-    constraints_in_stages,
-)
-from gpebo_cli.reduction.structure import RESIDUAL, Structure, analyse
+from gpebo_cli.reduction.strangeness_free import reduced
+from gpebo_cli.reduction.structure import Structure, analyse
 
 _AHEAD = np.linspace(0.0, 1.0, 17)  # seconds
 _SEEN = 2  # derivatives at the start by which an entry that is zero there is known
@@ -258,11 +253,7 @@ def hidden_constraints(
     g = np.concatenate(
         [np.broadcast_to(part, (mu + 1, len(t), n, part.shape[3])) for part in parts], axis=3
     )
-    if structure.stages:
-        stages = constraints_in_stages(system, structure, E, A, g, t, len(t))
-        A2, f2 = stages.A2, stages.f2
-    else:
-        A2, f2 = _by_array(system, structure, E, A, g * weights[:, None, :, None], t)
+    _, A2, f2, *_ = reduced(system, structure, E, A, g, t, len(t))
     terms = np.abs(g * weights[:, None, :, None]).max(axis=(0, 2))[:, None, :]
     A2 = A2 * (units / s.columns)
     # Rows of equal size first: they are of any size, and the factors below are then of order one.
@@ -275,27 +266,6 @@ def hidden_constraints(
         without_rounding(Q @ transpose(Q)) / units,
         inward[:, :, :driving], inward[:, :, driving:],
     )
-
-
-def _by_array(
-    system: DescriptorSystem, structure: Structure, E: Array, A: Array, g: Array, t: Array
-) -> tuple[Array, Array]:
-    """Â2 and its right-hand sides from the derivative array; g is scaled (μ + 1, N, n, c)."""
-    s, known = structure.scaling, structure.reference
-    e, a = scaled(E, A, s.rows, s.columns, s.time, len(g))
-    M, N = derivative_array(e, a, len(g) - 1)
-    stacked = np.moveaxis(g, 0, 1).reshape(len(t), -1, g.shape[3])
-    A2, f2, _, _, poor = by_elimination(
-        e[0], M, N, stacked, known.rows, known.columns, known.rank, known.Z1, len(t), MAX_GROWTH,
-        RESIDUAL,
-    )
-    if poor.any():
-        _, Z2 = by_singular_vectors(
-            system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
-        )
-        everywhere = np.broadcast_to(poor, len(t))
-        A2[poor], f2[everywhere] = transpose(Z2) @ N[poor], transpose(Z2) @ stacked[everywhere]
-    return A2, f2
 
 
 class _Along:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from gpebo_cli.kernels.structure_numpy import (
 from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem, distinct
 from gpebo_cli.numerics.linalg import inverse_or_none, transpose
 from gpebo_cli.reduction.derivative_array import forcing, who
-from gpebo_cli.reduction.stages import Stages, UnclearError, in_stages
+from gpebo_cli.reduction.stages import UnclearError, in_stages
 from gpebo_cli.reduction.structure import RESIDUAL, Structure, unclear_ranks
 
 MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
@@ -79,15 +80,15 @@ def strangeness_free_form(
     E, A = c.E[:, count], c.A[:, count]
     model = (scaling.rows, scaling.columns, scaling.time, mu + 1)
     every = max(1, len(t) // _LOOKS)
-    found = None
-    if structure.stages:
-        found = _with_stages(system, structure, E, A, forcing(c), t, every)
-    else:
-        found = kernels.structure.eliminated(
-            E, A, *model, c.B, F, c.u, theta, *pivots, every, MAX_GROWTH, RESIDUAL
-        )
+    found = None if structure.stages else kernels.structure.eliminated(
+        E, A, *model, c.B, F, c.u, theta, *pivots, every, MAX_GROWTH, RESIDUAL
+    )
     if found is None:
-        found = _with_singular_vectors(system, structure, E, A, forcing(c), t, every)
+        f = forcing(c)
+        found = in_own_states(
+            E[0], A[0], f[0], *reduced(system, structure, E, A, f[..., None], t, every),
+            *model[:3], every,
+        )
     E1, A1, f1, A2, f2, basis, offset, amplification = found
     none = not structure.a
     return StrangenessFree(
@@ -96,78 +97,66 @@ def strangeness_free_form(
     )
 
 
-def _with_stages(
+class Reduced(NamedTuple):
+    """0 = Â2 x + f2 in scaled rows and states, and what completes it, at N times."""
+
+    Z1: Array  # (N or 1, n, d) orthonormal basis of range(E T2), T2 of the kernel of Â2
+    A2: Array  # (N or 1, a, n)
+    f2: Array  # (N, a, c)
+    size: Array  # (·, a, n + c) of the terms of [Â2 f2], at every so many of the times
+    inverse: Array  # (N or 1, n, n) of [Z1ᵀE; Â2]
+
+
+def reduced(
     system: DescriptorSystem, structure: Structure, E: Array, A: Array, f: Array, t: Array,
     every: int,
-) -> tuple[Array, ...]:
-    """As the kernel ``eliminated``, from :func:`constraints_in_stages`."""
-    s = structure.scaling
-    stages = constraints_in_stages(system, structure, E, A, f[:, :, :, None], t, every)
-    mass = E[0] * (s.rows[:, None] * s.columns / s.time)
-    whole = np.concatenate([transpose(stages.Z1) @ mass, stages.A2], axis=1)
-    inverse, poor = inverse_or_none(whole)
-    _refuse_undetermined(system, poor, t)
-    return in_own_states(
-        E[0], A[0], f[0], stages.Z1, stages.A2, stages.f2, stages.size, inverse, s.rows, s.columns,
-        s.time, every,
-    )
+) -> Reduced:
+    """The constraints at the times t (N,), by stages, or by elimination from the reference.
 
+    Singular vectors are taken at times where the pivots of the reference will not do.
 
-def constraints_in_stages(
-    system: DescriptorSystem, structure: Structure, E: Array, A: Array, f: Array, t: Array,
-    every: int,
-) -> Stages:
-    """:func:`gpebo_cli.reduction.stages.in_stages` at times t (N,), in scaled rows and states.
-
-    Arguments are Taylor coefficients to the order μ, those of f (μ + 1, N, n, c).
+    Args:
+        system: the model, and
+        structure: of it.
+        E: Taylor coefficients to the order μ, (μ + 1, N or 1, n, n).
+        A: likewise.
+        f: of each column, (μ + 1, N, n, c).
+        t: times.
+        every: at every how many of them sizes are looked at.
 
     Raises:
         ModelError: a rank differs from that of ``structure``; names the time.
     """
-    mu, s = structure.mu, structure.scaling
+    mu, s, known = structure.mu, structure.scaling, structure.reference
     e, a = scaled(E, A, s.rows, s.columns, s.time, mu + 1)
     weights = (s.time ** np.arange(mu + 1))[:, None] * s.rows
     g = f[: mu + 1] * weights[:, None, :, None]
-    try:
-        return in_stages(e, a, g, structure.rank_tol, every, structure.stages)
-    except UnclearError as unclear:
-        raise unclear_ranks(
-            system, t[unclear.place], rounding=unclear.rounding
-        ) from unclear
-
-
-def _refuse_undetermined(system: DescriptorSystem, poor: BoolArray, t: Array) -> None:
-    if poor.any():
-        raise ModelError(
-            f"{who(system)}: the equations do not determine the state near "
-            f"t = {t[int(np.argmax(poor))]:.9g}"
-        )
-
-
-def _with_singular_vectors(
-    system: DescriptorSystem, structure: Structure, E: Array, A: Array, f: Array, t: Array,
-    every: int,
-) -> tuple[Array, ...]:
-    """As the kernel ``eliminated``; singular vectors at times where the pivots will not do."""
-    mu, scaling, reference = structure.mu, structure.scaling, structure.reference
-    model = (scaling.rows, scaling.columns, scaling.time)
-    e, aa = scaled(E, A, *model, mu + 1)
-    M, N = derivative_array(e, aa, mu)
+    if structure.stages:
+        try:
+            found = in_stages(e, a, g, structure.rank_tol, every, structure.stages)
+        except UnclearError as unclear:
+            raise unclear_ranks(
+                system, t[unclear.place], rounding=unclear.rounding
+            ) from unclear
+        whole = np.concatenate([transpose(found.Z1) @ e[0], found.A2], axis=1)
+        inverse, poor = inverse_or_none(whole)
+        _refuse_undetermined(system, poor, t)
+        return Reduced(found.Z1, found.A2, found.f2, found.size, inverse)
+    M, N = derivative_array(e, a, mu)
     # [Â2 | f2] = Z2ᵀ [N | g] with g = (f_0, …, f_μ)
-    weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
-    g = np.moveaxis(f[: mu + 1] * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
-    some = slice(0, None, every)
+    g = np.moveaxis(g, 0, 1).reshape(len(t), -1, g.shape[3])
     A2, f2, size, inverse, poor = by_elimination(
-        e[0], M, N, g, reference.rows, reference.columns, reference.rank, reference.Z1, every,
-        MAX_GROWTH, RESIDUAL,
+        e[0], M, N, g, known.rows, known.columns, known.rank, known.Z1, every, MAX_GROWTH, RESIDUAL
     )
-    Z1 = np.repeat(reference.Z1[None], len(M), axis=0)
-    Z1[poor], Z2 = by_singular_vectors(
+    if not poor.any():
+        return Reduced(known.Z1[None], A2, f2, size, inverse)
+    Z1 = np.repeat(known.Z1[None], len(M), axis=0)
+    Z1[poor], Z2 = _by_singular_vectors(
         system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
     )
     # What the elimination made grow there is not used, and amplifies nothing.
     A2[poor] = transpose(Z2) @ N[poor]
-    everywhere = np.broadcast_to(poor, len(t))
+    everywhere, some = np.broadcast_to(poor, len(t)), slice(0, None, every)
     f2[everywhere] = transpose(Z2) @ g[everywhere]
     terms = np.abs(joined(N, g, axis=2))
     again = np.arange(len(t))[some][everywhere[some]]
@@ -176,7 +165,15 @@ def _with_singular_vectors(
     whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
     inverse[poor], poor[poor] = inverse_or_none(whole)
     _refuse_undetermined(system, poor, t)
-    return in_own_states(E[0], A[0], f[0], Z1, A2, f2, size, inverse, *model, every)
+    return Reduced(Z1, A2, f2, size, inverse)
+
+
+def _refuse_undetermined(system: DescriptorSystem, poor: BoolArray, t: Array) -> None:
+    if poor.any():
+        raise ModelError(
+            f"{who(system)}: the equations do not determine the state near "
+            f"t = {t[int(np.argmax(poor))]:.9g}"
+        )
 
 
 def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
@@ -191,7 +188,7 @@ def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
     return _apply(c.D[0], c.u[0]) + _apply(c.H[0], c.theta[0])
 
 
-def by_singular_vectors(
+def _by_singular_vectors(
     system: DescriptorSystem, structure: Structure, E: Array, M: Array, N: Array, t: Array
 ) -> tuple[Array, Array]:
     """Orthonormal Z1 (N, n, d) and Z2 (N, ·, a) where the reference pivots will not do."""
