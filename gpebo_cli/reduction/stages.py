@@ -18,13 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from gpebo_cli.kernels.arrays import joined
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import taylor_product, transpose
 
 _EPS = float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
 _SHARE = 0.1  # of a constraint that rounding may be
 _CLEAR = 16.0  # times its rounding, what is smaller is zero
+_DOUBT = 1e3  # times its rounding, what is smaller may be zero
 
 
 class Stages(NamedTuple):
@@ -62,11 +63,13 @@ def in_stages(
     Raises:
         UnclearError: they are not, or the system is not uniquely solvable, or takes more orders.
     """
-    mass, noise, lost = E[0], _EPS, False
+    mass, noise, lost, found = E[0], _EPS, False, list[int]()
 
-    def require(holds: Array) -> None:
+    def require(holds: BoolArray, decides: Array | float = np.inf) -> None:
         if not holds.all():
-            raise UnclearError(int(np.argmin(holds)), rounding=lost)
+            # Where what decides is hardly more than its rounding, that is the reason.
+            near = np.asarray((rank_tol < decides) & (decides < _DOUBT * noise))
+            raise UnclearError(int(np.argmin(holds)), rounding=lost or bool((near & ~holds).any()))
 
     # Rounding errors of single entries, squared, in units of the last place of 1. An error of X
     # adds a share of A_r x + f_r. For a solution this is E_r x', where x moves as the coefficients
@@ -77,14 +80,13 @@ def in_stages(
     )
     rounding = [[_some(x, every, axis=1) ** 2 for x in (E, A, f)] for _ in range(2)]
     rows: list[tuple[Array, Array, Array]] = []
-    found: list[int] = []
     smallest = np.full((len(mass), 3), np.inf)
     while True:
         U, sigma, Vt = np.linalg.svd(E[0])
         relative = sigma / np.maximum(sigma[:, :1], _TINY)
         counts = (relative > max(rank_tol, _CLEAR * noise)).sum(axis=1)
         r, n = int(counts[0]) if ranks is None else (*ranks, len(U[0]))[len(found)], len(U[0])
-        require(counts == r)
+        require(counts == r, relative[np.arange(len(counts)), np.maximum(counts, r) - 1])
         smallest[:, 0] = np.minimum(smallest[:, 0], relative[:, r - 1] if r else np.inf)
         if r == n:
             break
@@ -118,12 +120,14 @@ def in_stages(
     require(np.full(1, len(rows) > 0))
     A2, f2, size = (np.concatenate(part, axis=1) for part in zip(*rows, strict=True))
     a = A2.shape[1]
-    sigma, Vt = np.linalg.svd(A2)[1:]
+    _, sigma, Vt = np.linalg.svd(A2)
     smallest[:, 1] = sigma[:, -1]
     Z1, sigma, _ = np.linalg.svd(mass @ transpose(Vt)[:, :, a:], full_matrices=False)
     if a < mass.shape[1]:
         smallest[:, 2] = sigma[:, -1] / np.maximum(np.linalg.norm(mass, axis=(1, 2)), _TINY)
-    require(smallest[:, 1:].min(axis=1) > max(rank_tol, _CLEAR * noise))
+    require(
+        smallest[:, 1:].min(axis=1) > max(rank_tol, _CLEAR * noise), smallest[:, 1:].min(axis=1)
+    )
     return Stages(A2, f2, Z1, np.sqrt(size), tuple(found), smallest)
 
 
