@@ -499,3 +499,15 @@ def test_units_of_many_states_are_those_that_singular_values_give(monkeypatch):
         for dense, sparse in zip(*found, strict=True):
             np.testing.assert_array_equal(sparse, dense)
         assert len(set(found[0].states)) > 1
+
+
+def test_one_case_with_many_parameters_is_measured_as_many_cases_are():
+    plant = full_plant(*ladder(17), u="sin(t)")
+    found = [
+        run(plant, estimator={"name": "least_squares", "f0": f0}, time={"horizon": 6.0},
+            observer={"xi_a0": [0.1] * 34}).cases[0]
+        for f0 in (1e-9, [1e-9, 1e-8])
+    ]
+    assert found[0]["rms_error_states"] > 0.01
+    for name in ("seconds_to_1pct_states", "final_error_states", "rms_error_states"):
+        assert found[0][name] == pytest.approx(found[1][name], rel=1e-6, nan_ok=True)

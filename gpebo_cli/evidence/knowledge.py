@@ -94,11 +94,16 @@ class Knowledge:
         V, spectrum, level = self.vectors[-1], self.eigenvalues[-1], self.level[-1]
         normalised = (V * np.maximum(spectrum, 0.0)) @ V.T
         chosen = np.flatnonzero(self.parameters[-1]).tolist()
-        seen = normalised.diagonal() >= level  # no eigenvalue is above what is on the diagonal
-        for j in np.flatnonzero(~self.parameters[-1] & seen).tolist():
+        left = normalised.copy()  # what those that are chosen do not explain of the others
+        for j in [*chosen, *np.flatnonzero(~self.parameters[-1]).tolist()]:
             more = [*chosen, j]
-            if np.linalg.eigvalsh(normalised[np.ix_(more, more)])[0] >= level[more].max():
+            if j not in chosen:  # no eigenvalue is above what is left of a column
+                if not left[j, j] >= 0.5 * level[j]:
+                    continue
+                if np.linalg.eigvalsh(normalised[np.ix_(more, more)])[0] < level[more].max():
+                    continue
                 chosen = more
+            left -= np.outer(left[:, j], left[j] / left[j, j])
         return np.sort(np.array(chosen, dtype=np.intp))
 
     def states(self, gain: Array, units: Array | None = None) -> BoolArray:
@@ -112,11 +117,15 @@ class Knowledge:
         kernel, slack = self._kernel
         if not kernel.any() and np.isfinite(gain).all():
             return np.ones((len(kernel), gain.shape[1]), dtype=bool)
+        last = gain[len(gain) - len(kernel) :]
         if units is not None:  # the row of a state that no parameter has part in is rounding
             own = np.abs(gain) / units[:, None]
-            whole = own.max(axis=1, keepdims=True, initial=0.0, where=np.isfinite(own))
-            gain = np.where(own <= _NOISE * np.maximum.accumulate(whole), 0.0, gain)
-        scaled = gain[len(gain) - len(kernel) :] / self.sizes[:, None, :]
+            whole = own.max(axis=1, initial=0.0)
+            if not np.isfinite(whole).all():
+                whole = own.max(axis=1, initial=0.0, where=np.isfinite(own))
+            whole = np.maximum.accumulate(whole)[-len(last) :, None]
+            last = np.where(own[-len(last) :] <= _NOISE * whole, 0.0, last)
+        scaled = last / self.sizes[:, None, :]
         size = _row_norms(scaled)
         return np.asarray(_row_norms(scaled @ kernel) <= slack[:, None] * size)
 

@@ -133,10 +133,13 @@ _Evaluation = Callable[[Array], tuple[Array, Array, Array]]
 
 def evaluation(
     state_map: StateMap, grid: Array, truth: Array, x: Array, sizes: tuple[Array, Array],
-    judged: BoolArray, chosen: IntArray, *, each: bool,
+    judged: BoolArray, chosen: IntArray, *, each: bool, alone: bool,
 ) -> _Evaluation:
-    """How a batch of cases is measured on the grid (M,) against η (M, p) and x (M, n)."""
-    if not isinstance(state_map, AffineStateMap):
+    """How a batch of cases is measured on the grid (M,) against η (M, p) and x (M, n).
+
+    ``each``: with the time of each quantity; ``alone``: there is one case only.
+    """
+    if not isinstance(state_map, AffineStateMap) or (alone and state_map.large):
         reconstruct = state_map.at(grid)
 
         def evaluate(eta: Array) -> tuple[Array, Array, Array]:

@@ -246,10 +246,14 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
         inverse, _ = inverse_or_none(np.array([1.0, -1.0])[:, None, None] * E - A)
         smallest = 1.0 / np.linalg.norm(inverse, axis=(1, 2))
     regular = float(smallest.max() / max(np.linalg.norm(A), np.finfo(float).tiny))
-    # Where the rows of E have ended, rank [E A; 0 C; 0 E] = rank E + rank [ZᵀA; C; E].
-    U, sigma, _ = np.linalg.svd(E)
-    rank = int((sigma > sigma[0] * n * np.finfo(float).eps).sum())
-    whole = rank + int(np.linalg.matrix_rank(np.concatenate([U[:, rank:].T @ A, C, E])))
+    # Where the rows of E have ended, rank [E A; 0 C; 0 E] = rank E + rank [ZᵀA; C; E], and the
+    # latter is rank E and that of [ZᵀA; C] on the kernel of E.
+    U, sigma, Vt = np.linalg.svd(E)
+    eps = n * np.finfo(float).eps
+    rank = int((sigma > sigma[0] * eps).sum())
+    rest = np.concatenate([U[:, rank:].T @ A, C])
+    seen = np.linalg.svd(rest @ Vt[rank:].T, compute_uv=False)
+    whole = 2 * rank + int((seen > np.linalg.norm(rest) * eps).sum())
     return [
         Assumption(
             "Regularity", "the pencil λE − A is regular (constant coefficients)", regular > 1e-12,

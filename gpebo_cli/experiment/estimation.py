@@ -370,7 +370,7 @@ def _estimate(
     sizes = accuracy.sizes_of(truth, natural, x)
     evaluate = accuracy.evaluation(
         state_map, grid, truth * told[0], x * told[1], sizes, accuracy.judged_of(source, p), chosen,
-        each=each,
+        each=each, alone=size == 1,
     )
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
     numbers = np.empty((len(METRICS) + each * (p + n), size))

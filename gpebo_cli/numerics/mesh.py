@@ -243,6 +243,18 @@ class Sampler:
                 np.matmul(self.weights[some], flat[element], out=sampled[some])
         return sampled.reshape(len(sampled), *values.shape[2:])
 
+    def products(self, values: Array, factors: Array) -> Array:
+        """Matrices (K, s + 1, n, p), at the times, with vectors there (M, p): (M, n).
+
+        Matrices of whole elements are multiplied: none is interpolated.
+        """
+        changes = np.flatnonzero(np.diff(self.element)) + 1
+        found = np.empty((len(factors), values.shape[2]))
+        for some in np.split(np.arange(len(factors)), changes):
+            each = values[self.element[some[0]]] @ factors[some].T
+            found[some] = np.einsum("mj,jnm->mn", self.weights[some], each)
+        return found
+
     @cached_property
     def _grouped(self) -> list[tuple[int, int, int]] | None:
         """Where several times in a row share elements: these, and the first and last of the times.

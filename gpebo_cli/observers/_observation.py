@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -15,6 +16,8 @@ from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps
 from gpebo_cli.regression.estimator import Estimator
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.samples import SampledRegression
+
+_LARGE = 32  # parameters, from which on gains are not sampled for one case
 
 # η̂ (g, M, p) at fixed times -> x̂ (g, M, n), NaN for a state the observer does not see
 Reconstruction = Callable[[Array], Array]
@@ -71,12 +74,20 @@ class AffineStateMap(StateMap):
     def at(self, t: Array) -> Reconstruction:
         """Sample offset and gain at the times t (M,) once for all cases."""
         sampler = self.offset.mesh.sampler(t)
-        offset, gain = sampler(self.offset.values), sampler(self.gain.values)
+        offset = sampler(self.offset.values)
+        gain = cache(lambda: sampler(self.gain.values))
 
         def reconstruct(eta: Array) -> Array:
-            return np.asarray(offset + np.matmul(gain, eta[..., None])[..., 0])
+            if len(eta) == 1 and self.large:
+                return offset + sampler.products(self.gain.values, eta[0])[None]
+            return np.asarray(offset + np.matmul(gain(), eta[..., None])[..., 0])
 
         return reconstruct
+
+    @property
+    def large(self) -> bool:
+        """Whether gains are so large that for one case they should not be sampled."""
+        return bool(self.gain.values.shape[3] >= _LARGE)
 
     def gains(self, t: Array, states: Array) -> Array:
         """The gain at the times t (M,) for every case of x̂ (g, M, n)."""

@@ -401,7 +401,7 @@ class Extension:
         And ln ‖Φ(end)‖₂, which is 0 at the start.
         """
         values = self.trajectory.values
-        some = np.stack([values[0, 0], largest_over_time(values, 2), values[-1, -1]])
+        some = np.stack([values[0, 0], self.assembled.largest, values[-1, -1]])
         Phi = comparable(some[..., 1 + q :], self.units)
         return largest_entry(Phi), log_norm(Phi[-1])
 
@@ -478,12 +478,6 @@ class _Monitor:
 
     def __call__(self, values: Array, extras: tuple[Array, ...]) -> Iterator[Kind]:
         """All signals with their floors; SolverError if the extension is beyond all bounds."""
-        if largest_entry(values) > _LARGEST:
-            raise SolverError(
-                f"the dynamic extension of plant {self._system.name} grows beyond {_LARGEST:.0e}: "
-                "A_0 is unstable; use observer.remedy=output_injection, reset or "
-                "current_coordinates, or a shorter time.horizon"
-            )
         plain = bool((self.units == 1.0).all())
         self._whole = values if plain else values * self.units, *extras
         if self._past:
@@ -495,6 +489,12 @@ class _Monitor:
         self.latest = regression_signals(
             z, self._system.q, self._basis, AlgebraicEquations(*seen)
         )
+        if (self.latest.largest / self.units).max(initial=0.0) > _LARGEST:
+            raise SolverError(
+                f"the dynamic extension of plant {self._system.name} grows beyond {_LARGEST:.0e}: "
+                "A_0 is unstable; use observer.remedy=output_injection, reset or "
+                "current_coordinates, or a shorter time.horizon"
+            )
         for signal, floor in self.latest.kinds(self.axes):
             if signal is not None:
                 yield signal.reshape(*self._whole[0].shape[:2], -1), floor
@@ -559,16 +559,16 @@ def joined(parts: Iterable[Extension], elements: int) -> Extension:
         }.items():
             whole[name].add(values, size / max(elements, size))
         rest.append((part.error_estimate, part.weakest, found.Y_scale, found.column_scale,
-                     found.moving))
+                     found.largest, found.moving))
         end, rule, units = part.mesh.edges[-1:], part.mesh.rule, part.units
-    errors, weak, of_Y, of_columns, moving = zip(*rest, strict=True)
+    errors, weak, of_Y, of_columns, largest, moving = zip(*rest, strict=True)
     over_time: dict[str, Any] = {name: whole[name].values for name in OVER_TIME}
     mesh = Mesh(np.append(whole["edges"].values, end), rule)
     return Extension(
         Trajectory(mesh, whole["z"].values), max(errors),
         replace(
             found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
-            moving=np.max(moving, axis=0),
+            largest=np.max(largest, axis=0), moving=np.max(moving, axis=0),
         ),
         np.maximum.accumulate(whole["scale"].values, axis=0), units, min(weak),
     )
@@ -592,12 +592,12 @@ def _assembled(
             _over_time(e if e.shape[:2] == (1, 1) else e[part, places])
             for e in (values, *solution.extras)
         )
-        terms, sizes = term_sizes(z, system.q, reduced.basis, AlgebraicEquations(*seen))
+        of_gain, sizes = term_sizes(z, system.q, reduced.basis, AlgebraicEquations(*seen))
         elements = len(sizes) // 3
         scale.append(sizes.reshape(elements, 3, sizes.shape[1]).max(axis=1))
         if as_found:
             continue
-        terms = terms.reshape(elements, 3, *terms.shape[1:]).max(axis=1).repeat(points, axis=0)
+        terms = of_gain().reshape(elements, 3, system.n, -1).max(axis=1).repeat(points, axis=0)
         some = slice(first * points, part.stop * points)
         here = replace(found, Y=found.Y[some], psi=found.psi[some], offset=found.offset[some],
                        gain=found.gain[some])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -32,7 +32,8 @@ class Assembled:
     Y_scale: float  # size of the terms of Y before they cancel
     column_scale: Array  # (p,) and of the columns of ψ: each has the unit of its parameter
     eliminated: BoolArray  # (n,) states that take part in what is eliminated
-    moving: Array  # (n, p) sizes of the gain of w = P x, which the eliminated part may cancel
+    largest: Array  # (k, 1 + p) sizes of z over time
+    moving: Array  # (n, p) of the gain of w = P x, which the eliminated part may cancel
 
     def kinds(self, basis: Array | None = None) -> Iterator[tuple[Any, Any]]:
         """Everything the mesh has to resolve, with the size below which it is rounding.
@@ -117,9 +118,9 @@ def regression_signals(
         sizes = np.maximum(sizes, (np.abs(algebraic) @ np.abs(z)).max(axis=(0, 1), initial=0.0))
         nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= _VANISHING * sizes[1:]
         psi = np.where(nothing, 0.0, psi)
-    moving = np.abs(basis) @ largest_over_time(z)[:, 1:]
-    used = np.asarray(H.any(axis=(0, 2)))
-    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, moving)
+    largest, used = largest_over_time(z), np.asarray(H.any(axis=(0, 2)))
+    moving = np.abs(basis) @ largest[:, 1:]
+    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, largest, moving)
 
 
 def resolved(
@@ -147,7 +148,7 @@ def resolved(
 
 def term_sizes(
     z: Array, q: int, basis: Array, equations: AlgebraicEquations
-) -> tuple[Array, Array]:
+) -> tuple[Callable[[], Array], Array]:
     """Sizes of the terms of the gain (N, n, p), and of those of each column of ψ (N, p).
 
     An equation of large numbers counts as much as its projection can add to a residual, or as
@@ -156,8 +157,11 @@ def term_sizes(
     z, inward = np.abs(z[:, :, 1:]), transpose(equations.range)
     seen = np.abs(equations.on_basis) @ z
     seen[:, :, :q] += np.abs(equations.G)
-    terms = np.abs(basis) @ z
-    terms += np.abs(equations.elimination) @ (np.abs(inward) @ seen)
+
+    def of_gain() -> Array:
+        through = np.abs(equations.elimination) @ (np.abs(inward) @ seen)
+        return np.asarray(np.abs(basis) @ z + through)
+
     projected = np.abs(orthonormal_complement(equations.range)) @ seen
-    return terms, np.maximum(projected, _ROUNDING * seen).max(axis=1)
+    return of_gain, np.maximum(projected, _ROUNDING * seen).max(axis=1)
 

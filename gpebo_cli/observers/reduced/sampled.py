@@ -190,7 +190,7 @@ class SampledObserver:
         Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
         growth = largest_entry(Phi[1:])
         smallest = float(o.injectivity.min())
-        terms, scale = term_sizes(z, system.q, self.basis, equations)
+        of_gain, scale = term_sizes(z, system.q, self.basis, equations)
         if before is not None:
             growth, scale[0] = max(growth, before.growth), np.maximum(scale[0], before.scale)
             smallest = min(smallest, before.injectivity)
@@ -209,7 +209,7 @@ class SampledObserver:
             errors = ErrorSteps(step, *(
                 np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
             ))
-        offset, gain = resolved(assembled, terms, self.form)
+        offset, gain = resolved(assembled, of_gain(), self.form)
         return state, SampledBlock(
             regression, offset, gain, z, scale, errors, self.form.units.states
         )
