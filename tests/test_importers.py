@@ -262,6 +262,29 @@ def test_what_continues_and_what_is_a_comment():
     ("L1 a 0 1\nL2 b 0 1\nK1 L1 L2 1.5", "a coupling is at most 1"),
     ("R1 a 0 {1", "is not closed"),
     (".subckt s a\nR1 a 0 1\nX1 a s\n.ends\nX1 b s\nR2 b 0 1", "nested more than 20 deep"),
+    ("R1=5", "'R1=5' is no element: a name comes first"), ("X1=s", "a name comes first"),
+    ("R1 a", "R1 needs 2 nodes and has 1"),
+    ("= R1 a 0 1", "= needs a name before it"), (".param\nR1 a 0 1", ".param needs name=value"),
+    (".subckt s a b\n.subckt r a b", ".subckt inside .subckt s"),
+    (".subckt s", "needs a name and nodes"), (".ends", ".ends without .subckt"),
+    (".subckt s a b\nR1 a b 1", ".subckt s has no .ends"),
+    (".subckt s a b\nR1 a b 1\n.ends\nX1 a s", "X1 has 1 nodes and the subcircuit s has 2"),
+    (".subckt s a r=1\nR1 a 0 {r}\n.ends\nX1 a s rr=2", "s has no parameter rr; did you mean r"),
+    (".model d d\nR1 a 0 1", ".model is not read"),
+    ("K1 L1 L2", "two inductors and a coefficient"),
+    ("R1 a 0 1 ic=2", "R1: ic= is not read here"), ("R1 a 0 1 tc1=2", "tc1= changes the value"),
+    ("T1 a 0 b 0 2", "T1 needs n=RATIO"), ("F1 a 0", "needs the voltage source whose current"),
+    ("S1 a 0", "S1 needs its instants"), ("S1 a 0 on=x", "on=x has to be times in seconds"),
+    ("S1 a 0 on=1,2 off=3", "on and off have to take turns"),
+    ("V1 a 0 SIN(0 1 f)", "SIN(…) takes numbers"), ("V1 a 0 SIN(0 1)", "needs at least 3 numbers"),
+    ("V1 a 0 SIN(0 1 1 0 0 0 0)", "has 7 numbers; at most 6"),
+    ("V1 a 0 EXP(0 1 0 0 1 1)", "needs positive time constants"),
+    ("V1 a 0 PWL(0 1 2)", "pairs of a time and a value"),
+    ("V1 a 0 PWL(1 1 0 2)", "times that do not fall"),
+    ("V1 a 0 PULSE(0 1 0 1n 1n 2u 1u 3)", "longer than their period"),
+    ("V1 a 0 PULSE(0 1 0 1n 1n 1u 2u 2000)", "at most 1000 are read"),
+    ("V1 a 0 1 2", "is no source"), ("R1 a 0 1\n" * 20001, "lines; at most"),
+    ("\n".join(f"R{k} a 0 1" for k in range(5001)), "more than 5000 elements"),
 ])
 def test_mistakes_in_netlists(lines, message):
     with pytest.raises(ConfigError) as error:
@@ -369,6 +392,9 @@ def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     ({"G": [[1, 2, 3]]}, "G[0] has 3 entries; expected 2"), ({"stiffness": 1}, "unknown key"),
     ({"measure": ["q3"]}, "did you mean"), ({"M": [[1, True], [0, 1]]}, "M[0][1]"),
     ({"positions": ["a"]}, "positions has 1 names and M has 2 rows"),
+    ({"measure": "q1"}, "expected a list of names"), ({"inputs": ["u"]}, "inputs maps names to"),
+    ({"K": 3}, "K must be a list of rows"), ({"K": [1, 2]}, "K[0] must be a list"),
+    ({"M": [[0] * 1001]}, "M has more than"), ({"units": "m"}, "units maps names to texts"),
 ])
 def test_mistakes_in_mechanics(change, message):
     with pytest.raises(ConfigError) as error:
@@ -376,6 +402,7 @@ def test_mistakes_in_mechanics(change, message):
     assert message in str(error.value)
 
 
+MARKET = "%%MatrixMarket matrix array real general\n1 1\n-1\n"
 A = np.array([[0.0, 1.0], [-2.0, -0.3]])
 B, C = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
 
@@ -490,10 +517,36 @@ def test_files_of_matrices(tmp_path):
     ({"B": B}, "the matrix A is missing"),
     ({"A": A, "B": np.ones((3, 1))}, "B is 3 × 1; expected 2 × 1"),
     ({"A": [[np.nan]]}, "not finite"), ({"A": [[1j]]}, "real numbers"),
+    ({"A": sparse.eye(2001)}, "A has 2001 states; at most 2000"),
 ])
 def test_mistakes_in_matrices(matrices, message):
     with pytest.raises(ConfigError, match=message):
         from_matrices(matrices, "p")
+
+
+def test_mistakes_in_what_belongs_to_matrices():
+    with pytest.raises(ConfigError, match="initial_state has 3 values for 2 states"):
+        from_matrices({"A": A}, "p", initial_state=[1, 2, 3])
+    with pytest.raises(ConfigError, match="1 names of states for 2 of them"):
+        from_matrices({"A": A}, "p", states=["a"])
+
+
+@pytest.mark.parametrize(("files", "message"), [
+    ({"b.B.mtx": "", "note.mtx": ""}, "B.mtx is no Matrix Market file"),
+    ({"B.mtx": MARKET}, "has no file A.mtx or NAME.A.mtx"),
+    ({"A.mtx": MARKET, "p.A.mtx": MARKET}, "two files for A; give a folder of one system"),
+])
+def test_mistakes_in_folders_of_matrices(files, message, tmp_path):
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    with pytest.raises(ConfigError, match=message):
+        from_file(tmp_path, "p")
+
+
+def test_text_of_a_linear_model_with_ragged_rows(tmp_path):
+    (tmp_path / "m.py").write_text("A = [[0, 1], [2]]\n")
+    with pytest.raises(ConfigError, match="A has rows of different lengths"):
+        from_file(tmp_path / "m.py", "p")
 
 
 def test_from_a_file_on_the_command_line(tmp_path):

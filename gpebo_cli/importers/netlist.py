@@ -218,6 +218,14 @@ def _options(text: str, place: Place) -> tuple[list[str], dict[str, str]]:
     return plain, options
 
 
+def _element_of(line: str, place: Place) -> tuple[list[str], dict[str, str]]:
+    """The words of an element, its name first, and its options."""
+    plain, options = _options(line, place)
+    if not plain:
+        raise place.error(f"{shown(line)} is no element: a name comes first, then its nodes")
+    return plain, options
+
+
 class _Reader:
     """Collects elements while subcircuits are put in place."""
 
@@ -326,7 +334,7 @@ class _Reader:
         self, line: str, place: Place, nodes: Mapping[str, str], scope: Mapping[str, str],
         prefix: str, depth: int,
     ) -> None:
-        plain, given = _options(line, place)
+        plain, given = _element_of(line, place)
         plain = [word for word in plain if word.lower() != "params:"]
         if len(plain) < 2 or plain[-1].lower() not in self.blocks:
             what = shown(plain[-1]) if len(plain) > 1 else "nothing"
@@ -360,7 +368,7 @@ class _Reader:
         self, line: str, place: Place, nodes: Mapping[str, str], scope: Mapping[str, str],
         prefix: str,
     ) -> None:
-        plain, options = _options(line, place)
+        plain, options = _element_of(line, place)
         name, kind = plain[0], plain[0][0].upper()
         if kind == "K":
             element = self._coupling(plain, scope, place, prefix)
