@@ -12,7 +12,7 @@ from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec
 
 from gpebo_cli.evidence.excitation import assess, persistent
-from gpebo_cli.evidence.metrics import settling_time, time_rms
+from gpebo_cli.evidence.metrics import measure_squares, settling_time, time_rms
 from gpebo_cli.observers import observe
 from gpebo_cli.settings import (
     ExcitationSettings,
@@ -109,6 +109,16 @@ def test_settling_time_counts_the_last_excursion():
     t = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
     error = np.array([[1.0, 1e-3, 0.5, 1e-3, 1e-3]])
     assert 2.0 < settling_time(t, error)[0] < 3.0
+
+
+def test_norms_that_start_at_rounding_have_settled_at_once():
+    """A plant that starts where the observer does: its errors are rounding at all times."""
+    t = np.linspace(0.0, 4.0, 5)
+    squares = np.array([[0.0, 1e-30, 1e-32, 0.0, 1e-31], [0.0, 1.0, 1e-3, 1e-9, 1e-9]])
+    found = measure_squares(t, squares, np.zeros((2, 1)), squares, np.zeros((2, 1)))
+    np.testing.assert_array_equal(found[:2, 0], 0.0)
+    assert (2.0 < found[:2, 1]).all()
+    assert (found[:2, 1] < 3.0).all()
 
 
 def test_time_rms():

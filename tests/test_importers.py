@@ -574,6 +574,8 @@ def test_a_large_plant_has_its_matrices_in_a_file_beside_it(tmp_path, monkeypatc
     Path("ladder.cir").write_text(text)
     done = gpebo("new", "plant", "ladder", "--from", "ladder.cir", cwd=tmp_path)
     assert done.stdout.splitlines()[:2] == ["plant/ladder.npz", "plant/ladder.yaml"]
+    assert "nothing is measured: an observer needs outputs" in done.stdout
+    assert "gpebo run --config-dir . plant=ladder observer=none\n" in done.stdout
     plant = yaml.safe_load(Path("plant/ladder.yaml").read_text())
     assert plant["matrices"] == "ladder.npz"
     assert "E" not in plant

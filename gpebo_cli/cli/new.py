@@ -31,6 +31,7 @@ FROM_FILE = {
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,79}")
 _WORDS = ("null", "true", "false", "yes", "no", "on", "off", "nan", "inf")  # mean more in YAML
 _GROUPS = {"recipe": "experiment"}  # of kinds that are not called as their group
+_UNSEEN = "nothing is measured: an observer needs outputs, as in --measure STATE,STATE"
 _RUNS = """\
 it runs as it stands:      gpebo run --config-dir {folder} {kind}={name}
 when you have changed it:  gpebo check --config-dir {folder} {kind}={name}
@@ -64,6 +65,8 @@ def main(words: list[str]) -> int:
         found, told = _from_file(name, options)
         contents = {path.with_name(file): content for file, content in found.items()}
         _check_name(kind, name, list(contents))
+        if _UNSEEN in told:
+            name += " observer=none"
 
     from gpebo_cli.results.files import make_folder, write_file
 
@@ -106,6 +109,8 @@ def _from_file(name: str, options: Options) -> tuple[dict[str, bytes], str]:
     try:
         structure = structure_of(system, TimeSettings(), SolverSettings())
         said.append(f"index {structure.index} as computed")
+        if not system.outputs:
+            said.append(_UNSEEN)
     except GpeboError as error:
         said.append(f"it is written, but cannot be simulated yet: {error}")
     return draft.files(), "".join(f"{line}\n" for line in said)

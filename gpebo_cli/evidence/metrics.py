@@ -74,14 +74,24 @@ def measure_squares(
     out = np.full((5, len(last_parameters)), np.nan)
     if of_parameters is not None:
         known = None if last is None else last[:, 0]
-        out[0] = settling_time(t, of_parameters, SETTLED**2, last=known)
+        out[0] = _norm_settled(t, of_parameters, known)
         out[2] = np.abs(last_parameters).max(axis=1, initial=0.0)
     if of_states is not None:
         known = None if last is None else last[:, 1]
-        out[1] = settling_time(t, of_states, SETTLED**2, last=known)
+        out[1] = _norm_settled(t, of_states, known)
         out[4] = time_rms(t, of_states)
         out[3] = np.abs(last_states).max(axis=1)
     return out
+
+
+def _norm_settled(t: Array, squares: Array, last: Array | None) -> Array:
+    """:func:`settling_time` (G,) of norms in units of sizes, from their squares (G, M).
+
+    As in :func:`levels`, a norm that starts at rounding is to stay below 1 % of one.
+    """
+    some = squares[:, 0] > _NOTHING**2
+    level = SETTLED**2 * np.where(some, squares[:, 0], 1.0)
+    return settling_time(t, squares, level=level, last=last if some.all() else None)
 
 
 def levels(first: Array, size: Array) -> Array:
