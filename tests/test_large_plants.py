@@ -511,3 +511,20 @@ def test_one_case_with_many_parameters_is_measured_as_many_cases_are():
     assert found[0]["rms_error_states"] > 0.01
     for name in ("seconds_to_1pct_states", "final_error_states", "rms_error_states"):
         assert found[0][name] == pytest.approx(found[1][name], rel=1e-6, nan_ok=True)
+
+
+@pytest.mark.parametrize("chain", [0.0, 1.0])
+def test_nine_states_of_which_none_is_differential(chain):
+    """x_k = x_{k+1}' where there is a chain, else zero: nothing is left to integrate."""
+    n = 9
+    plant = {
+        "name": "algebraic", "states": [f"x{k}" for k in range(n)], "inputs": {"u": "-cos(t)"},
+        "outputs": ["y"], "E": chain * np.eye(n, k=1), "A": np.eye(n),
+        "B": [*([[0]] * (n - 1)), [1]], "C": np.eye(1, n), "initial_state": np.zeros(n),
+    }
+    solver = {"max_strangeness_index": n}
+    found = run(plant, solver=solver, time={"horizon": 3, "samples": 11})
+    assert found.details.simulation.index == (n if chain else 1)
+    np.testing.assert_allclose(found["x8"], np.cos(found.t), atol=1e-12)
+    np.testing.assert_allclose(found["x4"], chain * np.cos(found.t), atol=1e-11)
+    assert abs(found.errors["x0"][0, -1]) < 1e-10

@@ -46,7 +46,9 @@ def counted(number: int, noun: str) -> str:
 
 
 def items_of(value: object) -> list[object] | None:
-    """The items of a list, None for anything else (text is not a list of letters)."""
+    """The items of a list or an array, None for anything else (text is no list of letters)."""
+    if isinstance(value, np.ndarray) and value.ndim == 1:
+        return list(value.tolist())
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return list(value)
     return None

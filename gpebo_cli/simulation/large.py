@@ -193,6 +193,8 @@ def _simulated(
     system, tol = plant.system, solver.tol
     plant.entries(mesh)
     form = plant.eliminate(mesh)
+    if not form.d:
+        return None  # there is nothing to integrate, and the derivative array has all states
     if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
         return None  # what jumps then is for the derivative array to say
     M, units = plant.matrix(), form.units
