@@ -245,6 +245,19 @@ def test_the_power_law_is_exact_after_a_finite_time_and_not_before(alpha, gamma2
     assert near.requirement.evidence["needed"] == pytest.approx(needed)
 
 
+@pytest.mark.parametrize("size", [1e-70, 1e-77, 1e-81])
+def test_the_power_law_stands_still_where_nothing_is_left_of_the_regressor(size):
+    """Δ is of size⁴, next to the smallest number, and the residual is zero."""
+    def psi(t):
+        rows = [[1.0 + 0.0 * t, np.sin(t)], [np.cos(t), 1.0 + 0.0 * t]]
+        return size * np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+    eta = np.array([1.0, 2.0])
+    faint = LinearRegression.from_functions(psi, lambda t: psi(t) @ eta, ["a", "b"], 10.0, 8)
+    found = run("power", faint, np.linspace(0.0, 10.0, 5), initial=eta.tolist())
+    np.testing.assert_allclose(found[0], np.broadcast_to(eta, (5, 2)), rtol=1e-14)
+
+
 def test_a_regressor_that_stays_exciting_when_the_excitation_ends():
     """Behind the Δ of drem nothing arrives any more; behind the new one the rest does."""
     ends, t = regression(fading, ETA, horizon=40.0), np.linspace(0.0, 40.0, 81)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.estimators._mixing import SINGULAR
 from gpebo_cli.estimators._scalar import ScalarPath
-from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.mesh import Mesh, legendre_tail
+from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.numerics.mesh import legendre_tail
 
 _TOLERANCE, _ROUNDING = 1e-11, 1e-15
+_AT_ONCE = 1024  # elements
+_INSIDE = 1e-3  # of a step: which element a node belongs to
 _ITERATIONS = 12  # of Newton's method
+_NOTHING = 1e-290  # next to the smallest number
 _SHORTEST = 1e-11  # steps, relative to the element
 
 
@@ -42,17 +46,25 @@ class PowerLaw:
         out = np.empty((len(eta), len(path.t)))
         out[:, : np.searchsorted(path.t, path.mesh.edges[0], side="right")] = eta[:, None]
         step = np.ones(len(eta))  # of the element, as it turned out to be good
-        for left, right in zip(path.mesh.edges[:-1], path.mesh.edges[1:], strict=True):
+        for number, (left, right) in enumerate(pairwise(path.mesh.edges.tolist())):
+            if number % _AT_ONCE == 0:  # signals of many elements at once cost little
+                edges = path.mesh.edges[number : number + _AT_ONCE + 1]
+                whole = self._signals(edges[:-1], edges[1:])
             at = np.zeros(len(eta))  # share of the element that is done
             wanted = np.flatnonzero((path.t > left) & (path.t <= right))
             places = (path.t[wanted] - left) / (right - left)
             while (lanes := np.flatnonzero(at < 1.0)).size:
                 end = at[lanes] + step[lanes]
                 end = np.where(end > 1.0 - 1e-9, 1.0, end)
-                values, good = self._step(
-                    left + (right - left) * at[lanes], left + (right - left) * end,
-                    eta[lanes], gamma[lanes], column[lanes],
-                )
+                from_, to = (left + (right - left) * share for share in (at[lanes], end))
+                if at.any() or (end < 1.0).any():
+                    pairs, of = np.unique(np.stack([from_, to]), axis=1, return_inverse=True)
+                    delta, Y, digits = (x[of] for x in self._signals(*pairs))
+                else:
+                    same = np.full(len(lanes), number % _AT_ONCE)
+                    delta, Y, digits = (x[same] for x in whole)
+                Y = Y[np.arange(len(lanes)), :, column[lanes]]
+                values, good = self._step(to - from_, eta[lanes], gamma[lanes], delta, Y, digits)
                 step[lanes] *= np.where(good, np.where(step[lanes] < 1.0, 2.0, 1.0), 0.25)
                 if step.min() < _SHORTEST:
                     raise SolverError(f"the power law is not resolved near t = {left:.6g}")
@@ -66,25 +78,33 @@ class PowerLaw:
                 at[lanes] = np.where(good, end, at[lanes])
         return np.moveaxis(out.reshape(*shape, -1), 1, 2)
 
+    def _signals(self, left: Array, right: Array) -> tuple[Array, Array, Array]:
+        """Δ (n, s), 𝐘 (n, s, P) and digits (n, s) at the nodes of steps (n,)."""
+        rule = self.path.mesh.rule
+        h = (right - left)[:, None]
+        places = left[:, None] + h * rule.points
+        places[:, -1] = right
+        inside = places.clip(places[:, :1] + _INSIDE * h, places[:, -1:] - _INSIDE * h)
+        delta, Y, digits = self.path.signals(places[:, 1:].ravel(), inside[:, 1:].ravel())
+        shape = len(left), rule.stages
+        return delta.reshape(shape), Y.reshape(*shape, -1), digits.reshape(shape)
+
     def _step(
-        self, left: Array, right: Array, eta: Array, gamma: Array, column: IntArray
+        self, h: Array, eta: Array, gamma: Array, delta: Array, Y: Array, digits: Array
     ) -> tuple[Array, BoolArray]:
-        """Collocation of n laws over steps (n,) of their own: η̂ (n, s + 1), and which are resolved.
+        """Collocation of n laws over steps h (n,) of their own, along signals (n, s) each.
 
         Unknown are w = ⌈r⌋^α at the nodes: ⌈w_i⌋^{1/α} = 𝐘_i − Δ_i η̂_i is smooth in them where a
         power of r is not, and η̂ follows by integration.
+
+        Returns:
+            η̂ (n, s + 1), and which are resolved.
         """
         path, rule = self.path, self.path.mesh.rule
-        pairs, lane = np.unique(np.stack([left, right]), axis=1, return_inverse=True)
-        places = np.concatenate([Mesh(pair, rule).points for pair in pairs.T])
-        inside = np.concatenate([Mesh(pair, rule).inside for pair in pairs.T])
-        found = path.signals(places.ravel(), inside.ravel())
-        delta, digits = (found[i].reshape(places.shape)[lane, 1:] for i in (0, 2))
-        Y = found[1].reshape(*places.shape, -1)[lane, 1:, column]
         # Where 𝐘/Δ is rounding nothing is known, and the estimate does not move.
         known = (digits > SINGULAR) & (delta != 0.0)
         rest = np.where(known, Y - delta * eta[:, None], 0.0)
-        integral = (right - left)[:, None, None] * rule.integration * delta[:, None]
+        integral = h[:, None, None] * rule.integration * delta[:, None]
         coupling, diagonal = delta[:, :, None] * integral, np.arange(rule.stages)
         w, before = np.sign(rest) * np.abs(rest) ** self.alpha, np.full_like(rest, np.inf)
         ratio, root = self.beta / self.alpha, 1.0 / self.alpha
@@ -99,6 +119,8 @@ class PowerLaw:
             slope = gamma[:, None] + self.gamma2 * ratio * size ** (ratio - 1.0)
             J = coupling * slope[:, None]
             J[:, diagonal, diagonal] += np.where(delta, root * size ** (root - 1.0), 1.0)
+            # Where nothing is left of Δ and r nothing moves.
+            J[:, diagonal, diagonal] += np.where(np.abs(J).max(axis=2) > _NOTHING, 0.0, 1.0)
             F = np.sign(w) * size**root + delta * moved - rest
             w, before = w - np.linalg.solve(J, F[..., None])[..., 0], moved
         values = np.concatenate([eta[:, None], eta[:, None] + moved], axis=1)

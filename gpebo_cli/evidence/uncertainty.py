@@ -38,6 +38,7 @@ _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level
 _GROUPS = 2000  # of samples, by which many of them are replaced at first
 _PER_ELAPSED = 64  # groups at least, since the start, at first
 _AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
+_BESIDE = 8  # errors that stand beside each other in a factor
 _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
 
 
@@ -148,25 +149,26 @@ def propagated(
         maps = _element_maps(observer, estimator, mesh, part, n)
         size = maps.shape[2]
         zeta = observer(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]
+        chosen = (sampler.element >= first) & (sampler.element < first + stretch)
+        element, weights = sampler.element[chosen], sampler.weights[chosen]
+        wanted, place = np.unique(element - first, return_inverse=True)
         factors, L = _factors(
             maps[:, -1], fresh[part] | anew[part], shares[part, None] * np.sqrt(variances), L,
-            anew[part], zeta,
+            anew[part], zeta, wanted,
         )
-        chosen = (sampler.element >= first) & (sampler.element < first + stretch)
-        if not chosen.any():
+        if not len(wanted):
             continue
-        element, weights = sampler.element[chosen], sampler.weights[chosen]
-        own = element - first
-        here = np.einsum("ms,msij->mij", weights[:, 1:], maps[own])
+        own = factors[place]
+        here = np.einsum("ms,msij->mij", weights[:, 1:], maps[element - first])
         here[:, :, :size] += weights[:, 0, None, None] * np.eye(size)
-        reached = here @ factors[own]  # of [ζ; s] (M, size, size + signals)
+        reached = here @ own  # of [ζ; s] (M, size, ·)
         inside = mesh.inside[element, 1]
         o, e = observer(t[chosen], inside), estimator(t[chosen], inside)
         zeta = o.A.shape[1]
         eta = e.C @ reached[:, zeta:]
         rows = o.C.shape[1] - n  # of Y; those of the offset stand below
         x = gain[chosen] @ eta
-        e_now = factors[own, size:] / shares[element, None, None]  # of one sample, not of many
+        e_now = own[:, size:] / shares[element, None, None]  # of one sample, not of many
         x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ e_now
         of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
     return of_eta, of_x, np.zeros((0, 0)) if L is None else L
@@ -405,9 +407,12 @@ def _joint(
 
 
 def _factors(
-    ends: Array, fresh: BoolArray, deviations: Array, L: Array | None, anew: BoolArray, zeta: int
+    ends: Array, fresh: BoolArray, deviations: Array, L: Array | None, anew: BoolArray, zeta: int,
+    wanted: IntArray,
 ) -> tuple[Array, Array]:
-    """L of [ζ; s; e] at the left end of every element (K, d + m + r, d + m + r), and at the end.
+    """L of [ζ; s; e] at the left ends of the elements ``wanted`` (W, d + m + r, ·), and at the end.
+
+    The errors of several samples stand in L side by side, before it is made triangular again.
 
     Args:
         ends: what an element makes of it, (K, d, d + m + r).
@@ -416,19 +421,28 @@ def _factors(
         L: at the start; None: everything is known there.
         anew: where ζ is zero, (K,).
         zeta: its size.
+        wanted: ascending.
     """
     size, signals = ends.shape[1], deviations.shape[1]
-    L = np.zeros((size + signals, size + signals)) if L is None else L
-    out = np.empty((len(ends), *L.shape))
+    own = np.arange(signals)
+    width = used = size + _BESIDE * signals
+    L = np.zeros((size + signals, width)) if L is None else L
+    L = np.pad(L, ((0, 0), (0, width - L.shape[1])))
+    out, told = np.empty((len(wanted), *L.shape)), 0
+    asked = np.isin(np.arange(len(ends)), wanted).tolist()
     for k, end in enumerate(ends):
         if anew[k]:
             L[:zeta] = 0.0
         if fresh[k]:  # another e, independent of those before
-            L[:size, :size] = np.asarray(np.linalg.qr(L[:size].T, mode="r")).T
-            L[:size, size:] = 0.0
+            if used == width:
+                L[:size, :size] = np.asarray(np.linalg.qr(L[:size].T, mode="r")).T
+                L[:size, size:] = 0.0
+                used = size
             L[size:] = 0.0
-            L[size:, size:] = np.diag(deviations[k])
-        out[k] = L
+            L[size + own, used + own] = deviations[k]
+            used += signals
+        if asked[k]:
+            out[told], told = L, told + 1
         L[:size] = end @ L
     return out, L
 
