@@ -165,6 +165,7 @@ def test_arrays_by_name_and_what_can_be_checked():
         run(regression=measured, data={**arrays, "y": np.zeros(7)})
     with pytest.raises(ConfigError, match="has no outputs; noise of the signals is noise"):
         run(regression=measured, data=arrays, noise={"name": "gaussian", "outputs": 0.1})
+    run(regression=measured, data=arrays, noise={"name": "gaussian", "inputs": {"y": 0.1}})
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.2])

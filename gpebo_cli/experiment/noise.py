@@ -76,16 +76,17 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
     if settings.seed < 0:
         raise ConfigError(f"noise.seed: expected 0 or more, got {settings.seed}")
     outputs, inputs = system.outputs, system.inputs
-    if settings.outputs and not outputs and system.regression is not None:
-        raise ConfigError(
-            f"noise.outputs: regression {system.name} makes Y of its signals and has no outputs; "
-            "noise of the signals is noise.inputs"
-        )
-    return NoiseLevels(
+    levels = NoiseLevels(
         per_name(settings.outputs, outputs, "output", "noise.outputs", absent=0.0),
         per_name(settings.inputs, inputs, "input", "noise.inputs", absent=0.0),
         per_name(settings.quantisation, outputs, "output", "noise.quantisation", absent=0.0),
     )
+    if settings.outputs and levels.silent and system.regression is not None and not outputs:
+        raise ConfigError(
+            f"noise.outputs: regression {system.name} makes Y of its signals and has no outputs; "
+            "noise of the signals is noise.inputs"
+        )
+    return levels
 
 
 def signal_noise(settings: NoiseSettings, levels: NoiseLevels) -> SignalNoise:
