@@ -14,6 +14,7 @@ import keyword
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.expressions import RESERVED
@@ -84,6 +85,28 @@ class _Block:
     lines: list[tuple[Place, str]] = field(default_factory=list)
 
 
+class _Scope(NamedTuple):
+    """What names mean in a block."""
+
+    nodes: Mapping[str, str]  # what its ports are called outside
+    known: Mapping[str, str]  # parameters by lower-case name, with what they are in the plant
+    prefix: str = ""  # of names inside, ``x1_``
+    depth: int = 0  # of nesting
+
+    def node(self, word: str) -> str:
+        """A node as the plant has it."""
+        node = _node(word)
+        return node if node == GROUND else self.nodes.get(node, self.prefix + node)
+
+    def quantity(self, text: str) -> str:
+        """``v(node)`` or ``i(element)`` as the plant has them, anything else as it stands."""
+        match = re.fullmatch(r"([vi])\((\w+)\)", text.replace(" ", ""))
+        if match is None:
+            return text
+        name = self.node(match[2]) if match[1] == "v" else self.prefix + match[2]
+        return f"{match[1]}({name})"
+
+
 def read_netlist(text: str, file: str = "netlist") -> Netlist:
     """Read a netlist.
 
@@ -97,7 +120,7 @@ def read_netlist(text: str, file: str = "netlist") -> Netlist:
     title, lines = _logical_lines(text, file)
     outside, blocks = _blocks(lines)
     reader = _Reader(blocks)
-    reader.expand(outside, {}, {}, "", 0)
+    reader.expand(outside, _Scope({}, {}))
     if not reader.elements:
         raise ConfigError(f"{file}: there is no element in it (the first line is a title)")
     return Netlist(
@@ -236,20 +259,10 @@ class _Reader:
         self.initial: dict[str, float] = {}
         self.saved: list[str] = []
 
-    def expand(
-        self, block: _Block, nodes: Mapping[str, str], scope: Mapping[str, str], prefix: str,
-        depth: int,
-    ) -> None:
-        """Read the lines of a block.
-
-        Args:
-            block: its lines.
-            nodes: what its ports are called outside.
-            scope: parameters by lower-case name, with what they are called in the plant.
-            prefix: of names inside, ``x1_``.
-            depth: of nesting.
-        """
-        known = dict(scope)
+    def expand(self, block: _Block, scope: _Scope) -> None:
+        """Read the lines of a block, in which its own parameters are known, too."""
+        known = dict(scope.known)
+        scope = scope._replace(known=known)
         lines = [(place, line, line.split()[0].lower()) for place, line in block.lines]
         for place, line, head in lines:
             if head in (".param", ".params"):
@@ -257,16 +270,16 @@ class _Reader:
                 if not given:
                     raise place.error(".param needs name=value")
                 for name, value in given.items():
-                    known[name] = self._parameter(prefix + name, value, known, place)
+                    known[name] = self._parameter(scope.prefix + name, value, known, place)
         for place, line, head in lines:
             if head.startswith(".param"):
                 continue
             if head.startswith("."):
-                self._command(head, line, place, prefix, nodes)
+                self._command(head, line, place, scope)
             elif head.startswith("x"):
-                self._instance(line, place, nodes, known, prefix, depth)
+                self._instance(line, place, scope)
             else:
-                self._element(line, place, nodes, known, prefix)
+                self._element(line, place, scope)
 
     def _parameter(self, name: str, value: str, scope: Mapping[str, str], place: Place) -> str:
         taken = {key.lower() for key in self.parameters}.union(RESERVED, keyword.kwlist)
@@ -304,9 +317,7 @@ class _Reader:
                 out.append(match["rest"])
         return "".join(out).strip()
 
-    def _command(
-        self, head: str, line: str, place: Place, prefix: str, nodes: Mapping[str, str]
-    ) -> None:
+    def _command(self, head: str, line: str, place: Place, scope: _Scope) -> None:
         rest = line.split(None, 1)[1] if len(line.split(None, 1)) > 1 else ""
         if head == ".ic":
             _, given = _options(rest, place)
@@ -314,11 +325,11 @@ class _Reader:
                 found = number(value)
                 if found is None:
                     raise place.error(f".ic {quantity} = {shown(value)} is not a number")
-                self.initial[_inside(quantity, prefix, nodes)] = found
+                self.initial[scope.quantity(quantity)] = found
         elif head in (".save", ".probe", ".print"):
             for quantity in _tokens(rest, place):
                 if quantity.lower() not in ("tran", "all"):
-                    self.saved.append(_inside(quantity.lower(), prefix, nodes))
+                    self.saved.append(scope.quantity(quantity.lower()))
         elif head in (".include", ".inc", ".lib"):
             raise place.error(
                 f"{head} would read another file, and a netlist is read alone; put its lines here"
@@ -330,10 +341,7 @@ class _Reader:
             )
         # Other commands ask for analyses, which gpebo's own settings describe.
 
-    def _instance(
-        self, line: str, place: Place, nodes: Mapping[str, str], scope: Mapping[str, str],
-        prefix: str, depth: int,
-    ) -> None:
+    def _instance(self, line: str, place: Place, scope: _Scope) -> None:
         plain, given = _element_of(line, place)
         plain = [word for word in plain if word.lower() != "params:"]
         if len(plain) < 2 or plain[-1].lower() not in self.blocks:
@@ -343,7 +351,7 @@ class _Reader:
                 + (nearest(plain[-1].lower(), self.blocks) if len(plain) > 1 else "")
             )
         block = self.blocks[plain[-1].lower()]
-        if depth >= MAX_DEPTH:
+        if scope.depth >= MAX_DEPTH:
             raise place.error(f"subcircuits are nested more than {MAX_DEPTH} deep ({block.name})")
         ends = plain[1:-1]
         if len(ends) != len(block.ports):
@@ -357,21 +365,18 @@ class _Reader:
                     f"{plain[0]}: {block.name} has no parameter {key}"
                     + nearest(key, block.defaults)
                 )
-        inside = prefix + plain[0].lower() + "_"
-        ports = dict(zip(block.ports, (_outer(word, nodes, prefix) for word in ends), strict=True))
-        inner = dict(scope)
+        inside = scope.prefix + plain[0].lower() + "_"
+        ports = dict(zip(block.ports, map(scope.node, ends), strict=True))
+        inner = dict(scope.known)
         for key, default in block.defaults.items():
-            inner[key] = self._parameter(inside + key, given.get(key, default), scope, place)
-        self.expand(block, ports, inner, inside, depth + 1)
+            inner[key] = self._parameter(inside + key, given.get(key, default), scope.known, place)
+        self.expand(block, _Scope(ports, inner, inside, scope.depth + 1))
 
-    def _element(
-        self, line: str, place: Place, nodes: Mapping[str, str], scope: Mapping[str, str],
-        prefix: str,
-    ) -> None:
+    def _element(self, line: str, place: Place, scope: _Scope) -> None:
         plain, options = _element_of(line, place)
         name, kind = plain[0], plain[0][0].upper()
         if kind == "K":
-            element = self._coupling(plain, scope, place, prefix)
+            element = self._coupling(plain, scope, place)
         elif kind not in NODES:
             raise place.error(
                 f"{shown(name)}: elements are {', '.join([*NODES, 'K', 'X'])} by their first letter"
@@ -381,9 +386,9 @@ class _Reader:
             ends, rest = plain[1 : 1 + count], plain[1 + count :]
             if len(ends) < count:
                 raise place.error(f"{name} needs {count} nodes and has {len(ends)}")
-            where = tuple(_outer(word, nodes, prefix) for word in ends)
-            element = self._valued(kind, name, where, rest, options, scope, place, prefix)
-        full = prefix + name
+            where = tuple(map(scope.node, ends))
+            element = self._valued(kind, name, where, rest, options, scope, place)
+        full = scope.prefix + name
         if not _WORD.fullmatch(full):
             raise place.error(f"{shown(name)} cannot be a name; use letters, digits and _")
         if full.lower() in self.elements:
@@ -394,20 +399,18 @@ class _Reader:
             raise place.error(f"there are more than {MAX_ELEMENTS} elements")
         self.elements[full.lower()] = replace(element, name=full)
 
-    def _coupling(
-        self, plain: Sequence[str], scope: Mapping[str, str], place: Place, prefix: str
-    ) -> Element:
+    def _coupling(self, plain: Sequence[str], scope: _Scope, place: Place) -> Element:
         if len(plain) != 4:
             raise place.error(f"{plain[0]} needs two inductors and a coefficient, as K1 L1 L2 0.9")
-        value = self.value(plain[3], scope, place, plain[0])
+        value = self.value(plain[3], scope.known, place, plain[0])
         if isinstance(value, float) and not abs(value) <= 1.0:
             raise place.error(f"{plain[0]}: a coupling is at most 1, got {value:g}")
-        coils = tuple(prefix + word.lower() for word in plain[1:3])
+        coils = tuple(scope.prefix + word.lower() for word in plain[1:3])
         return Element("K", plain[0], (), value, place, coils)
 
     def _valued(
         self, kind: str, name: str, where: tuple[str, ...], rest: list[str],
-        options: dict[str, str], scope: Mapping[str, str], place: Place, prefix: str,
+        options: dict[str, str], scope: _Scope, place: Place,
     ) -> Element:
         controls: tuple[str, ...] = ()
         allowed = {"C": ("ic",), "L": ("ic",), "S": ("on", "off", "ron", "roff"), "T": ("n",)}
@@ -420,22 +423,22 @@ class _Reader:
             raise place.error(f"{name}: {wrong[0]}= changes the value; write the value itself")
         value: float | str
         if kind in "VI":
-            value = self._source(rest, scope, place, name)
+            value = self._source(rest, scope.known, place, name)
         elif kind == "S":
-            value = self._switch(options, scope, place, name)
+            value = self._switch(options, scope.known, place, name)
         elif kind == "T":
             if rest or "n" not in options:
                 raise place.error(f"{name} needs n=RATIO, as in T1 a 0 b 0 n=2")
-            value = self.value(options["n"], scope, place, name)
+            value = self.value(options["n"], scope.known, place, name)
         else:
             if kind in "FH":
                 if not rest:
                     raise place.error(f"{name} needs the voltage source whose current controls it")
-                controls, rest = (prefix + rest[0].lower(),), rest[1:]
+                controls, rest = (scope.prefix + rest[0].lower(),), rest[1:]
             if len(rest) != 1:
                 got = "none" if not rest else " ".join(rest)
                 raise place.error(f"{name} needs one value, a number or {{expression}}; got {got}")
-            value = self.value(rest[0], scope, place, name)
+            value = self.value(rest[0], scope.known, place, name)
         if kind in "RLCST" and isinstance(value, float) and value == 0.0:
             raise place.error(f"{name} has the value 0")
         initial = None
@@ -497,19 +500,6 @@ class _Reader:
                 "PULSE(…), PWL(…) or EXP(…)"
             )
         return self.value(words[0], scope, place, name)
-
-
-def _outer(word: str, nodes: Mapping[str, str], prefix: str) -> str:
-    node = _node(word)
-    return node if node == GROUND else nodes.get(node, prefix + node)
-
-
-def _inside(quantity: str, prefix: str, nodes: Mapping[str, str]) -> str:
-    match = re.fullmatch(r"([vi])\((\w+)\)", quantity.replace(" ", ""))
-    if match is None:
-        return quantity
-    name = _outer(match[2], nodes, prefix) if match[1] == "v" else prefix + match[2]
-    return f"{match[1]}({name})"
 
 
 def _padded(numbers: Sequence[float], least: int, defaults: Sequence[float]) -> list[float]:
