@@ -19,6 +19,7 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
+from gpebo_cli.numerics.refinement import wanted_parts
 
 # (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p), and σ_min/σ_max of Ω (N,)
 MixedSignals = Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -28,7 +29,6 @@ MixedSignals = Callable[[Array, Array], tuple[Array, Array, Array]]
 _CONSTANT, _SMALL = 1e-13, 1e-8
 _TOLERANCE = 1e-10
 _MAX_ELEMENTS = 100_000
-_MAX_PARTS = 8
 _ROUNDING = 1e-15  # relative error of Ω; σ_max/σ_min times that is the one of 𝐘/Δ
 _UNKNOWN = 0.1  # relative error of 𝐘/Δ from which on it says nothing
 _SLACK = 30.0  # how far above its mean rounding may show in a polynomial's last coefficients
@@ -197,9 +197,7 @@ def _resolved(
         poor &= mesh.steps > 1e-12 * np.maximum(np.abs(mesh.edges[1:]), path.mesh.steps.max())
         if not poor.any():
             return mesh, values
-        parts = np.ones(mesh.size, dtype=np.intp)
-        wanted = 1.25 * (tail[poor] / _TOLERANCE) ** (1.0 / mesh.rule.stages)
-        parts[poor] = np.clip(np.ceil(wanted), 2, _MAX_PARTS).astype(np.intp)
+        parts = wanted_parts(tail, poor, _TOLERANCE, mesh.rule.stages)
         if parts.sum() > _MAX_ELEMENTS:
             raise SolverError(
                 f"the estimator is not resolved near t = {mesh.edges[int(np.argmax(tail))]:.6g} "

@@ -11,7 +11,7 @@ from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Trajectory, joined
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import with_realisations
@@ -54,9 +54,7 @@ class VectorLaw:
             sizes = np.maximum(sizes, np.abs(solution.values).max(axis=(0, 1)))
             found.append(Trajectory(solution.mesh, solution.values[:, :, : len(start)]))
             first, eta = part.stop, found[-1].final
-        edges = np.unique(np.concatenate([each.mesh.edges for each in found]))
-        mesh = Mesh(edges, self.M.mesh.rule)
-        return Trajectory(mesh, np.concatenate([each.values for each in found]))
+        return joined(found)
 
     def _over(
         self, packed: Trajectory, gains: Array, start: Array, sizes: float | Array

@@ -17,7 +17,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import RecordingResult
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
 from gpebo_cli.observers import AffineStateMap, Observation
 from gpebo_cli.regression.errors import ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
@@ -181,13 +181,11 @@ def _filled(values: Array, rows: int) -> Array:
 def _joined(signals: Sequence[Trajectory], shifts: Sequence[float]) -> Trajectory:
     """One after the other, all by the rule with the most stages, in which each is exact."""
     rule = max((each.mesh.rule for each in signals), key=lambda each: each.stages)
-    edges: list[Array] = []
-    values: list[Array] = []
-    for signal, by in zip(signals, shifts, strict=True):
-        mesh = Mesh(signal.mesh.edges, rule)
-        own = signal.values
-        if signal.mesh.rule.stages != rule.stages:
-            own = mesh.along(signal).values
-        values.append(own)
-        edges.append(mesh.edges + by if not edges else (mesh.edges + by)[1:])
-    return Trajectory(Mesh(np.concatenate(edges), rule), np.concatenate(values))
+    same = (
+        each if each.mesh.rule.stages == rule.stages else Mesh(each.mesh.edges, rule).along(each)
+        for each in signals
+    )
+    return joined([
+        Trajectory(Mesh(each.mesh.edges + by, rule), each.values)
+        for each, by in zip(same, shifts, strict=True)
+    ])

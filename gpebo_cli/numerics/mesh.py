@@ -339,6 +339,13 @@ class Trajectory:
         return Trajectory(mesh, filtered.reshape(self.values.shape))
 
 
+def joined(pieces: Sequence[Trajectory]) -> Trajectory:
+    """Signals on neighbouring meshes of one rule as one."""
+    edges = [pieces[0].mesh.edges[:1], *(piece.mesh.edges[1:] for piece in pieces)]
+    mesh = Mesh(np.concatenate(edges), pieces[0].mesh.rule)
+    return Trajectory(mesh, np.concatenate([piece.values for piece in pieces]))
+
+
 def equal_lengths(h: Array) -> tuple[IntArray, Array]:
     """Group (K,) of each length, and the group's mean in its place.
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, GpeboError, SolverError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, signal_scale
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined, signal_scale
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.linearised import Linearised
@@ -153,10 +153,3 @@ def _ends(system: DescriptorSystem, t: float, x: Array, error: GpeboError) -> Gp
         f"plant {system.name}: the solution cannot be followed beyond t = {t:.9g} "
         f"({system.states[large]} = {x[large]:.3g} there): {said}"
     )
-
-
-def joined(pieces: list[Trajectory]) -> Trajectory:
-    """Trajectories (n,) one after the other as one."""
-    edges = [pieces[0].mesh.edges[:1], *(piece.mesh.edges[1:] for piece in pieces)]
-    mesh = Mesh(np.concatenate(edges), pieces[0].mesh.rule)
-    return Trajectory(mesh, np.concatenate([piece.values for piece in pieces]))
