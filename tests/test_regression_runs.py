@@ -163,17 +163,21 @@ def test_arrays_by_name_and_what_can_be_checked():
         run(regression=measured)
     with pytest.raises(ConfigError, match=r"t \(1001,\), s \(1001,\), y \(7,\)"):
         run(regression=measured, data={**arrays, "y": np.zeros(7)})
+    made = {**measured, "Y": ["lp(y, 9)"], "psi": [["lp(s, 9)", "lp(1, 9)"]]}
     with pytest.raises(ConfigError, match="has no outputs; noise of the signals is noise"):
-        run(regression=measured, data=arrays, noise={"name": "gaussian", "outputs": 0.1})
-    run(regression=measured, data=arrays, noise={"name": "gaussian", "inputs": {"y": 0.1}})
+        run(regression=made, data=arrays, noise={"name": "gaussian", "outputs": 0.1})
+    run(regression=made, data=arrays, noise={"name": "gaussian", "inputs": {"y": 0.1}})
 
 
-@pytest.mark.parametrize("wrong", [0.0, 0.2])
-def test_a_measured_Y_is_compared_with_the_fitted_one(wrong):
+@pytest.mark.parametrize(("wrong", "name"), [(0.0, "Y_1"), (0.2, "Y_1"), (0.0, "y")])
+def test_a_measured_Y_is_compared_with_the_fitted_one(wrong, name):
+    """Y left out, or a recorded signal that stands nowhere else."""
     t, level = np.linspace(0.0, 20.0, 801), 0.05
     noise = level * np.random.default_rng(5).standard_normal(len(t))
     given = {**SINE, "signals": {"s": None}, "psi": [["s", 1]]}
-    data = {"t": t, "s": np.sin(t), "Y_1": 2 * np.sin(t) - 1 + wrong * np.sin(3 * t) + noise}
+    if name == "y":
+        given |= {"signals": {"s": None, "y": None}, "Y": ["y"]}
+    data = {"t": t, "s": np.sin(t), name: 2 * np.sin(t) - 1 + wrong * np.sin(3 * t) + noise}
     found = run(regression=given, data=data, estimator="least_squares",
                 noise={"name": "gaussian", "outputs": level, "sample_time": t[1]})
     fit = found.details.fit
@@ -184,6 +188,8 @@ def test_a_measured_Y_is_compared_with_the_fitted_one(wrong):
     assert "fit" in found.figures
     if not wrong:
         assert fit.ratio == pytest.approx(1.0, abs=0.1)
+        std = level * np.sqrt(t[1] / 10.0)  # ∫ sin² is 10 to a few percent
+        assert found.to_pandas("estimates")["a_std"].iloc[-1] == pytest.approx(std, rel=0.1)
 
 
 @pytest.mark.parametrize("estimator", ["drem", "annihilator", "instrumental", "power"])

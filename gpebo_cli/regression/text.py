@@ -13,6 +13,7 @@ elements end where a delayed signal jumps or has a kink.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -234,6 +235,10 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         raise ConfigError(f"{where}: signals must map names to expressions, such as {{u: sin(t)}}")
     psi_rows, right = _list(mapping, "psi", where), mapping.get("Y")
     count = len(psi_rows)
+    outputs = [f"Y_{i + 1}" for i in range(count)] if right is None else []
+    if measured := _measured(mapping, signals):
+        signals = {name: value for name, value in signals.items() if name not in measured}
+        mapping, right, outputs = {**mapping, "Y": None}, None, measured
     recorded = tuple(name for name, value in signals.items() if value is None)
     signals = {name: 0 if value is None else value for name, value in signals.items()}
     parametrisation, own = _parametrisation(mapping, len(signals), count, where)
@@ -242,7 +247,7 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
             "states": [], "E": [], "A": [], "initial_state": [],
             **{k: v for k, v in mapping.items() if k not in ("signals", "Y", "psi", "S", "box")},
             "inputs": signals,
-            "outputs": [] if right is not None else [f"Y_{i + 1}" for i in range(count)],
+            "outputs": outputs,
             **own,
         },
         source, "regression",
@@ -273,6 +278,17 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         Y = record([read(value, f"Y[{i}]") for i, value in enumerate(texts)])
     found = tuple(operators.found.values())
     return TextRegression(system, found, record(psi), Y, recorded, parametrisation)
+
+
+def _measured(mapping: Mapping[str, object], signals: Mapping[str, object]) -> list[str]:
+    """The names in Y, if it is made of recorded signals that stand nowhere else: outputs."""
+    right = mapping.get("Y")
+    if not isinstance(right, list) or len(right) != len(_list(mapping, "psi", "")):
+        return []
+    names = [str(entry).strip() for entry in right]
+    elsewhere = set(re.findall(r"\w+", f"{mapping['psi']} {mapping.get('parameters')}"))
+    own = all(name in signals and signals[name] is None for name in names)
+    return names if own and len({*names} - elsewhere) == len(names) else []
 
 
 def _parametrisation(
