@@ -10,6 +10,7 @@ from kernel_paths import by_both
 from scipy.special import gammaln
 from test_kernels_jets import tape_of, texts
 
+from gpebo_cli import run
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.model.expressions import Bounds, breakpoints, parse, record, resolved
 from gpebo_cli.model.plant import plant_from_mapping
@@ -133,8 +134,25 @@ def test_more_switching_than_can_be_followed_is_refused():
 @given(st.floats(0.01, 0.99), st.sampled_from([1e-2, 1e-3, 3e-4, 1e-5]))
 @settings(max_examples=40, deadline=None)
 def test_one_narrow_pulse_anywhere_is_integrated(place, width):
-    text = f"exp(-((t - {20 * place})/{width})**2)"
-    np.testing.assert_allclose(integrated(text), width * np.sqrt(np.pi), rtol=1e-8)
+    """By itself, and over a divisor that no bound of a long cell keeps away from zero."""
+    pulse = f"exp(-((t - {20 * place})/{width})**2)"
+    np.testing.assert_allclose(integrated(pulse), width * np.sqrt(np.pi), rtol=1e-8)
+    s, weights = np.polynomial.hermite.hermgauss(40)
+    mean = weights @ (1.0 / ((20 * place + width * s - 10) ** 2 + 0.1))
+    np.testing.assert_allclose(
+        integrated(f"{pulse}/(t**2 - 20*t + 100.1)"), width * mean, rtol=1e-8
+    )
+
+
+@pytest.mark.parametrize("power", ["", "**2", "**3"])
+def test_a_pole_that_no_point_of_a_first_mesh_hits_is_refused(power):
+    """Of x' = x/(t − a) all solutions are zero at a, and nothing says which one goes on."""
+    with pytest.raises(GpeboError, match=r" t = 3\.3\b"):
+        run({
+            "name": "pole", "states": ["a", "b"], "inputs": {"u": "sin(t)"},
+            "E": [[1, 0], [0, 0]], "A": [[f"1/(t - 3.3){power}", 1], [1, 1]], "B": [[0], [1]],
+            "initial_state": [0, 0],
+        }, observer="none", time={"horizon": 10})
 
 
 @pytest.mark.parametrize(("w", "power"), [("25*pi", 2000), ("2.5*pi", 20000)])

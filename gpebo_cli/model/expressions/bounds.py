@@ -81,7 +81,8 @@ def resolved(bounds: Bounds, edges: Array) -> Array:
         f(t) = Σ_{k<K} f_k(m) (t − m)^k + f_k(τ) (t − m)^K      for some τ of a cell around m,
 
     the bounds of f_K over the cell say by how much f can differ from such a polynomial. What is
-    looked at a dozen times between these edges cannot hide a pulse.
+    looked at a dozen times between these edges cannot hide a pulse. What has no finite bound, as
+    a quotient while its divisor might vanish, is cut until it has one, and at a pole to rounding.
 
     Args:
         bounds: of expressions of time alone.
@@ -95,7 +96,8 @@ def resolved(bounds: Bounds, edges: Array) -> Array:
     rest, size = _rest(bounds, low, high)
     while len(low) < _MOST_CELLS:
         # A bound that nothing reaches falls while its cell is cut.
-        poor = (rest > RESOLVED * size.max(axis=0)).any(axis=1) & (depth < _DEEPEST)
+        finite = np.where(np.isfinite(size), size, 0.0)
+        poor = (rest > RESOLVED * finite.max(axis=0)).any(axis=1) & (depth < _DEEPEST)
         if not poor.any():
             break
         middle = 0.5 * (low[poor] + high[poor])
