@@ -278,6 +278,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "states are booleans": (lambda: mine(states=[True, False]), "boolean true as a name; quote it"),
     "states are numbers": (lambda: mine(states=[1, 2]), "the name '1'"),
     "state is reserved": (lambda: mine(states=["t", "x2"]), "t, which is reserved"),
+    "state is a sum": (lambda: mine(states=["states", "x2"]), "a state cannot be called states;"),
     "state is a function": (lambda: mine(states=["sin", "x2"]), "sin, which is reserved"),
     "state is no identifier": (lambda: mine(states=["x-1", "x2"]), "the name 'x-1'"),
     "state is not ASCII": (lambda: mine(states=["θ", "x2"]), "the name"),

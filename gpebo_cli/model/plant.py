@@ -85,6 +85,11 @@ def plant_from_mapping(
             f"{plant}: the unknown {clash[0]} has the name of the estimated initial error of "
             f"the state {clash[0][3:]}; choose another name"
         )
+    for name in {"parameters", "states"}.intersection((*unknowns, *states)):
+        raise ConfigError(
+            f"{plant}: {elsewhere[name]} cannot be called {name}; seconds_to_1pct_{name} in "
+            f"cases.csv is of all {name}"
+        )
     parameters = read_parameters(plant, mapping.get("parameters"), signals, elsewhere)
 
     everything = {**signals, **parameters}
