@@ -16,6 +16,7 @@ from gpebo_cli.evidence.knowledge import (
     knowledge,
     least_share,
     smallest_and_margin,
+    tells_nothing,
 )
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
@@ -33,6 +34,8 @@ _ROUNDS, _SAME_TIME = 30, 1e-12
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
 _STEPS = 0.25 ** np.array([0.0, 1.0, 2.0, 4.0, 6.0, 9.0])
 _AROUND = np.concatenate([-_STEPS, [0.0], _STEPS[::-1]])
+_BLOCK = 16  # times that are looked at together, from the end on
+_MANY = 64  # parameters, from which on spectra are not asked whether there is anything to know
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -55,7 +58,8 @@ class Excitation:
     weakest_direction: Direction  # in units of each parameter's own size
     parameters: tuple[str, ...]
     final: Knowledge  # at the last of the times
-    least_share: OnDemand[Array] = OnDemand()  # (N,) of all parameters' ``known.share``
+    # (N,) of all parameters' ``known.share``, 0 some time before it is ``WELL`` for good
+    least_share: OnDemand[Array] = OnDemand()
     known: OnDemand[Knowledge] = OnDemand()
     gram_eigenvalues: OnDemand[Array] = OnDemand()  # (N, p)
     # (N,) smallest eigenvalue of the Gram matrix over the trailing window
@@ -97,7 +101,10 @@ def assess(
     gram = regression.gram  # of parameters that move, on a mesh of its own
     evidence = _Evidence(regression, t, window, tol)
     ends = gram.mesh.edges[1:]
-    smallest, margin = smallest_and_margin(gram.values[:, -1], *evidence.beside(ends))
+    at_ends = gram.values[:, -1], *evidence.beside(ends)
+    smallest = margin = np.zeros(len(ends))
+    if p < _MANY or rho is not None or not tells_nothing(*at_ends):
+        smallest, margin = smallest_and_margin(*at_ends)
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
     # or half as well as they ever are.
     enough = min(WELL, 0.5 * float(smallest[margin >= 1.0].max(initial=0.0)))
@@ -163,8 +170,15 @@ class _Evidence:
         return knowledge(self.regression.gram(at), *self.beside(at))
 
     def least_share(self) -> Array:
-        """Of the parameters, (N,)."""
-        return least_share(self.regression.gram(self.t), *self.beside(self.t))
+        """Of the parameters, (N,); 0 some time before it is ``WELL`` for good."""
+        found = np.zeros(len(self.t))
+        for last in range(len(self.t), 0, -_BLOCK):
+            part = slice(max(last - _BLOCK, 0), last)
+            at = self.t[part]
+            found[part] = least_share(self.regression.gram(at), *self.beside(at))
+            if found[part].min() < WELL:
+                break
+        return found
 
     def eigenvalues(self, at: Array | None = None) -> Array:
         """Those of G, (M, p)."""

@@ -9,6 +9,7 @@ no such size: its parameter is not seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -180,6 +181,17 @@ def smallest_and_margin(
     spectrum = symmetric_eigenvalues(normalised)
     smallest = np.maximum(spectrum.min(axis=1, initial=1.0), 0.0)
     return smallest, np.asarray(smallest / level.max(axis=1, initial=_SINGULAR))
+
+
+def tells_nothing(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> bool:
+    """Whether the ``margin`` of :func:`knowledge` is surely below 1 at all times: by Cholesky."""
+    normalised, _, level = _normalised(gram, terms, elapsed, tol)
+    normalised -= 0.9 * level.max(axis=1)[:, None, None] * np.eye(normalised.shape[1])
+    for N in normalised[::-1]:  # what is told at all is told at the end
+        with suppress(np.linalg.LinAlgError):
+            np.linalg.cholesky(N)
+            return False
+    return True
 
 
 def least_share(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Array:

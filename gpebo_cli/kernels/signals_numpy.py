@@ -38,13 +38,16 @@ def tails(
 
 def tails_of(
     sizes: Array, last: Array, points: int, foot: float, share: float, floor: float,
-    least: Array | None,
+    least: Array | None, units: Array | float = 1.0,
 ) -> Array:
-    """:func:`tails` of signals by their largest sizes (K, c) and last coefficients (K, used, c)."""
+    """:func:`tails` of signals by their largest sizes (K, c) and last coefficients (K, used, c).
+
+    The sizes are in ``units``; ``least`` is for signals without them.
+    """
     used, size = last.shape[1], np.maximum.accumulate(sizes, axis=0)
     final = size[-1]
     size = np.maximum(size, foot * final)
-    unit = np.ones_like(final)
+    unit = units * np.ones_like(final)
     if least is not None:
         unit = np.maximum(np.maximum(final, least), _TINY)
         size = np.where(final < unit, 1.0, size / unit)

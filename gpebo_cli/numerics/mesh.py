@@ -56,9 +56,9 @@ class Looked(NamedTuple):
 
     def unresolved(self, rule: RadauRule, units: Array | float) -> Array:
         """As :func:`unresolved` of these signals in units (c,), without a floor."""
-        last = self.last[:, -used_coefficients(rule) :] / units
         return signals_numpy.tails_of(
-            self.sizes / units, last, len(rule.points), _FOOT, SHARE, 0.0, None
+            self.sizes / units, self.last[:, -used_coefficients(rule) :], len(rule.points), _FOOT,
+            SHARE, 0.0, None, units,
         )
 
     def tail(self, rule: RadauRule, scale: Array) -> Array:
@@ -248,11 +248,18 @@ class Sampler:
 
         Matrices of whole elements are multiplied: none is interpolated.
         """
-        changes = np.flatnonzero(np.diff(self.element)) + 1
+        changes, point = np.flatnonzero(np.diff(self.element)) + 1, self.weights.argmax(axis=1)
         found = np.empty((len(factors), values.shape[2]))
         for some in np.split(np.arange(len(factors)), changes):
-            each = values[self.element[some[0]]] @ factors[some].T
-            found[some] = np.einsum("mj,jnm->mn", self.weights[some], each)
+            matrices, weights = values[self.element[some[0]]], self.weights[some]
+            there = weights.max(axis=1) == 1.0
+            at, between = some[there], some[~there]
+            if len(at):  # at points of the mesh, which follow each other
+                own = matrices[point[at[0]] : point[at[-1]] + 1]
+                own = own if len(own) == len(at) else matrices[point[at]]
+                found[at] = np.matmul(own, factors[at][..., None])[..., 0]
+            each = matrices @ factors[between].T
+            found[between] = np.einsum("mj,jnm->mn", weights[~there], each)
         return found
 
     @cached_property

@@ -277,7 +277,7 @@ def _mapped(
     for k in np.unique(group, return_index=True)[1]:
         own, change = elements.sweeps(
             R, h[k : k + 1], *fixed, np.zeros((1, d, 0)), kicks, onward[:1], np.eye(d), weights,
-            8.0 * EPS, *limits,
+            max(_DIGITS * tol, 8.0 * EPS), *limits,
         )
         maps.append(own[0, 1:].reshape(s * d, d))
         changes = np.maximum(changes, change)
