@@ -121,18 +121,9 @@ def propagated(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, groups: Groups,
     variances: Array, t: Array, L: Array | None, starts: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """:func:`deviations` from a factor L of cov [ζ; s; e] at the start; also gives L at the end.
+    """:func:`deviations` of grouped samples; the third is L (size, ·) of cov [ζ; s; e] at the end.
 
-    Args:
-        observer: as there, with all arguments but L.
-        estimator: see there.
-        gain: see there, (M, n, p).
-        edges: see there.
-        groups: of the samples.
-        variances: see there.
-        t: see there.
-        L: at the first edge, (size, ·); None: everything is known there.
-        starts: see there.
+    It starts from ``L`` at the first edge; None: everything is known there.
     """
     n, p = gain.shape[1:]
     mesh, fresh, shares = _mesh(edges, groups)
@@ -212,15 +203,8 @@ def of_least_squares(
     """One standard deviation at the end of what least squares make of the data, (p,) and (n,).
 
     η̂ = G⁺h in units of the parameters' own sizes: what is not determined is left out, and its
-    numbers mean nothing.
-
-    Args:
-        observer: as of :func:`deviations`, with ``instants`` and ``variances``.
-        regression: without resets.
-        known: of G, the end last.
-        gain: of the state at the end, (n, p).
-        instants: see above.
-        variances: see above.
+    numbers mean nothing. The regression has no resets, ``known`` is of G with the end last, and the
+    ``gain`` is that of the state at the end (n, p); the others are as of :func:`deviations`.
     """
     mesh, p, V = regression.mesh, regression.p, known.vectors[-1]
     seen = known.eigenvalues[-1] >= known.level[-1].max(initial=0.0)

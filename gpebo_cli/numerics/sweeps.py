@@ -145,16 +145,10 @@ def solve(
 ) -> LinearSolution | None:
     """As :func:`gpebo_cli.numerics.collocation.solve`, or None where sweeps will not do.
 
-    Args:
-        problem: what to solve, but for its coefficients.
-        equation: A, f (P or 1, d, ·) of the first columns and what the monitor needs, at the
-            points of a mesh, of which some elements (K,) are those of the mesh before, else −1.
-        mesh: where to start; its edges stay edges.
-        units: of the components (d,).
-        tol: see there.
-        max_elements: see there.
-        restarts: see there.
-        stiff: elements are solved and not swept over.
+    In place of the problem's coefficients the ``equation`` gives A, f (P or 1, d, ·) of the first
+    columns and what the monitor needs, at the points of a mesh, of which some elements (K,) are
+    those of the mesh before, else −1. Components have ``units`` (d,). Where it is ``stiff``,
+    elements are solved and not swept over.
 
     Raises:
         SolverError: ``max_elements`` do not reach ``tol``; names the time.

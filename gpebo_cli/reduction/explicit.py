@@ -28,7 +28,6 @@ _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
 _SOUND = 0.1  # of the largest entry of its row, in units of the states
 _ROUNDING, _CLEAR = 1e-13, 1e-9  # of what an entry is the difference of: zero below, sure above
 _FILL = 40  # entries per equation; with more of them, a matrix is not sparse
-_TINY = float(np.finfo(float).tiny)
 
 Row = dict[int, Array]
 

@@ -385,9 +385,3 @@ def _unknown(system: DescriptorSystem, name: str, why: str) -> str:
         f"{name}, {why}; of samples and of noisy signals they are not known; of a recording, "
         "data.hold=cubic takes those of its interpolant, which amplify its noise"
     )
-
-
-__all__ = [
-    "EquationForm", "Equations", "HiddenConstraints", "InputDerivatives", "ModelError",
-    "hidden_constraints", "strangeness_free",
-]
