@@ -123,7 +123,7 @@ def propagated(
 ) -> tuple[Array, Array, Array]:
     """:func:`deviations` of grouped samples; the third is L (size, ·) of cov [ζ; s; e] at the end.
 
-    It starts from ``L`` at the first edge; None: everything is known there.
+    It starts from ``L`` at the first edge; None: everything is known there. ``gain`` is (M, n, p).
     """
     n, p = gain.shape[1:]
     mesh, fresh, shares = _mesh(edges, groups)

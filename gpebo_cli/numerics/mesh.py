@@ -347,7 +347,7 @@ class Trajectory:
 
 
 def joined(pieces: Sequence[Trajectory]) -> Trajectory:
-    """Signals on neighbouring meshes of one rule as one."""
+    """Signals (K, s + 1, …) on neighbouring meshes of one rule as one."""
     edges = [pieces[0].mesh.edges[:1], *(piece.mesh.edges[1:] for piece in pieces)]
     mesh = Mesh(np.concatenate(edges), pieces[0].mesh.rule)
     return Trajectory(mesh, np.concatenate([piece.values for piece in pieces]))
