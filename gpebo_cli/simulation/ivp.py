@@ -136,11 +136,11 @@ def _sample(
             state = restarts[float(left)](state)
         margin = 1e-9 * (right - left)
 
-
         def derivative(
             t: float, x: Array, low: float = left + margin, high: float = right - margin,
             calls: Iterator[int] = count(1),  # noqa: B008 - one for each piece is what is meant
         ) -> Array:
+            """ẋ (n m,), or SolverError where it is asked for too often."""
             called = next(calls)
             if called > _LOOK and called * (high - low) > _MOST * (t - low):
                 raise SolverError(
