@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from plants import seen, shipped
 from test_cli import FAST, folders, gpebo
@@ -28,6 +29,7 @@ from gpebo_cli.observers.kalman_bucy import filter_model, noise_model
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.results.figures import describe
 from gpebo_cli.results.report import estimate_table
 from gpebo_cli.settings import (
     NoiseSettings,
@@ -313,3 +315,41 @@ def test_the_table_does_not_ask_since_when_a_moving_parameter_is_known():
     assert "from" in lines["theta1"]
     assert "from" not in lines["w_x1"]
     assert not lines["w_x1"].rstrip().endswith("no")
+
+
+@pytest.mark.parametrize("level", ["given", "from the residual"])
+def test_a_recording_has_its_own_sample_times_and_noise(level):
+    """A constant level, measured at uneven times: its deviation is that of the mean of the data."""
+    plant = {
+        "name": "level", "states": ["x"], "outputs": ["y"], "initial_state": {"x": 0},
+        "E": [[1]], "A": [[0]], "C": [[1]],
+    }
+    rng, sigma = np.random.default_rng(4), 0.3
+    h = np.concatenate([np.full(200, 0.1), [4.0], np.full(200, 0.1)])
+    t = np.concatenate([[0.0], np.cumsum(h)])
+    y = 2.0 + sigma * rng.standard_normal(len(t))
+    noise = {"noise": {"name": "gaussian", "outputs": sigma}} if level == "given" else {}
+    result = api_run(
+        plant, observer={"name": "kalman_bucy", "P0": 1e4}, data=pd.DataFrame({"t": t, "y": y}),
+        time={"samples": 11}, **noise,
+    )
+    # By information, 1/σ²h per second: the pause has as much as one sample.
+    of_mean, estimation = sigma / np.sqrt(len(h)), result.details.estimation
+    assert estimation.states_std[0, -1, 0] == pytest.approx(of_mean, rel=0.08)
+    assert abs(result["x_hat"][0, -1] - 2.0) < 3 * of_mean
+    assert ("taken from the residual, 0.3" in result.verdict) == (level != "given")
+
+
+def test_a_figure_of_a_recording_shows_where_states_swing():
+    """Not only what is near the last value."""
+    t = np.linspace(0.0, 20.0, 201)
+    data = pd.DataFrame({"t": t, "y": np.sin(t)})
+    plant = {
+        "name": "swing", "states": ["a", "b"], "outputs": ["y"], "initial_state": {"a": 0, "b": 1},
+        "E": [[1, 0], [0, 1]], "A": [[0, 1], [-1, 0]], "C": [[1, 0]],
+    }
+    found = api_run(plant, estimator="least_squares", data=data).details
+    [panels] = describe(found, ["estimates_a"]).values()
+    for panel in panels:
+        assert panel.limits[0] < -0.9
+        assert panel.limits[1] > 0.9

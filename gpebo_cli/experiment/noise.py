@@ -89,10 +89,16 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
     return levels
 
 
-def signal_noise(settings: NoiseSettings, levels: NoiseLevels) -> SignalNoise:
-    """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12."""
+def signal_noise(
+    settings: NoiseSettings, levels: NoiseLevels, instants: Array | None = None
+) -> SignalNoise:
+    """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12.
+
+    A recording has samples of its own, at ``instants``.
+    """
     outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
-    return SignalNoise(levels.inputs, outputs, settings.sample_time)
+    step = settings.sample_time if instants is None else float(np.diff(instants).mean())
+    return SignalNoise(levels.inputs, outputs, step, instants is not None)
 
 
 @dataclass(frozen=True, eq=False)

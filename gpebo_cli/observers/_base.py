@@ -29,7 +29,8 @@ class SignalNoise:
 
     inputs: Array  # (m,) standard deviation of every sample
     outputs: Array  # (r,)
-    sample_time: float  # seconds
+    sample_time: float  # seconds, on the average
+    recorded: bool = False  # each element of the signals' mesh is from one sample to the next
 
     @property
     def variances(self) -> Array:

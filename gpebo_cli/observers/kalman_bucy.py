@@ -24,12 +24,13 @@ of the standard deviations of x̂; its correlation with ζ̂ (of order T_s) is n
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.evidence.uncertainty import noise_level
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
@@ -144,11 +145,17 @@ class NoiseModel:
     process: Array  # (n,)
     rows: Array  # (e + r,) zero: V needs none
 
-    def state_space(self, s: FilterModel, q: int, split: Split) -> StateSpace:
-        """The model with its covariances, one column of signals, w in the basis of a split."""
+    def state_space(
+        self, s: FilterModel, q: int, split: Split, steps: Array | float = 1.0
+    ) -> StateSpace:
+        """The model with its covariances, one column of signals, w in the basis of a split.
+
+        ``steps`` (N,) are those between samples, relative to the sample time.
+        """
         Zt = transpose(s.rows)
         D = Zt @ s.in_measurement
-        weighted = s.from_noise * self.signals  # Γ S
+        signals = self.signals * np.reshape(steps, (-1, 1, 1))
+        weighted = s.from_noise * signals  # Γ S
         Q = weighted @ transpose(s.from_noise)
         if self.process.any():
             # w stays in the range of P(t), and so does what drives it.
@@ -163,7 +170,7 @@ class NoiseModel:
             z=-(Zt @ s.g_y[:, :, None]),
             Q=Q,
             N=weighted @ transpose(D),
-            V=(D * self.signals) @ transpose(D) + (Zt * self.rows) @ s.rows,
+            V=(D * signals) @ transpose(D) + (Zt * self.rows) @ s.rows,
         )
 
 
@@ -228,6 +235,19 @@ class KalmanBucy:
         noise = signals.noise or SignalNoise(
             np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time
         )
+        edges, note = signals.mesh.edges, known.note
+        if noise.recorded and not noise.variances.any() and evidence.errors is not None:
+            alike = np.concatenate([np.zeros(system.m), np.ones(system.r)])
+            level = noise_level(evidence.errors, evidence.regression, edges[:-1], alike)
+            noise = replace(noise, outputs=np.full(system.r, np.nan_to_num(level)))
+            note += f"; noise of the outputs taken from the residual, {level:.2g}" * (level > 0.0)
+        unknown = noise.recorded and not noise.variances.any()
+
+        def steps(inside: Array) -> Array | float:
+            if not noise.recorded:
+                return 1.0
+            k = np.searchsorted(edges, inside, side="right").clip(1, len(edges) - 1)
+            return np.asarray((edges[k] - edges[k - 1]) / noise.sample_time)
 
         def reduced(t: Array, inside: Array) -> FilterModel:
             o = known.matrices(t, inside)
@@ -252,7 +272,8 @@ class KalmanBucy:
 
         def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
             s = reduced(t, inside)
-            return model_noise.state_space(s, q, split), (s.offset, s.gain, s.direct, s.projector)
+            space = model_noise.state_space(s, q, split, steps(inside))
+            return space, (s.offset, s.gain, s.direct, s.projector)
 
         def monitor(estimate: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
             offset, gain, *_ = extras
@@ -267,7 +288,7 @@ class KalmanBucy:
         offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
 
         def information(t: Array, inside: Array) -> tuple[Array, Array]:
-            m = model_noise.state_space(reduced(t, inside), q, split)
+            m = model_noise.state_space(reduced(t, inside), q, split, steps(inside))
             return m.A, transpose(m.c) @ np.linalg.solve(m.V, m.c)
 
         windows = window_gramians(
@@ -278,7 +299,8 @@ class KalmanBucy:
         return Observation(
             regression=evidence.regression,
             state_map=FilterStateMap(
-                filtered, AffineStateMap(offset, gain), direct, noise.variances
+                filtered, AffineStateMap(offset, gain), direct,
+                noise.variances + (np.nan if unknown else 0.0),
             ),
             truth=CurrentState(known),
             error_estimate=max(evidence.error_estimate, filtered.error_estimate),
@@ -296,7 +318,7 @@ class KalmanBucy:
             growth=None,
             estimator=Filter(filtered, observability),
             names=names,
-            note=known.note + _note(model_noise, self.regularisation),
+            note=note + _note(model_noise, self.regularisation),
         )
 
 
@@ -393,12 +415,12 @@ class FilterStateMap(Filtering):
         return self.affine.at(t)
 
     def deviations(self, t: Array) -> tuple[Array, Array]:
-        """Standard deviations of ζ̂ (M, n) and of x̂ (M, states)."""
+        """Standard deviations of ζ̂ (M, n) and of x̂ (M, states), NaN if nobody knows the noise."""
         P, _ = self.filtered.at(t)
         gain, direct = self.affine.gain(t), self.direct(t)
         of_state = np.einsum("mij,mjk,mik->mi", gain, P, gain)
         of_state += direct**2 @ self.variances
-        own = np.einsum("mii->mi", P)
+        own = np.einsum("mii->mi", P) + 0.0 * self.variances.sum()
         return np.sqrt(np.maximum(own, 0.0)), np.sqrt(np.maximum(of_state, 0.0))
 
 

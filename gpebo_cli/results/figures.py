@@ -538,9 +538,9 @@ def _estimate(
     drawn = values[_shown_cases(estimation)]
     if known:
         limits = _estimate_limits(truth.y, drawn)
-    else:  # what an estimate comes to stands for the truth
-        bands = [] if deviation is None else [low, high]
-        limits = _estimate_limits(drawn[0, -1:], np.vstack([drawn, *bands]))
+    else:  # what an estimate is in the second half stands for the truth
+        bands, late = [] if deviation is None else [low, high], drawn[0, drawn.shape[1] // 2 :]
+        limits = _estimate_limits(late, np.vstack([drawn, *bands]), abs(float(late[-1])))
     return Panel(name, curves, _unit(result, name), typeset(name, result.system.labels),
                  limits=limits)
 
@@ -575,13 +575,18 @@ def _truth(result: RunResult, name: str, t: Array, values: Array) -> Curve:
     return Curve(t, values, "true, not determined by the data", style.UNKNOWN)
 
 
-def _estimate_limits(truth: Array, guesses: Array) -> tuple[float, float] | None:
-    """Show the truth and all estimates, but do not let a wild one flatten the truth to a line."""
+def _estimate_limits(
+    truth: Array, guesses: Array, size: float = 0.0
+) -> tuple[float, float] | None:
+    """Show the truth and all estimates, but do not let a wild one flatten the truth to a line.
+
+    ``size`` of a truth that hardly moves.
+    """
     known = truth[np.isfinite(truth)]
     if not known.size:
         return None
     low, high = float(known.min()), float(known.max())
-    room = 2.0 * (high - low or abs(high) or 1.0)
+    room = 2.0 * (np.fmax(high - low, size) or abs(high) or 1.0)
     finite = guesses[np.isfinite(guesses)]
     lowest = float(np.min(finite, initial=low))
     highest = float(np.max(finite, initial=high))
