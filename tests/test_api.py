@@ -21,12 +21,17 @@ import gpebo_cli
 from gpebo_cli import (
     ConfigError,
     GpeboError,
+    Measurements,
     ModelError,
     Result,
+    SolverSettings,
+    TimeSettings,
     available,
     check,
     load_plant,
+    observe,
     run,
+    simulate,
     system_from_functions,
 )
 from gpebo_cli.api.choice import choose, default
@@ -124,6 +129,12 @@ def test_what_is_printed_is_what_the_command_prints(circuit, tmp_path):
     assert repr(circuit) == (
         "<gpebo run of circuit, t = 0 to 8 s, gpebo, 201 times, drem with 2 cases>"
     )
+    system = load_plant("circuit")
+    simulation = simulate(system, TimeSettings(horizon=2.0), SolverSettings())
+    measured = Measurements(simulation.signals.inputs, simulation.signals.outputs)
+    assert len(repr(simulation)) < 1000  # arrays over time are not printed
+    assert len(repr(observe(system, measured))) < 2000
+    assert "t = 0 to 2 s" in repr(simulation)
     shown = circuit._repr_html_()
     assert escape(circuit.verdict) in shown
     assert shown.count("<tr>") == 3

@@ -73,6 +73,9 @@ class Mesh:
     edges: Array  # (K + 1,) ascending
     rule: RadauRule
 
+    def __repr__(self) -> str:
+        return f"<mesh of {self.size} elements, t = {self.edges[0]:g} to {self.edges[-1]:g} s>"
+
     @property
     def size(self) -> int:
         """Number of elements K."""
@@ -284,6 +287,9 @@ class Trajectory:
 
     mesh: Mesh
     values: Array  # (K, s + 1, …)
+
+    def __repr__(self) -> str:
+        return f"<trajectory {self.values.shape[2:]} on a {repr(self.mesh)[1:]}"
 
     def __call__(self, t: Array, inside: Array | None = None) -> Array:
         """Values at the times t (N,), shape (N, ...); at edges see :meth:`Mesh.sampler`."""

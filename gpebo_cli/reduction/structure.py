@@ -7,7 +7,7 @@ Kunkel & Mehrmann, Differential-Algebraic Equations, Hypothesis 3.48: ranks of t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import NamedTuple
 
@@ -57,15 +57,15 @@ class Structure:
     mu: int  # strangeness index μ
     a: int  # number of constraints
     d: int  # number of differential equations, n − a
-    scaling: Scaling
+    scaling: Scaling = field(repr=False)
     rank_tol: float
     # Smallest one counted as nonzero, relative, at the probes where a bound of it is smallest.
     smallest_singular_value: float
     time_invariant: bool  # E and A are constant
-    reference: Pivots  # of one time, to start from at the others
+    reference: Pivots = field(repr=False)  # of one time, to start from at the others
     steady: bool  # no singular value behind the ranks comes near zero between the ends
     # z' = this z + … with z = Z1ᵀE x: Z1ᵀA T, [Z1ᵀE; Â2] T = [I; 0]; None where not determined
-    dynamics: Array | None  # (N or 1, d, d) at the probes, 1/s
+    dynamics: Array | None = field(repr=False)  # (N or 1, d, d) at the probes, 1/s
     # Ranks of E, see ``stages.py``, where the derivative array does not tell them clearly.
     stages: tuple[int, ...] = ()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -34,7 +34,7 @@ class LinearRegression:
     Y: Trajectory
     psi: Trajectory
     parameters: tuple[str, ...]
-    scale: Array | float  # (p,), or (K, p): so far, element by element
+    scale: Array | float = field(repr=False)  # (p,), or (K, p): so far, element by element
     resets: tuple[Reset, ...] = ()  # at edges of the mesh, in the order of time
     floor: float = 0.0  # size below which parameters are rounding
     dynamics: Dynamics | None = None  # of parameters that move; then there are no resets
