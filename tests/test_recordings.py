@@ -801,3 +801,21 @@ def test_deviations_of_several_files_are_those_of_independent_data(tmp_path):
     assert found.to_pandas("estimates")["k_std"].iloc[-1] == pytest.approx(std[1], rel=0.15)
     with pytest.raises(ConfigError, match="several files"):
         run(LEAKY, data=files, observer={"sample_time": 0.1})
+
+
+def test_a_recorded_state_that_ends_at_zero_is_judged_by_its_size_over_time():
+    """x = sin(πt/5) is zero at t = 20: an error of 1e-4 there is not large beside it."""
+    t = np.linspace(0, 20, 4001)
+    x, slope = np.sin(np.pi * t / 5), np.pi / 5 * np.cos(np.pi * t / 5)
+    plant = {
+        "name": "p", "states": ["x"], "outputs": ["y"], "inputs": {"u": "0"}, "F": [[1]],
+        "unknowns": {"k": 0.5}, "E": [[1]], "A": [[-1]], "B": [[1]], "C": [[1]],
+        "initial_state": [0],
+    }
+    recorded = pd.DataFrame({"t": t, "u": slope + x - 0.5, "y": x})
+    result = run(
+        plant, data=recorded, estimator={"name": "least_squares", "f0": 1e-3}
+    ).details
+    assert result.estimation.requirement.holds
+    assert 1e-5 < abs(result.estimation.parameters[0, -1, 0] - 0.5) < 1e-3
+    assert result.warnings == ()

@@ -208,9 +208,9 @@ def astray(
     Args:
         root: R (k, p + 1) with |R [−η; 1]|² = ∫‖Y − ψη‖².
         final: η̂ of all cases at the end (G, p).
-        states: from parameters (g, p) to x̂ at the end (g, n).
+        states: from parameters (g, p) to x̂ (g, M, n) at times of which the last is the end.
         quantities: names of parameters and states (p + n,).
-        sizes: of these (p + n,).
+        sizes: of these (p + n,), NaN for a state that nobody knows: least squares' own one counts.
         determined: which of them are.
         columns: the parameters that are estimated (k,), the others being zero.
     """
@@ -224,8 +224,10 @@ def astray(
     if more[best] <= _WORSE * least:
         return ()
     both = np.stack([final[best], eta])
-    one, other = np.hstack([both, states(both)])
-    away = np.abs(one - other) / np.maximum(np.fmax(sizes, np.abs(other)), _TINY)
+    x = states(both)
+    one, other = np.hstack([both, x[:, -1]])
+    own = np.append(np.abs(eta), np.abs(x[1]).max(axis=0, initial=0.0))
+    away = np.abs(one - other) / np.maximum(np.fmax(sizes, own), _TINY)
     far = determined & (away > _ASTRAY)
     if not far.any():
         return ()

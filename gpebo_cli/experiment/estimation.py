@@ -274,7 +274,10 @@ def at_samples(
         still=still,
         warnings=accuracy.astray(
             online.root, made.parameters[:, -1], online.last_states,
-            [*online.parameters, *system.states], np.concatenate(sizes),
+            [*online.parameters, *system.states],
+            np.append(sizes[0], np.where(
+                np.isnan(sizes[1]), np.abs(made.states).max(axis=(0, 1)), sizes[1]
+            )),
             np.append(made.known.parameters[-1], made.seen[-1]), columns,
         ) if by.requirement.holds else (),
     )
@@ -404,7 +407,8 @@ def _estimate(
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
         explaining=explaining,
         warnings=accuracy.astray(
-            regression.root, explaining, lambda eta: state_map.at(t[-1:])(eta[:, None])[:, 0],
+            regression.root, explaining,
+            lambda eta: state_map.at(kept)(eta[:, None].repeat(len(kept), axis=1)),
             [*regression.parameters, *system.states], np.concatenate(sizes),
             np.append(determined, seen), columns,
         ) if requirement.holds and about_own and _settles(observation) else (),

@@ -213,11 +213,11 @@ class Online:
         return self._observer.truth(extension)
 
     def last_states(self, eta: Array) -> Array:
-        """x̂ (g, n) at the newest sample that parameters η (g, p) say."""
+        """x̂ (g, 1, n) at the newest sample that parameters η (g, p) say."""
         (offset, gain, fit), S = self._last, self.root[:, :-1]
         if fit is not None:
-            return fit(eta[:, None], (S.T @ S)[None])[0][:, 0]
-        return np.asarray(offset + eta @ gain.T)
+            return fit(eta[:, None], (S.T @ S)[None])[0]
+        return np.asarray(offset + eta @ gain.T)[:, None]
 
     @property
     def requirement(self) -> Requirement:
