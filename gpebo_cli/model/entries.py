@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol, TypeGuard, runtime_checkable
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -31,15 +31,6 @@ class Entries(NamedTuple):
         return dict(zip(zip(*places, strict=True), values, strict=True))
 
 
-@runtime_checkable
-class ByEntries(CoefficientSource, Protocol):
-    """A source that has its entries apart."""
-
-    def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
-        """Those that are not always zero at the times t (N,), as :func:`entries` has them."""
-        ...
-
-
 def is_sparse(value: object) -> TypeGuard[Any]:
     """Whether a matrix is one of SciPy's sparse ones, which nobody has to import to know that."""
     return hasattr(value, "tocoo")
@@ -50,10 +41,11 @@ def entries(
 ) -> Entries:
     """Those of a source at the times t (N,), see ``CoefficientSource.taylor``.
 
-    A source that has its entries apart (:class:`ByEntries`) says so itself.
+    A source that has its entries apart gives them by a method of this name.
     """
-    if isinstance(source, ByEntries):
-        return source.entries(t, order, inside)
+    own: Callable[[Array, int, Array | None], Entries] | None = getattr(source, "entries", None)
+    if own is not None:
+        return own(t, order, inside)
     return entries_of(source.taylor(t, order, inside), source.constant)
 
 
