@@ -49,6 +49,7 @@ class DataSettings:
     separator: str = ","  # between cells: a character, or comma, semicolon, tab, space
     decimal: Literal[".", ","] = "."
     missing: Literal["refuse", "hold", "interpolate", "drop"] = "refuse"  # of empty cells and nan
+    gaps: list[float] | None = None  # numbers in the file that mean the same as an empty cell
     frame: object = None  # from Python: a pandas.DataFrame in place of a file
 
 

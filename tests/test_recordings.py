@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import os
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
@@ -13,6 +14,7 @@ from time import perf_counter
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from plants import shipped
@@ -24,6 +26,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.metrics import STANDING
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model import archive
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.recordings.guess import _factor, guess
@@ -732,10 +735,40 @@ def test_signals_that_are_not_found_are_said(tmp_path):
 
 
 def test_numbers_that_stand_for_gaps_are_said(tmp_path):
+    """9999 far from all others is taken for one; near others a person has to say."""
     path = tmp_path / "lab.csv"
-    path.write_text("t,V,y\n0,1,9999\n1,999,2\n2,3,9999\n")
-    doubts = guess(str(path), shipped("circuit")).doubts
-    assert doubts == ["2 cells are 9999: if that means a gap, leave them empty"]
+    path.write_text("t,V,y\n0,1,9999\n1,999,2\n2,3,9999\n3,2,2.5\n")
+    found = guess(str(path), shipped("circuit"))
+    assert (found.gaps, found.missing, found.doubts) == ([9999.0], 2, [])
+    path.write_text("t,V,y\n0,1,9999\n1,999,2\n2,3,9999\n3,2,9500\n")
+    found = guess(str(path), shipped("circuit"))
+    assert (found.gaps, found.missing) == ([], 0)
+    assert found.doubts == ["2 cells are 9999: if that means a gap, leave them empty"]
+
+
+def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
+    """Three commands: nobody has to know that the logger writes 9999."""
+    t = np.arange(0.0, 2.0, 0.02)
+    y = 1.0 + np.sin(t)
+    y[[7, 30, 31]] = 9999.0
+    plant = {"name": "level", "states": ["x"], "outputs": ["y"], "initial_state": {"x": 0},
+             "E": [[1]], "A": [[0]], "phi": ["cos(t)"], "C": [[1]]}
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "level.yaml").write_text(yaml.safe_dump(plant))
+    np.savetxt(tmp_path / "log.csv", np.c_[t, y], "%.17g", ",", header="t,y", comments="")
+    command = ("new", "recording", "log.csv", "--plant", "level", "--config-dir", ".")
+    assert gpebo(*command, cwd=tmp_path).returncode == 0
+    data = yaml.safe_load((tmp_path / "data" / "log.yaml").read_text())
+    assert (data["gaps"], data["missing"]) == ([9999.0], "interpolate")
+    settings = DataSettings(file=str(tmp_path / "log.csv"), missing="interpolate", gaps=[9999.0])
+    system = plant_from_mapping(plant, "level.yaml")
+    read = read_table(settings, system).samples.outputs[:, 0]
+    np.testing.assert_allclose(read, 1.0 + np.sin(t), atol=1e-3)
+    savemat(tmp_path / "log.mat", {"t": t, "y": y})
+    of_mat = read_table(replace(settings, file=str(tmp_path / "log.mat")), system).samples
+    np.testing.assert_allclose(of_mat.outputs[:, 0], read, rtol=1e-15)
+    with pytest.raises(ConfigError, match=r"9999 is a gap \(data.gaps\); data.missing says"):
+        read_table(replace(settings, missing="refuse"), system)
 
 
 @pytest.mark.parametrize(("written", "unit", "factor"), [

@@ -76,6 +76,8 @@ def text(file: str, plant: str, found: Guess) -> str:
     if found.scale:
         head.append("scale:      # factors from the file's units to the plant's")
         head += [f"  {line(s, v, reasons[f'scale.{s}'])}" for s, v in found.scale.items()]
+    if found.gaps:
+        head.append(line("gaps", found.gaps, reasons["gaps"]))
     gaps = f"{found.missing} cells are empty; or hold, drop, refuse" if found.missing else ""
     head.append(line("missing", "interpolate" if found.missing else "refuse", gaps))
     return "\n".join(head) + "\n"

@@ -41,6 +41,7 @@ class _Given:
     separator: str = ","
     decimal: Literal[".", ","] = "."
     missing: Literal["refuse", "hold", "interpolate", "drop"] = "refuse"
+    gaps: list[float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +194,7 @@ def _piecewise(name: str, content: Mapping[str, object], where: str, source: str
     data = DataSettings(
         name="csv", file=path, columns={TIME: given.time, name: column}, scale={name: given.scale},
         time_unit=given.time_unit, separator=given.separator, decimal=given.decimal,
-        missing=given.missing,
+        missing=given.missing, gaps=given.gaps,
     )
     alone = DescriptorSystem(  # of which the table is a recording; its matrices are not read
         where, (), None, np.zeros(0), inputs=(name,),  # type: ignore[arg-type]

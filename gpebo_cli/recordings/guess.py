@@ -37,7 +37,8 @@ class Guess:
         time_unit: as ``data.time_unit`` has it.
         columns: what each signal is called in the file.
         scale: factors from the file's units to the plant's.
-        missing: cells that are empty in the columns that are read.
+        missing: cells that are empty in the columns that are read, or hold one of
+        gaps: numbers that are nines alone, and farther from all others than these are apart.
         reasons: why, by key or signal.
         doubts: what was not understood, a line each.
         lacking: signals without a column.
@@ -49,6 +50,7 @@ class Guess:
     columns: dict[str, str] = field(default_factory=dict)
     scale: dict[str, float] = field(default_factory=dict)
     missing: int = 0
+    gaps: list[float] = field(default_factory=list)
     reasons: dict[str, str] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)
@@ -81,12 +83,9 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
     _find_time(header, cells, found)
     _find_signals(header, cells, system, found)
     taken = [header.index(name) for name in found.columns.values()]
-    every = csv.reader(lines[1:], delimiter=found.separator)
-    read = [row[k].strip() for row in every for k in taken if k < len(row)]
-    found.missing = sum(cell.lower() in MISSING for cell in read)
-    for cell, count in Counter(filter(_NINES.fullmatch, read)).items():
-        if count > 1:
-            found.doubts.append(f"{count} cells are {cell}: if that means a gap, leave them empty")
+    every = list(csv.reader(lines[1:], delimiter=found.separator))
+    for k in taken:
+        _find_gaps([row[k].strip() for row in every if k < len(row)], found)
     unused = [name for name in header if name not in found.columns.values()]
     if unused:
         found.doubts.append(f"not read: {', '.join(unused)}")
@@ -137,6 +136,25 @@ def _find_time(header: Sequence[str], cells: Sequence[Sequence[str]], found: Gue
     units = [_UNITS[word] for word in _words(header[k])[1:] if word in _UNITS]
     found.time_unit = units[0] if units else "s"
     found.reasons["time_unit"] = "from the header" if units else "not said in the file"
+
+
+def _find_gaps(cells: Sequence[str], found: Guess) -> None:
+    """Count the gaps of a column, empty ones and those of nines, into what is found."""
+    found.missing += sum(cell.lower() in MISSING for cell in cells)
+    nines = {c: n for c, n in Counter(filter(_NINES.fullmatch, cells)).items() if n > 1}
+    others = [_number(cell, found.decimal) for cell in cells if cell not in nines]
+    numbers = [number for number in others if number is not None]
+    for cell, count in nines.items():
+        value = _number(cell, found.decimal)
+        if value is None or not numbers:
+            continue
+        low, high = min(numbers), max(numbers)
+        if low - value > high - low or value - high > high - low:
+            found.missing += count
+            found.gaps += [value] * (value not in found.gaps)
+            found.reasons["gaps"] = f"{count} cells are {cell}, far from all others"
+        else:
+            found.doubts.append(f"{count} cells are {cell}: if that means a gap, leave them empty")
 
 
 def _words(name: str) -> list[str]:

@@ -265,8 +265,8 @@ class RowReader:
         return values
 
     def _value(self, where: str, cell: str, *, first: bool) -> float:
-        policy = self._data.missing
-        if cell.strip(" \t").lower() in MISSING:
+        policy, of_gap = self._data.missing, self._stands_for_gap(cell, first=first)
+        if of_gap or cell.strip(" \t").lower() in MISSING:
             if policy == "drop" or (policy != "refuse" and not first):
                 return math.nan
             if not cell.strip(" \t"):
@@ -274,6 +274,10 @@ class RowReader:
                     f"{where}: the sample is missing; every row needs a number there"
                     + ("" if first else ", or data.missing says what to do")
                 )
+        if of_gap:
+            raise ConfigError(
+                f"{where}: {cell.strip()} is a gap (data.gaps); data.missing says what to do"
+            )
         if first and self._data.time_unit == "datetime":
             [value], self._origin = seconds([cell], self._origin)
             if math.isnan(value):
@@ -296,6 +300,11 @@ class RowReader:
                 f"{where}: {shown(cell.strip())} is too large; numbers go up to {LARGEST:g} here"
             )
         return value
+
+    def _stands_for_gap(self, cell: str, *, first: bool) -> bool:
+        if first or not self._data.gaps or self._number.fullmatch(cell) is None:
+            return False
+        return float(cell.replace(self._data.decimal, ".")) in self._data.gaps
 
 
 def seconds(cells: Sequence[str], origin: Any) -> tuple[Array, Any]:
@@ -360,7 +369,7 @@ def _table(
 
 def _read_body(header: Header, data: DataSettings, body: bytes) -> Array:
     """The rows below the header, (N, columns): by pandas, or one by one."""
-    plain = data.missing == "refuse" and data.time_unit != "datetime"
+    plain = data.missing == "refuse" and data.time_unit != "datetime" and not data.gaps
     if plain and not re.search(rb'\A\xef\xbb\xbf|["\r\v\f\0]', body) and _even(header, data, body):
         values = _by_pandas(header, data, body)
         if values is not None and not np.any(np.diff(values[:, 0]) <= 0):
@@ -447,7 +456,10 @@ def _from_frame(
         if pd.api.types.is_datetime64_any_dtype(column):
             values = (column - column.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
         elif pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
-            values = column.to_numpy(dtype=np.float64, na_value=np.nan) * scale
+            values = column.to_numpy(dtype=np.float64, na_value=np.nan)
+            if k != header.positions[0]:
+                values = np.where(np.isin(values, data.gaps or ()), np.nan, values)
+            values = values * scale
         elif k == header.positions[0] and data.time_unit == "datetime":
             values, _ = seconds([str(cell) for cell in column], None)
         else:
