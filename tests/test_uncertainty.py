@@ -13,8 +13,10 @@ from plants import shipped
 from gpebo_cli import run
 from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence.metrics import standing_since
-from gpebo_cli.evidence.uncertainty import deviations, noise_level
+from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
 from gpebo_cli.experiment.pipeline import stream
+from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.results.report import run_lines
 from gpebo_cli.settings import DataSettings, NoiseSettings, Settings, TimeSettings
 
@@ -370,3 +372,15 @@ def test_an_estimate_that_was_not_moved_has_no_deviation(tmp_path, observer, siz
         std = result.estimation.parameters_std[0, -1]
         assert "not moved" not in told["b"]
         assert (np.abs(result.estimation.parameters[0, -1] - [1, 1e6, -1]) < 5 * std).all()
+
+
+@pytest.mark.parametrize("gain", [1e8, 1e20, 1e32])
+def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain):
+    """f' = −a f + e, s' = −g (s − c f): f as without s, and s goes to c f."""
+    a, c, h = 1e-4, 1e3, 0.4
+    A, B = np.array([[-a, 0.0], [gain * c, -gain]]), np.array([[1.0], [0.0]])
+    mesh = Mesh(np.array([0.0, h]), radau_rule(4))
+    A, B = (np.broadcast_to(each, (1, 4, *each.shape)) for each in (A, B))
+    (f, s), decayed = _maps(mesh, mesh.steps, A, B)[0, -1], np.exp(-a * h)
+    np.testing.assert_allclose(f, [decayed, 0.0, (1.0 - decayed) / a], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(s, c * f, rtol=1e-4, atol=1e-6)

@@ -39,6 +39,7 @@ _GROUPS = 2000  # of samples, by which many of them are replaced at first
 _PER_ELAPSED = 64  # groups at least, since the start, at first
 _AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
 _BESIDE = 8  # errors that stand beside each other in a factor
+_STIFF = 1e12  # rates times steps, from which on rows count alike
 _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
 
 
@@ -328,11 +329,16 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
         A: (K, s, d, d) at the nodes.
         B: (K, s, d, c).
     """
-    K = len(steps)
+    K, E = len(steps), None
+    size = 1.0 + steps[:, None] * np.abs(A).max(axis=(1, 3), initial=0.0)
+    # Beside the rows of a law with a large gain those of its filters would be rounding.
+    if size.max(initial=0.0) > _STIFF:
+        A, B = (x / size[:, None, :, None] for x in (A, B))
+        E = (np.eye(A.shape[-1]) / size[:, None]).repeat(1 + A.shape[1], axis=0)
     # At the left ends nothing is looked at.
     A, B = (np.concatenate([x[:, :1], x], axis=1).reshape(-1, *x.shape[2:]) for x in (A, B))
     return np.concatenate(elements.element_maps(
-        mesh.rule.differentiation, steps, None, A, B, None, None, np.arange(K), K
+        mesh.rule.differentiation, steps, E, A, B, None, None, np.arange(K), K
     ), axis=3)
 
 
