@@ -179,6 +179,7 @@ def test_fail_fast_stops_at_the_first_and_the_rest_can_be_run_later(tmp_path):
     assert "1 job without a result (fail_fast); go on with resume=sweep" in done.stderr
     assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "failed", "missing"]
     again = gpebo(*words, "resume=sweep", cwd=tmp_path)
+    assert not (tmp_path / "outputs").exists()
     assert again.returncode == 1
     assert again.stderr.count("\n") == 1
     assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "failed", "done"]

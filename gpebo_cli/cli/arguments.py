@@ -100,7 +100,8 @@ class Arguments:
         # Chosen here rather than in conf/gpebo.yaml: other primary configurations sweep, too.
         words = [f"hydra/sweeper={_SWEEPER}"]
         if self.resume is not None:
-            words.append(f"hydra.sweeper.resume={quoted(self.resume)}")
+            folder = quoted(self.resume)
+            words += [f"hydra.sweeper.resume={folder}", f"hydra.sweep.dir={folder}"]
         if self.fail_fast:
             words.append(f"hydra.sweeper.fail_fast={self.fail_fast}")
         if self.dry_run:
