@@ -161,6 +161,15 @@ def test_many_narrow_pulses_are_integrated(w, power):
     np.testing.assert_allclose(integrated(f"cos({w}*t)**{power}"), 20 * mean, rtol=1e-7)
 
 
+def test_more_pulses_than_cells_is_said(monkeypatch):
+    monkeypatch.setattr("gpebo_cli.model.expressions.bounds._MOST_VALUES", 1)
+    monkeypatch.setattr("gpebo_cli.model.expressions.bounds._MOST_CELLS", 1000)
+    plant = {"name": "p", "states": ["x"], "inputs": {"u": "cos(50*t)**2000"}, "E": [[1]],
+             "A": [[0]], "B": [[1]], "initial_state": [0]}
+    told = run(plant, observer="none", time={"horizon": 20}).verdict
+    assert "nothing bounds what functions that change so often do between" in told
+
+
 def test_the_derivative_of_a_steep_step_is_integrated():
     np.testing.assert_allclose(integrated("d(tanh(1e4*(t - 7.1234)))"), 2.0, rtol=1e-8)
 
@@ -177,4 +186,6 @@ def test_a_coefficient_that_passes_zero_twice_in_no_time_is_refused(place, width
 def test_smooth_functions_cost_no_cells():
     tape = record([parse(text, {}, "here") for text in ("sin(t)", "exp(-t)", "1/(2 - cos(2*t))")])
     edges = np.linspace(0, 20, 25)
-    np.testing.assert_array_equal(resolved(Bounds(tape), edges), edges)
+    found, short = resolved(Bounds(tape), edges)
+    assert short
+    np.testing.assert_array_equal(found, edges)

@@ -201,3 +201,17 @@ def test_squares_that_no_number_holds_are_refused_with_their_time(estimator):
     }
     with pytest.raises(SolverError, match=r"^Ω.* is too large for a number near t = 0\.\d+; write"):
         run(regression=given, estimator=estimator, time={"horizon": 1, "samples": 11})
+
+
+@pytest.mark.parametrize("psi", [
+    "p", "exp(-((q - 3.3127)/1e-4)**2)", "delay(p, 2)", "hp(p, 3)", "abs(sin(t) - 0.3)*p",
+])
+def test_a_narrow_pulse_is_seen_wherever_it_stands(psi):
+    given = {
+        "name": "pulse", "signals": {"p": "exp(-((t - 3.3127)/1e-4)**2)", "q": "t"},
+        "psi": [[1, psi]], "unknowns": {"a": 1, "b": 2},
+    }
+    found = run(regression=given, estimator={"name": "least_squares", "f0": 1e-12},
+                time={"horizon": 10})
+    assert found.details.excitation.is_ie
+    assert found.estimates["b"].ravel()[-1] == pytest.approx(2.0, rel=1e-4)

@@ -18,8 +18,8 @@ T = np.linspace(0.0, 10.0, 201)
 def on_mesh(mapping, tol=1e-12):
     model = regression_from_mapping({"name": "r", **mapping})
     solver = SolverSettings(tol=tol)
-    signals = signals_of_time(model.system, TimeSettings(horizon=10.0), solver)
-    regression, error = model.on(signals, None, tol, 100_000)
+    signals = signals_of_time(model.system, model, TimeSettings(horizon=10.0), solver)
+    regression, error = model.on(signals[0], None, tol, 100_000)
     assert error <= 1e-10
     return regression
 

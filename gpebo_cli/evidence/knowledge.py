@@ -184,7 +184,10 @@ def smallest_and_margin(
 
 
 def tells_nothing(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> bool:
-    """Whether the ``margin`` of :func:`knowledge` is surely below 1 at all times: by Cholesky."""
+    """Whether the ``margin`` of :func:`knowledge` is surely below 1 at all times: by Cholesky.
+
+    Of G (N, p, p), the terms it is made of and the times since the start (N,).
+    """
     normalised, _, level = _normalised(gram, terms, elapsed, tol)
     normalised -= 0.9 * level.max(axis=1)[:, None, None] * np.eye(normalised.shape[1])
     for N in normalised[::-1]:  # what is told at all is told at the end

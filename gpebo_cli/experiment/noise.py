@@ -94,7 +94,7 @@ def signal_noise(
 ) -> SignalNoise:
     """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12.
 
-    A recording has samples of its own, at ``instants``.
+    A recording has samples of its own, at ``instants`` (N,).
     """
     outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
     step = settings.sample_time if instants is None else float(np.diff(instants).mean())

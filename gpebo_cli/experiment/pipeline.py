@@ -133,7 +133,7 @@ def _experiment(
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
         source = several.joined_source([read(one, system, levels, samples) for one in each])
-    unbounded = functions_note(system)
+    unbounded = functions_note(system, source.simulation)
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
         excitation=None, estimation=None, metrics=None, assumptions=source.assumptions,

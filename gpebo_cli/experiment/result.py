@@ -93,6 +93,7 @@ class SimulationResult:
     measured_outputs: Array | None = None  # (N, r)
     state_errors: Array | None = None  # (n,) the estimate for each state, relative to its own size
     linear_solves: float | None = None  # what Newton's method cost; None: the plant is linear
+    bounded: bool = True  # known functions are, between the times at which they are evaluated
 
 
 SignalsResult = RecordingResult | SimulationResult

@@ -194,5 +194,5 @@ class _WithOutputs:
     def truth(self, t: Array) -> Array:
         return self.source.truth(t)
 
-    def resolved(self, edges: Array) -> Array | None:
+    def resolved(self, edges: Array) -> tuple[Array, bool]:
         return self.source.resolved(edges)

@@ -244,6 +244,7 @@ def _sample_simulation(
         state_errors=simulation.state_errors,
         linear_solves=None if simulation.effort is None else simulation.effort.linear_solves,
         elements=signals.mesh.size,
+        bounded=simulation.bounded,
     )
 
 

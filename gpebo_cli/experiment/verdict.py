@@ -119,15 +119,16 @@ def simulation_note(simulated: SimulationResult | None, tol: float) -> str:
     return told
 
 
-def functions_note(system: DescriptorSystem) -> str:
+def functions_note(system: DescriptorSystem, simulated: SimulationResult | None) -> str:
     """What the last line of a run has to say of functions without bounds, from "; " on."""
     source = system.coefficients
-    if not isinstance(source, FunctionCoefficients) or not source.functions:
+    if isinstance(source, FunctionCoefficients) and source.functions:
+        which = f"functions from Python ({', '.join(source.functions)})"
+    elif simulated is not None and not simulated.bounded:
+        which = "functions that change so often"
+    else:
         return ""
-    return (
-        f"; nothing bounds what functions from Python ({', '.join(source.functions)}) do between "
-        "the times at which they are evaluated"
-    )
+    return f"; nothing bounds what {which} do between the times at which they are evaluated"
 
 
 def newton_note(simulated: SimulationResult) -> str:

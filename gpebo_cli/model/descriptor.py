@@ -107,12 +107,12 @@ class CoefficientSource(Protocol):
         """Times strictly between ``start`` and ``stop`` where some entry jumps or has a kink."""
         ...
 
-    def resolved(self, edges: Array) -> Array | None:
+    def resolved(self, edges: Array) -> tuple[Array, bool]:
         """Edges of cells in which every known function is nearly a polynomial of low degree.
 
         They are ``edges`` (K + 1,), sorted, jumps and kinks among them, and more: nothing that is
-        looked at between them hides a pulse. None: nothing bounds these functions (from Python).
-        What depends on outputs is not among them.
+        looked at between them hides a pulse. But where the second value is False nothing says so:
+        functions come from Python, or need too many cells. What depends on outputs does not count.
         """
         ...
 

@@ -142,9 +142,9 @@ class FunctionCoefficients:
         """None: functions are taken to be smooth."""
         return np.zeros(0)
 
-    def resolved(self, edges: Array) -> None:  # noqa: ARG002
-        """None, whatever the edges (K + 1,): nothing bounds what functions do between the nodes."""
-        return
+    def resolved(self, edges: Array) -> tuple[Array, bool]:
+        """The same edges (K + 1,): nothing bounds what functions do between the nodes."""
+        return edges, not self.functions
 
     def _fill(self, name: str, values: Array, t: Array, signals: Array | None) -> None:
         """Fill ``values`` (order + 1, N, …), with derivatives as far as they are given."""

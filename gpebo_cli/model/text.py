@@ -78,7 +78,8 @@ class TextCoefficients:
     kept: dict[object, object] = field(default_factory=dict, init=False)
     # Breakpoints (number,) by the span, and edges (number,) of cells by the edges asked for.
     _breakpoints: dict[tuple[float, float], Array] = field(default_factory=dict, init=False)
-    _resolved: dict[bytes, Array] = field(default_factory=dict, init=False)  # (number,)
+    # (number,)
+    _resolved: dict[bytes, tuple[Array, bool]] = field(default_factory=dict, init=False)
 
     @cached_property
     def constant(self) -> frozenset[str]:
@@ -185,7 +186,7 @@ class TextCoefficients:
             self._breakpoints[start, stop] = breakpoints(self.tape, start, stop)
         return self._breakpoints[start, stop].copy()
 
-    def resolved(self, edges: Array) -> Array:
+    def resolved(self, edges: Array) -> tuple[Array, bool]:
         """Edges of cells in which nothing narrow hides, from edges (K + 1,); see the protocol."""
         key = edges.tobytes()
         if key not in self._resolved:

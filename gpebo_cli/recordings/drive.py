@@ -133,7 +133,7 @@ class Driven:
         inner = corners[(corners > start) & (corners < stop)]
         return np.union1d(self.given.breakpoints(start, stop), inner)
 
-    def resolved(self, edges: Array) -> Array | None:
+    def resolved(self, edges: Array) -> tuple[Array, bool]:
         """As of the text, from edges (K + 1,); between them the tables are polynomials."""
         return self.given.resolved(edges)
 

@@ -304,10 +304,8 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
     """Interior times, none of them special: equal spacing would hit the zeros of sin(k π t)."""
     t = start + (stop - start) * _PLACES
     jumps = system.coefficients.breakpoints(start, stop)
-    edges = None
     if not {"E", "A"} <= system.coefficients.constant:
-        edges = system.coefficients.resolved(initial_edges(start, stop, jumps))
-    if edges is not None:  # where something is narrow
+        edges, _ = system.coefficients.resolved(initial_edges(start, stop, jumps))
         steps = edges[1:] - edges[:-1]
         narrow = (steps < 0.4 * (stop - start) / FIRST_ELEMENTS).nonzero()[0]
         narrow = narrow[:: 1 + len(narrow) * _NARROW // _MOST_PROBES]

@@ -21,9 +21,19 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.model.expressions import Expression, Tape, breakpoints, nodes, parse, record
+from gpebo_cli.model.expressions import (
+    Bounds,
+    Expression,
+    Tape,
+    breakpoints,
+    nodes,
+    parse,
+    record,
+    resolved,
+)
 from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.syntax import signal
+from gpebo_cli.model.expressions.tape import UNKNOWN
 from gpebo_cli.model.plant import plant_from_mapping, read_parameters
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
@@ -88,6 +98,12 @@ class TextRegression:
         """Number of rows of ψ."""
         return len(self.psi.outputs) // self.system.q
 
+    @property
+    def tapes(self) -> list[Tape]:
+        """Those of psi, of Y if it has a text, and of the operators' arguments."""
+        of_operators = [operator.argument for operator in self.operators]
+        return [self.psi, *([] if self.Y is None else [self.Y]), *of_operators]
+
     def on(
         self, signals: Trajectory, Y: Trajectory | None, tol: float, max_elements: int
     ) -> tuple[LinearRegression, float]:
@@ -137,10 +153,8 @@ class TextRegression:
         """The signals' mesh with an edge wherever a delayed signal jumps or has a kink."""
         mesh = signals.mesh
         start, stop = float(mesh.edges[0]), float(mesh.edges[-1])
-        tapes = [self.psi, *([] if self.Y is None else [self.Y])]
-        tapes += [operator.argument for operator in self.operators]
         found = [self.system.coefficients.breakpoints(start, stop), _jumps(signals)]
-        cuts = np.concatenate(found + [breakpoints(tape, start, stop) for tape in tapes])
+        cuts = np.concatenate(found + [breakpoints(tape, start, stop) for tape in self.tapes])
         for operator in self.operators:
             if operator.name == "delay":
                 later = np.concatenate([[start], cuts]) + operator.number
@@ -182,7 +196,7 @@ def _jumps(signals: Trajectory) -> Array:
 class _Operators:
     """Collects the operators that are met while texts are parsed; equal ones are one."""
 
-    def __init__(self, signals: int) -> None:
+    def __init__(self, signals: Sequence[Expression]) -> None:
         self.found: dict[tuple[object, ...], Operator] = {}
         self._signals = signals
         self.calls: dict[str, tuple[int, Callable[..., Node]]] = {
@@ -200,9 +214,9 @@ class _Operators:
             raise nodes.FoldError(f"{name}: d(.) cannot stand inside; use hp for a derivative")
         key = (name, _structure(argument), number.value)
         if key not in self.found:
-            tape = record([Expression(argument, name, f"argument of {name}")])
+            tape = record([Expression(argument, name, f"argument of {name}")], self._signals)
             self.found[key] = Operator(name, tape, number.value)
-        place = self._signals + list(self.found).index(key)
+        place = len(self._signals) + list(self.found).index(key)
         return nodes.signal(f"{name}(…)", place)
 
 
@@ -257,7 +271,10 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
     named = {name: signal(name, k, "a signal") for k, name in enumerate(system.inputs)}
     elsewhere = dict.fromkeys((*system.unknowns, *system.states), "an unknown")
     known = named | read_parameters(where, mapping.get("parameters"), named, elsewhere)
-    operators = _Operators(system.m)
+    functions = [parse(value, known, f"{where}: signals") for value in signals.values()]
+    # A number may stand for a recording or for a table, of which nobody knows here.
+    of_time = [replace(one, node=UNKNOWN) if one.is_constant else one for one in functions]
+    operators = _Operators(of_time)
 
     def read(value: object, what: str) -> Expression:
         return parse(value, known, f"{where}: {what}", elsewhere, operators.calls)
@@ -275,9 +292,9 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         texts = _list(mapping, "Y", where)
         if len(texts) != count:
             raise ConfigError(f"{where}: Y has {len(texts)} entries and psi has {count} rows")
-        Y = record([read(value, f"Y[{i}]") for i, value in enumerate(texts)])
+        Y = record([read(value, f"Y[{i}]") for i, value in enumerate(texts)], of_time)
     found = tuple(operators.found.values())
-    return TextRegression(system, found, record(psi), Y, recorded, parametrisation)
+    return TextRegression(system, found, record(psi, of_time), Y, recorded, parametrisation)
 
 
 def _measured(mapping: Mapping[str, object], signals: Mapping[str, object]) -> list[str]:
@@ -370,7 +387,7 @@ def simulation_of(
             f"regression {system.name}: signals.{given.recorded[0]} is null, a column of a "
             "recording; give data.file, or a function of t"
         )
-    signals = signals_of_time(system, time, solver)
+    signals, bounded = signals_of_time(system, given, time, solver)
     mesh, outputs = signals.mesh, np.zeros((*signals.mesh.points.shape, 0))
     if given.Y is None:
         zero = Trajectory(mesh, np.zeros((*mesh.points.shape, given.rows)))
@@ -380,22 +397,30 @@ def simulation_of(
     theta = np.broadcast_to(system.initial_state, (*mesh.points.shape, system.n))
     return Simulation(
         Signals(signals, Trajectory(mesh, outputs), Trajectory(mesh, theta)), without_equations(),
-        system.initial_state, (), solver.tol, bounded=False,
+        system.initial_state, (), solver.tol, bounded=bounded,
     )
 
 
 def signals_of_time(
-    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
-) -> Trajectory:
-    """The signals that a regression's text gives as functions of time, resolved on a mesh.
+    system: DescriptorSystem, given: TextRegression, time: TimeSettings, solver: SolverSettings
+) -> tuple[Trajectory, bool]:
+    """The signals on a mesh that resolves them, and whether nothing narrow can hide on it.
 
-    Raises:
-        ConfigError: a signal without a finite value; names it and the time.
-        SolverError: the tolerance cannot be reached.
+    That is said of the signals, of psi, Y and the operators' arguments as functions of time.
     """
     start, stop = time.start, time.start + time.horizon
     cuts = system.coefficients.breakpoints(start, stop)
-    mesh = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
+    first = initial_mesh(start, stop, cuts, _FIRST_ELEMENTS, radau_rule(solver.stages))
+    edges, bounded = system.coefficients.resolved(first.edges)
+    for tape in given.tapes:
+        of_time = tape.of([place for place in tape.outputs if place in tape.of_time])
+        edges, short = resolved(Bounds(of_time), edges)
+        bounded &= short
+    for operator in given.operators:
+        if operator.name == "delay":  # what is narrow comes once more
+            later = np.setdiff1d(edges, first.edges) + operator.number
+            edges = np.union1d(edges, later[later < stop])
+    mesh = Mesh(edges, first.rule)
 
     def evaluated(mesh: Mesh) -> tuple[Array, list[tuple[Array, float]]]:
         u = system.coefficients.taylor(mesh.points.ravel(), 0, mesh.inside.ravel()).u[0]
@@ -407,4 +432,4 @@ def signals_of_time(
         evaluated, mesh, tol=solver.tol, max_elements=solver.max_elements,
         name=f"regression {system.name}",
     )
-    return Trajectory(mesh, values)
+    return Trajectory(mesh, values), bounded

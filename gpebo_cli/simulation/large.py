@@ -155,10 +155,8 @@ def large_simulation(
     start, stop = time.start, time.start + time.horizon
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
-    edges = system.coefficients.resolved(mesh.edges)
-    bounded = edges is not None
-    if edges is not None:
-        mesh = Mesh(edges, mesh.rule)
+    edges, bounded = system.coefficients.resolved(mesh.edges)
+    mesh = Mesh(edges, mesh.rule)
     plant = _Plant(system, solver.max_strangeness_index + 1)
     try:
         with np.errstate(all="ignore"):

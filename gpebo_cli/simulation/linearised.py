@@ -76,16 +76,16 @@ class Linearised:
         """Those of functions of time."""
         return self.system.coefficients.breakpoints(start, stop)
 
-    def resolved(self, edges: Array) -> Array | None:
+    def resolved(self, edges: Array) -> tuple[Array, bool]:
         """Cells for what depends on time alone, from edges (K + 1,); the guess has its own."""
-        found = self.system.coefficients.of_time.resolved(edges)
-        if found is None or len(self.guess.mesh.edges) == 2:
-            return found
+        found, bounded = self.system.coefficients.of_time.resolved(edges)
+        if not bounded or len(self.guess.mesh.edges) == 2:
+            return found, bounded
         inner = self.guess.mesh.edges[1:-1]
         apart = np.abs(found[np.clip(np.searchsorted(found, inner), 0, len(found) - 1)] - inner)
         before = np.abs(found[np.clip(np.searchsorted(found, inner) - 1, 0, None)] - inner)
         close = 1e-9 * np.diff(self.guess.mesh.edges).min()
-        return np.union1d(found, inner[np.minimum(apart, before) > close])
+        return np.union1d(found, inner[np.minimum(apart, before) > close]), bounded
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None

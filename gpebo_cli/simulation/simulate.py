@@ -95,14 +95,13 @@ def _simulate_linear(
     start, stop = time.start, time.start + time.horizon
     cuts = system.coefficients.breakpoints(start, stop)
     mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
-    edges = system.coefficients.resolved(mesh.edges)
-    if edges is not None:
-        mesh = Mesh(edges, mesh.rule)
+    edges, bounded = system.coefficients.resolved(mesh.edges)
+    mesh = Mesh(edges, mesh.rule)
     structure = analyse(
         system, start, stop, max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol
     )
     mesh, c, terms = _known_resolved(
-        system, structure, mesh, cuts, solver, bounded=edges is not None
+        system, structure, mesh, cuts, solver, bounded=bounded
     )
     first = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
     if solver.name == "ivp":
@@ -155,7 +154,7 @@ def _simulate_linear(
         initial_state=x0,
         jumps=tuple((t, *happened[t]) for t in sorted(happened)),
         error_estimate=solution.error_estimate,
-        bounded=edges is not None,
+        bounded=bounded,
         state_errors=solution.errors[:, 0],
         lost=solution.lost,
     )

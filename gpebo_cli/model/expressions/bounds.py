@@ -25,6 +25,8 @@ _DEEPEST = 45  # halvings of a cell
 _CELLS = 64  # to begin with, where roots are looked for
 _NARROWEST = 1e-13  # of the span; cells are not cut further
 _MOST_CELLS = 1 << 15
+_MOST_VALUES = 1 << 20  # of all expressions in all cells, where these are more
+_AT_ONCE = 1 << 14  # cells whose bounds are held at the same time
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one
 _BISECTIONS = 100  # more than enough to leave two neighbouring floats
 
@@ -72,7 +74,7 @@ class Bounds:
         return bounds[0], bounds[1]
 
 
-def resolved(bounds: Bounds, edges: Array) -> Array:
+def resolved(bounds: Bounds, edges: Array) -> tuple[Array, bool]:
     """Edges of cells that are few times longer than what hides nothing.
 
     In cells 2**COARSER times shorter every expression is nearly a polynomial of degree ORDER.
@@ -89,16 +91,18 @@ def resolved(bounds: Bounds, edges: Array) -> Array:
         edges: (K + 1,) where cells have to end, jumps and kinks among them.
 
     Returns:
-        these edges and more, sorted.
+        these edges and more, sorted; and whether all cells are short enough. There are too many
+        of those where not.
     """
     low, high = edges[:-1], edges[1:]
     depth = np.zeros(len(low), dtype=np.intp)  # how often each has been halved
     rest, size = _rest(bounds, low, high)
-    while len(low) < _MOST_CELLS:
+    most = max(_MOST_CELLS, _MOST_VALUES // max(1, size.shape[1]))
+    while True:
         # A bound that nothing reaches falls while its cell is cut.
         finite = np.where(np.isfinite(size), size, 0.0)
         poor = (rest > RESOLVED * finite.max(axis=0)).any(axis=1) & (depth < _DEEPEST)
-        if not poor.any():
+        if len(low) >= most or not poor.any():
             break
         middle = 0.5 * (low[poor] + high[poor])
         new = np.concatenate([low[poor], middle]), np.concatenate([middle, high[poor]])
@@ -109,7 +113,7 @@ def resolved(bounds: Bounds, edges: Array) -> Array:
             for old, more in zip((low, high, depth, rest, size), fresh, strict=True)
         )
     order = np.argsort(low)
-    return np.append(_coarser(low[order], depth[order], edges), edges[-1])
+    return np.append(_coarser(low[order], depth[order], edges), edges[-1]), not poor.any()
 
 
 def _coarser(low: Array, depth: IntArray, edges: Array) -> Array:
@@ -128,12 +132,16 @@ def _coarser(low: Array, depth: IntArray, edges: Array) -> Array:
 
 def _rest(bounds: Bounds, low: Array, high: Array) -> tuple[Array, Array]:
     """By how much expressions can differ from polynomials in each cell, and how large they get."""
-    least, most = bounds.of(low, high, ORDER, 0.5 * (low + high))
-    half = 0.5 * (high - low)
-    with np.errstate(invalid="ignore", over="ignore"):
-        radius = 0.5 * (most - least) * half[:, None] ** np.arange(ORDER + 1)[:, None, None]
-    radius = np.where(np.isnan(radius), np.inf, radius)
-    return radius.min(axis=0), np.maximum(-least[0], most[0])
+    rest, size = np.empty((2, len(low), len(bounds.tape.outputs)))
+    for first in range(0, len(low), _AT_ONCE):
+        here = slice(first, first + _AT_ONCE)
+        least, most = bounds.of(low[here], high[here], ORDER, 0.5 * (low[here] + high[here]))
+        half = 0.5 * (high[here] - low[here])
+        with np.errstate(invalid="ignore", over="ignore"):
+            radius = 0.5 * (most - least) * half[:, None] ** np.arange(ORDER + 1)[:, None, None]
+        rest[here] = np.where(np.isnan(radius), np.inf, radius).min(axis=0)
+        size[here] = np.maximum(-least[0], most[0])
+    return rest, size
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in par
 # never be gained again.
 _MOST_COMPILED = 1000
 _SWITCHES = ("abs", "sign", "min", "max")
-_UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
+UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
 # Function, its place in the pair of jets computed together, and which pair.
 _PAIRS = {
@@ -359,7 +359,7 @@ def record(expressions: Sequence[Expression], inputs: Sequence[Expression] = ())
             children = node.arguments
             if node.operation == "signal":
                 k = int(node.value)
-                children = (inputs[k].node if k < len(inputs) else _UNKNOWN,)
+                children = (inputs[k].node if k < len(inputs) else UNKNOWN,)
             missing = [a for a in children if id(a) not in place_of]
             if missing:
                 stack.extend(missing)
