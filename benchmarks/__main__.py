@@ -1,9 +1,9 @@
 """``make bench``, or ``python -m benchmarks [PART…]``; numbers are measured, never typed in.
 
 Writes ``benchmarks/benchmarks.json`` and, from it, ``docs/benchmarks.md``. Parts that are not
-measured keep what they had. Without words all parts are, but for ``sweeps``, which takes half an
-hour. ``python -m benchmarks kernels`` prints what each compiled kernel is worth and writes
-it into ``docs/decisions.md``.
+measured keep what they had. Without words all parts are, but for ``sweeps`` and ``recordings``,
+which take half an hour each. ``python -m benchmarks kernels`` prints what each compiled kernel is
+worth and writes it into ``docs/decisions.md``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks import circuit, cold, floor, gains, growth, ladders, problems, sweeps
+from benchmarks import circuit, cold, floor, gains, growth, ladders, problems, recordings, sweeps
 from benchmarks import kernels as ablation
 from benchmarks.measure import Row
 from benchmarks.page import PARTS, page
@@ -29,6 +29,7 @@ ROOT = Path(__file__).parent.parent
 JSON = ROOT / "benchmarks" / "benchmarks.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
 PLOT = ROOT / "docs" / "img" / "growth.png"
+SLOW = ("recordings", "sweeps")
 PACKAGES = ("numpy", "scipy", "matplotlib", "casadi", "scikit-sundae", "solve-dae", "diffrax",
             "jax")
 
@@ -54,6 +55,7 @@ MEASURE: dict[str, Callable[[], Measured]] = {
     "cold": lambda: (cold.rows(), {}),
     "growth": _growth,
     "floor": lambda: ([], {"table": floor.table()}),
+    "recordings": lambda: ([], {"rows": recordings.table()}),
     "sweeps": lambda: ([], {"rows": sweeps.table()}),
 }
 
@@ -127,7 +129,7 @@ def main(words: list[str]) -> int:
         return 2
     data = json.loads(JSON.read_text("utf-8")) if JSON.exists() else {"rows": [], "parts": {}}
     failed = []
-    for part in words or [part for part in PARTS if part != "sweeps"]:
+    for part in words or [part for part in PARTS if part not in SLOW]:
         sys.stderr.write(f"{part}\n")
         measured = environment()
         try:
