@@ -34,7 +34,7 @@ _ROUNDS, _SAME_TIME = 30, 1e-12
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
 _STEPS = 0.25 ** np.array([0.0, 1.0, 2.0, 4.0, 6.0, 9.0])
 _AROUND = np.concatenate([-_STEPS, [0.0], _STEPS[::-1]])
-_BLOCK = 16  # times that are looked at together, from the end on
+_BLOCK = 16  # times that are looked at together, from the end on, of more parameters than that
 _MANY = 64  # parameters, from which on spectra are not asked whether there is anything to know
 WINDOWS = 10  # default PE window: this many per horizon
 
@@ -172,8 +172,9 @@ class _Evidence:
     def least_share(self) -> Array:
         """Of the parameters, (N,); 0 some time before it is ``WELL`` for good."""
         found = np.zeros(len(self.t))
-        for last in range(len(self.t), 0, -_BLOCK):
-            part = slice(max(last - _BLOCK, 0), last)
+        size = _BLOCK if self.regression.p > _BLOCK else max(len(found), 1)
+        for last in range(len(found), 0, -size):
+            part = slice(max(last - size, 0), last)
             at = self.t[part]
             found[part] = least_share(self.regression.gram(at), *self.beside(at))
             if found[part].min() < WELL:
