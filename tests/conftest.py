@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 import hypothesis
 import pytest
+
+# The workers that start after this have one thread of BLAS each: two on a core wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # The same examples everywhere, so that a change is what makes a test fail. New ones are looked for
 # with `pytest --hypothesis-profile=explore`.

@@ -413,8 +413,8 @@ def test_a_stiff_sparse_plant_agrees_with_dense_collocation(monkeypatch):
     )
 
 
-@pytest.mark.parametrize(("cells", "one"), [(1, False), (5, True)])
-def test_blas_has_one_thread_where_matrices_are_of_a_middle_size(cells, one):
+@pytest.mark.parametrize(("cells", "one"), [(1, True), (5, True), (101, False)])
+def test_blas_has_one_thread_where_matrices_are_small(cells, one):
     asked = []
 
     def looked(_stage):
@@ -422,7 +422,7 @@ def test_blas_has_one_thread_where_matrices_are_of_a_middle_size(cells, one):
 
     with threadpool_limits(limits=2, user_api="blas"):
         before = threadpool_info()
-        run(plant(ladder, cells=cells), progress=looked, time={"horizon": 1.0})
+        run(plant(ladder, cells=cells), progress=looked, time={"horizon": 1.0}, observer="none")
         assert threadpool_info() == before
     assert asked
     assert all((1 in found) == one for found in asked)

@@ -16,6 +16,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
+from gpebo_cli.experiment.threads import one_thread
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.recordings.table import LineReader, samples
 from gpebo_cli.settings import Settings
@@ -24,6 +25,7 @@ _PIECE = 1 << 15  # bytes read at once, some 600 rows: as fast as larger ones
 _SOURCE = "standard input"
 
 
+@one_thread
 def run(settings: Settings, system: DescriptorSystem) -> int:
     """Treat rows until standard input ends; the verdict goes to stderr.
 

@@ -18,6 +18,7 @@ from gpebo_cli.evidence.excitation import Excitation, assess, estimable
 from gpebo_cli.evidence.knowledge import LARGE, Knowledge
 from gpebo_cli.evidence.uncertainty import of_least_squares
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
+from gpebo_cli.experiment.threads import one_thread
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import inverse_or_none
@@ -59,6 +60,7 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
     return examine(settings, system, both=True).assumptions
 
 
+@one_thread
 @np.errstate(all="ignore")  # as in a run
 def examine(
     settings: Settings, system: DescriptorSystem, *, both: bool = False

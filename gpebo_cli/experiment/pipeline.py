@@ -6,13 +6,11 @@ estimation at samples as its rows come.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
 from time import perf_counter
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -26,13 +24,12 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.pace import Pace, paced
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
+from gpebo_cli.experiment.threads import one_thread
 from gpebo_cli.experiment.uncertainty import sampled_deviations
 from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings
-
-_SMALL, _LARGE = 8, 200  # states, between which one thread is as fast as several
 
 
 class Stage(str):
@@ -70,6 +67,7 @@ class _Clock:
         self.seconds[name] = perf_counter() - since
 
 
+@one_thread
 def run_experiment(
     settings: Settings,
     system: DescriptorSystem,
@@ -91,32 +89,15 @@ def run_experiment(
         SolverError: a tolerance cannot be reached.
     """
     # What is not finite is found where it matters, with its reason and its time.
-    with _threads(system.n), np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):
         return _experiment(settings, system, progress, estimator)
-
-
-def _threads(n: int) -> AbstractContextManager[object]:
-    """One thread of BLAS where more of them would mostly wait for each other, for n states."""
-    if not _SMALL < n <= _LARGE:
-        return nullcontext()
-    # SciPy brings a BLAS of its own when it is needed; others are not called here.
-    pools = _pools("scipy.linalg" in sys.modules)
-    limited: AbstractContextManager[object] = pools.limit(limits=1, user_api="blas")
-    return limited
-
-
-@cache
-def _pools(_with_scipy: bool) -> Any:
-    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
-
-    return ThreadpoolController()
 
 
 def _experiment(
     settings: Settings, system: DescriptorSystem, progress: Callable[[str], None],
     estimator: estimators.Estimator | None,
 ) -> RunResult:
-    """:func:`run_experiment`, with as many threads as there are."""
+    """:func:`run_experiment`, wherever numbers are not finite."""
     levels = noise_levels(settings.noise, system)
     sources.check(settings, levels)
     observer = build(settings.observer)
