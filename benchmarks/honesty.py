@@ -122,9 +122,9 @@ class Manufactured:
         """What does not depend on time."""
         return frozenset({"B", "C"} | self.zero | ({"E", "A"} if self.still else set()))
 
-    def resolved(self, edges: Array) -> Array | None:  # noqa: ARG002
+    def resolved(self, edges: Array) -> tuple[Array, bool]:
         """No bounds between the nodes."""
-        return None
+        return edges, False
 
     def breakpoints(self, start: float, stop: float) -> Array:  # noqa: ARG002
         """None."""

@@ -144,7 +144,7 @@ class FunctionCoefficients:
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
         """The same edges (K + 1,): nothing bounds what functions do between the nodes."""
-        return edges, not self.functions
+        return edges, False
 
     def _fill(self, name: str, values: Array, t: Array, signals: Array | None) -> None:
         """Fill ``values`` (order + 1, N, …), with derivatives as far as they are given."""
