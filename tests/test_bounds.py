@@ -155,6 +155,18 @@ def test_a_pole_that_no_point_of_a_first_mesh_hits_is_refused(power):
         }, observer="none", time={"horizon": 10})
 
 
+@pytest.mark.parametrize("width", [1e-4, 1e-5])
+def test_a_narrow_pulse_along_an_output_is_seen(width):
+    """q' = −1000 exp(−((y − a)/w)²) q with y' = 0.1: ln q falls by 10⁴ w √π."""
+    pulse = f"-1000*exp(-((y - 0.46371)/{width})**2)"
+    found = run({
+        "name": "slit", "states": ["p", "q"], "inputs": {"u": 0.1}, "outputs": ["y"],
+        "E": [[1, 0], [0, 1]], "A": [[0, 0], [0, pulse]], "B": [[1], [0]], "C": [[1, 0]],
+        "initial_state": [0, 1],
+    }, observer="none", time={"horizon": 10})
+    assert found["q"][-1] == pytest.approx(np.exp(-1e4 * width * np.sqrt(np.pi)), rel=1e-6)
+
+
 @pytest.mark.parametrize(("w", "power"), [("25*pi", 2000), ("2.5*pi", 20000)])
 def test_many_narrow_pulses_are_integrated(w, power):
     mean = np.exp(gammaln((power + 1) / 2) - gammaln(power / 2 + 1)) / np.sqrt(np.pi)

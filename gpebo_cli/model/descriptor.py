@@ -112,7 +112,8 @@ class CoefficientSource(Protocol):
 
         They are ``edges`` (K + 1,), sorted, jumps and kinks among them, and more: nothing that is
         looked at between them hides a pulse. But where the second value is False nothing says so:
-        functions come from Python, or need too many cells. What depends on outputs does not count.
+        functions come from Python, or need too many cells. What depends on outputs does not count
+        here: it is looked at along a solution.
         """
         ...
 

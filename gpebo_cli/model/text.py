@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import prod
 
@@ -24,12 +24,15 @@ from gpebo_cli.model.expressions import (
     resolved,
     shorten,
 )
+from gpebo_cli.model.expressions.intervals import Interval
 
 # Shape of a matrix, and its entries by position, row after row; what is not there is 0.
 MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
 
 # Of its size before and after: a divisor that comes so near zero touches it.
 _TOUCHED = 1e-12
+_POLYNOMIAL = ("add", "subtract", "multiply", "negative", "signal")  # no narrower than a signal
+_MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +77,7 @@ class TextCoefficients:
     name: str
     restricted: TextCoefficients | None = None  # ``of_time``, where that is something else
     divisors: tuple[Expression, ...] = ()  # continuous ones of outputs, with the text they stand in
+    cells: Array | None = None  # (number,) edges of cells that are short for another reason
     # What others have found out about these matrices, by what was asked: they never change.
     kept: dict[object, object] = field(default_factory=dict, init=False)
     # Breakpoints (number,) by the span, and edges (number,) of cells by the edges asked for.
@@ -190,8 +194,25 @@ class TextCoefficients:
         """Edges of cells in which nothing narrow hides, from edges (K + 1,); see the protocol."""
         key = edges.tobytes()
         if key not in self._resolved:
+            if self.cells is not None:
+                inner = (self.cells > edges[0]) & (self.cells < edges[-1])
+                edges = np.union1d(edges, self.cells[inner])
             self._resolved[key] = resolved(self._bounds, edges)
         return self._resolved[key]
+
+    def along(
+        self, signals: Callable[[Array, Array], list[list[Interval]]], edges: Array
+    ) -> tuple[Array, bool]:
+        """:meth:`resolved` for what follows outputs, from edges (K + 1,) and bounds of signals."""
+        tape = self.tape.of([k for k in self.tape.outputs if k not in self.tape.of_time])
+        if all(i.operation in _POLYNOMIAL for k, i in enumerate(tape.instructions)
+               if k not in tape.of_time):
+            return edges, True
+        return resolved(Bounds(tape, signals), edges, _MOST_ALONG)
+
+    def with_cells(self, cells: Array) -> TextCoefficients:
+        """The same with ``cells`` (number,) among the edges of what is resolved in time."""
+        return replace(self, restricted=replace(self.of_time, cells=cells))
 
     @cached_property
     def _bounds(self) -> Bounds:

@@ -15,12 +15,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import factorial
+from math import comb, factorial
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.expressions.intervals import Interval
+from gpebo_cli.model.text import TextCoefficients
 from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.radau import RadauRule
@@ -128,6 +130,38 @@ class Linearised:
             x[k] = sampler(values) / factorial(k)
             values = (D @ values) / steps
         return x
+
+
+def looked_along(
+    system: DescriptorSystem, known: Trajectory
+) -> tuple[Array, bool]:
+    """Edges of cells in which what follows outputs hides nothing, and whether they are enough.
+
+    ``known`` are inputs and outputs (m + r,); the edges are those of its mesh and more.
+    """
+    source, mesh, values = system.coefficients, known.mesh, known.values
+    if not isinstance(source, TextCoefficients):
+        return mesh.edges, True
+    derivatives: list[Array] = []
+    steps, D = mesh.steps[:, None, None], _derivative(mesh.rule)
+    for _ in range(values.shape[1]):
+        derivatives.append(values)
+        values = (D @ values) / steps
+
+    def signals(low: Array, high: Array) -> list[list[Interval]]:
+        """Σ_j c_j (t − m)^j around the middle m of each cell, moved to any time of the cell."""
+        half = 0.5 * (high - low)
+        sampler = mesh.sampler(low + half, low + half)
+        c = np.array([sampler(d) / factorial(k) for k, d in enumerate(derivatives)])
+        found: list[list[Interval]] = [[] for _ in range(c.shape[2])]
+        for k in range(len(c)):
+            later = range(k + 1, len(c))
+            away = sum((comb(j, k) * np.abs(c[j]) * half[:, None] ** (j - k) for j in later), 0.0)
+            for j, jet in enumerate(found):
+                jet.append(Interval((c[k] - away)[:, j], (c[k] + away)[:, j]))
+        return found
+
+    return source.along(signals, mesh.edges)
 
 
 def _right_side(c: Coefficients, known: Coefficients, x: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from math import isfinite
+from typing import cast
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from gpebo_cli.model.descriptor import (
     check_sizes,
     distinct,
 )
+from gpebo_cli.model.text import TextCoefficients
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
@@ -40,7 +42,7 @@ from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.known import MARGIN, SHORT, inputs_resolved, known_joined
 from gpebo_cli.simulation.large import SMALL, large_simulation
-from gpebo_cli.simulation.linearised import Linearised
+from gpebo_cli.simulation.linearised import Linearised, looked_along
 from gpebo_cli.simulation.newton import follow
 from gpebo_cli.simulation.signals import Signals, Simulation
 
@@ -49,6 +51,8 @@ _LOOKED_AT = 32  # times at which the mixing of states is looked at
 _MOST_ALIKE, _LOOKED_AT_FOR_GROWTH = 6000, 2000  # elements: more are cut only where it grows
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
 _TINY = float(np.finfo(float).tiny)
+_LOOKS = 4  # at what entries do along a solution that is found closer and closer
+_SAME = 1e3  # tolerances, by which a closer look moves nothing
 
 
 def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Simulation:
@@ -77,8 +81,21 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         last[:] = [_simulate_linear(linear, window, settings)]
         return last[0].signals.states, last[0].structure.growth
 
-    effort = follow(system, time, replace(solver, name="collocation"), solve_linear)
-    found = last[0]
+    plant, text, before = system, cast(TextCoefficients, system.coefficients), None
+    for _ in range(_LOOKS):
+        effort = follow(plant, time, replace(solver, name="collocation"), solve_linear)
+        found = last[0]
+        x, y = found.signals.states, found.signals.outputs
+        if before is not None:
+            moved = np.abs(x.values - x.mesh.along(before).values).max(axis=(0, 1))
+            if (moved <= _SAME * solver.tol * np.abs(x.values).max(axis=(0, 1))).all():
+                break
+        known = Trajectory(x.mesh, np.concatenate([found.signals.inputs.values, y.values], axis=2))
+        cells, bounded = looked_along(plant, known)
+        found = replace(found, bounded=found.bounded and bounded)
+        if len(cells) == len(x.mesh.edges):
+            break
+        plant, before = replace(system, coefficients=text.with_cells(cells)), x
     if solver.name == "ivp":
         # Along a guess that is wrong by δ, the independent path is wrong by δ² only.
         linear = replace(system, coefficients=Linearised(system, found.signals.states))

@@ -6,6 +6,7 @@ when interval arithmetic says so, and is halved until it does.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,6 +37,8 @@ class Bounds:
     """Bounds of what a tape's expressions do over cells of time."""
 
     tape: Tape
+    # Taylor coefficients of the signals in cells; None: they are functions of time.
+    signals: Callable[[Array, Array], list[list[Interval]]] | None = None
     _programs: dict[tuple[int, bool], Program | None] = field(default_factory=dict, init=False)
 
     def of(self, low: Array, high: Array, order: int, inside: Array | None = None
@@ -53,7 +56,7 @@ class Bounds:
             least and largest values, (order + 1, N, number of outputs).
         """
         key = order, inside is not None
-        if kernels.expressions.RUNS_PROGRAMS:
+        if kernels.expressions.RUNS_PROGRAMS and self.signals is None:
             if key not in self._programs:
                 self._programs[key] = self.tape.program(*key)
             program = self._programs[key]
@@ -62,9 +65,10 @@ class Bounds:
                 found = kernels.expressions.intervals(low, high, decided, *program)
                 if found is not None:
                     return found
-        cell = Interval(low, high)
+        cell, along = Interval(low, high), self.signals and self.signals(low, high)
+        at: Any = cell if inside is None else inside
         with np.errstate(all="ignore"):
-            places: list[Any] = self.tape.run(cell, order, cell if inside is None else inside)
+            places: list[Any] = self.tape.run(cell, order, at, along)
         bounds = np.zeros((2, order + 1, len(low), len(self.tape.outputs)))
         for column, place in enumerate(self.tape.outputs):
             for k, value in enumerate(places[place][: order + 1]):
@@ -74,7 +78,7 @@ class Bounds:
         return bounds[0], bounds[1]
 
 
-def resolved(bounds: Bounds, edges: Array) -> tuple[Array, bool]:
+def resolved(bounds: Bounds, edges: Array, most: int = 0) -> tuple[Array, bool]:
     """Edges of cells that are few times longer than what hides nothing.
 
     In cells 2**COARSER times shorter every expression is nearly a polynomial of degree ORDER.
@@ -89,6 +93,7 @@ def resolved(bounds: Bounds, edges: Array) -> tuple[Array, bool]:
     Args:
         bounds: of expressions of time alone.
         edges: (K + 1,) where cells have to end, jumps and kinks among them.
+        most: so many cells are enough; 0: as many as _MOST_CELLS and _MOST_VALUES let.
 
     Returns:
         these edges and more, sorted; and whether all cells are short enough. There are too many
@@ -97,7 +102,7 @@ def resolved(bounds: Bounds, edges: Array) -> tuple[Array, bool]:
     low, high = edges[:-1], edges[1:]
     depth = np.zeros(len(low), dtype=np.intp)  # how often each has been halved
     rest, size = _rest(bounds, low, high)
-    most = max(_MOST_CELLS, _MOST_VALUES // max(1, size.shape[1]))
+    most = most or max(_MOST_CELLS, _MOST_VALUES // max(1, size.shape[1]))
     while True:
         # A bound that nothing reaches falls while its cell is cut.
         finite = np.where(np.isfinite(size), size, 0.0)
