@@ -61,7 +61,7 @@ class SolverSettings:
     tol: float = within(1e-12, 1e-15, 0.1)
     stages: int = within(14, 2, 16)  # Radau IIA stages per element, order 2 * stages - 1
     max_elements: int = within(200_000, 1)
-    max_seconds: float = within(90.0, 1)  # of computing, of a loop over cases, seeds or samples
+    max_seconds: float = within(90.0, 1)  # of computing: cases, seeds, samples, windows
     max_strangeness_index: int = within(6, 0, 20)
     # Singular values below rank_tol * (size of the factors) are zero.
     rank_tol: float = within(1e-10, 1e-15, 0.1)

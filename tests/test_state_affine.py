@@ -203,6 +203,11 @@ def test_functions_of_outputs_from_python():
     assert not one.bounded
 
 
+def test_a_simulation_that_would_take_too_long_is_refused_on_the_way():
+    with pytest.raises(SolverError, match="the simulation of 5000 s would take more computing"):
+        simulate(lorenz(), TimeSettings(horizon=5000.0), SolverSettings(max_seconds=1.0))
+
+
 def test_the_linearisation_is_the_derivative():
     """Against differences of the right side, with derivatives in time along a polynomial guess."""
     found = simulate(boost(), TimeSettings(horizon=1.0), SOLVER)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from time import process_time
 
 import numpy as np
 
@@ -31,6 +32,7 @@ _MOST_GROWTH = 12.0  # of the logarithm of a small error within one window
 _SHORTEST = 1e-8  # of the horizon; where shorter windows are needed the solution ends
 _AROUND = 1e-3  # of the horizon: a refusal so near to where the solution ends is about its end
 _SAFETY = 10.0
+_PART = 0.2  # of the computing time allowed, after which it is known whether that will do
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,9 @@ def follow(
     iterates, work, change = 0, 0.0, 0.0
     at_start = np.array([t])
     Linearised(system, _at_rest(x, t, length, solver)).taylor(at_start, 0)  # refuses by name
+    begin = process_time()
     while t < stop - 1e-12 * time.horizon:
+        _check_pace(system.name, process_time() - begin, t - time.start, time.horizon, solver)
         length = min(length, stop - t)
         if stop - t < 1.25 * length:
             length = stop - t
@@ -98,6 +102,19 @@ def follow(
         solve(linear, time, solver)
         iterates, work = iterates + 1, work + 1.0
     return Effort(len(pieces), iterates, work, change)
+
+
+def _check_pace(
+    name: str, spent: float, done: float, horizon: float, solver: SolverSettings
+) -> None:
+    """Refuse what will take too long, once a good part of the time is spent."""
+    if spent < _PART * solver.max_seconds or spent * horizon < solver.max_seconds * done:
+        return
+    raise SolverError(
+        f"plant {name}: the simulation of {horizon:g} s would take more computing time than "
+        f"solver.max_seconds = {solver.max_seconds:g} s (the first {done:.3g} s took {spent:.2g} "
+        "s); shorten time.horizon, or raise solver.max_seconds"
+    )
 
 
 def _window(
