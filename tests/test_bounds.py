@@ -167,6 +167,19 @@ def test_a_narrow_pulse_along_an_output_is_seen(width):
     assert found["q"][-1] == pytest.approx(np.exp(-1e4 * width * np.sqrt(np.pi)), rel=1e-6)
 
 
+@pytest.mark.parametrize(("what", "least"), [
+    ("gpebo_cli.model.text._MOST_ALONG", 2), ("gpebo_cli.simulation.simulate._LOOKS", 1),
+])
+def test_a_pulse_along_an_output_that_is_not_followed_far_enough_is_said(what, least, monkeypatch):
+    monkeypatch.setattr(what, least)
+    told = run({
+        "name": "slit", "states": ["p", "q"], "inputs": {"u": 0.1}, "outputs": ["y"],
+        "E": [[1, 0], [0, 1]], "A": [[0, 0], [0, "-1000*exp(-((y - 0.46371)/1e-5)**2)"]],
+        "B": [[1], [0]], "C": [[1, 0]], "initial_state": [0, 1],
+    }, observer="none", time={"horizon": 10}).verdict
+    assert "nothing bounds what functions that change so often do between" in told
+
+
 @pytest.mark.parametrize(("w", "power"), [("25*pi", 2000), ("2.5*pi", 20000)])
 def test_many_narrow_pulses_are_integrated(w, power):
     mean = np.exp(gammaln((power + 1) / 2) - gammaln(power / 2 + 1)) / np.sqrt(np.pi)

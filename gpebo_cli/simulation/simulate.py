@@ -92,16 +92,18 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
                 break
         known = Trajectory(x.mesh, np.concatenate([found.signals.inputs.values, y.values], axis=2))
         cells, bounded = looked_along(plant, known)
-        found = replace(found, bounded=found.bounded and bounded)
         if len(cells) == len(x.mesh.edges):
             break
         plant, before = replace(system, coefficients=text.with_cells(cells)), x
+    else:
+        bounded = False  # each closer look moved the solution
     if solver.name == "ivp":
         # Along a guess that is wrong by δ, the independent path is wrong by δ² only.
         linear = replace(system, coefficients=Linearised(system, found.signals.states))
         found = _simulate_linear(linear, time, solver)
     return replace(
-        found, effort=effort, error_estimate=max(found.error_estimate, effort.last_change)
+        found, effort=effort, error_estimate=max(found.error_estimate, effort.last_change),
+        bounded=found.bounded and bounded,
     )
 
 
