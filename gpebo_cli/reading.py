@@ -35,11 +35,7 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def read_text(path: str | os.PathLike[str], limit: int) -> str:
-    """The text of a regular file of at most ``limit`` bytes in UTF-8.
-
-    Raises:
-        ConfigError: it is no such file.
-    """
+    """The text of a regular file of at most ``limit`` bytes in UTF-8 (ConfigError)."""
     with open_regular(path) as stream:
         content = stream.read(limit + 1)
         size = os.fstat(stream.fileno()).st_size
@@ -52,12 +48,7 @@ def read_text(path: str | os.PathLike[str], limit: int) -> str:
 
 
 def strict_json(text: str | bytes) -> Any:
-    """The content of JSON text in which all numbers are finite.
-
-    Raises:
-        ValueError: it is none.
-        RecursionError: it is too deep.
-    """
+    """The content of JSON text in which all numbers are finite (ValueError, RecursionError)."""
     import json
 
     return json.loads(
@@ -67,11 +58,7 @@ def strict_json(text: str | bytes) -> Any:
 
 
 def finite(value: str | float) -> float:
-    """The number that ``value`` is.
-
-    Raises:
-        ValueError: it is none that is finite.
-    """
+    """The number that ``value`` is (ValueError: it is none that is finite)."""
     number = float(value)
     if not isfinite(number):
         raise ValueError(f"{value} is not a finite number")

@@ -66,20 +66,12 @@ class Registry(Generic[T]):
         return sorted({*self.ours, *self._theirs})
 
     def build(self, settings: Mapping[str, object]) -> T:
-        """The one that ``settings["name"]`` asks for, with the remaining keys as its settings.
-
-        Raises:
-            ConfigError: unknown name or key, with the nearest known one.
-        """
+        """The one that ``settings["name"]`` asks for, with the remaining keys as its settings."""
         rest = {k: v for k, v in settings.items() if k not in _DESCRIPTIVE}
         return cast(T, read(self.find(settings), rest, self.noun))
 
     def settings_of(self, settings: Mapping[str, object]) -> list[str]:
-        """The settings that the one called ``settings["name"]`` has.
-
-        Raises:
-            ConfigError: unknown name, with the nearest known one.
-        """
+        """The settings that the one called ``settings["name"]`` has."""
         return list(keys(self.find(settings)))
 
     def able(self, one: T | None, capability: type[Capability], asked: str) -> Capability:
@@ -99,11 +91,7 @@ class Registry(Generic[T]):
         raise ConfigError(f"{asked}; this one cannot, these can: {', '.join(there)}")
 
     def find(self, settings: Mapping[str, object]) -> type:
-        """The dataclass of ``settings["name"]``.
-
-        Raises:
-            ConfigError: there is none of that name, or it cannot be imported.
-        """
+        """The dataclass of ``settings["name"]`` (ConfigError)."""
         name = settings.get("name")
         if name in self.ours:
             module = import_module(f"gpebo_cli.{self.noun}s.{name}")

@@ -53,11 +53,7 @@ def unknown(what: str, given: object, known: Iterable[str], there: str = "known:
 
 
 def check_keys(given: Iterable[object], known: Collection[str], where: str) -> None:
-    """Refuse a key of a file that is not among those that are known.
-
-    Raises:
-        ConfigError: names it, and the keys that are.
-    """
+    """Refuse a key of a file that is not among those that are known (ConfigError)."""
     for key in given:
         if key not in known:
             raise ConfigError(
@@ -245,11 +241,7 @@ _WANTED = {
 def number(
     value: object, where: str, accept: Accepted = "positive", largest: float = LARGEST
 ) -> float:
-    """One number, which may come as text.
-
-    Raises:
-        ConfigError: not a number, not finite, or not as ``accept`` has it.
-    """
+    """One number, which may come as text (ConfigError)."""
     found = _number(value)
     if found is None and hasattr(value, "item"):  # a scalar of NumPy's
         found = _number(value.item())

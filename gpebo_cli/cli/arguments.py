@@ -220,11 +220,7 @@ def _with_data(overrides: list[str], config_name: str) -> list[str]:
 
 
 def _with_regression(overrides: list[str]) -> tuple[str, ...]:
-    """``regression=NAME`` stands in place of a plant and of an observer.
-
-    Raises:
-        ConfigError: one of them is chosen, too.
-    """
+    """``regression=NAME`` stands in place of a plant and of an observer (ConfigError)."""
     if not any(re.match(r"regression=(?!null$)", word) for word in overrides):
         return tuple(overrides)
     for word in overrides:
@@ -241,11 +237,7 @@ def quoted(text: str) -> str:
 
 
 def logspace(text: str, where: str) -> str | None:
-    """``logspace(a,b,n)`` as the values of a sweep, ``1e6,1e7,…``; None for any other text.
-
-    Raises:
-        ConfigError: a, b or n is not what the axis of a run would accept.
-    """
+    """``logspace(a,b,n)`` as the values of a sweep, ``1e6,1e7,…``; None for any other text."""
     if not _LOGSPACE.match(f"{where}={text}"):
         return None
     from gpebo_cli.estimators import axis  # the same numbers as in one run, to the last bit
@@ -303,11 +295,7 @@ def _checked(flag: str, value: str) -> str:
 
 
 def checked_folder(given: str | None) -> str | None:
-    """The folder that ``--config-dir`` names, absolute; None: none was given.
-
-    Raises:
-        ConfigError: there is no such folder.
-    """
+    """The folder that ``--config-dir`` names, absolute; None: none was given (ConfigError)."""
     if given is None:
         return None
     folder = os.path.abspath(os.path.expanduser(given))

@@ -50,12 +50,7 @@ _ADVICE = {
 
 
 def main(words: list[str]) -> int:
-    """Print the table, or JSON; 0 if everything that is needed holds, else 1.
-
-    Raises:
-        ConfigError: the words or the configuration are wrong.
-        GpeboError: the solver fails.
-    """
+    """Print the table, or JSON; 0 if everything that is needed holds, else 1 (ConfigError)."""
     as_json, sensors = "--json" in words, "sensors=all" in words
     wrong = [word for word in words if word.startswith("sensors=") and word != "sensors=all"]
     if wrong:

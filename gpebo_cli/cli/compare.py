@@ -27,12 +27,7 @@ _SHOWN_ROWS = 40
 
 
 def main(words: list[str]) -> int:
-    """Compare finished runs; the exit code.
-
-    Raises:
-        ConfigError: an unknown option or column, or a folder that is neither a run nor a sweep.
-        GpeboError: there is nothing to compare, or a file cannot be read or written.
-    """
+    """Compare finished runs; the exit code (ConfigError, GpeboError)."""
     arguments = parse("compare", words, _VALUES, _SWITCHES)
     if not arguments.words:
         raise ConfigError("gpebo compare needs folders of runs or sweeps; see gpebo compare --help")

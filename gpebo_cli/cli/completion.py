@@ -109,11 +109,7 @@ SCRIPTS = {"bash": _BASH, "zsh": _ZSH, "fish": _FISH}
 
 
 def main(words: list[str]) -> int:
-    """Print the script of a shell; the exit code.
-
-    Raises:
-        ConfigError: not one shell, or an unknown one.
-    """
+    """Print the script of a shell; the exit code (ConfigError)."""
     if len(words) != 1 or words[0] not in SCRIPTS:
         given = shown(" ".join(words)) if words else "nothing"
         raise ConfigError(

@@ -93,11 +93,7 @@ class Loader(ConfigLoaderImpl):
         super().__init__(path)
 
     def load_configuration(self, *args: Any, **kwargs: Any) -> DictConfig:
-        """As Hydra's.
-
-        Raises:
-            ConfigError: something in it names code to run, or a folder to search.
-        """
+        """As Hydra's (ConfigError: something in it names code to run, or a folder to search)."""
         try:
             config = super().load_configuration(*args, **kwargs)
         except (TypeError, ValueError) as error:  # +launcher=null or [1,2], for instance
@@ -140,11 +136,7 @@ def _leaves(value: object, where: str) -> Iterator[tuple[str, object]]:
 
 @contextmanager
 def session(arguments: Arguments) -> Iterator[Hydra]:
-    """Hydra, for one command; its errors as ours.
-
-    Raises:
-        ConfigError: the command line or a file is wrong.
-    """
+    """Hydra, for one command; its errors as ours (ConfigError)."""
     before = os.environ.get("HYDRA_FULL_ERROR", "")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # without it Hydra prints its errors and exits with 1
     logging.raiseExceptions = False  # a reader may close the pipe
@@ -196,11 +188,7 @@ def _quoted_within(value: object) -> str:
 
 
 def compose(hydra: Hydra, arguments: Arguments) -> tuple[DictConfig, bool]:
-    """The configuration, and whether it is of a sweep: a recipe may say so, too.
-
-    Raises:
-        ConfigError: it would run code.
-    """
+    """The configuration, and whether it is of a sweep: a recipe may say so, too."""
     words = _words(arguments)
     config = hydra.config_loader.load_configuration(
         arguments.config_name, words, RunMode.MULTIRUN, validate_sweep_overrides=False

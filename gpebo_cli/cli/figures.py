@@ -29,12 +29,7 @@ _FOLDERS = {"--output": "a folder", "--check": "a folder", "--update": "a folder
 
 
 def main(words: list[str]) -> int:
-    """Regenerate the figures; the exit code.
-
-    Raises:
-        ConfigError: an unknown recipe, option or format.
-        GpeboError: a run failed, a file cannot be written, or ``--check`` found a difference.
-    """
+    """Regenerate the figures; the exit code (ConfigError, GpeboError)."""
     options = parse("figures", words, {**_FOLDERS, **CONFIG_DIR}, VOLUME)
     config_dir = checked_folder(options.config_dir)
     names, formats = _asked(options, config_dir)
@@ -95,11 +90,7 @@ def _asked(options: Options, config_dir: str | None) -> tuple[list[str], list[st
 
 
 def known_recipe(command: str, name: str, known: Sequence[str]) -> str:
-    """``name``, one of the known recipes.
-
-    Raises:
-        ConfigError: it is none of them.
-    """
+    """``name``, one of the known recipes (ConfigError: it is none of them)."""
     if name not in known:
         raise unknown(f"gpebo {command}: there is no recipe {shown(name)}", name, known)
     return name
@@ -128,10 +119,6 @@ def run_recipes(
         names: of recipes.
         options: how much to say.
         config_dir: a folder of one's own.
-
-    Raises:
-        ConfigError: a recipe is wrong.
-        GpeboError: one of its runs failed; it is named.
     """
     from omegaconf import OmegaConf
 
@@ -184,9 +171,6 @@ def run_recipe_job(cfg: DictConfig, arguments: Arguments, options: Options) -> R
         cfg: the configuration.
         arguments: where files came from.
         options: how much to say.
-
-    Raises:
-        GpeboError: it fails.
     """
     from gpebo_cli.cli.job import read_job
     from gpebo_cli.cli.progress import Progress

@@ -39,11 +39,7 @@ class Remembered:
 
 
 def check() -> None:
-    """Raise what was lost.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed.
-    """
+    """Raise what was lost (KeyboardInterrupt: Ctrl-C was pressed)."""
     if Remembered.received:
         raise KeyboardInterrupt
 

@@ -38,9 +38,6 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
         cfg: the composed configuration, with or without Hydra's section.
         arguments: the command line, for where files came from.
         draw: whether figures are drawn unless the configuration says otherwise.
-
-    Raises:
-        ConfigError: the configuration or the plant is wrong.
     """
     config = composition.plain(cfg)
     settings = configuration.settings(config, draw=draw)
@@ -65,9 +62,6 @@ def run_job(job: Job, folder: str, *, quiet: bool = False, loud: bool = False) -
         folder: where to write.
         quiet: whether to leave the terminal alone: a sweep shows its own progress.
         loud: whether to say how long each stage took.
-
-    Raises:
-        GpeboError: the experiment failed, or a file cannot be written.
     """
     # Only now, when the configuration is known to be good: half a second of imports.
     from gpebo_cli.experiment.pipeline import run_experiment

@@ -44,12 +44,7 @@ to use it, install it, then run it: pip install -e {folder}
 
 
 def main(words: list[str]) -> int:
-    """Write the file; the exit code.
-
-    Raises:
-        ConfigError: no such kind, a name that cannot be one, or a file that exists.
-        GpeboError: the file cannot be written.
-    """
+    """Write the file; the exit code."""
     kind, name, options = _parse(words)
     folder = os.path.expanduser(options.config_dir or ".")
     if kind == RECORDING:

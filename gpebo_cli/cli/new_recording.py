@@ -25,7 +25,6 @@ def write(file: str, plant: str, folder: str) -> int:
 
     Raises:
         ConfigError: there is no such file or plant, or the YAML file exists already.
-        GpeboError: it cannot be written.
     """
     names = {name: home for home in (folder, conf_folder()) for name in choices(home, "plant")}
     if plant not in names:

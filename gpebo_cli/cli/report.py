@@ -10,12 +10,7 @@ from gpebo_cli.errors import ConfigError
 
 
 def main(words: list[str]) -> int:
-    """Write the page; the exit code.
-
-    Raises:
-        ConfigError: an unknown option, or a folder that is neither a run nor a sweep.
-        GpeboError: a file cannot be read or written.
-    """
+    """Write the page; the exit code (ConfigError)."""
     arguments = parse("report", words, {"--output": "a file"})
     if not arguments.words:
         raise ConfigError("gpebo report needs folders of runs or sweeps; see gpebo report --help")

@@ -55,12 +55,7 @@ class Finding:
 
 
 def main(words: list[str]) -> int:
-    """Run the recipes; the exit code: 1 if a number is off.
-
-    Raises:
-        ConfigError: there is no such recipe, or one is wrong.
-        GpeboError: a run failed, or the page cannot be written.
-    """
+    """Run the recipes; the exit code: 1 if a number is off."""
     options = parse("reproduce", words, _PAGE, VOLUME)
     page = options.values.get("--page")
     pictures = None if page is None else Path(page).parent / _PICTURES
@@ -93,7 +88,6 @@ def reproduced(
 
     Raises:
         ConfigError: its ``expected`` names no quantity of the run.
-        GpeboError: the run failed; the recipe is named.
     """
     from omegaconf import OmegaConf
 

@@ -19,11 +19,7 @@ STDIN = "-"  # as data.file: rows are read from standard input, as they come
 
 
 def main(words: list[str]) -> int:
-    """Do what the words after ``gpebo run`` ask for; the exit code.
-
-    Raises:
-        GpeboError: whatever is wrong with the words, the configuration or the run.
-    """
+    """Do what the words after ``gpebo run`` ask for; the exit code."""
     arguments = command_line.parse(words)
     if "--version" in arguments.switches:
         from gpebo_cli._version import __version__

@@ -27,12 +27,7 @@ _SOURCE = "standard input"
 
 @one_thread
 def run(settings: Settings, system: DescriptorSystem) -> int:
-    """Treat rows until standard input ends; the verdict goes to stderr.
-
-    Raises:
-        ConfigError: a row is wrong, or there is none; estimates of the rows before it are out.
-        ModelError: an assumption fails.
-    """
+    """Treat rows until standard input ends; the verdict goes to stderr (ConfigError)."""
     begin, online = stream(settings, system), None
     reader = LineReader(_SOURCE, settings.data, system)
     while True:

@@ -109,10 +109,6 @@ def run_sweep(
             on and when to stop.
         launcher: Hydra's, which runs :func:`run_sweep_job` somewhere and returns when all is done.
         loader: composes the configuration of a job.
-
-    Raises:
-        ConfigError: a job cannot be composed, or the folder has another sweep.
-        GpeboError: a job failed or has no result.
     """
     orders = config.hydra.sweeper
     folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()
@@ -148,11 +144,7 @@ def run_sweep(
 
 
 def check_number(overrides: Sequence[Override]) -> None:
-    """Refuse more jobs than anybody can wait for, before there is a list of them.
-
-    Raises:
-        ConfigError: the sweep has too many jobs.
-    """
+    """Refuse more jobs than anybody can wait for, before there is a list of them (ConfigError)."""
     jobs = 1
     for override in overrides:
         swept = override.value()

@@ -79,20 +79,12 @@ def load(folder: str, inside: str) -> dict[str, Any]:
 
 
 def load_path(path: str, group: str) -> dict[str, Any]:
-    """The content of a file that its user named by path; ``group`` says what it may say.
-
-    Raises:
-        ConfigError: the file cannot be read, or asks for what its kind may not.
-    """
+    """The content of a file that its user named by path; ``group`` says what it may say."""
     return _checked(path, path, f"{group}/file")
 
 
 def shipped(inside: str) -> dict[str, Any]:
-    """A file that comes with gpebo; it is parsed once, and everybody gets a copy.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """A file that comes with gpebo; it is parsed once, and everybody gets a copy."""
     return copy.deepcopy(_shipped(inside))
 
 

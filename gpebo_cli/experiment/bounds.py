@@ -139,11 +139,7 @@ class BoundedEstimates:
         return self.plain.requirement
 
     def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases at the times, (g, M, p).
-
-        Raises:
-            ConfigError: no estimate respects the bounds.
-        """
+        """η̂ of some cases at the times, (g, M, p)."""
         found = np.array(self.plain.parameters(cases))
         for i, eta in enumerate(found, cases.start or 0):
             metric = self.plain.weights(i) if isinstance(self.plain, Weighing) else self.gram

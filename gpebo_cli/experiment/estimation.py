@@ -76,13 +76,7 @@ def continuous(
     settings: Settings, system: DescriptorSystem, source: Source, levels: NoiseLevels,
     observer: Observer, estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
-    """Observer and estimator as differential equations.
-
-    Raises:
-        ConfigError: settings that do not fit the plant.
-        ModelError: an assumption of the observer fails.
-        SolverError: a tolerance cannot be reached.
-    """
+    """Observer and estimator as differential equations (SolverError)."""
     t = source.t
 
     def observe(signals: Source | Signals) -> Observation:
@@ -191,13 +185,7 @@ def at_samples(
     settings: Settings, system: DescriptorSystem, source: Source, levels: NoiseLevels,
     samples: Sampling, estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
-    """Observer and estimator at samples of the signals, ``samples.step`` apart.
-
-    Raises:
-        ConfigError: the observer or the estimator works in continuous time only.
-        ModelError: an assumption of the observer fails.
-        SolverError: a step between samples cannot be resolved.
-    """
+    """Observer and estimator at samples of the signals, ``samples.step`` apart (ConfigError)."""
     refuse_seeds(settings.noise)
     if source.pieces:
         raise ConfigError("data.file: several files need an observer in continuous time")

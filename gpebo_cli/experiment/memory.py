@@ -23,9 +23,6 @@ def check(settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cas
         system: the plant.
         levels: of the noise.
         cases: of the estimator.
-
-    Raises:
-        ConfigError: names the setting, what it would need, and the limit.
     """
     for what, numbers in _needs(settings, system, levels, cases, system.n).items():
         try:
@@ -41,11 +38,7 @@ def check(settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cas
 
 
 def check_samples(cases: int, samples: int, system: DescriptorSystem) -> None:
-    """The same of estimates at samples.
-
-    Raises:
-        ConfigError: they would need more.
-    """
+    """The same of estimates at samples."""
     numbers = 2 * _HELD * cases * samples * (system.q + 2 * system.n)
     check_memory(f"{cases} cases at {samples} samples", numbers)
 

@@ -63,12 +63,7 @@ class NoiseLevels:
 
 
 def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLevels:
-    """The levels by output and input of a plant, checked.
-
-    Raises:
-        ConfigError: a negative level, a list of the wrong length, an unknown name, a level of
-            outputs that a regression does not have, or a sample time or seed that cannot be.
-    """
+    """The levels by output and input of a plant, checked (ConfigError)."""
     if not (np.isfinite(settings.sample_time) and settings.sample_time > 0):
         raise ConfigError(
             f"noise.sample_time: expected a positive number of seconds, got {settings.sample_time}"
@@ -121,11 +116,7 @@ class SampledMesh:
 
 
 def check_samples(horizon: float, sample_time: float, max_elements: int) -> None:
-    """Refuse more samples than elements are allowed.
-
-    Raises:
-        ConfigError: names both numbers.
-    """
+    """Refuse more samples than elements are allowed (ConfigError: names both numbers)."""
     samples = horizon / sample_time
     if samples > max_elements:
         raise ConfigError(

@@ -122,10 +122,6 @@ class Online:
             deviations: of what is estimated; None: nobody asks for them.
             derivatives: of the inputs, as far as they are known.
             columns: parameters to estimate (k,), the others being zero; None: all.
-
-        Raises:
-            ConfigError: the observer or the estimator works in continuous time only.
-            ModelError: Assumption 1 fails at the start.
         """
         self._observer = observers.able(
             observers.build(settings.observer), observers.AtSamples,
@@ -157,12 +153,7 @@ class Online:
         self.count = 0
 
     def feed(self, t: Array, u: Array, y: Array) -> OnlineEstimates:
-        """Take the samples u (K, m) and y (K, r) at the times t (K,), after all earlier ones.
-
-        Raises:
-            ModelError: an assumption of the observer fails.
-            SolverError: a step between samples cannot be resolved.
-        """
+        """Take the samples u (K, m) and y (K, r) at the times t (K,), after all earlier ones."""
         self._state, block = self._observer.advance(self._state, t, u, y)
         self.fits = block.fit is not None
         if self._columns is not None:

@@ -55,11 +55,7 @@ def check_seeds(settings: NoiseSettings, levels: NoiseLevels, horizon: float) ->
 
 
 def refuse_seeds(settings: NoiseSettings) -> None:
-    """Refuse many seeds where there is no observer in continuous time.
-
-    Raises:
-        ConfigError: says what is possible.
-    """
+    """Refuse many seeds where there is no observer in continuous time (ConfigError)."""
     if settings.seeds > 1:
         raise ConfigError(
             f"noise.seeds = {settings.seeds} needs an observer in continuous time; otherwise run "
@@ -83,11 +79,6 @@ def over_seeds(
         settings: of the noise.
         levels: of the noise.
         pace: of the loop over seeds.
-
-    Raises:
-        ModelError: an assumption of the observer fails along some noise.
-        SolverError: a tolerance cannot be reached.
-        ConfigError: all seeds would take longer than a run may.
     """
     horizon = observation.regression.mesh.edges[-1:]
     seeds = range(settings.seed, settings.seed + settings.seeds)

@@ -50,7 +50,6 @@ def candidates(settings: Settings, system: DescriptorSystem) -> list[Sensor]:
 
     Raises:
         ConfigError: there is no simulation or no observer, or no strangeness-free form.
-        ModelError: the plant cannot be simulated.
     """
     if build(settings.observer) is None or settings.data.name == "csv" or system.regression:
         raise ConfigError("sensors=all needs a simulation of a plant (data=none) and an observer")

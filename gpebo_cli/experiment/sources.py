@@ -54,13 +54,7 @@ class Source:
 def simulated(
     settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None
 ) -> Source:
-    """Signals of the plant, for an observer that runs at ``samples`` or in continuous time.
-
-    Raises:
-        ConfigError: an impulse that an observer cannot be driven by.
-        ModelError: the plant cannot be simulated.
-        SolverError: a tolerance cannot be reached.
-    """
+    """Signals of the plant, for an observer that runs at ``samples`` or in continuous time."""
     start = settings.time.start
     t = _grid(settings, samples, start, start + settings.time.horizon)
     simulation = simulation_of(system, settings.time, settings.solver)
@@ -88,11 +82,7 @@ def simulated(
 def recorded(
     settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None  # noqa: ARG001  a source like the other
 ) -> Source:
-    """Signals of a recording; nobody knows what θ was when it was made.
-
-    Raises:
-        ConfigError: the file is wrong, or does not reach as far as it should.
-    """
+    """Signals of a recording; nobody knows what θ was when it was made."""
     recording = load(system, settings.data, settings.time, settings.solver.tol)
     t = _grid(settings, samples, *recording.span)
     return Source(
@@ -166,11 +156,7 @@ def _grid(settings: Settings, samples: Sampling | None, start: float, stop: floa
 
 
 def sample_times(step: float, start: float, stop: float) -> Array:
-    """start, start + T, … up to stop, (K,).
-
-    Raises:
-        ConfigError: there is none after the start, or there are too many.
-    """
+    """start, start + T, … up to stop, (K,) (ConfigError)."""
     count = int(np.floor((stop - start) / step * (1.0 + _ROUNDING)))
     if count < 1:
         raise ConfigError(

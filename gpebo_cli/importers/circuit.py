@@ -63,9 +63,6 @@ def circuit_from_netlist(
         measure: outputs, each a sum of node voltages and currents of elements, with a name or
             without: ``"v(out), y=i(L1)+2*i(V)"``.
         unknown: constant sources whose values are unknown parameters, ``"I5,V3"``.
-
-    Raises:
-        ConfigError: names the line, the element, or the quantity, and what would be accepted.
     """
     netlist = read_netlist(text, file)
     topology = examine(netlist, file)

@@ -54,11 +54,7 @@ class Piecewise:
     corners: Array  # samples (C,) where neighbouring pieces are not one polynomial
 
     def taylor(self, t: Array, order: int, inside: Array) -> Array:
-        """Taylor coefficients (order + 1, M) at times t (M,).
-
-        Raises:
-            ConfigError: a time outside of the table.
-        """
+        """Taylor coefficients (order + 1, M) at times t (M,) (ConfigError)."""
         first, last = self.t[0], self.t[-1]
         slack = _ROUNDING * max(abs(first), abs(last))
         if len(t) and (t.min() < first - slack or t.max() > last + slack):
@@ -102,11 +98,7 @@ class Driven:
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
     ) -> Coefficients:
-        """All matrices at the times t (N,), see the protocol.
-
-        Raises:
-            ConfigError: as for a text, or a time outside of a table.
-        """
+        """All matrices at the times t (N,), see the protocol."""
         if signals is not None:
             return self.given.taylor(t, order, inside, signals)
         found = self.given.taylor(t, order, inside)
@@ -147,9 +139,6 @@ def tables(
         inputs: what the file has under that key.
         where: the plant and the key, for messages.
         source: the file, beside which tables are looked for first.
-
-    Raises:
-        ConfigError: a table cannot be read, or lies outside of the folders of a plant's file.
     """
     if not isinstance(inputs, Mapping):
         return inputs, {}
@@ -169,11 +158,7 @@ def driven(system: DescriptorSystem, found: Mapping[str, Piecewise]) -> Descript
 
 
 def located(mapping: Mapping[str, object], source: str) -> Mapping[str, object]:
-    """A plant's mapping with the paths of its other files as they are from here.
-
-    Raises:
-        ConfigError: a file lies outside of the folders that this one may read from.
-    """
+    """A plant's mapping with the paths of its other files as they are from here."""
     if isinstance(mapping.get(ARCHIVE), str):
         mapping = {**mapping, ARCHIVE: beside(str(mapping[ARCHIVE]), source, ARCHIVE)}
     key = "signals" if "psi" in mapping else "inputs"

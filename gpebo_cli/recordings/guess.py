@@ -57,11 +57,7 @@ class Guess:
 
 
 def guess(path: str, system: DescriptorSystem) -> Guess:
-    """Look at the CSV file ``path`` for the signals of ``system``.
-
-    Raises:
-        ConfigError: it cannot be read, is no text, or has no two columns.
-    """
+    """Look at the CSV file ``path`` for the signals of ``system`` (ConfigError)."""
     if path.endswith((".mat", ".parquet")):
         raise ConfigError(
             f"{path}: there is nothing to guess in tables with types; data.file={path} reads it, "

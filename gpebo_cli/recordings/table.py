@@ -77,12 +77,7 @@ class Table:
 
 
 def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
-    """Read the recording that ``data`` names: CSV, Parquet, MAT, or a data frame.
-
-    Raises:
-        ConfigError: it cannot be read, or something in it is not what a recording has; one line
-            that names the file, the line and the column.
-    """
+    """Read the recording that ``data`` names: CSV, Parquet, MAT, or a data frame (ConfigError)."""
     if data.frame is not None:
         return _from_frame("data", data.frame, data, system, "")
     if data.file is None:
@@ -109,11 +104,7 @@ def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
 
 
 def read_file(path: str) -> bytes:
-    """The content of a regular file: a device or a pipe might never end.
-
-    Raises:
-        ConfigError: it is none, cannot be read, or is too large.
-    """
+    """The content of a regular file: a device or a pipe might never end (ConfigError)."""
     if os.path.isdir(path):
         raise ConfigError(f"data.file: {path} is a folder, not a file")
     try:
@@ -127,11 +118,7 @@ def read_file(path: str) -> bytes:
 
 
 def check_text(path: str, content: bytes) -> None:
-    """Refuse what is not UTF-8, by its line.
-
-    Raises:
-        ConfigError: says which line it is.
-    """
+    """Refuse what is not UTF-8, by its line (ConfigError: says which line it is)."""
     try:
         content.decode()
     except UnicodeDecodeError as error:
@@ -142,11 +129,7 @@ def check_text(path: str, content: bytes) -> None:
 
 
 def separator(data: DataSettings) -> str:
-    """The character between cells.
-
-    Raises:
-        ConfigError: it is no such character.
-    """
+    """The character between cells (ConfigError: it is no such character)."""
     found = _WORDS.get(data.separator, data.separator)
     if len(found) != 1 or found in '"\r\n' or found.isalnum() or found == data.decimal:
         raise ConfigError(
@@ -157,11 +140,7 @@ def separator(data: DataSettings) -> str:
 
 
 def split_cells(source: str, line: int, text: str, data: DataSettings) -> list[str]:
-    """The cells of one line; cells may be quoted.
-
-    Raises:
-        ConfigError: the line is not CSV.
-    """
+    """The cells of one line; cells may be quoted (ConfigError: the line is not CSV)."""
     if '"' not in text:
         return text.split(separator(data))
     try:
@@ -320,11 +299,7 @@ def seconds(cells: Sequence[str], origin: Any) -> tuple[Array, Any]:
 def fill(
     header: Header, data: DataSettings, values: Array, line: Sequence[int] | IntArray
 ) -> Array:
-    """Rows (N, columns) without gaps, as ``data.missing`` wants it.
-
-    Raises:
-        ConfigError: there is no sample to hold, or none on one side to interpolate from.
-    """
+    """Rows (N, columns) without gaps, as ``data.missing`` wants it (ConfigError)."""
     gaps = np.isnan(values)
     if data.missing == "drop":
         return np.asarray(values[~gaps.any(axis=1)])

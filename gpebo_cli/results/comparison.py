@@ -75,9 +75,6 @@ def figures(cases: Sequence[Case], metric: str = "") -> Iterator[tuple[str, Figu
         cases: in the order in which they matter: of many, the error curves of a few evenly
             spaced ones are drawn.
         metric: what heat maps show; empty: that by which cases are ranked.
-
-    Raises:
-        GpeboError: tables of a run are missing.
     """
     metric = metric or ranking(case.metrics for case in cases)
     for suffix, members in _comparable(cases).items():

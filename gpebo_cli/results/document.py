@@ -27,11 +27,7 @@ _MOST_CASES = 50
 
 
 def document(parts: Sequence[Found], made_by: Provenance) -> str:
-    """The page, complete in itself.
-
-    Raises:
-        GpeboError: a file of a run is missing, or is not what a run writes.
-    """
+    """The page, complete in itself."""
     title = f"gpebo: {', '.join(part.label for part in parts)}"
     sections = "".join(map(_part, parts))
     return html.document(title, sections + html.footer(made_by), embedded=True)

@@ -283,11 +283,7 @@ FIGURES: dict[str, FigureFunction] = {name: globals()[name] for name in FIGURE_N
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Refuse names that are not figures; worth doing before a long run.
-
-    Raises:
-        ConfigError: one is unknown; it is named with the most similar one that exists.
-    """
+    """Refuse names that are not figures; worth doing before a long run (ConfigError)."""
     for name in names:
         if name not in FIGURES:
             raise unknown(f"figures: there is no figure {shown(name)}", name, FIGURES)
@@ -328,12 +324,7 @@ def describe(
 
 
 def draw(result: RunResult, names: Iterable[str] | None = None) -> Iterator[tuple[str, Figure]]:
-    """Draw figures, one at a time, as ``settings.output`` wants them to look.
-
-    Raises:
-        ConfigError: a name is unknown, the run has nothing for it, or there is no such style; at
-            once, not at the first figure.
-    """
+    """Draw figures, one at a time, as ``settings.output`` wants them to look."""
     described = describe(result, names, strict=names is not None)
     look = result.settings.output
     if described:

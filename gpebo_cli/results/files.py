@@ -46,11 +46,7 @@ def csv_text(rows: Iterable[Iterable[str]]) -> str:
 
 
 def make_folder(path: Path) -> None:
-    """Create the folder ``path`` and its parents; one that exists is kept.
-
-    Raises:
-        GpeboError: it cannot be created, for instance because a file has that name.
-    """
+    """Create the folder ``path`` and its parents; one that exists is kept (GpeboError)."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -58,11 +54,7 @@ def make_folder(path: Path) -> None:
 
 
 def remove_files(paths: Iterable[Path]) -> None:
-    """Remove those of ``paths`` that exist.
-
-    Raises:
-        GpeboError: one of them cannot be removed.
-    """
+    """Remove those of ``paths`` that exist (GpeboError: one of them cannot be removed)."""
     for path in paths:
         try:
             path.unlink(missing_ok=True)

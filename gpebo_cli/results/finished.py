@@ -60,20 +60,12 @@ class Found:
 
     @property
     def cases(self) -> list[Case]:
-        """All cases of the runs.
-
-        Raises:
-            GpeboError: a file is missing or cannot be understood; it is named.
-        """
+        """All cases of the runs."""
         return [case for run in self.runs for case in read_run(*run)]
 
 
 def find(name: str) -> list[Found]:
-    """What a folder is, or all that is in it.
-
-    Raises:
-        ConfigError: neither a run nor a sweep, and nothing of that kind in it.
-    """
+    """What a folder is, or all that is in it (ConfigError)."""
     folder = Path(name)
     if not folder.is_dir():
         raise ConfigError(f"{name}: there is no such folder")
@@ -112,9 +104,6 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
         run: what to call it.
         folder: its folder.
         overrides: what distinguishes it from others, where that is known (a job of a sweep).
-
-    Raises:
-        GpeboError: a file is missing or cannot be understood; it is named.
     """
     summary = read_summary(folder)
     if summary.get("estimator") is None:
@@ -154,11 +143,7 @@ def _mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 
 
 def span(folder: Path) -> tuple[float, float]:
-    """First and last time of a finished run's signals.
-
-    Raises:
-        GpeboError: they are missing or cannot be understood.
-    """
+    """First and last time of a finished run's signals (GpeboError)."""
     path = folder / "signals.csv"
     try:
         with _opened(path) as stream:
@@ -173,11 +158,7 @@ def span(folder: Path) -> tuple[float, float]:
 
 
 def read_errors(cases: Sequence[Case]) -> list[ErrorCurves]:
-    """Error norms over time of ``cases``, each folder being read once.
-
-    Raises:
-        GpeboError: a file is missing or cannot be understood; it is named.
-    """
+    """Error norms over time of ``cases``, each folder being read once."""
     by_folder: dict[Path, set[int]] = {}
     for case in cases:
         by_folder.setdefault(case.folder, set()).add(case.number)
@@ -236,11 +217,7 @@ def _norm(columns: Sequence[Array], count: int) -> Array:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """The content of ``summary.json``.
-
-    Raises:
-        GpeboError: it is missing, or is none.
-    """
+    """The content of ``summary.json`` (GpeboError: it is missing, or is none)."""
     path = folder / "summary.json"
     try:
         content = strict_json(_bytes(path))

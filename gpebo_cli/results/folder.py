@@ -31,11 +31,6 @@ def write_run(
         folder: where to write.
         config_text: the resolved configuration, as YAML.
         made_by: versions and commit; by default those of this process.
-
-    Raises:
-        ConfigError: a figure asked for does not exist, or the run has nothing for it; nothing has
-            been written then.
-        GpeboError: a file cannot be written; the message names it.
     """
     wanted = result.settings.output.figures
     figures = draw(result, None if wanted is True else wanted or [])

@@ -51,9 +51,6 @@ def write_recipe(
         recipe: what was run.
         figures: what :func:`figures_of` returned.
         formats: some of :data:`gpebo_cli.results.names.FORMATS`, ``png`` among them.
-
-    Raises:
-        GpeboError: a file cannot be written.
     """
     make_folder(folder)
     remove_files(p for s in (*FORMATS, "csv") for p in sorted(folder.glob(f"fig*.{s}")))

@@ -106,9 +106,6 @@ def differences(panels: Sequence[Panel], reference: Path) -> Iterator[str]:
 
     Yields:
         One line per curve: which one, where it differs most and by how much.
-
-    Raises:
-        ConfigError: ``reference`` is not such a file.
     """
     header, table = _read(reference)
     block = blocks(panels)[0]

@@ -102,11 +102,7 @@ def our_rc(style: str | None = None) -> Iterator[None]:
 
 
 def check_look(style: str | None, labels: Mapping[str, str]) -> None:
-    """Refuse a style or a label of a plant that matplotlib does not understand.
-
-    Raises:
-        ConfigError: says which one.
-    """
+    """Refuse a style or a label of a plant that matplotlib does not understand (ConfigError)."""
     if style is not None:
         _style(style)
     if labels:
@@ -124,11 +120,7 @@ def check_look(style: str | None, labels: Mapping[str, str]) -> None:
 
 
 def _style(name: str) -> dict[str, Any]:
-    """A style that comes with matplotlib; a path or an address is none.
-
-    Raises:
-        ConfigError: there is none of that name.
-    """
+    """A style that comes with matplotlib; a path or an address is none (ConfigError)."""
     from matplotlib import rcParamsDefault
     from matplotlib.style import available, library
 
@@ -253,9 +245,6 @@ def compose(panels: Sequence[Panel], look: OutputSettings | None = None) -> Figu
     Args:
         panels: the horizontal axis is the first one's.
         look: width, resolution and style; by default a column at 200 dpi in our own.
-
-    Raises:
-        ConfigError: matplotlib has no such style.
     """
     look = look or OutputSettings()
     shown = panels[:MAX_PANELS]
@@ -361,11 +350,7 @@ def file_content(figure: Figure, suffix: str) -> bytes:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write ``figure`` in the format of the path's suffix, complete or not at all.
-
-    Raises:
-        GpeboError: the file cannot be written.
-    """
+    """Write ``figure`` in the format of the path's suffix, complete or not at all."""
     write_file(path, [file_content(figure, path.suffix[1:])])
 
 

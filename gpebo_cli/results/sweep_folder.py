@@ -48,11 +48,7 @@ class Plan:
     configuration: str
 
     def write(self, folder: Path) -> None:
-        """Write ``sweep.json``.
-
-        Raises:
-            GpeboError: it cannot be written.
-        """
+        """Write ``sweep.json``."""
         # Every job on a line of its own: the file is for people, too.
         lines = ",\n  ".join(json.dumps(dict(job), ensure_ascii=False) for job in self.jobs)
         digest = json.dumps(self.configuration)
@@ -60,11 +56,7 @@ class Plan:
 
 
 def read_plan(folder: Path) -> Plan | None:
-    """The plan in ``folder``, or None if there is none.
-
-    Raises:
-        ConfigError: there is one, but it is not of a sweep.
-    """
+    """The plan in ``folder``, or None if there is none (ConfigError)."""
     try:
         with open_regular(folder / PLAN) as stream:
             text = stream.read()
@@ -86,11 +78,7 @@ def job_folder(folder: Path, number: int) -> Path:
 
 
 def write_record(folder: Path, record: JobRecord) -> None:
-    """Write the ``result.json`` of a job to its own ``folder``.
-
-    Raises:
-        GpeboError: it cannot be written.
-    """
+    """Write the ``result.json`` of a job to its own ``folder``."""
     text = json.dumps(asdict(record), indent=1, ensure_ascii=False, allow_nan=False)
     write_text(folder / RESULT, text + "\n")
 
@@ -125,11 +113,7 @@ def read_records(folder: Path, plan: Plan) -> list[JobRecord]:
 
 
 def clear(folder: Path, numbers: Sequence[int]) -> None:
-    """Remove what earlier attempts left of these jobs and would be taken for a new result.
-
-    Raises:
-        GpeboError: a file cannot be removed.
-    """
+    """Remove what earlier attempts left of these jobs and would be taken for a new result."""
     remove_files([folder / STOP])
     for number in numbers:
         inside = job_folder(folder, number)
@@ -137,11 +121,7 @@ def clear(folder: Path, numbers: Sequence[int]) -> None:
 
 
 def write_table(folder: Path, records: Sequence[JobRecord]) -> None:
-    """Write ``results.csv``.
-
-    Raises:
-        GpeboError: it cannot be written.
-    """
+    """Write ``results.csv``."""
     write_text(folder / TABLE, csv_text(table(records)))
 
 

@@ -184,11 +184,7 @@ def frame(result: RunResult, name: str) -> DataFrame:
 
 
 def write_table(path: Path, table: Table) -> None:
-    """Write a table as CSV; NaN is an empty cell.
-
-    Raises:
-        GpeboError: the file cannot be written.
-    """
+    """Write a table as CSV; NaN is an empty cell."""
     first = "%d" if table.header[0] == "case" else "%.17g"
     pieces = (text for piece in table.pieces for text in _rows(piece, first))
     write_file(path, chain([_header(table.header)], pieces))
