@@ -17,7 +17,7 @@ from gpebo_cli.experiment.result import (
     SimulationResult,
     StateChange,
 )
-from gpebo_cli.findings import Assumption, Direction, Requirement
+from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.settings import OutputSettings, Settings
 
@@ -104,12 +104,9 @@ def make_result(
         gram_eigenvalues=eigenvalues,
         pe_level=0.01 * (1 - np.exp(-t)),
         window=2.0,
-        is_ie=True,
         t_c=0.24,
         rho=1e-7,
         lambda_min=float(eigenvalues[-1].min(initial=np.inf)),
-        condition=1e3,
-        weakest_direction=Direction({name: 1 / np.sqrt(p) for name in parameters}),
         parameters=tuple(parameters),
         known=known,
         least_share=known.share.min(axis=1, initial=1.0),

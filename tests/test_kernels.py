@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gpebo_cli import kernels
-from gpebo_cli.numerics.linalg import affine_scan, spectral_norm
+from gpebo_cli.numerics.linalg import affine_scan, largest
 from gpebo_cli.numerics.radau import radau_rule
 
 needs_kernels = pytest.mark.skipif(
@@ -468,9 +468,10 @@ def test_the_norm_of_numbers_whose_squares_vanish_or_overflow():
     for exponent in (-310.0, -161.93154924180968, -150.0, 0.0, 160.0):
         A = rng.normal(size=(29, 5, 7)) * 10.0**exponent
         with np.errstate(over="ignore"):
-            expected = 10.0**exponent * np.linalg.norm(A / 10.0**exponent, 2, axis=(1, 2)).max()
-        assert spectral_norm(A, 7) == pytest.approx(expected, rel=1e-10)
-    assert spectral_norm(np.zeros((3, 2, 2)), 2) == 0.0
+            omega = A[:, :, :5] / 10.0**exponent
+            expected = 10.0**exponent * np.linalg.norm(omega, 2, axis=(1, 2)).max()
+        assert largest(A) == pytest.approx(expected, rel=1e-10)
+    assert largest(np.zeros((3, 2, 2))) == 0.0
 
 
 @pytest.mark.parametrize("lanes", [1, 3, 3000])

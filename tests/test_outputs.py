@@ -247,8 +247,10 @@ def test_summary_gives_ranges_for_many_cases(tmp_path: Path) -> None:
 def test_summary_is_strict_json(tmp_path: Path) -> None:
     result = make_result(gammas=(1e6,))  # never reaches 1 %: NaN
     assert result.excitation is not None
-    excitation = replace(
-        result.excitation, condition=np.inf, t_c=None, pe_level=np.full(1001, np.nan)
+    final = result.excitation.final
+    excitation = replace(  # a spectrum that reaches zero has no condition
+        result.excitation, t_c=None, pe_level=np.full(1001, np.nan),
+        final=replace(final, eigenvalues=0.0 * final.eigenvalues),
     )
     summary = read_summary(write(replace(result, excitation=excitation), tmp_path))
     assert summary["cases"][0]["seconds_to_1pct_states"] is None

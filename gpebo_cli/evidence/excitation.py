@@ -15,7 +15,6 @@ from gpebo_cli.evidence.knowledge import (
     Knowledge,
     knowledge,
     least_share,
-    smallest_and_margin,
     tells_nothing,
 )
 from gpebo_cli.evidence.metrics import DECAY
@@ -50,12 +49,9 @@ class Excitation:
 
     t: Array  # (N,)
     window: float
-    is_ie: bool
     t_c: float | None  # first time at which all parameters can be told apart
     rho: float | None  # level asked of lambda_min(G); None: the verdict is free of units
     lambda_min: float  # at the horizon
-    condition: float  # largest over smallest eigenvalue of G with unit diagonal, at the horizon
-    weakest_direction: Direction  # in units of each parameter's own size
     parameters: tuple[str, ...]
     final: Knowledge  # at the last of the times
     # (N,) of all parameters' ``known.share``, 0 some time before it is ``WELL`` for good
@@ -66,6 +62,25 @@ class Excitation:
     pe_level: OnDemand[Array] = OnDemand()
 
     __getstate__ = evaluated
+
+    @property
+    def is_ie(self) -> bool:
+        """Whether ψ is interval-exciting."""
+        return self.t_c is not None
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest eigenvalue of G with unit diagonal, at the horizon."""
+        spectrum = self.final.eigenvalues[-1]
+        smallest = float(spectrum.min(initial=1.0))
+        return float(spectrum.max(initial=0.0)) / smallest if smallest > 0.0 else np.inf
+
+    @property
+    def weakest_direction(self) -> Direction:
+        """What ψ shows least, in units of each parameter's own size."""
+        v = self.final.vectors[-1, :, :1].ravel()
+        sign = 1.0 if max(v, key=abs, default=1.0) >= 0.0 else -1.0
+        return Direction(dict(zip(self.parameters, (sign * v).tolist(), strict=True)))
 
     @property
     def normalised_min(self) -> Array:
@@ -102,22 +117,21 @@ def assess(
     evidence = _Evidence(regression, t, window, tol)
     ends = gram.mesh.edges[1:]
     at_ends = gram.values[:, -1], *evidence.beside(ends)
-    smallest = margin = np.zeros(len(ends))
+    of_ends, enough = None, 0.0
     if p < _MANY or rho is not None or not tells_nothing(*at_ends):
-        smallest, margin = smallest_and_margin(*at_ends)
-    # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
-    # or half as well as they ever are.
-    enough = min(WELL, 0.5 * float(smallest[margin >= 1.0].max(initial=0.0)))
+        of_ends = knowledge(*at_ends)
+        # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
+        # or half as well as they ever are.
+        told = of_ends.smallest[of_ends.margin >= 1.0]
+        enough = min(WELL, 0.5 * float(told.max(initial=0.0)))
 
     def reached(at: Array, matrices: Array) -> Array:
         """A number that is at least 0 where ψ is exciting: a distance from that in logarithms."""
         if rho is not None:
             level = symmetric_eigenvalues(matrices)[:, 0] / rho
-        elif enough:
-            level, of = (smallest, margin) if at is ends else smallest_and_margin(
-                matrices, *evidence.beside(at)
-            )
-            level = np.minimum(level / enough, of)
+        elif of_ends is not None and enough:
+            known = of_ends if at is ends else knowledge(matrices, *evidence.beside(at))
+            level = np.minimum(known.smallest / enough, known.margin)
         else:
             level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
@@ -127,13 +141,13 @@ def assess(
 
         G grows: inside, λ_min(N) is at most that at the end times the largest growth of a G_jj.
         """
-        if rho is not None or not enough or regression.dynamics is not None:
+        if of_ends is None or rho is not None or not enough or regression.dynamics is not None:
             return np.zeros(gram.mesh.points.shape, dtype=bool)
         before = np.einsum("ksjj->ksj", gram.values[..., :p])
         last = np.broadcast_to(before[:, -1:], before.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
             growth = np.divide(last, before, out=np.ones_like(before), where=last > 0.0)
-            return np.asarray(smallest[:, None] * growth.max(axis=2, initial=1.0) < enough)
+            return np.asarray(of_ends.smallest[:, None] * growth.max(axis=2, initial=1.0) < enough)
 
     # What is looked at later must not keep what is known of this regression by now.
     later = replace(evidence, regression=replace(regression))
@@ -141,10 +155,10 @@ def assess(
     final, t_c = evidence.known(t[-1:]), _first_time(gram, ends, reached, hopeless, doubt)
     # From when on parameters are well determined a run says in any case.
     said = t_c is not None and (final.share >= WELL).all()
-    return excitation(
-        final, t, regression.parameters, float(evidence.eigenvalues(t[-1:])[0, 0]) if p else 0.0,
-        evidence.least_share() if said else later.least_share, later.known, later.eigenvalues,
-        later.levels, window, t_c, rho,
+    return Excitation(
+        t, window, t_c, rho, float(evidence.eigenvalues(t[-1:])[0, 0]) if p else 0.0,
+        regression.parameters, final, evidence.least_share() if said else later.least_share,
+        later.known, later.eigenvalues, later.levels,
     )
 
 
@@ -189,26 +203,6 @@ class _Evidence:
     def levels(self) -> Array:
         """The smallest eigenvalue over each trailing window, (N,)."""
         return segment_level(self.regression, self.t, self.window)
-
-
-def excitation(
-    final: Knowledge, t: Array, parameters: Sequence[str], lambda_min: float,
-    least_share: Array | Callable[[], Array], known: Knowledge | Callable[[], Knowledge],
-    gram_eigenvalues: Array | Callable[[], Array], pe_level: Array | Callable[[], Array],
-    window: float, t_c: float | None, rho: float | None,
-) -> Excitation:
-    """The evidence from what is known at the times t (N,) and at their end."""
-    spectrum = final.eigenvalues[-1]
-    v = final.vectors[-1, :, 0] if len(parameters) else np.zeros(0)
-    sign = 1.0 if max(v, key=abs, default=1.0) >= 0.0 else -1.0
-    smallest = float(spectrum[0]) if len(parameters) else 1.0
-    return Excitation(
-        t=t, gram_eigenvalues=gram_eigenvalues, pe_level=pe_level,
-        window=window, is_ie=t_c is not None, t_c=t_c, rho=rho, lambda_min=lambda_min,
-        condition=max(spectrum.tolist(), default=1.0) / smallest if smallest > 0.0 else np.inf,
-        weakest_direction=Direction(dict(zip(parameters, (sign * v).tolist(), strict=True))),
-        parameters=tuple(parameters), least_share=least_share, known=known, final=final,
-    )
 
 
 def estimable(

@@ -17,7 +17,6 @@ import numpy as np
 
 from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.linalg import symmetric_eigenvalues
 
 LARGE = 1e3  # of Φ: above it, states may be differences of terms that leave nothing of them
 _UNRESOLVED = 10.0  # tolerances of the terms of a column of ψ: what is smaller says nothing
@@ -173,21 +172,8 @@ def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> 
     return Knowledge(sizes, spectrum, vectors, level)
 
 
-def smallest_and_margin(
-    gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12
-) -> tuple[Array, Array]:
-    """``smallest`` and ``margin`` (M,) of :func:`knowledge`, without what takes eigenvectors."""
-    normalised, _, level = _normalised(gram, terms, elapsed, tol)
-    spectrum = symmetric_eigenvalues(normalised)
-    smallest = np.maximum(spectrum.min(axis=1, initial=1.0), 0.0)
-    return smallest, np.asarray(smallest / level.max(axis=1, initial=_SINGULAR))
-
-
 def tells_nothing(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> bool:
-    """Whether the ``margin`` of :func:`knowledge` is surely below 1 at all times: by Cholesky.
-
-    Of G (N, p, p), the terms it is made of and the times since the start (N,).
-    """
+    """Whether the ``margin`` of :func:`knowledge` of G (N, p, p) is surely below 1: by Cholesky."""
     normalised, _, level = _normalised(gram, terms, elapsed, tol)
     normalised -= 0.9 * level.max(axis=1)[:, None, None] * np.eye(normalised.shape[1])
     for N in normalised[::-1]:  # what is told at all is told at the end

@@ -12,7 +12,7 @@ import numpy as np
 
 from gpebo_cli import estimators, observers
 from gpebo_cli.estimators import InformationRoot
-from gpebo_cli.evidence.excitation import WELL, Excitation, excitation
+from gpebo_cli.evidence.excitation import WELL, Excitation
 from gpebo_cli.evidence.knowledge import LARGE, Knowledge, knowledge_of_roots
 from gpebo_cli.evidence.uncertainty import SampledDeviations
 from gpebo_cli.experiment.result import Fit
@@ -258,11 +258,11 @@ class Online:
             made.regression.t, made.known, made.gram_eigenvalues
         )
         known, eigenvalues = known.at(shown), eigenvalues[shown]
-        return excitation(
-            known.at(_NEWEST), t[shown], self.parameters,
-            float(eigenvalues[-1, 0]) if self.parameters else 0.0,
-            lambda: known.share.min(axis=1, initial=1.0), known, eigenvalues, pe_level, window,
-            self._t_c[0] if self._t_c[1] is None else self._t_c[1], self._rho,
+        return Excitation(
+            t[shown], window, self._t_c[0] if self._t_c[1] is None else self._t_c[1], self._rho,
+            float(eigenvalues[-1, 0]) if self.parameters else 0.0, tuple(self.parameters),
+            known.at(_NEWEST), lambda: known.share.min(axis=1, initial=1.0), known, eigenvalues,
+            pe_level,
         )
 
     @property

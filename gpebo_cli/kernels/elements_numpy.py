@@ -71,13 +71,7 @@ def solve_blocks(
 ) -> Array:
     """z (s, d, c) of (D_ij/h E_i T_j − δ_ij A_i T_i) z_j = right (s, d, c).
 
-    Args:
-        D: (s, s).
-        h: length of the element.
-        E: at the nodes (s, d, n).
-        A: likewise.
-        T: (s, n, d), None for the identity.
-        right: see above.
+    E and A are those at the nodes (s, d, n), T (s, n, d), None for the identity.
     """
     s, d, columns = right.shape
     coupling = E[:, :, None] if T is None else np.tensordot(E, T, axes=(2, 1))
@@ -284,9 +278,8 @@ def substituted(
         block: B of each step (m,): so many in ``full``, and counted on in
         full: transposed (G, F, s, s), and
         diagonal: (G, T, s).
-        f: of the first columns of X at the K (s + 1) points of all elements, or at one (P or 1, d,
-            f).
-        kicks: what is added to X at the end of each element (K, d, c), or None.
+        f: as of :func:`sweeps`, and
+        kicks: likewise.
         start: at the first left end (d, c).
 
     Returns:

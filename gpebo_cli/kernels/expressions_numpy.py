@@ -7,46 +7,27 @@ leave the work to it.
 
 from __future__ import annotations
 
-from gpebo_cli.kernels.arrays import Array, IntArray
+from typing import Any
+
+from gpebo_cli.kernels.arrays import Array
 
 RUNS_PROGRAMS = False
 
 
-def jets(
-    t: Array, inside: Array | None, signals: Array, code: IntArray, constants: Array,
-    results: IntArray, targets: IntArray, *matrices: Array,
-) -> tuple[Array, ...] | None:
+def jets(t: Array, inside: Array | None, signals: Array, *program: Any) -> tuple[Array, ...] | None:
     """Matrices (orders, N, ...) of which some entries are the results of a program.
 
-    Args:
-        t: times (N,).
-        inside: where jumps are decided (N,).
-        signals: further rows (rows, N).
-        code: operations (number, 4).
-        constants: of the program.
-        results: rows of the coefficients (orders, outputs).
-        targets: the matrix and the entry of each output (outputs, 2).
-        matrices: (orders, 1, ...) what they are elsewhere.
-
-    Returns:
-        None: the interpreter has to do it, or an operation may have to be refused.
+    Of times (N,), where jumps are decided (N,), further rows (rows, N), the program, the matrix
+    and the entry of each output (outputs, 2) and the matrices (orders, 1, ...) as they are
+    elsewhere. None: the interpreter has to do it, or an operation may have to be refused.
     """
-    del t, inside, signals, code, constants, results, targets, matrices
+    del t, inside, signals, program
     return None
 
 
 def intervals(
-    low: Array, high: Array, inside: Array, code: IntArray, constants: Array, results: IntArray
+    low: Array, high: Array, inside: Array, *program: Any
 ) -> tuple[Array, Array] | None:
-    """Bounds (orders, N, outputs) of the results of a program over cells of time; None: see above.
-
-    Args:
-        low: where cells begin (N,).
-        high: where they end (N,).
-        inside: where jumps are decided (N,).
-        code: operations (number, 4).
-        constants: of the program.
-        results: rows of the coefficients (orders, outputs).
-    """
-    del low, high, inside, code, constants, results
+    """Bounds (orders, N, outputs) of the results of a program over cells of time (N,), or None."""
+    del low, high, inside, program
     return None

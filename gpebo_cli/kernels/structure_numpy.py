@@ -71,15 +71,22 @@ def levels(
     Singular values below ``rank_tol``, relative, are zero; so many as ``constraints`` says belong
     to constraints, whatever they are; −1: as many as are zero.
     """
-    e, a = scaled(E, A, rows, columns, time, orders)
-    n = E.shape[2]
-    M, N = derivative_array(e, a, orders - 1)
+    counts, smallest, _ = _levels(*scaled(E, A, rows, columns, time, orders), rank_tol, constraints)
+    return counts.astype(np.float64), smallest
+
+
+def _levels(
+    e: Array, a: Array, rank_tol: float, constraints: int
+) -> tuple[IntArray, Array, Array]:
+    """:func:`levels` of scaled coefficients, and T2 where there are as many constraints as most."""
+    n = e.shape[2]
+    M, N = derivative_array(e, a, len(e) - 1)
     U, sigma, _ = np.linalg.svd(M)
     relative = sigma / array_size(sigma[:, 0], a)[:, None]
     counts = np.full(len(M), constraints)
     if constraints < 0:
         counts = M.shape[1] - (relative > rank_tol).sum(axis=1)
-    smallest = np.full((len(M), 3), np.inf)
+    smallest, T2 = np.full((len(M), 3), np.inf), np.zeros((1, n, 0))
     for count in np.unique(counts[counts <= n]):
         same, r = counts == count, M.shape[1] - int(count)
         if r:
@@ -88,41 +95,12 @@ def levels(
         _, s2, V2 = np.linalg.svd(np.swapaxes(U[same, :, r:], 1, 2) @ of_N)
         if count:
             smallest[same, 1] = s2[:, -1] / frobenius_norm(of_N)
+        T2 = np.swapaxes(V2, 1, 2)[:, :, count:]
         if count < n:
             of_E = e[0] if e.shape[1] == 1 else e[0, same]
-            s3 = np.linalg.svd(of_E @ np.swapaxes(V2, 1, 2)[:, :, count:], compute_uv=False)
+            s3 = np.linalg.svd(of_E @ T2, compute_uv=False)
             smallest[same, 2] = s3[:, -1] / frobenius_norm(of_E)
-    return counts.astype(np.float64), smallest
-
-
-def _at(coefficients: Array, k: int) -> Array:
-    """Coefficients (orders, N or 1, ...) at the time k."""
-    return coefficients[:, k if coefficients.shape[1] > 1 else 0]
-
-
-def _levels_at(
-    e: Array, a: Array, rank_tol: float, constraints: int
-) -> tuple[int, Array, Array]:
-    """Number of constraints, smallest singular values and T2 (n, d) at one time."""
-    n = e.shape[-1]
-    M, N = (x[0] for x in derivative_array(e[:, None], a[:, None], len(e) - 1))
-    U, sigma, _ = np.linalg.svd(M)
-    relative = sigma / array_size(sigma[:1], a[:, None])[0]
-    count = constraints if constraints >= 0 else len(M) - int((relative > rank_tol).sum())
-    smallest = np.full(3, np.inf)
-    if count > n:
-        return count, smallest, np.zeros((n, 0))
-    r = len(M) - count
-    if r:
-        smallest[0] = relative[r - 1]
-    _, s2, V2 = np.linalg.svd(U[:, r:].T @ N)
-    if count:
-        smallest[1] = s2[-1] / (np.linalg.norm(N) + _TINY)
-    T2 = V2.T[:, count:]
-    if count < n:
-        s3 = np.linalg.svd(e[0] @ T2, compute_uv=False)
-        smallest[2] = s3[-1] / (np.linalg.norm(e[0]) + _TINY)
-    return count, smallest, T2
+    return counts, smallest, T2
 
 
 def reference(
@@ -138,15 +116,15 @@ def reference(
         that carry its rank first; and Z1 (n, d), an orthonormal basis of range(E T2). With more
         constraints than states only the first one means something.
     """
+    E, A = (x if x.shape[1] == 1 else x[:, place : place + 1] for x in (E, A))
     e, a = scaled(E, A, rows, columns, time, orders)
-    e, a = _at(e, place), _at(a, place)
-    count, smallest, T2 = _levels_at(e, a, rank_tol, -1)
-    M = derivative_array(e[:, None], a[:, None], orders - 1)[0][0]
+    counts, smallest, T2 = _levels(e, a, rank_tol, -1)
+    count, M = int(counts[0]), derivative_array(e, a, orders - 1)[0][0]
     if count > len(rows):
         everything = np.arange(len(M))
-        return count, smallest, everything, everything, np.zeros((len(rows), 0))
-    Z1 = np.linalg.svd(e[0] @ T2, full_matrices=False)[0]
-    return count, smallest, *_pivots(M, len(M) - count), Z1
+        return count, smallest[0], everything, everything, np.zeros((len(rows), 0))
+    Z1 = np.linalg.svd(e[0, 0] @ T2[0], full_matrices=False)[0]
+    return count, smallest[0], *_pivots(M, len(M) - count), Z1
 
 
 def _pivots(matrix: Array, count: int) -> tuple[IntArray, IntArray]:

@@ -20,9 +20,8 @@ import numpy as np
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.mesh import SHARE, Mesh, used_coefficients
+from gpebo_cli.numerics.mesh import SHARE, Mesh
 from gpebo_cli.numerics.problem import LinearProblem
-from gpebo_cli.numerics.radau import RadauRule
 
 EPS = float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
@@ -62,8 +61,8 @@ def estimated_errors(
     rule, renewal = mesh.rule, problem.renewal
     noise[:, :, values.shape[2] :] += _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
     carried, largest = elements.carried_errors(
-        values, rule.to_legendre, _to_next(rule), last, particular, noise,
-        _signs(len(values), len(problem.start)), mesh.steps, LEVEL, END, CHANCE**2, _SAME,
+        values, rule.to_legendre, rule.to_next, last, particular, noise,
+        random_signs(len(values), len(problem.start), 2), mesh.steps, LEVEL, END, CHANCE**2, _SAME,
         renew=None if renewal is None else renewal.error,
     )
     if np.any(problem.uncertain):
@@ -86,15 +85,6 @@ def nothing_left(name: str, t: float) -> SolverError:
         f"the {name} grows so that rounding errors are larger than a state from t = {t:.6g} on, "
         "and no digit of it is known; shorten time.horizon"
     )
-
-
-@lru_cache(maxsize=16)
-def _to_next(rule: RadauRule) -> Array:
-    """Powers (j,) that make of the last Legendre coefficients the next: (ρ^j)^this = ρ^(s + 1)."""
-    points = rule.stages + 1
-    powers: Array = points / np.arange(points - used_coefficients(rule), points)
-    powers.flags.writeable = False
-    return powers
 
 
 def judged_errors(
@@ -123,9 +113,9 @@ def judged_errors(
     return Errors(np.where(np.isfinite(relative), relative, np.inf), lost, carried[-1])
 
 
-def _signs(K: int, n: int) -> Array:
-    """For each kind of error at the start and the ends of K elements, (K + 1, n, 2 _SIGNS)."""
-    return _first_signs(1 << K.bit_length(), n)[: K + 1]
+def random_signs(K: int, n: int, kinds: int = 1) -> Array:
+    """For so many kinds of error at the start and the ends of K elements, (K + 1, n, 3 kinds)."""
+    return _first_signs(1 << K.bit_length(), n)[: K + 1, :, : kinds * _SIGNS]
 
 
 @lru_cache(maxsize=16)
@@ -134,11 +124,6 @@ def _first_signs(count: int, n: int) -> Array:
     signs: Array = np.where(bits == 1, 1.0, -1.0)
     signs.flags.writeable = False
     return signs
-
-
-def random_signs(K: int, n: int) -> Array:
-    """For errors of one kind at the start and the ends of K elements, (K + 1, n, _SIGNS)."""
-    return _signs(K, n)[:, :, :_SIGNS]
 
 
 def least_sizes(problem: LinearProblem, made_of: Array, tol: float) -> Array:

@@ -34,7 +34,7 @@ def without_rounding(found: Array, terms: Array | None = None) -> Array:
 
 
 def transpose(a: Array) -> Array:
-    """Transpose the last two axes, (…, a, b) to (…, b, a)."""
+    """Of the last two axes, (…, a, b) to (…, b, a)."""
     return np.swapaxes(a, -1, -2)
 
 
@@ -160,18 +160,13 @@ def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
 
 
 def largest(extended: Array) -> float:
-    """‖Ω‖₂ of [Ω | 𝒴] (..., p, p + c), the largest of all."""
-    p = extended.shape[-2]
-    return spectral_norm(extended, p) if extended.size else 0.0
-
-
-def spectral_norm(matrices: Array, columns: int) -> float:
-    """‖·‖₂ of the first columns of matrices (..., a, b), the largest of all.
+    """‖Ω‖₂ of [Ω | 𝒴] (..., p, p + c), the largest of all.
 
     Singular values are computed only of matrices whose Frobenius norm leaves room for a larger one
     than that of the matrix with the largest Frobenius norm.
     """
-    flat = matrices[..., :columns].reshape(-1, matrices.shape[-2], columns)
+    p = extended.shape[-2]
+    flat = extended[..., :p].reshape(-1, p, p) if extended.size else np.zeros((0, p, p))
     size = float(np.abs(flat).max(initial=0.0))
     if size == 0.0 or not np.isfinite(size):
         return size

@@ -22,12 +22,10 @@ from gpebo_cli.numerics.radau import RadauRule
 # that nobody announced then shows up as an unresolved element, not as a wrong number.
 _INSIDE = 1e-3
 FIRST_ELEMENTS = 24  # of a first mesh: enough nodes to notice a pulse, few enough to be free
-_COEFFICIENTS = 4  # of the last ones, from which the next is predicted
 SHARE = 1e-3  # of the largest component: what is smaller is measured against that
 _FOOT = 1e-8  # of its final size: what a component was before may be that wrong
 _WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
 _MANY = 1 << 16  # numbers, from which on sampling them by element pays
-_KEPT_SAMPLERS, _KEPT_TIMES = 4, 1 << 14
 _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
 _JOINED = (8, 4, 2)  # as many elements become one
 _MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
@@ -51,19 +49,19 @@ class Looked(NamedTuple):
     def at(cls, values: Array, rule: RadauRule) -> Looked:
         """At values (K, s + 1, …)."""
         flat = _flat(values)
-        last = np.matmul(rule.to_legendre[-_COEFFICIENTS:], flat)
+        last = np.matmul(rule.to_legendre[-4:], flat)
         return cls(largest_within(flat), np.abs(last, out=last))
 
     def unresolved(self, rule: RadauRule, units: Array | float) -> Array:
         """As :func:`unresolved` of these signals in units (c,), without a floor."""
         return signals_numpy.tails_of(
-            self.sizes / units, self.last[:, -used_coefficients(rule) :], len(rule.points), _FOOT,
-            SHARE, 0.0, None, units,
+            self.sizes / units, self.last[:, -len(rule.to_next) :], len(rule.points), _FOOT, SHARE,
+            0.0, None, units,
         )
 
     def tail(self, rule: RadauRule, scale: Array) -> Array:
         """:func:`legendre_tail` of these signals, beside a scale (K, c)."""
-        return _predicted(self.last[:, -used_coefficients(rule) :], rule, scale)
+        return _predicted(self.last[:, -len(rule.to_next) :], rule, scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,27 +179,9 @@ class Mesh:
 
         At an edge the element that contains ``inside`` is used; by default the one to the right.
         """
-        t = np.asarray(t, dtype=np.float64)
-        if t.size > _KEPT_TIMES:
-            return self._new_sampler(t, inside)
-        asked = (t.tobytes(), None if inside is None else inside.tobytes())
-        for known, sampler in self._samplers:
-            if known == asked:
-                return sampler
-        sampler = self._new_sampler(t, inside)
-        self._samplers.insert(0, (asked, sampler))
-        del self._samplers[_KEPT_SAMPLERS:]
-        return sampler
-
-    @cached_property
-    def _samplers(self) -> list[tuple[tuple[bytes, bytes | None], Sampler]]:
-        """The last few: all signals of a run are reported at the same few sets of times."""
-        return []
-
-    def _new_sampler(self, t: Array, inside: Array | None) -> Sampler:
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
-        rule = self.rule
+        rule, t = self.rule, np.asarray(t, dtype=np.float64)
         belongs = t + _SNAP * np.abs(t) if inside is None else inside
         return Sampler(*signals.interpolation(
             self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
@@ -308,21 +288,16 @@ class Trajectory:
         out = 2.0 * (at_points @ np.moveaxis(slopes, 0, 1)) / self.mesh.steps[:, None, None]
         return Trajectory(self.mesh, out.reshape(self.values.shape))
 
-    def local_integral(self) -> Trajectory:
-        """∫ from the left end of each element, starting at zero again in the next one."""
-        return self._integral(on=False)
+    def integral(self, *, local: bool = False) -> Trajectory:
+        """∫ from the start of the mesh, by its own quadrature (order 2s − 1 at the ends).
 
-    def integral(self) -> Trajectory:
-        """∫ from the start of the mesh, by the mesh's own quadrature (order 2s − 1 at the ends)."""
-        return self._integral(on=True)
-
-    def _integral(self, *, on: bool) -> Trajectory:
-        """The values continue from the elements before, or from each left end."""
-        rule, mesh, flat = self.mesh.rule, self.mesh, _flat(self.values)
+        ``local``: from the left end of each element.
+        """
+        mesh, flat = self.mesh, _flat(self.values)
         out = np.zeros(flat.shape)
-        weights = mesh.steps[:, None, None] * rule.integration
+        weights = mesh.steps[:, None, None] * mesh.rule.integration
         np.matmul(weights, flat[:, 1:], out=out[:, 1:])
-        if on:
+        if not local:
             out[1:] += out[:-1, -1].cumsum(axis=0)[:, None]
         return Trajectory(mesh, out.reshape(self.values.shape))
 
@@ -401,7 +376,7 @@ def unresolved(values: Array, rule: RadauRule, floor: float | Array = 0.0) -> Ar
     """
     least, level = (floor, 0.0) if isinstance(floor, np.ndarray) else (None, floor)
     return signals.tails(
-        values, rule.to_legendre, used_coefficients(rule), _FOOT, SHARE, level, least
+        values, rule.to_legendre, len(rule.to_next), _FOOT, SHARE, level, least
     )
 
 
@@ -416,11 +391,6 @@ def unresolved_kinds(
     )))
 
 
-def used_coefficients(rule: RadauRule) -> int:
-    """How many of the last Legendre coefficients predict the next one."""
-    return min(_COEFFICIENTS, rule.stages - 1)
-
-
 def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     """Size of what an element's polynomial of degree s leaves out, shape (K, c).
 
@@ -428,18 +398,14 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     scale ρ^(s+1); the largest prediction counts. Several, because single coefficients vanish by
     accident, two of them where the signal is odd or even.
     """
-    # Of degrees s + 1 − used … s:
-    return _predicted(
-        np.abs(np.matmul(rule.to_legendre[-used_coefficients(rule) :], values)), rule, scale
-    )
+    last = np.abs(np.matmul(rule.to_legendre[-len(rule.to_next) :], values))
+    return _predicted(last, rule, scale)
 
 
 def _predicted(last: Array, rule: RadauRule, scale: Array) -> Array:
     """:func:`legendre_tail` (K, c) from the sizes of the last coefficients (K, used, c)."""
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
-    s, used = rule.stages, len(last[0])
-    to_next = (s + 1.0) / np.arange(s + 1 - used, s + 1)  # (ρ^j)^this = ρ^(s + 1)
-    predicted = np.minimum(last / size, 1.0) ** to_next[:, None]
+    predicted = np.minimum(last / size, 1.0) ** rule.to_next[:, None]
     return np.asarray(size[:, 0] * predicted.max(axis=1))
 
 

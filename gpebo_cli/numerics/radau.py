@@ -18,6 +18,7 @@ from gpebo_cli.model.descriptor import Array
 ComplexArray = NDArray[np.complex128]
 
 _QR_STEPS = 100
+_LAST = 4  # Legendre coefficients, at most, from which the next one is predicted
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,8 @@ class RadauRule:
     points: Array  # (s + 1,) 0 and the nodes
     barycentric: Array  # (s + 1,) weights of ``points``
     to_legendre: Array  # (s + 1, s + 1) values at ``points`` -> Legendre coefficients
+    # (j,) powers that make of each of the last j coefficients the next one: (ρ^k)^this = ρ^(s + 1)
+    to_next: Array
 
     @property
     def order(self) -> int:
@@ -89,6 +92,7 @@ def radau_rule(stages: int) -> RadauRule:
         points=points,
         barycentric=weights / np.abs(weights).max(),
         to_legendre=np.asarray(np.linalg.inv(at_points), dtype=np.float64),
+        to_next=(s + 1) / np.arange(max(s + 1 - _LAST, 2), s + 1),
     )
 
 

@@ -80,7 +80,7 @@ def window_gramians(
     )
     solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
     mesh, values = solution.trajectory.mesh, solution.trajectory.values
-    local = Trajectory(mesh, products(values, solution.extras)).local_integral().values[:, -1]
+    local = Trajectory(mesh, products(values, solution.extras)).integral(local=True).values[:, -1]
     return _sum_windows(mesh, values[:, -1], local)
 
 

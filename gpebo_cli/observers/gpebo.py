@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from gpebo_cli.errors import ConfigError, GpeboError, SolverError
-from gpebo_cli.evidence.knowledge import knowledge, smallest_and_margin
+from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.observers._base import Measurements, Sampling
 from gpebo_cli.observers._observation import AffineStateMap, Observation
@@ -230,7 +230,7 @@ def _told(
     last = gram.mesh.size - 1
     # What was told is told for good, where later on it drowns in the rounding of a long run.
     for some in (np.array([last]), last >> np.arange(1, last.bit_length() + 1)):
-        if smallest_and_margin(*asked(some))[1].max(initial=0.0) >= _CLEAR:
+        if knowledge(*asked(some)).margin.max(initial=0.0) >= _CLEAR:
             return steady, system.q + system.n
     known = knowledge(*asked(np.array([last])))
     sound = steady and bool(known.clarity[known.clarity >= 1.0].min(initial=np.inf) > _CLEAR)
