@@ -123,6 +123,12 @@ class Spectrum:
         smallest, largest = self.eigenvalues[:, 0], self.eigenvalues[:, -1]
         return np.divide(smallest, largest, out=np.zeros_like(largest), where=largest > 0.0)
 
+    def quotient(self) -> tuple[Array, Array]:
+        """G_z⁻¹ h_z (M, p, c), zero where it is rounding, and to how many digits (M,)."""
+        known = (self.digits > SINGULAR)[:, None, None]
+        eigenvalues, zero = self.eigenvalues[..., None], np.zeros_like(self.rotated)
+        inverse = np.divide(self.rotated, eigenvalues, out=zero, where=known)
+        return self.vectors @ inverse, self.digits
 
     def covariance(self, alpha: float, f0: float) -> Array:
         """αF = α (z f₀ I + α G_z)⁻¹, (M, p, p)."""

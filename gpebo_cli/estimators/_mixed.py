@@ -6,15 +6,15 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Protocol
 
 import numpy as np
 
-from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
+from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._recursive import (
-    Filter,
     KreisselmeierFilter,
+    Mixed,
     ScalarLaw,
     inverse_sampled,
     mix_sampled,
@@ -22,7 +22,7 @@ from gpebo_cli.estimators._recursive import (
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
-from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
@@ -149,26 +149,16 @@ def finite_time(mu: float) -> tuple[str, float, str]:
     return "IE with enough ∫Δ²", float(-np.log1p(-mu)), "finite-time convergence"
 
 
-def sampled_requirement(law: ScalarLaw, condition: str) -> Requirement:
-    """γ∫Δ² so far, at the smallest gain and in the group that has the least."""
-    gain, energy = float(law.gains.min()), float(law.energy.min())
-    if law.mu == 1.0:
-        return energy_requirement(condition, gain, energy)
-    condition, needed, needed_for = finite_time(law.mu)
-    return energy_requirement(condition, gain, energy, needed, needed_for)
+class Extending(Protocol):
+    """An extension at samples, with mixing."""
 
-
-class Mixed(NamedTuple):
-    """𝐘 = Δη at K samples, as :class:`ScalarLaw` takes it, in one group."""
-
-    delta: Array  # Δ (K, 1)
-    quotient: Array  # η̄ = 𝐘/Δ (K, 1, p)
-    usable: BoolArray  # where η̄ is more than rounding (K, 1)
-    behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]]
+    def update(self, regression: SampledRegression) -> Mixed:
+        """Δ and η̄ at K samples."""
+        ...
 
 
 class SampledMixing:
-    """The filters of an estimator at samples, and mixing."""
+    """The filters of an estimator at samples, and mixing; one group."""
 
     def __init__(self, settings: FilteredEstimator, parameters: Sequence[str]) -> None:
         self._filter = KreisselmeierFilter(filter_rates(settings.rates, parameters), settings.seen)
@@ -183,12 +173,15 @@ class SampledMixing:
 
 
 class RecursiveMixed:
-    """Filters of held signals, mixing, a closed-form step of the scalar law."""
+    """An extension of held signals, mixing, a closed-form step of the scalar law."""
 
-    def __init__(self, settings: FilteredEstimator, parameters: Sequence[str], mu: float) -> None:
-        self._mixing = SampledMixing(settings, parameters)
+    def __init__(
+        self, settings: GainEstimator, parameters: Sequence[str], mixing: Extending,
+        condition: str = "Δ not in L2", groups: int = 1, mu: float = 1.0,
+    ) -> None:
+        self._mixing, self._condition = mixing, condition
         gains = settings.gains("gamma", parameters)
-        self._law = ScalarLaw(settings.start(parameters), gains, 1, mu)
+        self._law = ScalarLaw(settings.start(parameters), gains, groups, mu)
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
@@ -196,8 +189,11 @@ class RecursiveMixed:
 
     @property
     def requirement(self) -> Requirement:
-        """γ∫Δ² so far."""
-        return sampled_requirement(self._law, "Δ not in L2")
+        """γ∫Δ² so far, at the smallest gain and in the group that has the least."""
+        law, aim = self._law, (self._condition, DECAY, "1 % of the initial error")
+        condition, needed, what = aim if law.mu == 1.0 else finite_time(law.mu)
+        gain, energy = float(law.gains.min()), float(law.energy.min())
+        return energy_requirement(condition, gain, energy, needed, what)
 
 
 # (η̂ (g, M, P), γ∫Δ² (g, M, P or 1), η̂ at the start (1 or g, 1, P)) -> estimates

@@ -89,9 +89,7 @@ class ScalarLaw:
         self._start, self.mu = start, mu
         self.gains = gains  # (g, 1 or p)
         self._eta = np.broadcast_to(start, (groups, len(gains), len(start))).copy()
-        self._delta = np.zeros((1, groups))
-        self._quotient: Array | None = None
-        self._usable = np.zeros((1, groups), dtype=bool)
+        self._steps = Steps()
         self.energy = np.zeros(groups)  # ∫Δ² so far, (D,)
         self._inverse: list[Array] | None = None  # Q of the last sample of each group
 
@@ -109,18 +107,14 @@ class ScalarLaw:
             behind: of each group the filter of 𝒴, and what η̄ is of 𝒴 (K, p, p), zero where it is
                 rounding.
         """
-        before = quotient[:1] if self._quotient is None else self._quotient
-        previous = np.concatenate([before, quotient[:-1]])
-        had = np.concatenate([self._usable, usable[:-1]])
-        energy = np.where(usable, over_steps(regression, delta**2, self._delta**2), 0.0)  # (K, D)
+        energy, previous, had = self._steps.update(regression, delta**2, quotient, usable)
         x = self.gains * energy[:, :, None, None]  # (K, D, g, 1 or p)
         decay = np.exp(-x)
         new, old = quotient[:, :, None], np.where(had[..., None], previous, quotient)[:, :, None]
         # η̄ is that of the new sample, or linear in ∫Δ² between both.
         of_new, of_old = _shares(x, decay, regression.hold)
         eta = affine_scan(decay, of_new * new + of_old * old, self._eta)[1:]  # (K, D, g, p)
-        self._eta, self._delta = eta[-1], delta[-1:]
-        self._quotient, self._usable = quotient[-1:], usable[-1:]
+        self._eta = eta[-1]
         so_far = self.energy + np.cumsum(energy, axis=0)
         self.energy = so_far[-1]
         w_c = np.minimum(np.exp(-self.gains * so_far[:, :, None, None]), 1.0 - self.mu)
@@ -162,6 +156,15 @@ class ScalarLaw:
         return tuple(out)
 
 
+class Mixed(NamedTuple):
+    """𝐘 = Δη at K samples, as :class:`ScalarLaw` takes it, in D groups."""
+
+    delta: Array  # Δ (K, D)
+    quotient: Array  # η̄ = 𝐘/Δ (K, D, p)
+    usable: BoolArray  # where η̄ is more than rounding (K, D)
+    behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]]
+
+
 class Filter(NamedTuple):
     """δf' = A δf + old δY + new δY' over each step, f = 𝒴 or more."""
 
@@ -176,23 +179,38 @@ def over_steps(regression: SampledRegression, values: Array, before: Array) -> A
     return np.asarray(old * np.concatenate([before, values[:-1]]) + new * values)
 
 
-def between(
-    regression: SampledRegression, quotient: Array, usable: BoolArray, before: Array,
-    was_usable: BoolArray,
-) -> Array:
-    """η̄ (K, D, p) of the steps: that of the new sample, or with lines between samples the mean.
+class Steps:
+    """The steps between samples of a mixed regression; it remembers the last sample."""
 
-    Args:
-        regression: its hold rule.
-        quotient: η̄ at the samples (K, D, p).
-        usable: where it is more than rounding (K, D).
-        before: η̄ at the sample before (1, D, p).
-        was_usable: whether it was usable (1, D).
-    """
-    if regression.hold == "zoh":
-        return quotient
-    both = (usable & np.concatenate([was_usable, usable[:-1]]))[..., None]
-    return np.where(both, 0.5 * (quotient + np.concatenate([before, quotient[:-1]])), quotient)
+    def __init__(self) -> None:
+        self._last: tuple[Array, Array, BoolArray] | None = None
+
+    def update(
+        self, regression: SampledRegression, weight: Array, quotient: Array, usable: BoolArray
+    ) -> tuple[Array, Array, BoolArray]:
+        """∫ weight (K, D), and of the sample before each η̄ (K, D, p) and whether it was usable.
+
+        Arguments are weight (K, D), η̄ (K, D, p), and where that is more than rounding (K, D).
+        """
+        known = np.zeros_like(weight[:1]), quotient[:1], np.zeros_like(usable[:1])
+        before, previous, was = known if self._last is None else self._last
+        self._last = weight[-1:], quotient[-1:], usable[-1:]
+        energy = np.where(usable, over_steps(regression, weight, before), 0.0)
+        return (
+            energy, np.concatenate([previous, quotient[:-1]]), np.concatenate([was, usable[:-1]])
+        )
+
+    def means(
+        self, regression: SampledRegression, weight: Array, mixed: Mixed
+    ) -> tuple[Array, Array, BoolArray]:
+        """∫ weight (K,), η̄ (K, p) of the steps, and where that is of both ends; in one group.
+
+        It is that of the new sample, or with lines between samples the mean.
+        """
+        energy, previous, had = self.update(regression, weight, mixed.quotient, mixed.usable)
+        both = had & mixed.usable & (regression.hold != "zoh")
+        mean = 0.5 * (mixed.quotient + previous)
+        return energy[:, 0], np.where(both[..., None], mean, mixed.quotient)[:, 0], both[:, 0]
 
 
 def integrating(regression: SampledRegression, beta: float) -> Filter:

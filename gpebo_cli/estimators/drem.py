@@ -9,7 +9,12 @@ import numpy as np
 
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._following import follow
-from gpebo_cli.estimators._mixed import FilteredEstimator, RecursiveMixed, filter_rates
+from gpebo_cli.estimators._mixed import (
+    FilteredEstimator,
+    RecursiveMixed,
+    SampledMixing,
+    filter_rates,
+)
 from gpebo_cli.estimators._vector import VectorEstimates
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
@@ -40,7 +45,7 @@ class Drem(FilteredEstimator):
 
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
-        return RecursiveMixed(self, parameters, mu)
+        return RecursiveMixed(self, parameters, SampledMixing(self, parameters), mu=mu)
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array

@@ -27,23 +27,21 @@ from gpebo_cli.estimators._base import GainEstimator, gain
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
+    RecursiveMixed,
     SampledMixing,
     filter_rates,
-    sampled_requirement,
     scalar_errors,
 )
 from gpebo_cli.estimators._mixing import filled, mix
-from gpebo_cli.estimators._recursive import Filter, ScalarLaw, between, over_steps
+from gpebo_cli.estimators._recursive import Filter, Mixed, Steps
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
 from gpebo_cli.estimators.drem import Drem
-from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
-from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import number
@@ -110,13 +108,13 @@ class Exciting(GainEstimator):
         law = scalar_path(found.mesh, signals, new, quotient, np.asarray(t), None, path.floor)
         return replace(inner, groups=(law,), condition="IE")
 
-    def recursive(self, parameters: Sequence[str]) -> RecursiveExciting:
+    def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
         """The estimator at samples.
 
         Raises:
             ConfigError: κ is not positive.
         """
-        return RecursiveExciting(self, parameters)
+        return RecursiveMixed(self, parameters, Rotation(self, parameters), "IE")
 
     def _turning(self, path: ScalarPath) -> Callable[[Array, Array], Array]:
         """φ'/Δ² = κ (π/2) e^{−κ∫Δ²} at times (N,)."""
@@ -153,29 +151,22 @@ class Exciting(GainEstimator):
         return tuple(partial(at, gain) for gain in self.gains("gamma", names))
 
 
-class RecursiveExciting:
-    """The rotation over each sample, exact for 𝐘/Δ as it is there or in the middle, and the law.
+class Rotation:
+    """The rotation over each sample, exact for 𝐘/Δ as it is there or in the middle.
 
     With c = e_1 + i e_2 and η̄ = 𝐘/Δ a turn by δ makes e^{iδ}(c + η̄) − η̄ of c.
     """
 
     def __init__(self, settings: Exciting, parameters: Sequence[str]) -> None:
-        p, gains = len(parameters), settings.gains("gamma", parameters)
-        self._mixing = SampledMixing(settings.linear, parameters)
+        self._mixing, self._steps = SampledMixing(settings.linear, parameters), Steps()
         self._kappa = number(settings.kappa, "estimator.kappa")
-        self._law = ScalarLaw(settings.start(parameters), gains, 1)
-        self._before = np.zeros((1, 1)), np.zeros((1, 1, p)), np.zeros((1, 1), bool)
-        self._energy, self._turned = 0.0, np.zeros(p, complex)  # ∫Δ², c e^{−iφ}
+        self._energy, self._turned = 0.0, np.zeros(len(parameters), complex)  # ∫Δ², c e^{−iφ}
         self._inverse: Array | None = None
 
-    def update(self, regression: SampledRegression) -> SampledEstimates:
-        """Take K samples and give the estimates at each."""
-        delta, quotient, usable, behind = self._mixing.update(regression)
-        square = delta**2
-        energy = np.where(usable, over_steps(regression, square, self._before[0]), 0.0)[:, 0]
-        had = np.concatenate([self._before[2], usable[:-1]])[:, 0]
-        mean = between(regression, quotient, usable, *self._before[1:])[:, 0]
-        self._before = square[-1:], quotient[-1:], usable[-1:]
+    def update(self, regression: SampledRegression) -> Mixed:
+        """Φ_21 and e_2/Φ_21 at K samples."""
+        mixed = self._mixing.update(regression)
+        energy, mean, both = self._steps.means(regression, mixed.delta**2, mixed)
         so_far = np.cumsum(np.concatenate([[self._energy], energy]))
         phi = -0.5 * np.pi * np.expm1(-self._kappa * so_far)
         self._energy, turn = float(so_far[-1]), np.exp(1j * np.diff(phi))
@@ -188,11 +179,10 @@ class RecursiveExciting:
         inverse = np.divide(1.0, new, out=np.zeros_like(new), where=known)
 
         def errors() -> tuple[list[Filter], list[Array]]:
-            (own,), (Q,) = behind()
+            (own,), (Q,) = mixed.behind()
             K, p = mean.shape
             before = Q[:1] if self._inverse is None else self._inverse
             previous, self._inverse = np.concatenate([before, Q[:-1]]), Q[-1:]
-            both = (regression.hold != "zoh") & had & usable[:, 0]
             share = np.where(both, 0.5, 1.0)[:, None, None]
             # δη̄ of a step is what follows from δ𝒴 before it and from both ends of it.
             of_state = share * Q @ own.A + (1.0 - share) * previous
@@ -209,14 +199,7 @@ class RecursiveExciting:
             )
             return [Filter(A, old, new)], [inverse[:, None, None] * np.eye(p, 3 * p, 2 * p)]
 
-        return self._law.update(
-            regression, new[:, None], (inverse[:, None] * e_2)[:, None], known[:, None], errors
-        )
-
-    @property
-    def requirement(self) -> Requirement:
-        """γ∫Φ_21² so far."""
-        return sampled_requirement(self._law, "IE")
+        return Mixed(new[:, None], (inverse[:, None] * e_2)[:, None], known[:, None], errors)
 
 
 ESTIMATOR = Exciting

@@ -21,20 +21,13 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
 from gpebo_cli.estimators._extension import averaged, lagged
-from gpebo_cli.estimators._mixed import MixedEstimates, sampled_requirement, scalar_errors
+from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
 from gpebo_cli.estimators._mixing import mix
-from gpebo_cli.estimators._recursive import (
-    Filter,
-    ScalarLaw,
-    inverse_sampled,
-    mix_sampled,
-)
-from gpebo_cli.findings import Requirement
+from gpebo_cli.estimators._recursive import Filter, Mixed, inverse_sampled, mix_sampled
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
-from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.samples import Past, SampledRegression, delayed
 from gpebo_cli.schema import number
@@ -68,13 +61,13 @@ class Instrumental(GainEstimator):
         """Means of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c)."""
         return averaged(regression, *self.seconds)
 
-    def recursive(self, parameters: Sequence[str]) -> RecursiveInstrumental:
+    def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
         """The estimator at samples.
 
         Raises:
             ConfigError: the delay or T₀ is not positive.
         """
-        return RecursiveInstrumental(self, parameters)
+        return RecursiveMixed(self, parameters, SampledMeans(self, parameters))
 
     def left(self, means: Array, names: Sequence[str]) -> Array:  # noqa: ARG002
         """What makes p equations of the 2p means (N, 2p, p + c), (N or 1, p, 2p)."""
@@ -111,8 +104,8 @@ class Instrumental(GainEstimator):
         return tuple(partial(at, gain) for gain in self.gains("gamma", names))
 
 
-class RecursiveInstrumental:
-    """The means at samples, with integrals as the hold has them; mixing, and the scalar law."""
+class SampledMeans:
+    """The means at samples, with integrals as the hold has them, and mixing."""
 
     def __init__(self, settings: Instrumental, parameters: Sequence[str]) -> None:
         self._settings, self._names = settings, parameters
@@ -122,11 +115,9 @@ class RecursiveInstrumental:
         self._past: Past | None = None
         self._late: Array | None = None  # ψ(t − d) at the last sample
         self._start: float | None = None
-        gains = settings.gains("gamma", parameters)
-        self._law = ScalarLaw(settings.start(parameters), gains, 1)
 
-    def update(self, regression: SampledRegression) -> SampledEstimates:
-        """Take K samples and give the estimates at each."""
+    def update(self, regression: SampledRegression) -> Mixed:
+        """Δ and η̄ at K samples."""
         t, p, rows = regression.t, regression.p, regression.rows
         psi = rows[..., :p]
         flat = psi[1:].reshape(len(t), -1)
@@ -154,12 +145,7 @@ class RecursiveInstrumental:
             own = (each / spans[1:] for each in (keep, old * seen[:-1], new * seen[1:]))
             return [Filter(*own)], [inverse_sampled(extended) @ left]
 
-        return self._law.update(regression, *mix_sampled(extended), behind)
-
-    @property
-    def requirement(self) -> Requirement:
-        """γ∫Δ² so far."""
-        return sampled_requirement(self._law, "Δ not in L2")
+        return Mixed(*mix_sampled(extended), behind)
 
 
 ESTIMATOR = Instrumental

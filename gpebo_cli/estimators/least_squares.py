@@ -73,29 +73,6 @@ class LeastSquares(ResumableEstimator):
         """M as a number, or None without a bound."""
         return None if self.bound is None else number(self.bound, "estimator.bound")
 
-    def known_at(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> list[tuple[InformationAt, ExtensionState]]:
-        """Prepare G_z, h_z and z of every case at the times t (M,), and at the end."""
-        bound = self.covariance_bound
-        made: dict[tuple[float, ...], tuple[InformationAt, ExtensionState]] = {}
-        out = []
-        bounded = bound is not None and max(self.axes()["beta"]) > 0.0
-        keys = [
-            (case["alpha"], case["f0"], case["beta"]) if bounded else (case["beta"],)
-            for case in self.cases
-        ]
-        check_held(regression, len(set(keys)))
-        for i, (case, key) in enumerate(zip(self.cases, keys, strict=True)):
-            if key not in made:
-                info = information(
-                    regression, case["alpha"], case["f0"], case["beta"], bound,
-                    known[i] if known else None,
-                )
-                made[key] = info.at(t), info.reached
-            out.append(made[key])
-        return out
-
     def errors(
         self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
     ) -> tuple[ErrorsAt, ...]:
@@ -115,14 +92,24 @@ class LeastSquares(ResumableEstimator):
 
     def informations(
         self, regression: LinearRegression, known: Sequence[ExtensionState]
-    ) -> tuple[Information, ...]:
-        """G_z, h_z and z of every case, from what was known before."""
-        return tuple(
-            information(
-                regression, case["alpha"], case["f0"], case["beta"], self.covariance_bound, before
-            )
-            for case, before in zip(self.cases, known or repeat(None), strict=False)
-        )
+    ) -> list[Information]:
+        """G_z, h_z and z of every case, from what was known before; those that are equal are one.
+
+        Raises:
+            ConfigError: they would hold too much memory.
+        """
+        bound, cases = self.covariance_bound, self.cases
+        bounded = bound is not None and max(case["beta"] for case in cases) > 0.0
+        needed = ["alpha", "f0", "beta"] if bounded else ["beta"]
+        keys = [tuple(case[name] for name in needed) for case in cases]
+        check_held(regression, len(set(keys)))
+        made: dict[tuple[float, ...], Information] = {}
+        for key, case, before in zip(keys, cases, known or repeat(None), strict=False):
+            if key not in made:
+                made[key] = information(
+                    regression, case["alpha"], case["f0"], case["beta"], bound, before
+                )
+        return [made[key] for key in keys]
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveLeastSquares:
         """The estimator at samples.
@@ -170,13 +157,11 @@ class LeastSquares(ResumableEstimator):
 
         After a reset the prior z f₀ I is about the new parameters, centred at the estimate there.
         """
-        found = self.known_at(regression, t, known)
+        infos = self.informations(regression, known)
+        at = {id(info): info.at(t) for info in infos}
         return LeastSquaresEstimates(
-            self.cases,
-            [information for information, _ in found],
-            self.start(regression.parameters),
-            tuple(reached for _, reached in found),
-            regression.realisations,
+            self.cases, [at[id(info)] for info in infos], self.start(regression.parameters),
+            tuple(info.reached for info in infos), regression.realisations,
         )
 
 

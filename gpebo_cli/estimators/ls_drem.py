@@ -13,17 +13,15 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._information import Information, Spectrum, check_held
-from gpebo_cli.estimators._mixed import MixedEstimates, sampled_requirement, scalar_errors
+from gpebo_cli.estimators._information import Information, Spectrum
+from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
 from gpebo_cli.estimators._mixing import SINGULAR, filled
-from gpebo_cli.estimators._recursive import ScalarLaw, integrating, quotient_of
+from gpebo_cli.estimators._recursive import Mixed, integrating, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
-from gpebo_cli.estimators.least_squares import LeastSquares
-from gpebo_cli.findings import Requirement
+from gpebo_cli.estimators.least_squares import LeastSquares, RecursiveLeastSquares
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
-from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
@@ -84,20 +82,20 @@ class LsDrem(ResumableEstimator):
         gains = self.gains("gamma", regression.parameters)
         return tuple(partial(at, case, info, gain) for case, info in pairs for gain in gains)
 
-    def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveLsDrem:
+    def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law.
 
         Raises:
             ConfigError: forgetting with a bound, which there is in continuous time only.
         """
-        return RecursiveLsDrem(self, parameters, mu)
+        part, cases = self.least_squares.recursive(parameters), self.least_squares.cases
+        return RecursiveMixed(self, parameters, SampledShares(part, cases), "IE", len(cases), mu)
 
     def resume(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,)."""
         part = self.least_squares
-        check_held(regression, len(part.cases))
         infos = part.informations(regression, known)
         return MixedEstimates(
             groups=tuple(
@@ -112,34 +110,26 @@ class LsDrem(ResumableEstimator):
         )
 
 
-class RecursiveLsDrem:
-    """LS+DREM at samples: least squares, mixing, and a closed-form step of the scalar law."""
+@dataclass(frozen=True, eq=False)
+class SampledShares:
+    """Least squares at samples, and mixing; a group for each of its cases."""
 
-    def __init__(self, settings: LsDrem, parameters: Sequence[str], mu: float) -> None:
-        part = settings.least_squares
-        self._part, self._cases = part.recursive(parameters), part.cases
-        gains = settings.gains("gamma", parameters)
-        self._law = ScalarLaw(settings.start(parameters), gains, len(self._cases), mu)
+    part: RecursiveLeastSquares
+    cases: Sequence[Mapping[str, float]]
 
-    def update(self, regression: SampledRegression) -> SampledEstimates:
-        """Take K samples and give the estimates at each."""
-        spectra = self._part.spectra(regression)
+    def update(self, regression: SampledRegression) -> Mixed:
+        """Δ and η̄ at K samples."""
+        spectra = self.part.spectra(regression)
         delta = [
             np.prod(_shares(s, case["alpha"], case["f0"]), axis=1)
-            for s, case in zip(spectra, self._cases, strict=True)
+            for s, case in zip(spectra, self.cases, strict=True)
         ]
         found = [quotient_of(s) for s in spectra]
         quotient, usable, inverse = zip(*found, strict=True)
-        return self._law.update(
-            regression, np.stack(delta, axis=1), np.stack(quotient, axis=1),
-            np.stack(usable, axis=1),
-            lambda: ([integrating(regression, case["beta"]) for case in self._cases], inverse),
+        return Mixed(
+            np.stack(delta, axis=1), np.stack(quotient, axis=1), np.stack(usable, axis=1),
+            lambda: ([integrating(regression, case["beta"]) for case in self.cases], inverse),
         )
-
-    @property
-    def requirement(self) -> Requirement:
-        """γ∫Δ² so far."""
-        return sampled_requirement(self._law, "IE")
 
 
 def mix_least_squares(
@@ -166,26 +156,18 @@ def mix_least_squares(
     usable, delta = np.empty(shape, dtype=bool), np.empty(shape)
     rows, columns = info.gram.values.shape[-2:]
     quotient = np.empty((*shape, rows * (columns - rows)))
-    for first in range(0, mesh.size, _AT_ONCE):  # all spectra at once are what takes the memory
-        part = slice(first, first + _AT_ONCE)
-        points = mesh.points[part]
-        s = info.spectrum(points.ravel(), mesh.inside[part].ravel())
-        own = s.digits > SINGULAR
-        inverse = np.divide(
-            s.rotated, s.eigenvalues[..., None], out=np.zeros_like(s.rotated),
-            where=own[:, None, None],
-        )
-        usable[part] = own.reshape(points.shape)
-        quotient[part] = (s.vectors @ inverse).reshape(*points.shape, -1)  # 𝐘/Δ = G_z⁻¹ h_z
-        delta[part] = np.prod(_shares(s, alpha, f0), axis=1).reshape(points.shape)
     # If no digit is left in the units that are given, each parameter's own size is the unit.
-    in_own_units = not usable.any()
-    for first in range(0, mesh.size if in_own_units else 0, _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        points = mesh.points[part]
-        found, digits = info.at(points.ravel(), mesh.inside[part].ravel()).quotient()
-        usable[part] = (digits > SINGULAR).reshape(points.shape)
-        quotient[part] = found.reshape(*points.shape, -1)
+    for in_own_units in (False, True):
+        for first in range(0, mesh.size, _AT_ONCE):  # all spectra at once would take much memory
+            part = slice(first, first + _AT_ONCE)
+            points = mesh.points[part]
+            at = info.at(points.ravel(), mesh.inside[part].ravel())
+            found, digits = at.quotient() if in_own_units else at.spectrum.quotient()
+            usable[part] = (digits > SINGULAR).reshape(points.shape)
+            quotient[part] = found.reshape(*points.shape, -1)
+            delta[part] = np.prod(_shares(at.spectrum, alpha, f0), axis=1).reshape(points.shape)
+        if usable.any():
+            break
     return scalar_path(mesh, signals, delta, filled(quotient, usable), t, floor=floor)
 
 

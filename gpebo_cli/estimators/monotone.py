@@ -23,7 +23,7 @@ from gpebo_cli.estimators._base import GainEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import SampledMixing, energy_requirement, filter_rates
 from gpebo_cli.estimators._mixing import mix
-from gpebo_cli.estimators._recursive import between, over_steps
+from gpebo_cli.estimators._recursive import Steps
 from gpebo_cli.estimators._scalar import ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.evidence.metrics import DECAY
@@ -189,9 +189,9 @@ class RecursiveMonotone:
 
     def __init__(self, settings: Monotone, parameters: Sequence[str]) -> None:
         self._settings = settings
-        self._mixing = SampledMixing(Drem(rates=settings.rates), parameters)
+        drem = Drem(rates=settings.rates)
+        self._mixing, self._steps = SampledMixing(drem, parameters), Steps()
         self._gains = settings.gains("gamma", parameters)[:, 0]
-        self._before = np.zeros((1, 1)), np.zeros((1, 1, len(parameters))), np.zeros((1, 1), bool)
         self._theta: Array | None = None  # (g, q)
         self._energy, self._mu = 0.0, 1.0
 
@@ -206,10 +206,8 @@ class RecursiveMonotone:
             S, T, self._mu, start = self._settings.law(regression.parametrisation)
             self._S, self._T = S, T
             self._theta = np.tile(start, (len(self._gains), 1))
-        delta, quotient, usable, _ = self._mixing.update(regression)
-        energy = np.where(usable, over_steps(regression, delta**2, self._before[0]), 0.0)[:, 0]
-        goal = between(regression, quotient, usable, *self._before[1:])[:, 0]
-        self._before = delta[-1:] ** 2, quotient[-1:], usable[-1:]
+        mixed = self._mixing.update(regression)
+        energy, goal, _ = self._steps.means(regression, mixed.delta**2, mixed)
         out = np.empty((len(energy), *self._theta.shape))
         for k, x in enumerate(self._gains * energy[:, None]):
             if energy[k] > 0.0:
@@ -217,7 +215,7 @@ class RecursiveMonotone:
             out[k] = self._theta
         self._energy += float(energy.sum())
         eta = self._S.values(out.reshape(-1, out.shape[-1])).reshape(*out.shape[:2], -1)
-        return SampledEstimates(np.moveaxis(eta, 0, 1), delta.T)
+        return SampledEstimates(np.moveaxis(eta, 0, 1), mixed.delta.T)
 
     def _step(self, theta: Array, x: Array, goal: Array) -> Array:
         """θ̂ (g, q) after x (g,) towards T η̄ (q,); in parts, where Newton's method asks for it."""

@@ -18,7 +18,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._mixed import MixedEstimates, SampledMixing, energy_requirement
 from gpebo_cli.estimators._power import PowerLaw
-from gpebo_cli.estimators._recursive import between, over_steps
+from gpebo_cli.estimators._recursive import Steps
 from gpebo_cli.estimators._scalar import ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.findings import Requirement
@@ -119,31 +119,28 @@ class RecursivePower:
     """
 
     def __init__(self, settings: Power, parameters: Sequence[str]) -> None:
-        self._mixing = SampledMixing(settings.linear, parameters)
+        self._mixing, self._steps = SampledMixing(settings.linear, parameters), Steps()
         self._alpha, self._gains = settings.alpha, settings.gains("gamma", parameters)
         self._start = settings.start(parameters)
         self._eta = np.broadcast_to(self._start, (len(self._gains), len(self._start)))
-        self._before = np.zeros((1, 1)), np.zeros((1, 1, len(self._start))), np.zeros((1, 1), bool)
         self._energy, self._error = 0.0, 0.0
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each; nobody knows how errors go through."""
-        delta, quotient, usable, _ = self._mixing.update(regression)
-        powers, rest = np.abs(delta) ** (1.0 + self._alpha), 1.0 - self._alpha
-        energy = np.where(usable, over_steps(regression, powers, self._before[0]), 0.0)
-        goal = between(regression, quotient, usable, *self._before[1:])[:, 0]
-        self._before = powers[-1:], quotient[-1:], usable[-1:]
+        mixed, rest = self._mixing.update(regression), 1.0 - self._alpha
+        powers = np.abs(mixed.delta) ** (1.0 + self._alpha)
+        energy, goal, _ = self._steps.means(regression, powers, mixed)
         out = np.empty((len(self._eta), len(goal), goal.shape[1]))
         for k, towards in enumerate(goal):
             error = towards - self._eta
-            left = np.abs(error) ** rest - rest * self._gains * energy[k, 0]
+            left = np.abs(error) ** rest - rest * self._gains * energy[k]
             self._eta = towards - np.sign(error) * np.maximum(left, 0.0) ** (1.0 / rest)
             out[:, k] = self._eta
         self._energy += float(energy.sum())
-        if usable.any():
-            last = quotient[np.flatnonzero(usable[:, 0])[-1], 0]
+        if mixed.usable.any():
+            last = mixed.quotient[np.flatnonzero(mixed.usable)[-1], 0]
             self._error = float(np.abs(last - self._start).max(initial=0.0))
-        return SampledEstimates(out, delta.T)
+        return SampledEstimates(out, mixed.delta.T)
 
     @property
     def requirement(self) -> Requirement:
