@@ -92,11 +92,15 @@ def test_figures_list_topics_recipes_and_columns():
     assert names("run", "--cfg", "j") == ["job"]
 
 
-def test_folders_are_left_to_the_shell():
-    assert names("run", "--config-dir", "x") == [":folders"]
-    assert names("run", "--config-dir=x") == [":folders--config-dir="]
-    assert names("run", "resume=x") == [":foldersresume="]
-    assert names("compare", "x") == [":folders"]
+def test_folders(here):
+    (here / "plant" / "inner").mkdir()
+    (here / "plant" / ".hidden").mkdir()
+    assert names("run", "--config-dir", "pl") == ["plant/"]
+    assert names("run", "--config-dir=pl") == ["--config-dir=plant/"]
+    assert names("run", "resume=plant/") == ["resume=plant/inner/"]
+    assert names("run", "resume=plant/.") == ["resume=plant/.hidden/"]
+    assert names("compare", "~/pl") == ["~/plant/"]
+    assert names("compare", "nothing/x") == []
 
 
 def test_what_cannot_be_completed_is_nothing():
@@ -137,7 +141,7 @@ LINES = [
     ("gpebo run time.h", {"time.horizon="}),
     ("gpebo run -m estimator=drem,ls", {"estimator=drem,ls_drem"}),
     ("gpebo list pl", {"plants"}),
-    ("gpebo run --config-dir pla", {"plant"}),
+    ("gpebo run --config-dir pla", {"plant/"}),
 ]
 
 
@@ -231,7 +235,7 @@ def test_fish(here):
     )
     answers = done.stdout.split("==\n")[:-1]
     for (line, expected), replies in zip(LINES, answers, strict=True):
-        found = {reply.partition("\t")[0].rstrip("/") for reply in replies.splitlines()}
+        found = {reply.partition("\t")[0] for reply in replies.splitlines()}
         assert found == expected, line
 
 

@@ -22,9 +22,6 @@ from gpebo_cli.results.names import FIGURE_NAMES, FORMATS, METRICS
 from gpebo_cli.schema import nearest, shown
 
 VOLUME = ("--quiet", "--verbose")
-FOLDERS = ":folders"
-"""Answered instead of candidates where a folder is wanted: the shell knows them better."""
-
 _LAUNCHER = "launcher"
 _SWEEP_FOLDERS = ("resume", "hydra.run.dir", "hydra.sweep.dir")
 _FIXED = {
@@ -42,23 +39,15 @@ _NOT_KEYS = ("name", "title", "reference", "defaults", "hydra")
 _BASH = """\
 # bash completion for gpebo; in ~/.bashrc:  eval "$(gpebo completion bash)"
 _gpebo() {
-    local line="${COMP_LINE:0:COMP_POINT}" cur="${COMP_WORDS[COMP_CWORD]}" word before reply folder
+    local line="${COMP_LINE:0:COMP_POINT}" cur="${COMP_WORDS[COMP_CWORD]}" word before reply
     word="${line##*[[:space:]]}"
     [[ $cur == [=:] ]] && cur=""
     before="${word%"$cur"}"
     COMPREPLY=()
     while IFS=$'\\t' read -r reply _; do
-        if [[ $reply == :folders* ]]; then
-            reply="${reply#:folders}"
-            compopt -o filenames 2>/dev/null
-            while IFS= read -r folder; do
-                folder="$reply$folder"
-                COMPREPLY+=("${folder#"$before"}")
-            done < <(compgen -d -- "${word#"$reply"}")
-            return
-        fi
-        case $reply in *=|*.|*\\[) compopt -o nospace 2>/dev/null ;; esac
-        COMPREPLY+=("${reply#"$before"}")
+        case $reply in *=|*.|*\\[|*/) compopt -o nospace 2>/dev/null ;; esac
+        reply="${reply#"$before"}"
+        COMPREPLY+=("${reply// /\\\\ }")
     done < <("${COMP_WORDS[0]}" __complete --line "$line" 2>/dev/null)
 }
 complete -F _gpebo gpebo
@@ -71,11 +60,7 @@ _gpebo() {
     local -a plain open shown_plain shown_open
     local reply text
     while IFS=$'\\t' read -r reply text; do
-        if [[ $reply == :folders* ]]; then
-            compset -P "${(b)reply#:folders}"
-            _files -/
-            return
-        elif [[ $reply == *(=|.|\\[) ]]; then
+        if [[ $reply == *(=|.|/|\\[) ]]; then
             open+=("$reply"); shown_open+=("$reply${text:+  -- $text}")
         else
             plain+=("$reply"); shown_plain+=("$reply${text:+  -- $text}")
@@ -91,16 +76,7 @@ _FISH = """\
 # fish completion for gpebo; in ~/.config/fish/config.fish:  gpebo completion fish | source
 function __gpebo
     set -l words (commandline -opc) (commandline -ct)
-    set -l replies ($words[1] __complete $words[2..-1] 2>/dev/null)
-    if string match -q ':folders*' -- "$replies[1]"
-        set -l before (string replace ':folders' '' -- $replies[1])
-        set -l typed (string replace -- "$before" '' (commandline -ct))
-        for folder in (__fish_complete_directories "$typed" '')
-            printf '%s%s\\n' "$before" $folder
-        end
-    else
-        printf '%s\\n' $replies
-    end
+    $words[1] __complete $words[2..-1] 2>/dev/null
 end
 complete -c gpebo -f -a '(__gpebo)'
 """
@@ -149,28 +125,24 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
     if not before:
         return _starting(word, [*commands, "--help", "--version"])
     command, *before = before
-    flag, equals, _ = word.partition("=")
-    if before and before[-1] in _FOLDER_OPTIONS:
-        return [FOLDERS]
-    if equals and flag in _FOLDER_OPTIONS:
-        return [f"{FOLDERS}{flag}="]
+    last, (key, equals, _) = "".join(before[-1:]), word.partition("=")
+    if last in _FOLDER_OPTIONS or (equals and key in (*_FOLDER_OPTIONS, *_SWEEP_FOLDERS)):
+        return _folders(word)
     if command in ("run", "check"):
         return _of_run(command, before, word)
-    found: dict[str, list[str]] = {
-        "list": list(KINDS),
+    if key == "figures.formats" and equals:
+        return _listed(word, FORMATS)
+    if command in ("compare", "report") and last != "--sort" and not word.startswith("-"):
+        return _folders(word)
+    found: dict[str, Iterable[str]] = {
+        "list": KINDS,
         "figures": [*choices(conf_folder(), "experiment"), "figures.formats=", *VOLUME],
         "new": [] if before else ["plant", "estimator", "observer", "recipe", "recording"],
         "reproduce": [*choices(conf_folder(), "experiment/published"), *VOLUME],
-        "completion": list(SCRIPTS),
+        "completion": SCRIPTS,
+        "compare": METRICS if last == "--sort" else (),
     }
-    if word.startswith("figures.formats="):
-        return _listed("figures.formats=", word, FORMATS)
-    if command in ("compare", "report"):
-        if before[-1:] == ["--sort"]:
-            return _starting(word, METRICS)
-        if not word.startswith("-"):
-            return [FOLDERS]
-    return _starting(word, [*found.get(command, []), *_options(command)])
+    return _starting(word, [*found.get(command, ()), *_options(command)])
 
 
 def _options(command: str) -> list[str]:
@@ -185,15 +157,13 @@ def _options(command: str) -> list[str]:
 def _of_run(command: str, before: Sequence[str], word: str) -> list[str]:
     """Options, groups and keys, and the values of those that have a few."""
     folders = [conf_folder(), *_config_dir(before)]
-    last = before[-1] if before else ""
+    last = "".join(before[-1:])
     if last in ("--config-name", "-cn"):
         return _starting(word, [name for folder in folders for name in choices(folder, "")])
-    for short, long in (("-c", "--cfg"), ("-i", "--info")):
-        if last in (short, long):
-            return _starting(word, VALUES[long])
+    if long := {"-c": "--cfg", "-i": "--info"}.get(last, last if last in VALUES else ""):
+        return _starting(word, VALUES[long])
     if word.startswith("-"):
-        more = ["--json"] if command == "check" else ["-m"]
-        return _starting(word, [*more, "--help", *OPTIONS])
+        return _starting(word, ["--json" if command == "check" else "-m", "--help", *OPTIONS])
     key, equals, _ = word.partition("=")
     if equals:
         return _values(key, word, folders)
@@ -202,10 +172,8 @@ def _of_run(command: str, before: Sequence[str], word: str) -> list[str]:
 
 
 def _values(key: str, word: str, folders: Sequence[str]) -> list[str]:
-    if key in _SWEEP_FOLDERS:
-        return [f"{FOLDERS}{key}="]
     if key == "figures" and "[" in word:
-        return _listed("figures=", word, FIGURE_NAMES)
+        return _listed(word, FIGURE_NAMES)
     if key in _FIXED:
         return _starting(word, [f"{key}={value}" for value in _FIXED[key]])
     if key not in (*GROUPS, _LAUNCHER):
@@ -220,11 +188,7 @@ def _values(key: str, word: str, folders: Sequence[str]) -> list[str]:
             if name not in taken:
                 path = os.path.join(folder, key, f"{name}.yaml")
                 titles.setdefault(f"{stem}{name}", described(path)[0])
-    return [
-        f"{text}\t{told}" if told else text
-        for text, told in titles.items()
-        if text.startswith(word)
-    ]
+    return [f"{text}\t{titles[text]}".rstrip() for text in _starting(word, titles)]
 
 
 def _keys(word: str, before: Sequence[str], folders: Sequence[str]) -> list[str]:
@@ -234,9 +198,9 @@ def _keys(word: str, before: Sequence[str], folders: Sequence[str]) -> list[str]
     if not dot:
         top = [key for key in _outline(primary) if key not in (*_NOT_KEYS, "figures")]
         inside = [f"{name}." for name in (*_WITH_KEYS, *top)]
-        return ["figures=", "resume=", "fail_fast=", "hydra.run.dir=", "hydra.sweep.dir=", *inside]
+        return ["figures=", "fail_fast=", *(f"{key}=" for key in _SWEEP_FOLDERS), *inside]
     if section == "hydra":
-        return ["hydra.run.dir=", "hydra.sweep.dir="]
+        return [f"{key}=" for key in _SWEEP_FOLDERS]
     if section in _WITH_KEYS:
         chosen = [w.partition("=")[2] for w in before if w.startswith(f"{section}=")]
         name = chosen[-1] if chosen else default(section)
@@ -264,11 +228,24 @@ def _config_dir(words: Sequence[str]) -> list[str]:
     return []
 
 
-def _listed(stem: str, word: str, names: Iterable[str]) -> list[str]:
+def _folders(word: str) -> list[str]:
+    """Folders that what stands behind an option's ``=`` can become, with a slash at the end."""
+    key, equals, path = word.rpartition("=")
+    stem = key + equals + path[: path.rfind("/") + 1]
+    try:
+        inside = os.scandir(os.path.expanduser(os.path.dirname(path)) or ".")
+    except OSError:
+        return []
+    hidden = os.path.basename(path).startswith(".")
+    found = [one.name for one in inside if one.is_dir() and (hidden or one.name[0] != ".")]
+    return _starting(word, [f"{stem}{name}/" for name in sorted(found)])
+
+
+def _listed(word: str, names: Iterable[str]) -> list[str]:
     """``[a,b`` with one more name."""
     head, separator, _ = word.rpartition("," if "," in word else "[")
     given = head.partition("[")[2].split(",")
-    begun = f"{head}{separator}" if separator else f"{stem}["
+    begun = head + separator if separator else f"{word.partition('=')[0]}=["
     return _starting(word, [f"{begun}{name}" for name in names if name not in given])
 
 
