@@ -78,9 +78,10 @@ def _text(node: ast.expr) -> str:
 
 def _meaning(docstring: str, kind: str) -> str:
     """What the docstring says of an error of this kind; else what the function does."""
-    pattern = rf"^\s*{kind}: (.*?)(?=^\s*\w+Error: |\n\n|\Z)"
+    pattern = rf"(?:^\s*|\(){kind}: (.*?)(?=\s\w+Error: |\n\n|\)\.|\Z)"
     found = re.search(pattern, docstring, re.MULTILINE | re.DOTALL)
     text = found[1] if found else docstring.partition("\n\n")[0]
+    text = re.sub(r" \((?:\w+Error(?:, )?)+\)", "", text)
     return " ".join(text.replace("``", "`").split())
 
 

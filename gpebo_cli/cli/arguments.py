@@ -9,41 +9,32 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
+from gpebo_cli.cli import options
+from gpebo_cli.cli.options import PLAIN, Options
 from gpebo_cli.configs.locations import GROUPS, LOOK, PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.schema import nearest, shown, unknown
+from gpebo_cli.schema import shown, unknown
 
-_SWITCHES = {
-    "--dry-run": "--dry-run",
-    "--hydra-help": "--hydra-help",
-    "-m": "--multirun",
-    "-r": "--run",
-    "--version": "--version",
-    "--resolve": "--resolve",
-    "-q": "--quiet",
-    "-v": "--verbose",
-    "-sc": "--shell-completion",
-}
-_WITH_VALUE = {
-    "-c": "--cfg",
-    "-p": "--package",
-    "-cd": "--config-dir",
-    "-cn": "--config-name",
-    "-i": "--info",
-}
-_LONG = {long: long for long in (*_SWITCHES.values(), *_WITH_VALUE.values())}
-OPTIONS = tuple(_LONG)
-"""Long names of all options of ``gpebo run``."""
-
-_ONE_OF = ("--run", "--multirun", "--cfg", "--info", "--shell-completion", "--hydra-help")
 VALUES = {
     "--cfg": ("job", "hydra", "all"),
     "--info": ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
 }
 """What an option that has few values accepts."""
+
+_WITH_VALUE = {
+    **{flag: f"one of {', '.join(accepted)}" for flag, accepted in VALUES.items()},
+    **dict.fromkeys(("--package", "--config-dir", "--config-name"), "a value"),
+}
+_SWITCHES = (
+    "--multirun", "--dry-run", "--quiet", "--verbose", "--resolve", "--hydra-help", "--version",
+)
+OPTIONS = (*_SWITCHES, *_WITH_VALUE)
+"""Long names of all options of ``gpebo run``."""
+
+_ONE_OF = ("--multirun", "--cfg", "--info", "--hydra-help")
 
 _LOGSPACE = re.compile(r"^([^=]+)=(logspace\([^()'\"]*\))$")
 # What Hydra's grammar reads as a number, a truth value or nothing.
@@ -62,53 +53,35 @@ _KEYS = (
 class Arguments:
     """What ``gpebo run`` was asked to do."""
 
+    given: Options = PLAIN
     overrides: tuple[str, ...] = ()
-    switches: frozenset[str] = frozenset()  # long names
     config_dir: str | None = None  # absolute
     config_name: str = PRIMARY
-    options: Mapping[str, str] = field(default_factory=dict)  # of those with a value
     resume: str | None = None  # absolute folder of a sweep to go on with
     fail_fast: str = ""  # as given; empty: not given
-    dry_run: bool = False
 
     @property
     def of_a_sweep(self) -> str:
         """A word that only a sweep understands, or nothing."""
-        if self.dry_run:
-            return "--dry-run"
-        if self.resume is not None:
-            return "resume"
-        return "fail_fast" if self.fail_fast else ""
+        known = {"--dry-run": self._dry_run, "resume": self.resume, "fail_fast": self.fail_fast}
+        return next((word for word, given in known.items() if given), "")
 
     @property
-    def quiet(self) -> bool:
-        """Whether only errors and warnings are wanted."""
-        return "--quiet" in self.switches
-
-    @property
-    def loud(self) -> bool:
-        """Whether stages and what the solvers did are wanted, too."""
-        return "--verbose" in self.switches
+    def _dry_run(self) -> bool:
+        return "--dry-run" in self.given.switches
 
     @property
     def for_hydra(self) -> list[str]:
         """The overrides that Hydra composes."""
-        return [*self.overrides, *self._sweeper]
-
-    @property
-    def _sweeper(self) -> list[str]:
         # Chosen here rather than in conf/gpebo.yaml: other primary configurations sweep, too.
-        words = [f"hydra/sweeper={_SWEEPER}"]
+        words = [*self.overrides, f"hydra/sweeper={_SWEEPER}"]
         if self.resume is not None:
             folder = quoted(self.resume)
             words += [f"hydra.sweeper.resume={folder}", f"hydra.sweep.dir={folder}"]
         if self.fail_fast:
             words.append(f"hydra.sweeper.fail_fast={self.fail_fast}")
-        if self.dry_run:
-            words.append("hydra.sweeper.dry_run=true")
-        if self.quiet:
-            words.append("hydra.sweeper.quiet=true")
-        return words
+        orders = {"dry_run": self._dry_run, "quiet": self.given.quiet}
+        return words + [f"hydra.sweeper.{key}=true" for key, given in orders.items() if given]
 
     @property
     def folders(self) -> list[str]:
@@ -126,74 +99,52 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
     Args:
         words: after the command.
         command: its name, for messages.
-        more: options that the command has besides those of ``gpebo run``, for messages.
+        more: switches that the command has besides those of ``gpebo run``.
 
     Raises:
         ConfigError: an unknown flag, a flag without its value, a folder or a primary
             configuration that does not exist.
     """
-    overrides: list[str] = []
-    switches: set[str] = set()
-    values: dict[str, str] = {}
-    sweep: dict[str, str] = {}
-    rest = iter(words)
-    for word in rest:
+    for word in words:
         if any("\ud800" <= character <= "\udfff" for character in word):
             raise ConfigError(f"{shown(word)} is not text in UTF-8")
-        if not word.startswith("-"):
-            key, _, text = word.partition("=")
-            if key in _SWEEP_WORDS:
-                sweep[key] = text
-            else:
-                overrides.append(_stored(word))
-            continue
-        given, equals, value = word.partition("=")
-        flag = _SWITCHES.get(given) or _WITH_VALUE.get(given) or _LONG.get(given)
-        if flag is None:
-            key = given.lstrip("-")
-            if key.partition(".")[0] in _KEYS:
-                raise ConfigError(
-                    f"unknown option {shown(given)}; {key} is written without dashes, as in "
-                    f"{key}={value or 'VALUE'}"
-                )
+        key, _, value = word.partition("=")
+        if word.startswith("-") and (key := key.lstrip("-")).partition(".")[0] in _KEYS:
             raise ConfigError(
-                f"unknown option {shown(given)}; see gpebo {command} --help"
-                + nearest(given, [*_LONG, *more])
+                f"{shown(word)} is no option; {key} is written without dashes, as in "
+                f"{key}={value or 'VALUE'}"
             )
-        if flag in _SWITCHES.values():
-            if equals:
-                raise ConfigError(f"{flag} takes no value, got {shown(value)}")
-            switches.add(flag)
-            continue
-        if not equals:
-            value = next(rest, "")
-        values[flag] = _checked(flag, value)
-    config_dir = checked_folder(values.pop("--config-dir", None))
-    config_name = _config_name(values.pop("--config-name", None), config_dir)
+    given = options.parse(command, words, _WITH_VALUE, (*_SWITCHES, *more))
+    _check_questions(given)
+    sweep = {key: text for key, _, text in (word.partition("=") for word in given.words)
+             if key in _SWEEP_WORDS}
+    overrides = [_stored(w) for w in given.words if w.partition("=")[0] not in _SWEEP_WORDS]
+    config_dir = checked_folder(given.config_dir)
+    config_name = _config_name(given.values.get("--config-name"), config_dir)
     overrides = _with_data(overrides, config_name)
-    multirun = "--multirun" in switches
-    _check_questions(switches, values)
+    multirun = "--multirun" in given.switches
     return Arguments(
+        given,
         _with_regression([_override(word, multirun=multirun) for word in overrides]),
-        frozenset(switches),
         config_dir,
         config_name,
-        values,
         _resume(sweep.get("resume")),
         _fail_fast(sweep.get("fail_fast")),
-        "--dry-run" in switches,
     )
 
 
-def _check_questions(switches: Collection[str], values: Mapping[str, str]) -> None:
+def _check_questions(given: Options) -> None:
     """Hydra answers one question at a time."""
-    asked = [flag for flag in _ONE_OF if flag in switches or flag in values]
+    for flag, accepted in VALUES.items():
+        if (value := given.values.get(flag, accepted[0])) not in accepted:
+            raise ConfigError(f"{flag} needs {_WITH_VALUE[flag]}, got {shown(value)}")
+    asked = [flag for flag in _ONE_OF if flag in given.switches or flag in given.values]
     if len(asked) > 1:
         raise ConfigError(f"only one of {', '.join(asked)} at a time")
-    if {"--quiet", "--verbose"} <= set(switches):
+    if given.quiet and given.loud:
         raise ConfigError("-q and -v: one of them")
     for flag in ("--resolve", "--package"):
-        if (flag in switches or flag in values) and "--cfg" not in values:
+        if (flag in given.switches or flag in given.values) and "--cfg" not in given.values:
             raise ConfigError(f"{flag} is for what --cfg prints; add --cfg job")
 
 
@@ -282,16 +233,6 @@ def _fail_fast(given: str | None) -> str:
     if given.lower() not in ("true", "false"):
         raise ConfigError(f"fail_fast: expected true or false, got {shown(given)}")
     return given.lower()
-
-
-def _checked(flag: str, value: str) -> str:
-    accepted = VALUES.get(flag)
-    if accepted is not None and value not in accepted:
-        got = f", got {shown(value)}" if value else ""
-        raise ConfigError(f"{flag} needs one of {', '.join(accepted)}{got}")
-    if not value or value.startswith("-"):
-        raise ConfigError(f"{flag} needs a value; see gpebo run --help")
-    return value
 
 
 def checked_folder(given: str | None) -> str | None:

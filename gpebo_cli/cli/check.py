@@ -51,15 +51,15 @@ _ADVICE = {
 
 def main(words: list[str]) -> int:
     """Print the table, or JSON; 0 if everything that is needed holds, else 1 (ConfigError)."""
-    as_json, sensors = "--json" in words, "sensors=all" in words
+    sensors = "sensors=all" in words
     wrong = [word for word in words if word.startswith("sensors=") and word != "sensors=all"]
     if wrong:
         raise ConfigError(f"{wrong[0]}: the only choice is sensors=all, every state in turn")
     arguments = command_line.parse(
-        [word for word in words if word not in ("--json", "sensors=all")], "check",
-        ("--json", "--help"),
+        [word for word in words if word != "sensors=all"], "check", ["--json"]
     )
-    word = "-m" if "--multirun" in arguments.switches else arguments.of_a_sweep
+    switches = arguments.given.switches
+    word = "-m" if "--multirun" in switches else arguments.of_a_sweep
     if word:
         raise ConfigError(f"gpebo check looks at one configuration; leave out {word}")
     from gpebo_cli.cli import composition
@@ -80,7 +80,7 @@ def main(words: list[str]) -> int:
     found = examined.assumptions
     title = f"plant {job.system.name}, observer {job.settings.observer['name']}"
     sys.stdout.write(
-        _json(examined, tried) if as_json
+        _json(examined, tried) if "--json" in switches
         else _table(title, found, [*_knowledge(examined), *_sensors(tried)])
     )
     return 0 if all(a.holds for a in found) else 1

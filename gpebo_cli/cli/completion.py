@@ -15,13 +15,13 @@ from contextlib import suppress
 
 from gpebo_cli.cli.arguments import OPTIONS, VALUES
 from gpebo_cli.cli.listing import KINDS, described
+from gpebo_cli.cli.options import VOLUME
 from gpebo_cli.cli.usage import HELP_OF
 from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder, default, outline
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.results.names import FIGURE_NAMES, FORMATS, METRICS
 from gpebo_cli.schema import nearest, shown
 
-VOLUME = ("--quiet", "--verbose")
 _LAUNCHER = "launcher"
 _SWEEP_FOLDERS = ("resume", "hydra.run.dir", "hydra.sweep.dir")
 _FIXED = {

@@ -161,7 +161,7 @@ def _words(arguments: Arguments) -> list[str]:
     comma; in brackets it is YAML.
     """
     parser = OverridesParser.create()
-    swept = "--multirun" in arguments.switches
+    swept = "--multirun" in arguments.given.switches
     return [_readable(parser, word, swept=swept) for word in arguments.for_hydra]
 
 
@@ -193,7 +193,7 @@ def compose(hydra: Hydra, arguments: Arguments) -> tuple[DictConfig, bool]:
     config = hydra.config_loader.load_configuration(
         arguments.config_name, words, RunMode.MULTIRUN, validate_sweep_overrides=False
     )
-    swept = "--multirun" in arguments.switches or config.hydra.mode == RunMode.MULTIRUN
+    swept = "--multirun" in arguments.given.switches or config.hydra.mode == RunMode.MULTIRUN
     mode = RunMode.MULTIRUN if swept else RunMode.RUN
     loader = cast("Loader", hydra.config_loader)
     loader.validate_sweep_overrides_legal(
@@ -208,16 +208,14 @@ def compose(hydra: Hydra, arguments: Arguments) -> tuple[DictConfig, bool]:
 def show(hydra: Hydra, arguments: Arguments) -> bool:
     """Answer ``--cfg``, ``--info`` and the like; whether there was such a question."""
     name, words = arguments.config_name, _words(arguments)
-    options = arguments.options
-    if "--hydra-help" in arguments.switches:
+    options = arguments.given.values
+    if "--hydra-help" in arguments.given.switches:
         program = [f"{os.path.basename(sys.argv[0])} run", *words]
         sys.argv = program  # the parser is called after it
         parser = get_args_parser()
         hydra.hydra_help(name, parser, parser.parse_args(words))
-    elif "--shell-completion" in arguments.switches:
-        hydra.shell_completion(name, words)
     elif "--cfg" in options:
-        package, resolve = options.get("--package"), "--resolve" in arguments.switches
+        package, resolve = options.get("--package"), "--resolve" in arguments.given.switches
         hydra.show_cfg(name, words, options["--cfg"], package, resolve)
     elif "--info" in options:
         hydra.show_info(options["--info"], name, words)

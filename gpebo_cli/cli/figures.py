@@ -83,7 +83,7 @@ def _asked(options: Options, config_dir: str | None) -> tuple[list[str], list[st
         if key == _FORMATS:
             formats = _formats(value)
         elif equals and key != "experiment":
-            raise no_option("figures", key, (*_FOLDERS, *CONFIG_DIR, _FORMATS, "--help"))
+            raise no_option("figures", key, (*_FOLDERS, *CONFIG_DIR, _FORMATS))
         else:
             names.append(known_recipe("figures", word.removeprefix("experiment="), known))
     return list(dict.fromkeys(names)), formats

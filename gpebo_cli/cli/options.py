@@ -1,4 +1,4 @@
-"""Words of the commands that Hydra does not run: options with a value, switches, and the rest."""
+"""Words of a command: options with a value, switches, and the rest."""
 
 from __future__ import annotations
 
@@ -6,21 +6,26 @@ from gpebo_cli.errors import ConfigError
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # `gpebo list` loads nothing that Python has not loaded
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
-VOLUME = ("--quiet", "-q", "--verbose", "-v")
+VOLUME = ("--quiet", "--verbose")
 """Switches of commands that take long: nothing but errors, or how long each stage took."""
 
-CONFIG_DIR = {"--config-dir": "a folder", "-cd": "a folder"}
+CONFIG_DIR = {"--config-dir": "a folder"}
 """Where files of one's own are, for those commands that look for some."""
+
+_SHORT = {
+    "-m": "--multirun", "-q": "--quiet", "-v": "--verbose", "-c": "--cfg", "-p": "--package",
+    "-cd": "--config-dir", "-cn": "--config-name", "-i": "--info",
+}
 
 
 class Options:
     """The words of a command, sorted.
 
     Attributes:
-        values: by option, the last one where it was given twice.
-        switches: those that were given.
+        values: by the long name of an option, the last one where it was given twice.
+        switches: those that were given, by their long names.
         words: the rest, in order.
     """
 
@@ -33,18 +38,18 @@ class Options:
 
     @property
     def config_dir(self) -> str | None:
-        """The folder given with ``--config-dir`` or ``-cd``."""
-        return self.values.get("--config-dir", self.values.get("-cd"))
+        """The folder given with ``--config-dir``."""
+        return self.values.get("--config-dir")
 
     @property
     def quiet(self) -> bool:
-        """Whether only errors are wanted."""
-        return not {"--quiet", "-q"}.isdisjoint(self.switches)
+        """Whether only errors and warnings are wanted."""
+        return "--quiet" in self.switches
 
     @property
     def loud(self) -> bool:
-        """Whether stages are wanted, too."""
-        return not {"--verbose", "-v"}.isdisjoint(self.switches)
+        """Whether stages and what the solvers did are wanted, too."""
+        return "--verbose" in self.switches
 
 
 PLAIN = Options({}, frozenset(), ())
@@ -52,16 +57,16 @@ PLAIN = Options({}, frozenset(), ())
 
 
 def parse(
-    command: str, words: Sequence[str], values: Mapping[str, str], switches: Sequence[str] = ()
+    command: str, words: Sequence[str], values: Mapping[str, str], switches: Collection[str] = ()
 ) -> Options:
     """Sort the words of ``gpebo <command>``.
 
     Args:
         command: its name, for messages.
         words: what follows it.
-        values: options that have a value, ``--option VALUE`` or ``--option=VALUE``, and what the
-            value is: "a folder".
-        switches: options that have none.
+        values: long names of options that have a value, ``--option VALUE`` or ``--option=VALUE``,
+            and what the value is: "a folder".
+        switches: long names of options that have none.
 
     Raises:
         ConfigError: an unknown option, or one without its value.
@@ -72,13 +77,16 @@ def parse(
     rest = iter(words)
     for word in rest:
         key, equals, value = word.partition("=")
+        key = _SHORT.get(key, key)
         if key in values:
             value = value if equals else next(rest, "")
             if not value or value.startswith("--"):
                 raise ConfigError(f"{key} needs {values[key]}; see gpebo {command} --help")
             given[key] = value
-        elif word in switches:
-            switched.add(word)
+        elif key in switches:
+            if equals:
+                raise ConfigError(f"{key} takes no value, got {value!r}")
+            switched.add(key)
         elif word.startswith("-"):
             raise no_option(command, key, (*values, *switches, "--help"))
         else:
@@ -90,8 +98,7 @@ def no_option(command: str, key: str, known: Sequence[str]) -> ConfigError:
     """The error for an option that the command does not have."""
     from gpebo_cli.schema import nearest, shown
 
-    long = [name for name in known if name.startswith("--") or len(name) > 3]
     return ConfigError(
-        f"gpebo {command}: {shown(key)} is no option; known: {', '.join(long)}"
-        + nearest(key, long)
+        f"gpebo {command}: {shown(key)} is no option; see gpebo {command} --help"
+        + nearest(key, known)
     )

@@ -21,7 +21,7 @@ STDIN = "-"  # as data.file: rows are read from standard input, as they come
 def main(words: list[str]) -> int:
     """Do what the words after ``gpebo run`` ask for; the exit code."""
     arguments = command_line.parse(words)
-    if "--version" in arguments.switches:
+    if "--version" in arguments.given.switches:
         from gpebo_cli._version import __version__
 
         sys.stdout.write(f"gpebo {__version__}\n")
@@ -65,21 +65,21 @@ def _once(config: DictConfig, arguments: Arguments) -> int:
 
         return stream.run(job.settings, job.system)
     # Its name has parts of the configuration, which has been checked by now.
-    folder = os.path.abspath(str(config.hydra.run.dir))
+    folder, given = os.path.abspath(str(config.hydra.run.dir)), arguments.given
     from gpebo_cli.results.files import make_folder
     from gpebo_cli.results.report import loud_lines, run_lines
 
     make_folder(Path(folder))  # now, and not after an hour, if it cannot be made
     try:
-        result = run_job(job, folder, quiet=arguments.quiet, loud=arguments.loud)
+        result = run_job(job, folder, quiet=given.quiet, loud=given.loud)
     except BaseException:
         remove_if_empty(folder)
         raise
 
-    lines = [] if arguments.quiet else run_lines(result, os.path.relpath(folder))
+    lines = [] if given.quiet else run_lines(result, os.path.relpath(folder))
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     sys.stdout.flush()  # before what follows on stderr
-    more = loud_lines(result) if arguments.loud else []
+    more = loud_lines(result) if given.loud else []
     more += [f"gpebo: warning: {line}" for line in result.warnings]
     sys.stderr.write("".join(f"{line}\n" for line in more))
     return 0

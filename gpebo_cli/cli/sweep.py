@@ -77,7 +77,7 @@ def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
     interrupts.check()
     try:
         job = read_job(cfg, arguments, draw=False)
-        rows = case_rows(run_job(job, str(folder), quiet=True, loud=arguments.loud))
+        rows = case_rows(run_job(job, str(folder), quiet=True, loud=arguments.given.loud))
         cases = [{k: v if math.isfinite(v) else None for k, v in row.items()} for row in rows]
     except GpeboError as raised:
         error = str(raised)
