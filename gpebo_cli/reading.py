@@ -68,13 +68,8 @@ def finite(value: str | float) -> float:
 def beside(file: str, source: str, where: str) -> str:
     """Where a file that a plant names is: beside the plant's, in its ``--config-dir``, or here.
 
-    Args:
-        file: its path as the plant has it.
-        source: the plant's file; empty for what a caller gives from Python, who may name any file.
-        where: plant and key, for messages.
-
-    Raises:
-        ConfigError: elsewhere, of a plant from a file, which may be a stranger's.
+    Without the plant's file as ``source`` it is from Python, which may name any file. Elsewhere it
+    is refused (ConfigError): a plant's file may be a stranger's.
     """
     if not source:
         return file

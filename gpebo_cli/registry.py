@@ -77,13 +77,7 @@ class Registry(Generic[T]):
     def able(self, one: T | None, capability: type[Capability], asked: str) -> Capability:
         """``one`` as something that has a capability, a protocol.
 
-        Args:
-            one: any.
-            capability: its protocol.
-            asked: what is asked for and by which setting, for the message.
-
-        Raises:
-            ConfigError: it has not; names those that have.
+        If it has not, a ConfigError begins with what is ``asked`` for, by which setting.
         """
         if isinstance(one, capability):
             return one

@@ -35,15 +35,9 @@ def choose(
 ) -> tuple[dict[str, Any], str]:
     """The content of a group and the file that it is from.
 
-    Args:
-        group: ``plant``, ``observer``, ``estimator`` or ``solver``.
-        given: None (the default), the name of a file of the group, or a mapping: its ``name``
-            is that of a file, whose values hold where the mapping says nothing. Of a plant, a
-            path to a file or a mapping that is the whole of it.
-        config_dir: a folder of one's own with ``GROUP/NAME.yaml``.
-
-    Raises:
-        ConfigError: nothing has that name, or the file is wrong.
+    ``given`` is None (the default), the name of a file of the group, or a mapping: its ``name`` is
+    that of a file, whose values hold where the mapping says nothing. Of a plant, it is also the
+    path of a file, or a mapping that is the whole of it (ConfigError: nothing has that name).
     """
     if group in _WHOLE and isinstance(given, Mapping):
         return dict(given), ""

@@ -115,12 +115,7 @@ def _split(line: str) -> list[str]:
 
 
 def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
-    """What the last word can become, each with a description behind a tab where there is one.
-
-    Args:
-        words: after ``gpebo``, the last one being typed.
-        commands: names of all commands.
-    """
+    """What the last of the words after ``gpebo`` can become, with a description behind a tab."""
     *before, word = words
     if not before:
         return _starting(word, [*commands, "--help", "--version"])

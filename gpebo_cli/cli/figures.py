@@ -113,13 +113,7 @@ def _formats(text: str) -> list[str]:
 def run_recipes(
     names: list[str], options: Options = PLAIN, config_dir: str | None = None
 ) -> Iterator[Recipe]:
-    """Compose and run recipes, one at a time.
-
-    Args:
-        names: of recipes.
-        options: how much to say.
-        config_dir: a folder of one's own.
-    """
+    """Compose and run recipes, one at a time, those of a folder of one's own included."""
     from omegaconf import OmegaConf
 
     from gpebo_cli.cli.composition import session
@@ -165,13 +159,7 @@ def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConf
 
 
 def run_recipe_job(cfg: DictConfig, arguments: Arguments, options: Options) -> RunResult:
-    """Run one composed configuration; nothing is written.
-
-    Args:
-        cfg: the configuration.
-        arguments: where files came from.
-        options: how much to say.
-    """
+    """Run one composed configuration; nothing is written."""
     from gpebo_cli.cli.job import read_job
     from gpebo_cli.cli.progress import Progress
     from gpebo_cli.experiment.pipeline import run_experiment

@@ -32,12 +32,9 @@ class Job:
 
 
 def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
-    """The job that ``cfg`` describes.
+    """The job that ``cfg`` describes, with or without Hydra's section.
 
-    Args:
-        cfg: the composed configuration, with or without Hydra's section.
-        arguments: the command line, for where files came from.
-        draw: whether figures are drawn unless the configuration says otherwise.
+    ``draw``: whether figures are drawn unless the configuration says otherwise.
     """
     config = composition.plain(cfg)
     settings = configuration.settings(config, draw=draw)
@@ -55,14 +52,7 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
 
 
 def run_job(job: Job, folder: str, *, quiet: bool = False, loud: bool = False) -> RunResult:
-    """Run the experiment of ``job`` and write ``folder``.
-
-    Args:
-        job: what to run.
-        folder: where to write.
-        quiet: whether to leave the terminal alone: a sweep shows its own progress.
-        loud: whether to say how long each stage took.
-    """
+    """Run the experiment of ``job`` and write ``folder``."""
     # Only now, when the configuration is known to be good: half a second of imports.
     from gpebo_cli.experiment.pipeline import run_experiment
     from gpebo_cli.results.figures import check_names

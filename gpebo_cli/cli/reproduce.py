@@ -81,13 +81,8 @@ def reproduced(
 ) -> Iterator[Finding]:
     """Run a recipe of ``experiments/published`` and compare, where its data are here.
 
-    Args:
-        name: of the recipe.
-        options: how much to say meanwhile.
-        pictures: a folder for a small figure of the run, if any.
-
-    Raises:
-        ConfigError: its ``expected`` names no quantity of the run.
+    A small figure of the run goes to the folder ``pictures`` (ConfigError: ``expected`` names no
+    quantity of the run; GpeboError: the run failed).
     """
     from omegaconf import OmegaConf
 

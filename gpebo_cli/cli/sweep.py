@@ -58,12 +58,8 @@ _SUBDIR = "${hydra:job.num}"
 def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
     """Run one job and record what became of it, in whatever process this is.
 
-    A job that fails is recorded and the next one runs; Hydra itself would stop at the first.
-
-    Args:
-        cfg: the job's configuration, without Hydra's section.
-        arguments: the command line, for where files came from.
-        starter: the process of the sweep; if it is killed, this one ends, too.
+    A job that fails is recorded and the next one runs; Hydra itself would stop at the first. If
+    the process ``starter`` of the sweep is killed, this one ends, too.
     """
     workers.follow(starter)
     hydra = HydraConfig.get()
@@ -103,12 +99,9 @@ def run_sweep(
 ) -> None:
     """Run those of ``jobs`` that are not done, write ``results.csv``, print its beginning.
 
-    Args:
-        jobs: the overrides of each job; its number is its place here.
-        config: the composed configuration the jobs start from; ``hydra.sweeper`` says where to go
-            on and when to stop.
-        launcher: Hydra's, which runs :func:`run_sweep_job` somewhere and returns when all is done.
-        loader: composes the configuration of a job.
+    A job is a list of overrides, its number is its place; ``hydra.sweeper`` of ``config``, from
+    which all start, says where to go on and when to stop. The launcher runs
+    :func:`run_sweep_job` somewhere and returns when all is done.
     """
     orders = config.hydra.sweeper
     folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()

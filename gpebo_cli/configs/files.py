@@ -58,12 +58,8 @@ def package(inside: str) -> str:
 def load(folder: str, inside: str) -> dict[str, Any]:
     """The content of ``folder/inside.yaml``; of a file of ours, as it is.
 
-    Args:
-        folder: :func:`conf_folder`, or a folder that may be a stranger's.
-        inside: ``GROUP/NAME``, or the name of a primary configuration.
-
-    Raises:
-        ConfigError: the file cannot be read, or asks for what its kind may not.
+    ``inside`` is ``GROUP/NAME`` or the name of a primary configuration, and the folder may be a
+    stranger's (ConfigError: the file cannot be read, or asks for what its kind may not).
     """
     path = os.path.join(folder, f"{inside}.yaml")
     if folder == conf_folder():

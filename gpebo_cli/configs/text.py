@@ -22,15 +22,9 @@ _Parser: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml is 10 ti
 
 
 def parse(text: str, path: str, *, ours: bool = False) -> Any:
-    """The plain data in a YAML text.
+    """The plain data in a YAML text of the file ``path`` (ConfigError: it is more, or not YAML).
 
-    Args:
-        text: the content of a file.
-        path: its name, for messages.
-        ours: whether it comes with gpebo: then ``${``, which OmegaConf replaces, may stand in it.
-
-    Raises:
-        ConfigError: it is not YAML, or more than data.
+    Only in one of ``ours``, that come with gpebo, may ``${`` stand, which OmegaConf replaces.
     """
     try:
         return _Builder(path, ours=ours).build(text)

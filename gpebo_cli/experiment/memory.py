@@ -16,14 +16,7 @@ _HELD = 4  # arrays of every kind that are alive at once; measured
 
 
 def check(settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cases: int) -> None:
-    """Refuse a run that would need more memory than one run may.
-
-    Args:
-        settings: of the run.
-        system: the plant.
-        levels: of the noise.
-        cases: of the estimator.
-    """
+    """Refuse a run that would need more memory than one run may."""
     for what, numbers in _needs(settings, system, levels, cases, system.n).items():
         try:
             check_memory(what, numbers)

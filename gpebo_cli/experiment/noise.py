@@ -129,10 +129,7 @@ def check_samples(horizon: float, sample_time: float, max_elements: int) -> None
 def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
     """``mesh`` with every sample instant an edge; its own edges stay.
 
-    Args:
-        mesh: of the true signals.
-        sample_time: T_s, seconds.
-        parts: into how many elements an interval between instants is cut.
+    ``parts``: into how many elements an interval between instants is cut.
     """
     start, stop = mesh.edges[0], mesh.edges[-1]
     count = max(1, ceil((stop - start) / sample_time - _SAME))
@@ -148,17 +145,9 @@ def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
 
 
 def measure(signals: Signals, settings: NoiseSettings, levels: NoiseLevels) -> Signals:
-    """The signals as the observer sees them, on a mesh that ends elements at the instants.
+    """u + e, y + e and the true states, on a mesh that ends elements at the sample instants.
 
     Without noise these are ``signals`` themselves, to the last bit.
-
-    Args:
-        signals: the true ones.
-        settings: sample time, shape and seed.
-        levels: see :func:`noise_levels`.
-
-    Returns:
-        u + e, y + e, and the true states.
     """
     if levels.silent:
         return signals

@@ -110,14 +110,14 @@ class Online:
         derivatives: InputDerivatives | None = None,
         columns: IntArray | None = None,
     ) -> None:
-        """Prepare for samples of which the first is at ``start``.
+        """Prepare for samples of which the first, [u; y] (m + r,), is at ``start``.
 
         Args:
             settings: observer, estimator, solver and level of excitation.
             system: the plant.
             hold: what is assumed between samples, zoh or linear.
-            start: time of the first sample.
-            sample: the first one, [u; y] (m + r,).
+            start: seconds.
+            sample: the first one.
             estimator: used instead of the one that the settings name.
             deviations: of what is estimated; None: nobody asks for them.
             derivatives: of the inputs, as far as they are known.
@@ -196,11 +196,7 @@ class Online:
         )
 
     def truth(self, extension: Array) -> observers.Truth:
-        """What the parameters really are at samples, for those who know the states.
-
-        Args:
-            extension: [ξ_a | ξ_b | Φ] at the samples it will be asked about, (K, n_w, 1 + q + n_a).
-        """
+        """What the parameters really are, from [ξ_a | ξ_b | Φ] (K, n_w, 1 + q + n_a)."""
         return self._observer.truth(extension)
 
     def last_states(self, eta: Array) -> Array:
@@ -248,11 +244,8 @@ class Online:
     ) -> Excitation:
         """The evidence of all samples so far, with what is remembered of their way.
 
-        Args:
-            made: what they gave; None: nobody has kept more than the newest.
-            shown: which of those, (M,).
-            pe_level: at those that are shown, (M,).
-            window: of it, seconds.
+        It is shown at some samples (M,) of what ``made`` has, with the ``pe_level`` (M,) over
+        ``window`` seconds; without it, at the newest.
         """
         t, known, eigenvalues = self._newest if made is None else (
             made.regression.t, made.known, made.gram_eigenvalues

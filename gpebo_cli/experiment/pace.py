@@ -14,16 +14,10 @@ _LOOK = 1.0  # seconds after which a loop is known well enough
 
 
 def paced(count: int, what: str, limit: float, share: Callable[[float], None]) -> Loop:
-    """What a loop tells after each part of its rounds.
+    """What a loop of ``count`` rounds calls after each part of them, with how many are done.
 
-    Args:
-        count: of rounds.
-        what: they are, for messages.
-        limit: of computing time in seconds.
-        share: told how much is done.
-
-    Raises:
-        ConfigError: by what is returned; the whole loop would take longer than the limit.
+    It refuses the loop if all of it would take longer than ``limit`` seconds of computing time
+    (ConfigError), and hands on the share that is done.
     """
     begin = process_time()
 

@@ -68,14 +68,14 @@ def over_seeds(
     theta: Array, estimator: Estimator, settings: NoiseSettings, levels: NoiseLevels,
     pace: Pace,
 ) -> NoiseStatistics:
-    """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, …
+    """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, … of all cases.
 
     Args:
         observation: made from the noisy signals of ``seed``.
         observe: makes one from measured signals.
         signals: the true ones.
         theta: true values of the unknowns at the horizon, (1, q).
-        estimator: all of its cases are assessed.
+        estimator: of these cases.
         settings: of the noise.
         levels: of the noise.
         pace: of the loop over seeds.

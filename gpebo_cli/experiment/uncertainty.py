@@ -41,10 +41,8 @@ def sampled_deviations(
 ) -> SampledDeviations | None:
     """Deviations of an observer at samples; None if there is no noise.
 
-    Args:
-        noise: its settings.
-        levels: its levels; zeros mean unknown but for a simulation.
-        source: of the signals; None: a stream, each of whose rows has errors of its own.
+    Levels that are zero are unknown but for a simulation. Without a source the samples are a
+    stream, each of whose rows has errors of its own.
     """
     recorded = source is None or source.recording is not None
     if levels.silent and not recorded:

@@ -54,16 +54,7 @@ def circuit_from_netlist(
     text: str, name: str, file: str = "netlist", measure: str | Iterable[str] | None = None,
     unknown: str | Iterable[str] | None = None,
 ) -> tuple[PlantDraft, Topology]:
-    """The descriptor system of a netlist, and what its topology says.
-
-    Args:
-        text: the netlist.
-        name: of the plant.
-        file: for messages.
-        measure: outputs, each a sum of node voltages and currents of elements, with a name or
-            without: ``"v(out), y=i(L1)+2*i(V)"``.
-        unknown: constant sources whose values are unknown parameters, ``"I5,V3"``.
-    """
+    """The descriptor system of a netlist (see ``from_netlist``), and what its topology says."""
     netlist = read_netlist(text, file)
     topology = examine(netlist, file)
     measured = split_names(measure)

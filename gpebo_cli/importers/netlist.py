@@ -108,15 +108,7 @@ class _Scope(NamedTuple):
 
 
 def read_netlist(text: str, file: str = "netlist") -> Netlist:
-    """Read a netlist.
-
-    Args:
-        text: of the file; its first line is the title.
-        file: its name, for messages.
-
-    Raises:
-        ConfigError: names the line, the element and what would be accepted.
-    """
+    """Read a netlist, whose first line is the title; a ConfigError names line and element."""
     title, lines = _logical_lines(text, file)
     outside, blocks = _blocks(lines)
     reader = _Reader(blocks)

@@ -133,13 +133,7 @@ class Driven:
 def tables(
     inputs: object, where: str, source: str = ""
 ) -> tuple[object, dict[str, Piecewise]]:
-    """The inputs of a file with zero for each table, and the tables by name.
-
-    Args:
-        inputs: what the file has under that key.
-        where: the plant and the key, for messages.
-        source: the file, beside which tables are looked for first.
-    """
+    """The inputs of a plant's file ``source`` with zero for each table, and the tables by name."""
     if not isinstance(inputs, Mapping):
         return inputs, {}
     found = {

@@ -64,19 +64,11 @@ def recording_mesh(
     t: Array, values: Array, hold: str, span: tuple[float, float], source: CoefficientSource,
     tol: float,
 ) -> Mesh:
-    """A mesh on which the held samples and the plant's matrices are resolved, at least cost.
+    """A mesh on which held samples (N, c) at t (N,) and the plant's matrices are resolved.
 
-    Every sample where the held signal is not smooth is an edge. Many samples make short elements
-    on which a few nodes do; few make long ones that want more: of several rules the one that
-    needs the fewest points in all is taken.
-
-    Args:
-        t: sample times (N,).
-        values: samples (N, c) of all signals.
-        hold: between samples.
-        span: start and end of the experiment, within the samples.
-        source: the plant's matrices; their jumps are edges too.
-        tol: of the solver.
+    Every sample where the held signal is not smooth is an edge, and every jump of the matrices.
+    Many samples make short elements on which a few nodes do; few make long ones that want more: of
+    several rules the one that needs the fewest points in all is taken.
     """
     start, stop = span
     inner = (t > start) & (t < stop)

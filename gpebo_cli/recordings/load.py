@@ -52,14 +52,8 @@ def load(
 ) -> Recording:
     """Read ``data.file`` and make signals of it on the time span asked for.
 
-    Args:
-        system: names of the columns, and matrices that the mesh has to resolve.
-        data: the file and the hold rule.
-        time: ``start`` −∞ is the first sample, ``horizon`` ∞ lasts to the last one.
-        tol: of the solver.
-
-    Raises:
-        ConfigError: the file is not a recording of this plant, or shorter than the span.
+    A start of −∞ is the first sample, a horizon of ∞ lasts to the last one (ConfigError: the file
+    is not a recording of this plant, or shorter than the span).
     """
     if data.file == "-":
         raise ConfigError(

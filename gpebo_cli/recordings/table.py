@@ -486,9 +486,7 @@ class LineReader:
     def feed(self, piece: bytes, *, last: bool = False) -> tuple[list[list[float]], str]:
         """Rows that are complete with ``piece``, and what is wrong with the next one, if anything.
 
-        Args:
-            piece: what came.
-            last: nothing else will: what stands behind the last newline is a line, too.
+        After the ``last`` piece what stands behind the last newline is a line, too.
         """
         *lines, self._rest = (self._rest + piece).split(b"\n")
         if last and self._rest.strip():

@@ -71,10 +71,8 @@ def ordered(cases: Sequence[Case], by: str, *, reverse: bool = False) -> list[Ca
 def figures(cases: Sequence[Case], metric: str = "") -> Iterator[tuple[str, Figure]]:
     """Draw, one at a time: error curves, metrics over each number that varies, heat maps.
 
-    Args:
-        cases: in the order in which they matter: of many, the error curves of a few evenly
-            spaced ones are drawn.
-        metric: what heat maps show; empty: that by which cases are ranked.
+    Of many cases, the error curves of a few evenly spaced ones are drawn. Heat maps show
+    ``metric``, by default that by which cases are ranked.
     """
     metric = metric or ranking(case.metrics for case in cases)
     for suffix, members in _comparable(cases).items():

@@ -296,15 +296,8 @@ def describe(
 
     With ``None``, all but what says little: ``signals``, which the paper does not have, is there if
     there was no observer or it saw something else than the truth; ``parameters`` if θ varies or
-    the signals are a recording.
-
-    Args:
-        result: the run.
-        names: of figures.
-        strict: whether a figure that the run has nothing for is refused.
-
-    Raises:
-        ConfigError: a name is unknown, or is refused.
+    the signals are a recording. A name that is unknown is a ConfigError, and, if ``strict``, one
+    that the run has nothing for.
     """
     if names is None:
         noisy = result.signals.measured_outputs is not None

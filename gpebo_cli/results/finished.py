@@ -100,10 +100,7 @@ def is_run(folder: Path) -> bool:
 def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]:
     """All cases of a finished run; none if it had no estimator.
 
-    Args:
-        run: what to call it.
-        folder: its folder.
-        overrides: what distinguishes it from others, where that is known (a job of a sweep).
+    ``overrides`` distinguish it from others, where that is known (a job of a sweep).
     """
     summary = read_summary(folder)
     if summary.get("estimator") is None:

@@ -24,13 +24,7 @@ def write_run(
     What the run does not have (without an observer: all but the plant's signals) is not written,
     and files of the same names from an earlier run in the same folder are removed: none of
     them tells of another run than the others. ``summary.json`` comes last, so that a folder
-    that has one is complete.
-
-    Args:
-        result: the run; ``settings.output.figures`` chooses the figures.
-        folder: where to write.
-        config_text: the resolved configuration, as YAML.
-        made_by: versions and commit; by default those of this process.
+    that has one is complete. Figures that do not exist are refused before anything is written.
     """
     wanted = result.settings.output.figures
     figures = draw(result, None if wanted is True else wanted or [])

@@ -44,14 +44,7 @@ def figures_of(recipe: Recipe) -> dict[str, list[Panel]]:
 def write_recipe(
     folder: Path, recipe: Recipe, figures: Mapping[str, list[Panel]], formats: Sequence[str]
 ) -> Section:
-    """Draw ``figures`` into ``folder``, a CSV file beside each; earlier ones are removed.
-
-    Args:
-        folder: of this recipe.
-        recipe: what was run.
-        figures: what :func:`figures_of` returned.
-        formats: some of :data:`gpebo_cli.results.names.FORMATS`, ``png`` among them.
-    """
+    """Draw ``figures`` into ``folder``, a CSV file beside each; earlier ones are removed."""
     make_folder(folder)
     remove_files(p for s in (*FORMATS, "csv") for p in sorted(folder.glob(f"fig*.{s}")))
     study = STUDIES.get(recipe.name, Study())

@@ -45,9 +45,8 @@ def page(sections: Sequence[Section], made_by: Provenance) -> str:
 def case_table(named: Sequence[tuple[str, dict[str, float]]]) -> list[list[str]]:
     """Header and rows of what distinguishes cases, and their metrics.
 
-    Args:
-        named: name of the run (empty if there is only one) and the case's gains and metrics,
-            named as in ``cases.csv``.
+    Each has the name of its run, empty if there is only one, and gains and metrics by the names
+    of ``cases.csv``.
     """
     if not named:
         return []

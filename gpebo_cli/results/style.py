@@ -238,13 +238,10 @@ def drawn(panel: Panel, curve: Curve) -> Array:
 
 
 def compose(panels: Sequence[Panel], look: OutputSettings | None = None) -> Figure:
-    """Draw ``panels`` below each other over one axis, each below its own legend, if any.
+    """Draw ``panels`` below each other over the first one's axis, each below its own legend.
 
-    At most :data:`MAX_PANELS` are drawn; a line at the bottom says how many were left out.
-
-    Args:
-        panels: the horizontal axis is the first one's.
-        look: width, resolution and style; by default a column at 200 dpi in our own.
+    At most :data:`MAX_PANELS` are drawn; a line at the bottom says how many were left out. By
+    default it is a column at 200 dpi in our own style.
     """
     look = look or OutputSettings()
     shown = panels[:MAX_PANELS]

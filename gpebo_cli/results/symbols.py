@@ -55,10 +55,8 @@ def symbol(gain: str) -> str:
 def math_of(name: str, labels: Mapping[str, str]) -> str:
     r"""A name as mathtext without its dollars; empty where it is a phrase and no symbol.
 
-    Args:
-        name: of a signal or a parameter: ``x1`` becomes ``x_{1}``, ``theta`` becomes ``\theta``,
-            ``e0_il`` becomes ``e_{0,i_L}`` if that is the label of ``il``.
-        labels: what the plant's author writes instead, by name.
+    ``x1`` becomes ``x_{1}``, ``theta`` becomes ``\theta``, and ``e0_il`` becomes ``e_{0,i_L}`` if
+    ``i_L`` is the label of ``il``: ``labels`` are what the plant's author writes, by name.
     """
     if name in labels:
         return labels[name]

@@ -158,18 +158,10 @@ TABLES: dict[str, Callable[[RunResult], Table | None]] = {
 
 
 def frame(result: RunResult, name: str) -> DataFrame:
-    """One table of a run.
+    """One of the :data:`TABLES` of a run (ConfigError: it is none, or this run does not have it).
 
-    Args:
-        result: the run.
-        name: one of :data:`TABLES`.
-
-    Returns:
-        ``signals``, ``regression`` and ``excitation`` are indexed by ``t`` in seconds,
-        ``estimates`` by ``case`` and ``t``, ``cases`` by ``case``.
-
-    Raises:
-        ConfigError: there is no table of that name, or this run does not have it.
+    ``signals``, ``regression`` and ``excitation`` are indexed by ``t`` in seconds, ``estimates`` by
+    ``case`` and ``t``, ``cases`` by ``case``.
     """
     if name not in TABLES:
         raise unknown(f"there is no table {name!r}", name, TABLES)
