@@ -65,6 +65,7 @@ def regression(K=40, r=2, p=3, hold="zoh", steps=None):
         ("circuit", {"name": "ls_drem", "gamma": 10}),
         ("circuit", {"name": "ls_drem", "gamma": 10, "beta": 0.2}),
         ("circuit", {"name": "drem"}),
+        ("circuit", {"name": "lion"}),
         ("descriptor", {"name": "ls_drem", "gamma": 5}),
         ("circuit", {"name": "fct", "gamma": 1e8}),
         ("circuit", {"name": "fct", "extension": "least_squares", "gamma": 1}),
@@ -291,6 +292,19 @@ def test_filters_of_a_constant_are_exact_at_any_steps(hold):
     np.testing.assert_allclose(values, expected, rtol=1e-12, atol=1e-14)
 
 
+def test_rows_that_were_zero_so_far_are_not_taken():
+    """Two rows alone, then three: from the sample on which the third wakes, all start anew."""
+    block, rates = regression(K=40, r=3, hold="linear"), np.array([0.5, 1.0, 2.0])
+    block.rows[:, 2] = 0.0
+    two = replace(block, rows=block.rows[:, :2])
+    own, alone = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
+    np.testing.assert_array_equal(own.update(block), alone.update(two))
+    block.rows[20:] = regression(K=20, r=3, hold="linear").rows
+    part = replace(block, t=block.t[19:], steps=block.steps[19:], rows=block.rows[19:])
+    own, late = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
+    np.testing.assert_array_equal(own.update(block)[19:], late.update(part))
+
+
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 @pytest.mark.parametrize("gain", [1e-3, 1.0, 1e6, 1e14])
 def test_the_scalar_law_is_stable_for_any_gain_and_any_sample_time(hold, gain):
@@ -411,9 +425,13 @@ def test_the_monotone_law_at_samples(gain):
 NOT_ALONG_RESETS = ["exciting", "instrumental", "annihilator", "monotone"]
 
 
-def test_estimators_of_continuous_time_say_what_there_is():
-    with pytest.raises(ConfigError, match="these can: annihilator, drem, exciting, fct, gradient"):
-        estimators.able(estimators.build({"name": "lion"}), estimators.Recursive, "samples")
+def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():
+    assert all(
+        isinstance(estimators.build({"name": name}), estimators.Recursive)
+        for name in estimators.names()
+    )
+    with pytest.raises(ConfigError, match=r"these can: annihilator, drem, exciting, .*, lion"):
+        estimators.able(object(), estimators.Recursive, "samples")
 
 
 @pytest.mark.parametrize("name", NOT_ALONG_RESETS)

@@ -123,6 +123,7 @@ def fed(system, estimator, t, u, y, hold="linear", noise=None, cut=0):
     ("zoh", {"name": "gradient"}), ("linear", {"name": "gradient"}), ("zoh", {"name": "mre"}),
     ("linear", {"name": "mre"}), ("linear", {"name": "fct", "gamma": 1e8}),
     ("zoh", {"name": "exciting"}), ("linear", {"name": "exciting", "kappa": 1e7}),
+    ("linear", {"name": "lion", "gamma": 1e6}),
 ])
 def test_at_samples_they_are_what_each_error_by_itself_does(hold, estimator):
     """Estimates are affine in every sample: the variances of the responses add up, to rounding."""

@@ -86,6 +86,14 @@ class FilteredEstimator(ResumableEstimator):
 
         return tuple(partial(at, gain) for gain in self.gains("gamma", names))
 
+    def at_samples(self, rates: Array) -> KreisselmeierFilter:
+        """The filters in discrete time, with rates of shape (p,)."""
+        return KreisselmeierFilter(rates, self.seen)
+
+    def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
+        """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
+        return RecursiveMixed(self, parameters, SampledMixing(self, parameters), mu=mu)
+
     @abstractmethod
     def seen(self, psi: Array) -> Array:
         """What the filters of 𝒴 take of Y, (N, p, rows), for ψ (N, rows, p)."""
@@ -161,14 +169,14 @@ class SampledMixing:
     """The filters of an estimator at samples, and mixing; one group."""
 
     def __init__(self, settings: FilteredEstimator, parameters: Sequence[str]) -> None:
-        self._filter = KreisselmeierFilter(filter_rates(settings.rates, parameters), settings.seen)
+        self._filter = settings.at_samples(filter_rates(settings.rates, parameters))
 
     def update(self, regression: SampledRegression) -> Mixed:
         """Δ and η̄ at K samples."""
         extended = self._filter.update(regression)
         return Mixed(
             *mix_sampled(extended),
-            lambda: ([self._filter.errors(regression)], [inverse_sampled(extended)]),
+            lambda: ([self._filter.errors()], [inverse_sampled(extended)]),
         )
 
 

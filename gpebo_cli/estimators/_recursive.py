@@ -236,28 +236,31 @@ class KreisselmeierFilter:
     ζ (p, rows) is ψᵀ, or what else an extension makes of ψ.
     """
 
-    def __init__(self, rates: Array, seen: Callable[[Array], Array] = transpose) -> None:
-        self._seen, self._rates = seen, rates[:, None]  # one per row
+    def __init__(self, rates: Array, zeta: Callable[[Array], Array] = transpose) -> None:
+        self._zeta, self._rates = zeta, rates[:, None]  # one per row
         self._value = np.zeros((len(rates), len(rates) + 1))
 
     def update(self, regression: SampledRegression) -> Array:
         """[Ω | 𝒴] (K, p, p + 1) at the samples."""
-        outer = self._seen(regression.rows[..., : regression.p]) @ regression.rows
-        decay, of_new, of_old = self._steps(regression)
-        values = affine_scan(decay, of_new * outer[1:] + of_old * outer[:-1], self._value)[1:]
+        x = self._rates * regression.steps[:, None, None]  # (K, p, 1)
+        decay = np.exp(-x)
+        of_new, of_old = _shares(x, decay, regression.hold)
+        kept, old, new = self.seen(regression)
+        self._last = decay, old, new = kept * decay, of_old * old, of_new * new
+        taken = new @ regression.rows[1:] + old @ regression.rows[:-1]
+        values = affine_scan(decay, taken, self._value)[1:]
         self._value = values[-1]
         return values
 
-    def _steps(self, regression: SampledRegression) -> tuple[Array, Array, Array]:
-        x = self._rates * regression.steps[:, None, None]  # (K, p, 1)
-        decay = np.exp(-x)
-        return decay, *_shares(x, decay, regression.hold)
+    def seen(self, regression: SampledRegression) -> tuple[Array | float, Array, Array]:
+        """0 where a step starts anew, else 1, and ζ at its ends, (K, p, rows) each."""
+        zeta = self._zeta(regression.rows[..., : regression.p])
+        return 1.0, zeta[:-1], zeta[1:]
 
-    def errors(self, regression: SampledRegression) -> Filter:
-        """What the filter of 𝒴 does to errors of Y."""
-        decay, of_new, of_old = self._steps(regression)
-        into = self._seen(regression.rows[..., : regression.p])
-        return Filter(decay * np.eye(regression.p), of_old * into[:-1], of_new * into[1:])
+    def errors(self) -> Filter:
+        """What the filter of 𝒴 does to errors of Y, over the steps of the last update."""
+        decay, old, new = self._last
+        return Filter(decay * np.eye(len(self._rates)), old, new)
 
 
 def inverse_sampled(extended: Array) -> Array:

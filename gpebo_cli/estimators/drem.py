@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._following import follow
-from gpebo_cli.estimators._mixed import (
-    FilteredEstimator,
-    RecursiveMixed,
-    SampledMixing,
-    filter_rates,
-)
+from gpebo_cli.estimators._mixed import FilteredEstimator, filter_rates
 from gpebo_cli.estimators._vector import VectorEstimates
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
@@ -42,10 +36,6 @@ class Drem(FilteredEstimator):
     def size(self, regression: LinearRegression) -> float:
         """The size of ψᵀψ, which no filter exceeds."""
         return largest(regression.outer.values)
-
-    def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
-        """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
-        return RecursiveMixed(self, parameters, SampledMixing(self, parameters), mu=mu)
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array

@@ -8,10 +8,12 @@ import numpy as np
 
 from gpebo_cli.estimators._extension import lion
 from gpebo_cli.estimators._mixed import FilteredEstimator
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.estimators._recursive import KreisselmeierFilter
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.samples import SampledRegression
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +32,33 @@ class Lion(FilteredEstimator):
         rows, p = psi.shape[1:]
         return np.broadcast_to(np.eye(rows)[np.arange(p) % rows], (len(psi), p, rows))
 
+    def at_samples(self, rates: Array) -> KreisselmeierFilter:
+        """The filters, with rates of shape (p,), where no row is known before its sample."""
+        return _RowFilter(rates)
+
     def size(self, regression: LinearRegression) -> float:
         """The size of p rows of ψ, which no filter exceeds."""
         return float(np.sqrt(regression.p * largest(regression.outer.values)))
+
+
+class _RowFilter(KreisselmeierFilter):
+    """Row i takes row i mod r of the r rows whose ψ was not zero at all samples so far.
+
+    Where one more is not, the filters start anew.
+    """
+
+    _awake: BoolArray | bool = False
+
+    def seen(self, regression: SampledRegression) -> tuple[Array | float, Array, Array]:
+        """0 where a step starts anew, else 1, and which rows are taken (K, p, rows), twice."""
+        awake = np.asarray(regression.rows[..., :-1].any(axis=2))
+        awake[0] = self._awake
+        awake = np.logical_or.accumulate(awake)  # (K + 1, rows)
+        self._awake, kept = awake[-1], (awake[1:] == awake[:-1]).all(axis=1)
+        order = np.argsort(~awake[1:], axis=1, kind="stable")
+        place = np.arange(regression.p) % np.maximum(awake[1:].sum(axis=1), 1)[:, None]
+        rows = np.eye(order.shape[1])[np.take_along_axis(order, place, axis=1)]
+        return kept[:, None, None] * 1.0, rows, rows
 
 
 ESTIMATOR = Lion

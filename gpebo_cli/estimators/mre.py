@@ -138,7 +138,7 @@ class RecursiveMemoryExtension:
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δ𝒴 of the filters, δη̂' = (I − L∫Ω) δη̂ + L ∫δ𝒴, of every case."""
-            own, K = self._filter.errors(regression), len(omega)
+            own, K = self._filter.errors(), len(omega)
             old, new = (share[:, None, None] for share in regression.shares)
             out = []
             for by, left in zip(L, shrunk, strict=True):

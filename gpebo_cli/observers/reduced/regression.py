@@ -17,7 +17,7 @@ from gpebo_cli.reduction.form import EquationForm
 
 _ROUNDING = 1e-3  # of a projection, in terms of what is resolved
 _NOISE = 1e-11  # of the terms of a gain: beyond what extensions are resolved to
-_VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
+VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
 OVER_TIME = ("Y", "psi", "offset", "gain")  # of what is assembled
 
 
@@ -94,8 +94,8 @@ class Assembled:
     def _rows(self) -> IntArray:
         """Rows of the residual that are more than rounding of their terms."""
         in_psi, in_Y = largest_over_time(self.psi), largest_over_time(self.Y)
-        large = (in_psi > _VANISHING * self.column_scale).any(axis=1)
-        kept: IntArray = (large | (in_Y > _VANISHING * self.Y_scale)).nonzero()[0]
+        large = (in_psi > VANISHING * self.column_scale).any(axis=1)
+        kept: IntArray = (large | (in_Y > VANISHING * self.Y_scale)).nonzero()[0]
         return kept
 
 
@@ -116,7 +116,7 @@ def regression_signals(
     )
     if basis.shape[0] == basis.shape[1]:  # the kernel of E turns: products with w cancel, too
         sizes = np.maximum(sizes, (np.abs(algebraic) @ np.abs(z)).max(axis=(0, 1), initial=0.0))
-        nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= _VANISHING * sizes[1:]
+        nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= VANISHING * sizes[1:]
         psi = np.where(nothing, 0.0, psi)
     largest, used = largest_over_time(z), np.asarray(H.any(axis=(0, 2)))
     moving = np.abs(basis) @ largest[:, 1:]

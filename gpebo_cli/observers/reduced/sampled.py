@@ -28,7 +28,12 @@ from gpebo_cli.observers._base import ByName
 from gpebo_cli.observers._observation import InitialError, SampledBlock, largest_entry
 from gpebo_cli.observers.reduced.extension import begin_at, choose_form, needed, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
-from gpebo_cli.observers.reduced.regression import regression_signals, resolved, term_sizes
+from gpebo_cli.observers.reduced.regression import (
+    VANISHING,
+    regression_signals,
+    resolved,
+    term_sizes,
+)
 from gpebo_cli.observers.reduced.response import error_system
 from gpebo_cli.observers.reduced.split import comparable, split_in_frame, units_along
 from gpebo_cli.recordings.hold import edges, held
@@ -183,10 +188,6 @@ class SampledObserver:
         o, driving = self._matrices(t, t, np.hstack([u, y]))
         equations = o.equations(driving)
         assembled = regression_signals(z, system.q, self.basis, equations)
-        rows = np.concatenate([assembled.psi, assembled.Y[:, :, None]], axis=2)
-        if self.regression == "paper":
-            rows = rows[:, -system.r :]
-        previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
         Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
         growth = largest_entry(Phi[1:])
         smallest = float(o.injectivity.min())
@@ -195,6 +196,12 @@ class SampledObserver:
             growth, scale[0] = max(growth, before.growth), np.maximum(scale[0], before.scale)
             smallest = min(smallest, before.injectivity)
         scale = np.maximum.accumulate(scale, axis=0)
+        noise = (np.abs(assembled.psi) <= VANISHING * scale[:, None]).all(axis=2, keepdims=True)
+        psi = np.where(noise, 0.0, assembled.psi)
+        rows = np.concatenate([psi, assembled.Y[:, :, None]], axis=2)
+        if self.regression == "paper":
+            rows = rows[:, -system.r :]
+        previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
         state = SampledState(
             float(t[-1]), u[-1], y[-1], z[-1], rows[-1], scale[-1], growth, smallest,
             0.0 if before is None else before.error_estimate,
