@@ -132,15 +132,16 @@ def propagated(
         fresh[0] = bool((np.abs(groups.starts - edges[0]) < 1e-3 * mesh.steps[0]).any())
     sampler = mesh.sampler(t)
     of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
-    stretch = _stretch(observer, estimator, mesh, n)
+    zeta, own = (x(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1] for x in (observer, estimator))
+    stretch = max(1, _CHUNK // ((zeta + own) * mesh.rule.stages) ** 2)
     anew = np.zeros(mesh.size, dtype=bool)
     if starts is not None:
         anew[np.searchsorted(mesh.edges, starts)] = True
     for first in range(0, mesh.size, stretch):
         part = slice(first, first + stretch)
-        maps = _element_maps(observer, estimator, mesh, part, n)
-        size = maps.shape[2]
-        zeta = observer(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]
+        joint = _joint(observer, estimator, mesh, part, n)
+        maps = _maps(mesh, mesh.steps[part], joint.A, joint.B)  # of [ζ; s]
+        size = zeta + own
         chosen = (sampler.element >= first) & (sampler.element < first + stretch)
         element, weights = sampler.element[chosen], sampler.weights[chosen]
         wanted, place = np.unique(element - first, return_inverse=True)
@@ -150,17 +151,16 @@ def propagated(
         )
         if not len(wanted):
             continue
-        own = factors[place]
+        before = factors[place]
         here = np.einsum("ms,msij->mij", weights[:, 1:], maps[element - first])
         here[:, :, :size] += weights[:, 0, None, None] * np.eye(size)
-        reached = here @ own  # of [ζ; s] (M, size, ·)
+        reached = here @ before  # of [ζ; s] (M, size, ·)
         inside = mesh.inside[element, 1]
         o, e = observer(t[chosen], inside), estimator(t[chosen], inside)
-        zeta = o.A.shape[1]
         eta = e.C @ reached[:, zeta:]
         rows = o.C.shape[1] - n  # of Y; those of the offset stand below
         x = gain[chosen] @ eta
-        e_now = own[:, size:] / shares[element, None, None]  # of one sample, not of many
+        e_now = before[:, size:] / shares[element, None, None]  # of one sample, not of many
         x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ e_now
         of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
     return of_eta, of_x, np.zeros((0, 0)) if L is None else L
@@ -207,22 +207,26 @@ def of_least_squares(
     numbers mean nothing. The regression has no resets, ``known`` is of G with the end last, and the
     ``gain`` is that of the state at the end (n, p); the others are as of :func:`deviations`.
     """
-    mesh, p, V = regression.mesh, regression.p, known.vectors[-1]
+    mesh, V = regression.mesh, known.vectors[-1]
     seen = known.eigenvalues[-1] >= known.level[-1].max(initial=0.0)
     inverse = np.where(seen, 1.0 / np.where(seen, known.eigenvalues[-1], 1.0), 0.0)
     inverse = (V * inverse) @ V.T / known.sizes[-1] / known.sizes[-1][:, None]
+    of_eta, of_x = deviations(
+        observer, _sums(regression, inverse), gain[None], mesh.edges, instants, variances,
+        mesh.edges[-1:],
+    )
+    return of_eta[-1], of_x[-1]
+
+
+def _sums(regression: LinearRegression, made: Array) -> ErrorsAt:
+    """Errors of Y to those of what is made (k, p) of h = ∫ψᵀY."""
+    p = regression.p
 
     def of_h(t: Array, inside: Array) -> ErrorSystem:
         into = transpose(regression.psi(t, inside))
-        return ErrorSystem(
-            np.zeros((1, p, p)), into, inverse[None], np.zeros((1, *into.shape[1:]))
-        )
+        return ErrorSystem(np.zeros((1, p, p)), into, made[None], np.zeros((1, *into.shape[1:])))
 
-    end = mesh.edges[-1:]
-    of_eta, of_x = deviations(
-        observer, of_h, gain[None], mesh.edges, instants, variances, end
-    )
-    return of_eta[-1], of_x[-1]
+    return of_h
 
 
 def noise_level(
@@ -257,13 +261,10 @@ def noise_level(
             o.A, o.B, np.concatenate([C, C], axis=1), np.concatenate([D, D], axis=1)
         )
 
-    def of_h(t: Array, inside: Array) -> ErrorSystem:
-        into = transpose(regression.psi(t, inside))
-        return ErrorSystem(np.zeros((1, p, p)), into, root[None], np.zeros((1, *into.shape[1:])))
-
     t = np.linspace(mesh.edges[0], mesh.edges[-1], _TIMES)
     of_fit, of_rows = deviations(
-        of_Y, of_h, np.zeros((len(t), rows, p)), mesh.edges, instants, outputs, t, starts
+        of_Y, _sums(regression, root), np.zeros((len(t), rows, p)), mesh.edges, instants, outputs,
+        t, starts,
     )
     duration = float(mesh.edges[-1] - mesh.edges[0])
     expected = duration * float((of_rows**2).sum(axis=1).mean()) - float((of_fit[-1] ** 2).sum())
@@ -275,12 +276,6 @@ def noise_level(
         residual = regression.Y(instants) - regression.psi(instants) @ eta
         square = duration * float((residual**2).sum(axis=-1).mean())
     return float(np.sqrt(square / expected)) if expected > 0.0 else np.nan
-
-
-def _stretch(observer: ErrorsAt, estimator: ErrorsAt, mesh: Mesh, n: int) -> int:
-    """How many elements are taken at once."""
-    width = _joint(observer, estimator, mesh, slice(0, 1), n).A.shape[-1] * mesh.rule.stages
-    return max(1, _CHUNK // int(width) ** 2)
 
 
 def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, Array]:
@@ -310,14 +305,6 @@ def _among(t: Array, times: Array, near: float) -> BoolArray:
     padded = np.concatenate([[-np.inf], times, [np.inf]])
     k = np.searchsorted(padded, t).clip(1)
     return np.asarray(np.minimum(t - padded[k - 1], padded[k] - t) <= near)
-
-
-def _element_maps(
-    observer: ErrorsAt, estimator: ErrorsAt, mesh: Mesh, part: slice, n: int
-) -> Array:
-    """[ζ; s] at each node from that at the left end and from e, (K, stages, d, d + m + r)."""
-    joint = _joint(observer, estimator, mesh, part, n)
-    return _maps(mesh, mesh.steps[part], joint.A, joint.B)
 
 
 def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:

@@ -49,10 +49,9 @@ class Explicit:
     columns: IntArray  # (e,) of its entries, in the order of I
     entries: Array  # (N or 1, e)
     f: Array  # (N or 1, d)
-    # x_i = −(Σ a_k x_k + φ) one after the other: i, {k: a (N or 1,)}, φ (N or 1,)
+    # x_i −= Σ a_k x_k + φ one after the other: i, {k: a (N or 1,)}, φ (N or 1,)
     others: tuple[tuple[int, Row, Array], ...]
-    # x_j = x̃_j − Σ W x_k for those that stand together under a derivative, applied last
-    shifts: tuple[tuple[int, Row], ...]
+    shifts: int  # how many, the last of these, are x_j −= Σ W x_k: together under a derivative
     mu: int
     state_units: Array  # (n,)
     pivot: float  # the smallest one at any time, relative to its row
@@ -78,7 +77,7 @@ class Explicit:
     def reduced(self, x: Array) -> Array:
         """x_I (d,) of a state (n,)."""
         shifted = x.copy()
-        for j, row in self.shifts:
+        for j, row, _ in self.others:
             shifted[j] += sum(w[0] * x[k] for k, w in row.items())
         return shifted[self.states]
 
@@ -88,7 +87,6 @@ class Explicit:
             self, entries=self.entries[:1], f=self.f[:1],
             others=tuple((i, {k: a[:1] for k, a in row.items()}, phi[:1])
                          for i, row, phi in self.others),
-            shifts=tuple((i, {k: w[:1] for k, w in row.items()}) for i, row in self.shifts),
         )
 
     def states_from(self, z: Array) -> Array:
@@ -96,12 +94,9 @@ class Explicit:
         x = np.zeros((len(self.state_units), len(z), z.shape[2]))
         x[self.states] = np.moveaxis(z, 1, 0)
         for i, row, known in self.others:
-            x[i] = -known[:, None]
+            x[i] -= known[:, None]
             for k, a in row.items():
                 x[i] -= a[:, None] * x[k]
-        for i, row in self.shifts:
-            for k, w in row.items():
-                x[i] -= w[:, None] * x[k]
         return np.moveaxis(x, 0, 1)
 
     def sizes_from(self, size: Array) -> Array:
@@ -111,9 +106,6 @@ class Explicit:
         for i, row, _ in self.others:
             for k, a in row.items():
                 x[i] += np.abs(a).max() * x[k]
-        for i, row in self.shifts:
-            for k, w in row.items():
-                x[i] += np.abs(w).max() * x[k]
         return x
 
 
@@ -135,10 +127,6 @@ def _derivative(a: Array) -> Array:
     if len(a) < 2:
         raise MoreOrdersError
     return np.array(jets.derivative(list(a), len(a) - 2))
-
-
-def _one(orders: int) -> Array:
-    return np.eye(orders, 1)
 
 
 def _size(a: Array) -> float:
@@ -325,9 +313,9 @@ def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
     chosen = np.array([equation_of[k] for k in states.tolist()], dtype=np.intp)
     return Explicit(
         states, *A.assembled(chosen, states), A.forcing(chosen),
-        tuple((i, {k: a[0] for k, a in row.items()}, phi[0]) for i, row, phi in reversed(others)),
-        tuple((i, {k: w[0] for k, w in row.items()}) for i, row in shifts), mu, units,
-        min(E.least, A.least), scaling.weights,
+        tuple((i, {k: a[0] for k, a in row.items()}, phi[0])
+              for i, row, phi in (*reversed(others), *shifts)),
+        len(shifts), mu, units, min(E.least, A.least), scaling.weights,
     )
 
 
@@ -363,19 +351,19 @@ def _leading(E: _Equations, A: _Equations) -> dict[int, int]:
 
 def _shifted(
     E: _Equations, A: _Equations, equation_of: dict[int, int]
-) -> list[tuple[int, Row]]:
+) -> list[tuple[int, Row, Array]]:
     """Take W away: x_j = x̃_j − Σ W x_k, x̃_j' = … + W' x_k."""
     shifts = []
     for j, i in equation_of.items():
         W = {k: w for k, w in E.rows.get(i, {}).items() if k != j}
         if not W:
             continue
-        shifts.append((j, W))
+        shifts.append((j, W, np.zeros((1, 1))))
         for other in list(A.where(j)):
             A.add(other, -A.row(other)[j], W, None)
         moving = {k: _derivative(w) for k, w in W.items() if w.shape[1] > 1 or (w[1:] != 0.0).any()}
         if moving:
-            A.add(i, _one(len(next(iter(moving.values())))), moving, None)
+            A.add(i, np.eye(len(next(iter(moving.values()))), 1), moving, None)
     return shifts
 
 
@@ -422,7 +410,7 @@ def _differentiated(
     A.row(i)
     A.known[i] = _sum(A.known[i], changes)
     moving = {k: _derivative(a) for k, a in row.items() if a.shape[1] > 1}
-    A.add(i, _one(len(changes)), moving, None)
+    A.add(i, np.eye(len(changes), 1), moving, None)
     for k, a in row.items():
         A.add(i, a, A.row(equation_of[k]), A.known[equation_of[k]])
 

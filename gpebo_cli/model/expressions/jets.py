@@ -209,11 +209,6 @@ def tangent(a: Jet, order: int, hyperbolic: bool = False) -> Jet:
     return y
 
 
-def tanh(a: Jet, order: int) -> Jet:
-    """tanh(a)."""
-    return tangent(a, order, hyperbolic=True)
-
-
 UNARY: dict[str, Callable[[Jet, int], Jet]] = {
     "negative": negative,
     "derivative": derivative,
@@ -221,7 +216,7 @@ UNARY: dict[str, Callable[[Jet, int], Jet]] = {
     "erf": erf,
     **{name: partial(primitive, name) for name in _PRIMITIVES},
     "tan": tangent,
-    "tanh": tanh,
+    "tanh": partial(tangent, hyperbolic=True),
 }
 BINARY: dict[str, Callable[[Jet, Jet, int], Jet]] = {
     "add": add,
