@@ -190,7 +190,8 @@ def test_stages_of_a_constant_system_decouple(stages, d):
     rule, step = radau_rule(stages), 0.3
     E, A = np.eye(d) + 0.1 * rng.normal(size=(d, d)) / np.sqrt(d), rng.normal(size=(d, d)) / 9
     right = rng.normal(size=(stages, d, 2))
-    Z = solve_constant(stages, step, E, A, right)
+    D = radau_rule(stages).differentiation
+    Z = solve_constant(D, step, E[None], A[None], None, right)
     back = np.einsum("ij,kl,jlc->ikc", rule.differentiation / step, E, Z, optimize=True) - A @ Z
     np.testing.assert_allclose(back, right, atol=1e-11 * np.abs(Z).max() * stages**2)
 

@@ -268,9 +268,6 @@ def _element_maps(
     if known is None or not _is_constant(known):
         numbers += s * s * n * n
     chunk = max(1, min(_CHUNK // max(numbers, 1), _POINTS // (s + 1)))
-    if len(h) <= chunk:
-        c = problem.coefficients(t.ravel(), inside.ravel()) if known is None else known
-        return _solve_elements(problem, mesh.rule, h, t, c)
     whole: list[Array] = []  # filled piece by piece: all pieces beside the whole are twice as much
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
@@ -280,6 +277,8 @@ def _element_maps(
             c = _at_points(known, slice(i * (s + 1), (i + chunk) * (s + 1)))
         maps = _solve_elements(problem, mesh.rule, h[part], t[part], c)
         piece = [maps.homogeneous, maps.particular, maps.noise, *maps.extras]
+        if len(h) <= chunk:
+            return maps
         if not whole:
             whole = [
                 values if values.shape[:2] == (1, 1) else np.empty((len(h), *values.shape[1:]))
@@ -330,7 +329,7 @@ def _solve_elements(
     groups = int(group.max(initial=-1)) + 1
     solve: Callable[..., tuple[Array, Array]] = elements.element_maps
     if _is_constant(c) and s * c.A.shape[1] > _DIRECT:
-        solve = decoupled_maps
+        solve = partial(elements_numpy.element_maps, solve=solve_constant)
     try:
         homogeneous, particular = solve(
             rule.differentiation, h, c.E, c.A, c.f, basis, offset, group, groups
@@ -384,29 +383,21 @@ def _with_instants(noise: Array, solution: Trajectory, cuts: Array) -> Array:
     return found
 
 
-def _by_stages(D: Array, h: float, E: Array, A: Array, T: Array | None, right: Array) -> Array:
-    """As ``elements_numpy.solve_blocks`` for constant E, A and T."""
+def solve_constant(D: Array, h: float, E: Array, A: Array, T: Array | None, right: Array) -> Array:
+    """As ``elements_numpy.solve_blocks`` for E, A (s, d, n) and T that are constant."""
     E, A = (E[0], A[0]) if T is None else (E[0] @ T[0], A[0] @ T[0])
-    return solve_constant(len(D), h, E, A, right)
 
-
-decoupled_maps = partial(elements_numpy.element_maps, solve=_by_stages)
-"""As ``elements.element_maps`` for constant E, A and T: stages are decoupled."""
-
-
-def solve_constant(s: int, step: float, E: Array, A: Array, right: Array) -> Array:
-    """(D/h ⊗ E − I ⊗ A) Z = ``right`` for constant E, A (d, d); Z and ``right`` (s, d, columns)."""
     def solve(shift: complex, r: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.solve(shift * E - A, r), dtype=np.complex128)
 
-    return decoupled(s, step, right, solve, E)
+    return decoupled(len(D), h, right, solve, E)
 
 
 def decoupled(
     s: int, step: float, right: Array, solve: Callable[[complex, ComplexArray], ComplexArray],
     E: Array | None = None,
 ) -> Array:
-    """:func:`solve_constant` by what solves (shift E − A) y = r, y and r (d, columns).
+    """(D/h ⊗ E − I ⊗ A) Z = ``right`` (s, d, columns) by what solves (shift E − A) y = r.
 
     With D = U T Uᴴ the stages decouple from the last to the first: s systems of size d instead of
     one of size s·d. ``E`` (d, d): None is the identity.

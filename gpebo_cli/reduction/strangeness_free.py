@@ -135,9 +135,7 @@ def reduced(
         try:
             found = in_stages(e, a, g, structure.rank_tol, every, structure.stages)
         except UnclearError as unclear:
-            raise unclear_ranks(
-                system, t[unclear.place], rounding=unclear.rounding
-            ) from unclear
+            raise unclear_ranks(system, t, unclear) from unclear
         whole = np.concatenate([transpose(found.Z1) @ e[0], found.A2], axis=1)
         inverse, poor = inverse_or_none(whole)
         _refuse_undetermined(system, poor, t)

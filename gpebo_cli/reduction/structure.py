@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from math import isfinite
 from typing import NamedTuple
 
@@ -151,28 +152,25 @@ def _analysed(
         if mu:
             c = system.coefficients.taylor(t, mu)
         _refuse_overflow(system, c, scaling, mu)
-        levels, reference = _judged(t, c, mu, scaling, rank_tol, invariant)
-        if reference is None:
+        levels = _judged(t, c, mu, scaling, rank_tol, invariant)
+        if levels.reference is None:
             reason = levels.failure
             continue
         if mu and (levels.least < _UNCLEAR or _differs(t, c, scaling, rank_tol, levels.a)):
             staged = _in_stages(system, t, max_mu, rank_tol, levels.least)
             if staged is not None:
                 return staged
-
-        def lines(
-            _: Array, c: Coefficients, column: IntArray, which: IntArray, mu: int = mu,
-            a: int = levels.a, reference: Pivots = reference,
-        ) -> Array:
-            return _lines(c, mu, scaling, rank_tol, a, column, which, reference)
-
+        lines = partial(
+            _lines, mu=mu, scaling=scaling, rank_tol=rank_tol, a=levels.a,
+            reference=levels.reference,
+        )
         steady = invariant or _follow_dips(system, t, levels.smallest, mu, rank_tol, lines)
         if not levels.a and "E" not in system.coefficients.constant:
             _refuse_crossing(system, t, c.E[0])
         return Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
             smallest_singular_value=levels.least, time_invariant=invariant,
-            reference=reference, steady=steady,
+            reference=levels.reference, steady=steady,
             dynamics=None if levels.dynamics is None else levels.dynamics / scaling.time,
         )
     staged = _in_stages(system, t, max_mu, rank_tol)
@@ -205,9 +203,7 @@ def _in_stages(
         try:
             smallest = found(t, c).smallest
         except UnclearError as unclear:
-            raise unclear_ranks(
-                system, t[unclear.place], rounding=unclear.rounding
-            ) from unclear
+            raise unclear_ranks(system, t, unclear) from unclear
         return np.asarray(smallest.reshape(-1, _DIP_POINTS, 3)[which, :, column])
 
     while True:
@@ -222,7 +218,7 @@ def _in_stages(
                 break
         if mu == max_mu:
             if rounding and not least:
-                raise unclear_ranks(system, t[0], rounding=True)
+                raise unclear_ranks(system, t, UnclearError(0, rounding=True))
             return None
         mu += 1
     ranks = stages.ranks
@@ -263,10 +259,11 @@ def _differs(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float, a: in
     return bool(stages.A2.shape[1] != a)
 
 
-def unclear_ranks(system: DescriptorSystem, t: float, *, rounding: bool) -> ModelError:
-    """What :mod:`.stages` could not tell at the time t."""
-    why = f"a rank changes near t = {t:.9g}; choose a horizon that avoids this time"
-    if rounding:
+def unclear_ranks(system: DescriptorSystem, t: Array, unclear: UnclearError) -> ModelError:
+    """What :mod:`.stages` could not tell at one of the times t (N,)."""
+    when = t[unclear.place]
+    why = f"a rank changes near t = {when:.9g}; choose a horizon that avoids this time"
+    if unclear.rounding:
         why = (
             "rounding of its largest entries leaves no digit of its hidden constraints: rates or "
             "units in one equation are too far apart for its index; leave out what is fastest"
@@ -321,8 +318,8 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
 
 def _judged(
     t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, invariant: bool
-) -> tuple[_Levels, Pivots | None]:
-    """Levels at all times, or at one that says why this μ will not do; and where to start from.
+) -> _Levels:
+    """Levels at all times, or at one that says why this μ will not do.
 
     ``c`` may have more times than t where E and A are constant.
     """
@@ -332,9 +329,10 @@ def _judged(
     # A μ that will not do fails at one time already.
     a, smallest, rows, columns, Z1 = kernels.structure.reference(*model, middle, rank_tol)
     smallest = smallest[None]
-    failure = _too_many(a, n, at) if a > n else _why_not(at, smallest, rank_tol)
+    failure = f"{a} constraints appear for {n} states (t = {at[0]:.6g})"
+    failure = failure if a > n else _why_not(at, smallest, rank_tol)
     if failure:
-        return _Levels(a, smallest, failure), None
+        return _Levels(a, smallest, failure)
     reference = Pivots((mu + 1) * n - a, rows, columns, Z1)
     E, A = c.E[:, : len(t)], c.A[:, : len(t)]
     bounds, left, dynamics = kernels.structure.bounds(
@@ -342,7 +340,7 @@ def _judged(
     )
     finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
     if invariant:
-        return _Levels(a, smallest, "", float(smallest.min()), dynamics=finite), reference
+        return _Levels(a, smallest, "", reference, float(smallest.min()), finite)
     # Away from rank changes bounds serve as well as singular values, and the elimination that
     # the reduction does anyway gives them for a fraction of the price. Singular values are computed
     # where a bound is small, or smallest.
@@ -355,15 +353,11 @@ def _judged(
     counts, exact = kernels.structure.levels(E, A, *model[2:], rank_tol, -1)
     if (counts != a).any():
         sigma = relative_singular_values(E, A, *model[2:])
-        return _Levels(a, bounds, _changes(sigma, counts, t[which])), None
+        return _Levels(a, bounds, _changes(sigma, counts, t[which]))
     bounds[which] = exact
-    failure = _why_not(t[which], exact, rank_tol)
-    levels = _Levels(a, bounds, failure, float(exact.min()), dynamics=finite)
-    return levels, None if failure else reference
-
-
-def _too_many(a: int, n: int, t: Array) -> str:
-    return f"{a} constraints appear for {n} states (t = {t[0]:.6g})"
+    if failure := _why_not(t[which], exact, rank_tol):
+        return _Levels(a, bounds, failure)
+    return _Levels(a, bounds, "", reference, float(exact.min()), finite)
 
 
 class _Levels(NamedTuple):
@@ -372,6 +366,7 @@ class _Levels(NamedTuple):
     a: int
     smallest: Array  # (N, 3) of M, Â2 and E T2, relative to the size of their factors; or bounds
     failure: str
+    reference: Pivots | None = None  # where to start from
     least: float = np.inf  # of those that were computed
     dynamics: Array | None = None  # (N or 1, d, d) in scaled time, see ``Structure``
 
@@ -501,8 +496,8 @@ _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
 
 
 def _lines(
-    c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, a: int, column: IntArray,
-    which: IntArray, reference: Pivots,
+    _: Array, c: Coefficients, column: IntArray, which: IntArray, *, mu: int, scaling: Scaling,
+    rank_tol: float, a: int, reference: Pivots,
 ) -> Array:
     """Columns (D,) of the levels that belong to ``a`` constraints, (D, points).
 
