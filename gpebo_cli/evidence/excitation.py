@@ -210,12 +210,8 @@ def estimable(
 ) -> dict[str, float | None]:
     """From when on each parameter and state can be known; None where it cannot be.
 
-    Args:
-        known: at the times
-        t: (N,), the last of which is the end.
-        parameters: their names.
-        states: their names; a parameter of the same name comes first.
-        seen: which states are determined at the same times, (N, n).
+    ``known`` and which states are ``seen`` (M, n) are at the times t (M,), the last of which is the
+    end. A parameter with the name of a state comes first.
     """
     times = since(t, np.concatenate([known.parameters, seen], axis=1))
     of_states = dict(zip(states, times[len(parameters) :], strict=True))
@@ -235,14 +231,9 @@ def _first_time(
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
     Each round looks where the polynomial through the four nearest points, t of the level, points,
-    else the secant, and at distances around it that fall by powers of four.
-
-    Args:
-        gram: G (p, p), perhaps with further columns.
-        edges: right ends of its elements (K,).
-        reached: of times (M,) and G there.
-        hopeless: points (K, s + 1) at which it is surely negative.
-        doubt: a difference of it that is rounding.
+    else the secant, and at distances around it that fall by powers of four. ``edges`` are the right
+    ends of elements, ``hopeless`` the points (K, s + 1) at which it is surely negative, and
+    ``doubt`` is a difference that is rounding.
     """
     mesh = gram.mesh
     ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
@@ -319,13 +310,9 @@ def segment_level(regression: LinearRegression, t: Array, window: float) -> Arra
 def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     """λ_min of ∫_{t−T}^{t} ψᵀψ at the times t (M,); NaN before the first whole one.
 
-    Whole elements are summed afresh for every window. The difference G(t) − G(t − T) was
-    rejected: once a regressor has died out, it is the rounding of two large numbers.
-
-    Args:
-        outer: ψᵀψ, shape (p, p); further columns are not looked at.
-        t: ends of the windows.
-        window: T, in seconds.
+    Whole elements are summed afresh for every window T, in seconds. The difference G(t) − G(t − T)
+    was rejected: once a regressor has died out, it is the rounding of two large numbers. Of
+    ``outer``, ψᵀψ (p, p), further columns are not looked at.
     """
     mesh = outer.mesh
     level = np.full(len(t), np.nan)
@@ -391,15 +378,11 @@ def sampled_window_level(regression: SampledRegression, window: float) -> Array:
 
 
 def persistent(outer: Trajectory, gain: float) -> Requirement:
-    """Whether ψ keeps exciting, and whether that is enough at this gain.
+    """Whether ψ keeps exciting, and enough at γ = ``gain``, by ``outer``, ψᵀψ (p, p).
 
-    The evidence is the smallest λ_min of ∫ψᵀψ (or of what takes its place) over sliding windows
-    of a tenth of the horizon. An error shrinks by about exp(−γ λ_min) per window while γ λ_min is
+    The evidence is the smallest λ_min of ∫ψᵀψ (or of what takes its place) over sliding windows of
+    a tenth of the horizon. An error shrinks by about exp(−γ λ_min) per window while γ λ_min is
     small, so 1 % within the horizon's ten windows needs γ λ_min ≥ ln(100)/10.
-
-    Args:
-        outer: ψᵀψ, shape (p, p).
-        gain: the smallest γ of the estimator.
     """
     mesh = outer.mesh
     length = float(mesh.edges[-1] - mesh.edges[0]) / WINDOWS

@@ -109,10 +109,9 @@ class Knowledge:
     def states(self, gain: Array, units: Array | None = None) -> BoolArray:
         """Which states x = offset + gain η are determined, shape (M, n).
 
-        Args:
-            gain: at ascending times, the last M of which are those (M or more, n, p); NaN for a
-                state that nothing is known of.
-            units: of the states (n,), in which errors of a gain are of one size; None: not known.
+        The gain is at ascending times, the last M of which are those (M or more, n, p); NaN for a
+        state that nothing is known of. Errors of a gain are of one size in ``units`` of the states
+        (n,), if known.
         """
         kernel, slack = self._kernel
         if not kernel.any() and np.isfinite(gain).all():
@@ -133,12 +132,9 @@ class Knowledge:
         """Of which states (n,) x = offset + gain η something is left beside errors, at the end.
 
         Where Φ has grown, states are small differences of large terms: neither what the kernel of N
-        leaves open, nor rounding, may then amount to more than a thousandth of them.
-
-        Args:
-            h: ∫ψᵀY at the end (p,).
-            offset: at all times (N, n).
-            gain: the same (N, n, p), NaN for a state that nothing is known of.
+        leaves open, nor rounding, may then amount to more than a thousandth of them. Of h = ∫ψᵀY at
+        the end (p,), and the offset (N, n) and gain (N, n, p) at all times, NaN where nothing is
+        known.
         """
         V, spectrum, clear = self.vectors[-1], self.eigenvalues[-1], self.clarity[-1] >= 1.0
         root = np.sqrt(spectrum[clear])
@@ -159,13 +155,10 @@ def _row_norms(matrices: Array) -> Array:
 
 
 def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:
-    """What is known from G (M, p, p) at M times.
+    """What is known from G (M, p, p) at M times; further columns are not looked at.
 
-    Args:
-        gram: further columns are not looked at.
-        terms: size of the terms that the columns of ψ are made of, (M, p) or (p,).
-        elapsed: seconds that G has been gathered for, (M,).
-        tol: to which ψ is resolved, relative to its terms.
+    ``terms`` (M, p) or (p,) are sizes of the terms that the columns of ψ are made of, ``elapsed``
+    (M,) the seconds that G has been gathered for. ψ is resolved to ``tol``, relative to its terms.
     """
     normalised, sizes, level = _normalised(gram, terms, elapsed, tol)
     spectrum, vectors = np.linalg.eigh(normalised)

@@ -116,10 +116,8 @@ def settling_times(t: Array, error: Array, size: Array) -> Array:
 def standing_since(t: Array, away: Array, deviation: Array) -> Array:
     """From when on c estimates are within ±2σ of the final ones, (g, c), in seconds.
 
-    Args:
-        t: times (M,).
-        away: how far they are from what they are by the data up to the end, (g, M, c).
-        deviation: σ at the end, (g, c), NaN where it is not known.
+    ``away`` (g, M, c) is how far at the times t (M,) they are from what they are by the data up to
+    the end, the deviation (g, c) is σ at the end, NaN where it is not known.
     """
     away = np.abs(np.moveaxis(away, 2, 1))
     level = 2.0 * deviation
@@ -156,14 +154,10 @@ def settling_time(
 
 
 def settled(t: Array, last: Array, before: Array, after: Array, level: Array) -> Array:
-    """:func:`settling_time` where the time is known at which an error is above its level last.
+    """:func:`settling_time` (...) where it is known when an error is above its level last.
 
-    Args:
-        t: times (M,).
-        last: index of that time, −1 where there is none (...).
-        before: size of the error there (...).
-        after: size of the error at the next time (...).
-        level: of the error (...).
+    ``last`` is the index of that time among t (M,), −1 where there is none, ``before`` and
+    ``after`` are the error there and at the next time, ``level`` is that of the error.
     """
     tiny = np.finfo(float).tiny
     high, low, wanted = (np.log(np.maximum(e, tiny)) for e in (before, after, level))

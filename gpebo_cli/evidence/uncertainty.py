@@ -170,17 +170,12 @@ def after_reset(
     L: Array, estimator: ErrorsAt, end: tuple[Array, Array], reset: Reset,
     known: ExtensionState | None,
 ) -> Array:
-    """L of [ζ; s; e] after a reset, where w starts from its estimate.
+    """L of [ζ; s; e] (size, ·) after a reset, where w starts from its estimate.
 
-    η₊ = T η + τ + V ζ and ζ₊ = 0. The error of 𝒴 becomes S δ𝒴 − Ω₊ V ζ, and that of an
-    estimate from which the estimator starts T δη̂ − V ζ.
-
-    Args:
-        L: before.
-        estimator: of the segment that ends.
-        end: its end, as time and where functions that jump are decided, (1,) each.
-        reset: with ``errors`` V.
-        known: [Ω | 𝒴] at the end; None: the estimator has no extension.
+    η₊ = T η + τ + V ζ and ζ₊ = 0. The error of 𝒴 becomes S δ𝒴 − Ω₊ V ζ, and that of an estimate
+    from which the estimator starts T δη̂ − V ζ. The segment that ends does so at ``end``, as time
+    and where functions that jump are decided, (1,) each, with ``known`` [Ω | 𝒴]; None: there is no
+    extension.
     """
     system = estimator(*end)
     V = np.zeros((0, 0)) if reset.errors is None else reset.errors
@@ -233,20 +228,15 @@ def noise_level(
     observer: ErrorsAt, regression: LinearRegression, instants: Array, outputs: Array,
     starts: Array | None = None,
 ) -> float:
-    """σ of recorded outputs from the residual of least squares; ``outputs`` are their ratios.
+    """σ of recorded outputs from the residual of least squares of a regression without resets.
 
     With r = Y − ψ G⁻¹h, and P_h the covariance of h for σ = 1,
 
         E ∫|r|² dt = σ² (∫ E|δY|² dt − tr(G⁻¹ P_h)):
 
     the second term is what the fit of p parameters takes away, the noise being coloured by ζ.
-
-    Args:
-        observer: errors of [u; y] to those of Y and more.
-        regression: of the recording, without resets.
-        instants: times of its samples.
-        outputs: variance of each signal [u; y] relative to σ², (m + r,).
-        starts: as of :func:`deviations`.
+    ``outputs`` are variances of each signal [u; y] relative to σ², (m + r,), and the other
+    arguments are as of :func:`deviations`.
     """
     mesh, rows, p = regression.mesh, regression.psi.values.shape[2], regression.p
     final = regression.gram.final
@@ -310,11 +300,7 @@ def _among(t: Array, times: Array, near: float) -> BoolArray:
 def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
     """z at each node from that at the left end and from e, z' = A z + B e; (K, s, d, d + c).
 
-    Args:
-        mesh: its rule has s stages.
-        steps: (K,) seconds.
-        A: (K, s, d, d) at the nodes.
-        B: (K, s, d, c).
+    A (K, s, d, d) and B (K, s, d, c) are at the nodes of elements with these ``steps`` (K,).
     """
     K, E = len(steps), None
     size = 1.0 + steps[:, None] * np.abs(A).max(axis=(1, 3), initial=0.0)
@@ -389,16 +375,9 @@ def _factors(
 ) -> tuple[Array, Array]:
     """L of [ζ; s; e] at the left ends of the elements ``wanted`` (W, d + m + r, ·), and at the end.
 
-    The errors of several samples stand in L side by side, before it is made triangular again.
-
-    Args:
-        ends: what an element makes of it, (K, d, d + m + r).
-        fresh: where another e begins, (K,).
-        deviations: of e, (K, m + r).
-        L: at the start; None: everything is known there.
-        anew: where ζ is zero, (K,).
-        zeta: its size.
-        wanted: ascending.
+    The errors of several samples stand in L side by side, before it is made triangular again. An
+    element makes ``ends`` of it (K, d, d + m + r); another e (K, m + r) begins where ``fresh``, and
+    ζ is zero where ``anew``.
     """
     size, signals = ends.shape[1], deviations.shape[1]
     own = np.arange(signals)

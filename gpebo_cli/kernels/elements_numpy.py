@@ -108,16 +108,11 @@ def chain(
     homogeneous: Array, particular: Array, start: Array,
     renew: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, int]:
-    """Values at all points from the maps of the elements, and how many in front are finite.
+    """Values (K, s + 1, n, c) at all points from the maps of the elements.
 
-    Args:
-        homogeneous: responses to the left ends (K or 1, s, n, n).
-        particular: (K, s, n, c).
-        start: at the first left end (n, c).
-        renew: what replaces the value (n, c) that an element before has reached.
-
-    Returns:
-        (K, s + 1, n, c), and a number of elements.
+    Of the responses to the left ends (K or 1, s, n, n), particular solutions (K, s, n, c) and the
+    value at the first left end (n, c). ``renew`` replaces the value (n, c) that an element before
+    has reached. The second result is how many elements in front are finite.
     """
     size, s, n, columns = particular.shape
     maps = np.broadcast_to(homogeneous, (size, s, n, n))

@@ -68,13 +68,8 @@ def interpolation(
 ) -> tuple[IntArray, Array]:
     """Elements (N,) that contain ``belongs`` (N,), weights (N, s + 1) for the values at t (N,).
 
-    Args:
-        edges: of the elements (K + 1,).
-        places: of the points in an element (s + 1,).
-        barycentric: weights of the points (s + 1,).
-        t: times.
-        belongs: times that decide about the element.
-        exact: nearer than this, in elements, a point's own value is taken.
+    Elements have ``edges`` (K + 1,), and points at ``places`` (s + 1,) with ``barycentric``
+    weights. Nearer than ``exact`` to a point, in elements, the point's own value is taken.
     """
     element = edges[1:-1].searchsorted(belongs, side="right")
     left = edges[element]

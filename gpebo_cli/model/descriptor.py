@@ -181,9 +181,8 @@ class DescriptorSystem:
 def check_sizes(system: DescriptorSystem, t: Array) -> None:
     """Refuse numbers whose squares and products overflow: all that came of them would be wrong.
 
-    Args:
-        system: a plant; of matrices that depend on outputs only values without signals are seen.
-        t: times (N,) at which to look; an entry that is not finite there is reported by others.
+    At times t (N,); an entry that is not finite there is reported by others. Of matrices that
+    depend on outputs only values without signals are seen.
 
     Raises:
         ConfigError: names the entry, its value and the time.

@@ -228,12 +228,8 @@ def coefficients_of(
 ) -> TextCoefficients:
     """Coefficients from entries by the names in ``MATRIX_NAMES``, and those of theta.
 
-    Args:
-        entries: shape of each, and what stands in it.
-        inputs: expressions of the inputs, which stand for their names in ``entries``.
-        outputs: names that have values only along signals.
-        name: of the plant, for messages.
-        restricted: the same without what depends on outputs; None: it is made here.
+    Inputs stand for their names in ``entries``, outputs have values only along signals;
+    ``restricted`` is the same without what depends on outputs, None: it is made here.
     """
     if restricted is None and any(
         not e.node.signals.isdisjoint(outputs)

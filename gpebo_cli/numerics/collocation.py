@@ -235,10 +235,8 @@ def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray) -> _ElementMaps
 def merged(before: Sequence[Array], after: Sequence[Array], kept: IntArray) -> list[Array]:
     """Of all elements of a mesh, from those of the mesh before and of the fresh ones.
 
-    Args:
-        before: of the elements before (K, s, ...) each, or (1, 1, ...) where all have the same.
-        after: of the fresh elements, in the same way.
-        kept: for each element which one before it is, −1 for a fresh one (K',).
+    Both (K, s, ...) each, or (1, 1, ...) where all have the same; ``kept`` (K',) says for each
+    element which one before it is, −1 for a fresh one.
     """
     fresh = kept < 0
 

@@ -49,14 +49,10 @@ def estimated_errors(
 ) -> Errors:
     """Errors of the point values (K, s + 1, n, columns) of a solution.
 
-    Args:
-        problem: the equation.
-        mesh: of K elements.
-        last: maps from left ends to right ends (K or 1, n, n).
-        particular: right ends from zero (K, n, columns).
-        noise: what the terms of the equation, [of each component, and alone], can bring about in an
-            element (K or 1, n, n + columns); relative rounding of them is an error.
-        values: the solution.
+    Of maps from left ends to right ends, ``last`` (K or 1, n, n), right ends from zero,
+    ``particular`` (K, n, columns), and ``noise`` (K or 1, n, n + columns): what the terms of the
+    equation, [of each component, and alone], can bring about in an element; relative rounding of
+    them is an error.
     """
     rule, renewal = mesh.rule, problem.renewal
     noise[:, :, values.shape[2] :] += _TINY / EPS * values[:, 0].any(axis=0)  # what underflows

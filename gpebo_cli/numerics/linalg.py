@@ -21,11 +21,8 @@ def without_rounding(found: Array, terms: Array | None = None) -> Array:
     """``found`` (N, i, j) with zeros for entries that are the rounding of their terms at all times.
 
     An equation that says nothing of a quantity must not seem to say a little: what is computed from
-    it would be noise, which no mesh resolves.
-
-    Args:
-        found: overwritten.
-        terms: size of what each entry is the sum of, (N or 1, i, j); None: that of the largest.
+    it would be noise, which no mesh resolves. ``found`` is overwritten. ``terms`` (N or 1, i, j)
+    are the sizes of what each entry is the sum of; None: that of the largest entry.
     """
     size = largest_over_time(found)
     whole = size.max(initial=0.0) if terms is None else largest_over_time(terms)
@@ -126,19 +123,11 @@ def symmetric_eigenvalues(matrices: Array) -> Array:
 
 
 def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
-    """All z_k of z_{k+1} = a_k z_k + b_k along axis 0.
+    """All z_k of z_{k+1} = a_k z_k + b_k, shape (K + 1, ...), with a and b (K, ...).
 
-    For few recurrences a parallel prefix scan: it composes neighbouring affine maps in
-    log2(K) vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the
-    recurrence. For many, the recurrence itself, each step vectorised over all of them.
-
-    Args:
-        factor: a, shape (K, ...), broadcastable against ``shift``.
-        shift: b, shape (K, ...).
-        start: z_0, broadcastable against (...).
-
-    Returns:
-        z_0 … z_K, shape (K + 1, ...).
+    For few recurrences a parallel prefix scan: it composes neighbouring affine maps in log2(K)
+    vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the recurrence. For
+    many, the recurrence itself, each step vectorised over all of them.
     """
     shape = np.broadcast_shapes(factor.shape, shift.shape)
     out = np.empty((shape[0] + 1, *shape[1:]))

@@ -137,7 +137,8 @@ class Mesh:
     ) -> Mesh:
         """Neighbours of equal length joined where a polynomial over all of them does as well.
 
-        Compared at all points of the short elements, so that nothing they have seen is lost.
+        Compared at all points of the short elements, so that nothing they have seen is lost. Where
+        nothing is joined, it is this mesh itself.
 
         Args:
             values: point values (K, s + 1, c) of signals.
@@ -145,9 +146,6 @@ class Mesh:
             tol: by how much a value may change, relative to the signal's own size so far.
             keep: edges (B,) that stay.
             longest: no element is joined to one that is longer.
-
-        Returns:
-            this mesh itself, where nothing is joined.
         """
         inner = set(np.searchsorted(self.edges, keep).tolist()) if len(keep) else set()
         bounds = [0, *sorted(inner - {0, self.size}), self.size]
@@ -304,10 +302,8 @@ class Trajectory:
     def low_pass(self, rate: Array | float, start: Array | None = None) -> Trajectory:
         """Z of Z' = −λ (Z − S): the filter λ/(p + λ) applied to this signal S.
 
-        Args:
-            rate: λ > 0 in 1/s, a scalar () or an array that broadcasts against one value of the
-                signal.
-            start: Z at the start, of the shape of one value; None: 0.
+        With a rate λ > 0 in 1/s, a scalar () or an array that broadcasts against one value (...,)
+        of the signal, and with Z at the start of the shape of one value; None: 0.
         """
         mesh, rule = self.mesh, self.mesh.rule
         shape = self.values.shape[2:]
@@ -358,21 +354,14 @@ def _flat(values: Array) -> Array:
 
 
 def unresolved(values: Array, rule: RadauRule, floor: float | Array = 0.0) -> Array:
-    """How far each element is from resolving signals of one kind, relative to their own size.
+    """How far each element is from resolving signals of one kind, relative to their own size, (K,).
 
-    The first Legendre coefficient that an element leaves out (see :func:`legendre_tail`) against
-    the largest value of that component so far: in a system that grows, what is an invisible error
-    beside the end of the horizon is what the end is made of.
-
-    Args:
-        values: at the points (K, s + 1, c).
-        rule: the mesh's rule.
-        floor: size below which a signal of this kind is rounding; or
-            sizes (c,) that the components count as having where they are smaller: then all of them
-            are compared in units of their own size.
-
-    Returns:
-        shape (K,).
+    The first Legendre coefficient that an element leaves out of values (K, s + 1, c) (see
+    :func:`legendre_tail`) against the largest value of that component so far: in a system that
+    grows, what is an invisible error beside the end of the horizon is what the end is made of. The
+    ``floor`` is the size below which a signal of this kind is rounding; or sizes (c,) that the
+    components count as having where they are smaller: then all of them are compared in units of
+    their own size.
     """
     least, level = (floor, 0.0) if isinstance(floor, np.ndarray) else (None, floor)
     return signals.tails(

@@ -72,13 +72,8 @@ def resolve(
 ) -> tuple[Mesh, Found, float]:
     """Resolve signals that are known: nothing is integrated.
 
-    Args:
-        evaluate: what is wanted on a mesh, and the signals (K, s + 1, c) to resolve, each kind with
-            its floor (see :func:`unresolved_kinds`).
-        mesh: where to start; its edges stay edges.
-        tol: relative to each signal's own size.
-        max_elements: refuse to go beyond.
-        name: of the signals, for messages.
+    ``evaluate`` gives what is wanted on a mesh, and the signals (K, s + 1, c) to resolve, each kind
+    with its floor (see :func:`unresolved_kinds`); the rest is as of :func:`refine`.
 
     Returns:
         The mesh, what is wanted on it, and the largest tail.

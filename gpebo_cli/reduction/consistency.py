@@ -25,15 +25,10 @@ _IMPULSE = 1e-9  # impulses below this share of the state's size are rounding
 def consistent_state(form: StrangenessFree, x0: Array, weights: Array) -> Array:
     """The consistent x nearest to x0 in its differential part, shape (n,).
 
-    Minimises ‖W E (x − x0)‖ subject to A2 x + f2 = 0, where W makes the rows of E comparable.
-    Unique, because E has full column rank on the kernel of A2; NaN where numbers are so large or
-    so small that it has not. A state that satisfies the constraints to rounding is returned as it
-    is.
-
-    Args:
-        form: the strangeness-free equations at times of which the start is the first.
-        x0: the state asked for (n,).
-        weights: W (n,), see :class:`gpebo_cli.reduction.derivative_array.Scaling`.
+    Minimises ‖W E (x − x0)‖ subject to A2 x + f2 = 0 at the first time of ``form``, where the
+    weights W (n,) make the rows of E comparable, see :class:`.derivative_array.Scaling`. Unique,
+    because E has full column rank on the kernel of A2; NaN where numbers are so large or so small
+    that it has not. A state that satisfies the constraints to rounding is returned as it is.
     """
     if form.basis is None or form.offset is None:
         return x0.copy()

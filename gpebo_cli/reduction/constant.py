@@ -179,17 +179,11 @@ def _constraints(e: Array, a: Array, max_mu: int) -> tuple[list[tuple[Array, lis
 
 
 def scales_of(E: Array, A: Array) -> tuple[Array, Array, float]:
-    """Of rows and columns (n,), and the unit of time, by which E/τ and A are of the size one.
+    """Scales of rows and columns (n,) and of time by which E/τ and A (n, n) are of the size one.
 
     By largest entries: means of logarithms, as in ``derivative_array.balance``, count the smallest
     ones as much, and of full matrices those are rounding (the driven cavity is then undecided).
-
-    Args:
-        E: (n, n).
-        A: (n, n).
-
-    Returns:
-        Powers of two, so that scaling commits no rounding error.
+    They are powers of two, so that scaling commits no rounding error.
     """
     E, A = np.abs(E), np.abs(A)
     r, c, time = np.zeros(len(E)), np.zeros(len(E)), 0.0

@@ -291,12 +291,7 @@ def scaling_of(found: Entries, n: int) -> Scaling:
 
 
 def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
-    """Eliminate.
-
-    Args:
-        found: the model at N times, to some order.
-        scaling: of the model.
-        f: Taylor coefficients (orders, N or 1, n) of what is known in the equations.
+    """Eliminate, with the model at N times and f (orders, N or 1, n), what is known in it.
 
     Raises:
         MoreOrdersError: derivatives are needed of a higher order.

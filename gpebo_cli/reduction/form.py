@@ -108,11 +108,9 @@ class EquationForm:
     ) -> EquationForm:
         """As given, in the units of the plant at its start: what comes later changes no unit.
 
-        Args:
-            system: the model.
-            inputs: derivatives of the inputs, as far as they are known.
-            at: the time of the start (1,), where functions that jump are decided, and [u; y]
-                (1, m + r) there for matrices that follow them; None: at 0, without signals.
+        With what is known of derivatives of ``inputs``, and ``at`` the time of the start (1,),
+        where functions that jump are decided, and [u; y] (1, m + r) there for matrices that follow
+        them; None: at 0, without signals.
         """
         t, inside, signals = at or (np.zeros(1), np.zeros(1), None)
         plain = cls(system, Units.plain(system), inputs=inputs)
@@ -231,12 +229,8 @@ def hidden_constraints(
 ) -> HiddenConstraints:
     """M, M_v and M_θ at the times t (N,), with v = [u, u', …, u^(μ)/μ!, 1].
 
-    Args:
-        system: the model.
-        structure: of it.
-        units: of the states (n,), in which M is an orthogonal projector.
-        t: times.
-        c: the model there, to the order μ.
+    In ``units`` of the states (n,), M is an orthogonal projector; ``c`` is the model to the order
+    μ.
 
     Raises:
         ModelError: a rank differs from that of ``structure``; names the time.

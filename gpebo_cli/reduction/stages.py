@@ -136,10 +136,8 @@ def _rounding(
 ) -> tuple[list[Array], list[Array]]:
     """Squared errors of [A_z, f_z], and of [E, A, f] of the next stage, from those before.
 
-    Args:
-        rounding: of [E, A, f], Taylor coefficients.
-        squares: of W1, W2, Wz, V and of X, by which these are multiplied.
-        residual: square of what an error of X is multiplied with.
+    ``squares`` are those of W1, W2, Wz, V and X, by which these are multiplied, ``residual`` that
+    of what an error of X is multiplied with.
     """
     w1, w2, wz, v, x = squares
     (e_r, e_z), *wrong = ((w1 @ y, w2 @ y) for y in rounding)

@@ -113,16 +113,9 @@ def reduced(
 ) -> Reduced:
     """The constraints at the times t (N,), by stages, or by elimination from the reference.
 
-    Singular vectors are taken at times where the pivots of the reference will not do.
-
-    Args:
-        system: the model, and
-        structure: of it.
-        E: Taylor coefficients to the order μ, (μ + 1, N or 1, n, n).
-        A: likewise.
-        f: of each column, (μ + 1, N, n, c).
-        t: times.
-        every: at every how many of them sizes are looked at.
+    Singular vectors are taken at times where the pivots of the reference will not do. E and A are
+    Taylor coefficients to the order μ (μ + 1, N or 1, n, n), f those of each column (μ + 1, N, n,
+    c); at ``every`` so many times sizes are looked at.
 
     Raises:
         ModelError: a rank differs from that of ``structure``; names the time.
@@ -175,12 +168,7 @@ def _refuse_undetermined(system: DescriptorSystem, poor: BoolArray, t: Array) ->
 
 
 def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
-    """D u + H θ at N times, (N, r): the part of the outputs that no state is in, if there is any.
-
-    Args:
-        c: the model there.
-        zero: names of matrices that vanish.
-    """
+    """D u + H θ at N times, (N, r): what no state has part in; None: there is nothing."""
     if {"D", "H"} <= zero:
         return None
     return _apply(c.D[0], c.u[0]) + _apply(c.H[0], c.theta[0])

@@ -200,18 +200,10 @@ def breakpoints(tape: Tape, start: float, stop: float) -> Array:
 def roots(tape: Tape, knots: Array, start: float, stop: float) -> Array:
     """Times strictly between ``start`` and ``stop`` where an argument of a switch changes sign.
 
-    A cell is dropped if bounds keep the argument away from zero, searched by bisection where
-    it is monotone, and halved else, down to rounding. (A tangential zero has no change of sign,
-    and switches nothing.)
-
-    Args:
-        tape: expressions with switches.
-        knots: sorted times (B,) at which cells end because something jumps.
-        start: of the search.
-        stop: of it.
-
-    Returns:
-        unsorted, perhaps with repetitions.
+    A cell is dropped if bounds keep the argument away from zero, searched by bisection where it is
+    monotone, and halved else, down to rounding. (A tangential zero has no change of sign, and
+    switches nothing.) Cells end at ``knots`` (B,), sorted, where something jumps. What is found is
+    unsorted.
 
     Raises:
         ConfigError: there are too many.

@@ -128,10 +128,8 @@ class Tape:
     ) -> Program | None:
         """What :meth:`taylor` does, for the compiled kernel; None where that is not worth it.
 
-        Args:
-            order: highest coefficient wanted.
-            apart: whether the times at which jumps are decided are others than the times.
-            signals: how many coefficients of how many signals are given; None: no signals are.
+        Jumps are decided at other times if ``apart``. With ``signals``, so many coefficients of so
+        many are given.
         """
         if len(self.instructions) > _MOST_COMPILED:
             return None
@@ -285,18 +283,11 @@ class Assembly:
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
     ) -> tuple[Array, ...] | None:
-        """Taylor coefficients of the matrices at the times t (N,), by the compiled kernel.
+        """As :meth:`Tape.taylor` at the times t (N,), of the matrices, by the compiled kernel.
 
-        Args:
-            t: times (N,).
-            order: highest coefficient wanted.
-            inside: where jumps are decided.
-            signals: as for :meth:`Tape.taylor`.
-
-        Returns:
-            shape (order + 1, N, ...) each, read-only where constant in time; None where there is
-            no kernel for it, or where it met an operation that may have to be refused:
-            :meth:`Tape.taylor` has to decide.
+        They are (order + 1, N, ...) each, read-only where constant in time; None where there is no
+        kernel for it, or where it met an operation that may have to be refused: :meth:`Tape.taylor`
+        has to decide.
         """
         if not kernels.expressions.RUNS_PROGRAMS:
             return None
@@ -340,11 +331,7 @@ def _first_not_finite(coefficient: Coefficient) -> float:
 
 
 def record(expressions: Sequence[Expression], inputs: Sequence[Expression] = ()) -> Tape:
-    """Record expressions on one tape.
-
-    Args:
-        expressions: its outputs.
-        inputs: the first signals as functions of time, for when nobody says what they were.
+    """Record expressions on one tape; ``inputs`` stand for signals that nobody has told.
 
     Raises:
         ConfigError: more than MAX_INSTRUCTIONS different operations.
