@@ -6,13 +6,7 @@ All that an author needs is imported from here (docs/howto/estimator.md); the mo
 with an underscore may change.
 """
 
-from gpebo_cli.estimators._base import (
-    GainEstimator,
-    ResumableEstimator,
-    axis,
-    combinations,
-    gain,
-)
+from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, axis, combinations, gain
 from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
 from gpebo_cli.estimators._information import Information, information
 from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reached

@@ -58,8 +58,7 @@ class SolvedEstimates(Unmixed):
         sigma = [np.linalg.svd(e[-1, :, :-1], compute_uv=False) for e in self.extended]
         worst = min(float(s[-1] / s[0]) for s in sigma)
         return Requirement(
-            name="F⁻¹ regular",
-            holds=worst >= _DIGITS,
+            name="F⁻¹ regular", holds=worst >= _DIGITS,
             evidence={"reciprocal_condition": worst, "needed": _DIGITS},
             text=f"σ_min/σ_max of F⁻¹ is {worst:.2g} at the end; needed is {_DIGITS:.0e}",
         )

@@ -150,8 +150,7 @@ class ScalarLaw:
                 A[:, s:, s:] = keep * np.eye(p)
                 out.append(ErrorRecursion(
                     A, np.concatenate([own.old, on_new @ own.old], axis=1),
-                    np.concatenate([own.new, on_new @ own.new], axis=1),
-                    np.eye(p, s + p, s) / by,
+                    np.concatenate([own.new, on_new @ own.new], axis=1), np.eye(p, s + p, s) / by,
                 ))
         return tuple(out)
 

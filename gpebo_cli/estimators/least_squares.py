@@ -211,8 +211,7 @@ class LeastSquaresEstimates(Unmixed):
 def ratio_requirement(reached: float) -> Requirement:
     """Whether α λ_min(G)/f₀ is enough."""
     return Requirement(
-        name="λ_min(G) → ∞",
-        holds=reached >= 99.0,
+        name="λ_min(G) → ∞", holds=reached >= 99.0,
         evidence={"alpha_lambda_min_over_f0": reached, "needed": 99.0},
         text=f"α λ_min(G)/f₀ = {reached:.3g}; 1 % of the initial error needs 99",
     )
@@ -250,10 +249,7 @@ class RecursiveLeastSquares:
             """δη̂ = αF δh_z."""
             filters = [integrating(regression, case["beta"]) for case in self._cases]
             return tuple(
-                ErrorRecursion(
-                    own.A, own.old, own.new,
-                    s.covariance(case["alpha"], case["f0"]),
-                )
+                ErrorRecursion(own.A, own.old, own.new, s.covariance(case["alpha"], case["f0"]))
                 for own, case, s in zip(filters, self._cases, spectra, strict=True)
             )
 

@@ -100,9 +100,7 @@ class MemoryExtension(ResumableEstimator):
         gains = self.gains("gamma", regression.parameters)
         return VectorEstimates(
             law=VectorLaw(
-                M=Trajectory(mesh, identity),
-                N=omega,
-                b=Trajectory(mesh, values[..., p:]),
+                M=Trajectory(mesh, identity), N=omega, b=Trajectory(mesh, values[..., p:]),
                 floor=regression.floor,
             ),
             start=self.start(regression.parameters),

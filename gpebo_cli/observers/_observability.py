@@ -44,11 +44,7 @@ class _Identity:
 
 
 def window_gramians(
-    model: Callable[[Array, Array], tuple[Array, Array]],
-    n: int,
-    mesh: Mesh,
-    *,
-    tol: float,
+    model: Callable[[Array, Array], tuple[Array, Array]], n: int, mesh: Mesh, *, tol: float,
     max_elements: int,
 ) -> WindowGramians:
     """M over windows of a tenth of the horizon, from every edge that leaves room for one.

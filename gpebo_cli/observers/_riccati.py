@@ -155,16 +155,9 @@ class Filtered:
 
 
 def run_filter(
-    model: Callable[[Array, Array], tuple[StateSpace, tuple[Array, ...]]],
-    start: Array,
-    P0: Array,
-    mesh: Mesh,
-    *,
-    tol: float,
-    max_elements: int,
-    monitor: Monitor | None = None,
-    name: str = "Kalman-Bucy filter",
-    floor: Array | float = 0.0,
+    model: Callable[[Array, Array], tuple[StateSpace, tuple[Array, ...]]], start: Array, P0: Array,
+    mesh: Mesh, *, tol: float, max_elements: int, monitor: Monitor | None = None,
+    name: str = "Kalman-Bucy filter", floor: Array | float = 0.0,
 ) -> Filtered:
     """Solve Riccati equation and filter on ``mesh``, refined until P and ζ̂ are resolved.
 

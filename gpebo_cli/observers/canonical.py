@@ -34,12 +34,7 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import Measurements, initial_extension, output_scale
-from gpebo_cli.observers._observation import (
-    InitialError,
-    Observation,
-    Reconstruction,
-    log_norm,
-)
+from gpebo_cli.observers._observation import InitialError, Observation, Reconstruction, log_norm
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.schema import unknown
 from gpebo_cli.settings import SolverSettings
@@ -78,8 +73,7 @@ def canonical_blocks(system: DescriptorSystem, t: Array, inside: Array) -> Block
     free_E[n_a:, n_a:] = np.tril(np.ones((n - n_a, n - n_a), bool), -1)
     free_A[:n_a, :n_a] = True
     for name, matrix, expected, free in (
-        ("E", E, expected_E, free_E),
-        ("A", A, expected_A, free_A),
+        ("E", E, expected_E, free_E), ("A", A, expected_A, free_A),
     ):
         wrong = (np.abs(matrix - expected) > _ZERO) & ~free
         if wrong.any():
@@ -167,10 +161,7 @@ class Canonical:
             size = 1e-3 * float(np.abs(outputs.values[:, :, suitable]).max(initial=0.0))
             level = float(np.abs(psi).max(initial=0.0))
             kinds = (
-                (Y, size),
-                (psi, 0.0),
-                (products[..., :-1], 0.0),
-                (products[..., -1], level * size),
+                (Y, size), (psi, 0.0), (products[..., :-1], 0.0), (products[..., -1], level * size),
             )
             return [(signal.reshape(*shape, -1), floor) for signal, floor in kinds]
 
@@ -183,16 +174,12 @@ class Canonical:
         zb = _unknown_input_observer(self, system, mesh, signals, n_a)
         return Observation(
             regression=LinearRegression(
-                Trajectory(mesh, Y),
-                Trajectory(mesh, psi),
-                (*system.unknowns, *names),
+                Trajectory(mesh, Y), Trajectory(mesh, psi), (*system.unknowns, *names),
                 np.abs(psi).max(axis=(0, 1, 2), initial=0.0),
             ),
             state_map=CanonicalStateMap(
                 xi_a=Trajectory(mesh, xi),
-                gain=Trajectory(mesh, np.concatenate([xi_b, -Phi], axis=-1)),
-                zb=zb,
-                n_b=n_b,
+                gain=Trajectory(mesh, np.concatenate([xi_b, -Phi], axis=-1)), zb=zb, n_b=n_b,
             ),
             truth=InitialError(
                 np.eye(n_a, system.n), xi_a0, np.eye(n_a, system.n), solution.trajectory
@@ -200,9 +187,7 @@ class Canonical:
             error_estimate=solution.error_estimate,
             assumptions=(
                 Assumption(
-                    "Assumption 3",
-                    "at least one output does not see z_b",
-                    True,
+                    "Assumption 3", "at least one output does not see z_b", True,
                     {"outputs": ", ".join(system.outputs[k] for k in suitable)},
                 ),
                 *(zb.assumptions if zb is not None else ()),
@@ -429,8 +414,7 @@ def transition_decay(M: Trajectory) -> float:
     The values of M have shape (K, s + 1, 2, 2).
     """
     problem = LinearProblem(
-        lambda t, inside: LinearEquation(None, M(t, inside), np.zeros((1, 2, 2))),
-        np.eye(2),
+        lambda t, inside: LinearEquation(None, M(t, inside), np.zeros((1, 2, 2))), np.eye(2),
         name="M_w",
     )
     solution = solve(problem, M.mesh, tol=1e-6, max_elements=1_000_000)
@@ -491,8 +475,7 @@ def estimate_zb(zb: UnknownInputObserver, t: Array, za: Array) -> Array:
     )
     problem = LinearProblem(
         lambda t, inside: LinearEquation(None, zb.M(t, inside), driven(t, inside)),
-        np.repeat(zb.start[:, None], g, axis=1),
-        name="observer of z_b",
+        np.repeat(zb.start[:, None], g, axis=1), name="observer of z_b",
     )
     # On the given mesh: ẑ_a is known at its points only.
     r = solve(problem, mesh, tol=1e300, max_elements=mesh.size).trajectory

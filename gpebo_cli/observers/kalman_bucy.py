@@ -37,12 +37,7 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers._base import ByName, Measurements, SignalNoise
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
-from gpebo_cli.observers._observation import (
-    AffineStateMap,
-    Filtering,
-    Observation,
-    Reconstruction,
-)
+from gpebo_cli.observers._observation import AffineStateMap, Filtering, Observation, Reconstruction
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
 from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
@@ -391,8 +386,7 @@ def _measurement_noise(
     return Assumption(
         "Measurement noise",
         "its covariance V(t) is positive definite, regularised where the noise leaves it singular",
-        True,
-        used,
+        True, used,
     )
 
 

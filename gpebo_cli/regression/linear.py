@@ -136,8 +136,7 @@ class LinearRegression:
             piece = Mesh(mesh.edges[first : last + 1], mesh.rule)
             out.append(replace(
                 self, Y=Trajectory(piece, self.Y.values[first:last]),
-                psi=Trajectory(piece, self.psi.values[first:last]), resets=(),
-                floor=floor,
+                psi=Trajectory(piece, self.psi.values[first:last]), resets=(), floor=floor,
             ))
         return tuple(out)
 

@@ -84,11 +84,7 @@ def consistent_start(
 
 
 def solve(
-    problem: LinearProblem,
-    mesh: Mesh,
-    *,
-    tol: float,
-    max_elements: int,
+    problem: LinearProblem, mesh: Mesh, *, tol: float, max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None,
 ) -> LinearSolution:
     """Same meaning as :func:`gpebo_cli.numerics.collocation.solve`, for E = I (n, n) only.

@@ -243,8 +243,7 @@ def _simulated(
         return [(x, least[:, 0]), (y, of_y[:, 0]), (u, shares)]
 
     problem = LinearProblem(
-        _no_coefficients, z0[:, None], monitor, f"plant {system.name}",
-        floor_z, apart=True,
+        _no_coefficients, z0[:, None], monitor, f"plant {system.name}", floor_z, apart=True,
     )
     solution = sweeps.solve(
         problem, equation, mesh, units=units, tol=tol, max_elements=solver.max_elements,

@@ -10,33 +10,16 @@ from typing import cast
 import numpy as np
 
 from gpebo_cli.errors import ModelError, SolverError
-from gpebo_cli.model.descriptor import (
-    Array,
-    Coefficients,
-    DescriptorSystem,
-    check_sizes,
-    distinct,
-)
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
 from gpebo_cli.model.text import TextCoefficients
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
-from gpebo_cli.numerics.mesh import (
-    FIRST_ELEMENTS,
-    SHARE,
-    Kind,
-    Mesh,
-    Trajectory,
-    initial_mesh,
-)
+from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, SHARE, Kind, Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
-from gpebo_cli.reduction.strangeness_free import (
-    StrangenessFree,
-    direct_part,
-    strangeness_free_form,
-)
+from gpebo_cli.reduction.strangeness_free import StrangenessFree, direct_part, strangeness_free_form
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp

@@ -122,8 +122,7 @@ class ObserverMatrices:
         has to fulfil, and w must stay in range P.
         """
         return replace(
-            self,
-            dynamics=self.dynamics - gain @ self.on_basis,
+            self, dynamics=self.dynamics - gain @ self.on_basis,
             from_unknowns=self.from_unknowns - gain @ self.G,
             from_signals=self.from_signals - gain @ self.g_signals,
         )

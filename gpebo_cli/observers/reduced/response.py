@@ -30,8 +30,7 @@ def error_system(o: ObserverMatrices, kept: IntArray | slice, inputs: int) -> Er
     R, H, Q1 = o.residual[:, kept], o.elimination, transpose(o.range)
     g = o.of_noise(o.g_signals, inputs)
     return ErrorSystem(
-        o.dynamics,
-        o.of_noise(o.from_signals, inputs),
+        o.dynamics, o.of_noise(o.from_signals, inputs),
         _stacked(R @ o.on_basis, o.split.basis - H @ (Q1 @ o.on_basis)),
         _stacked(R @ g, -H @ (Q1 @ g)),
     )

@@ -227,10 +227,8 @@ def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
     a, b = first.regression, rest.regression
     return SampledBlock(
         SampledRegression(
-            np.concatenate([a.t, b.t]),
-            np.concatenate([a.steps, b.steps]),
-            np.concatenate([a.rows[:1], b.rows]),
-            b.hold,
+            np.concatenate([a.t, b.t]), np.concatenate([a.steps, b.steps]),
+            np.concatenate([a.rows[:1], b.rows]), b.hold,
         ),
         np.concatenate([first.offset, rest.offset]),
         np.concatenate([first.gain, rest.gain]),
@@ -279,8 +277,7 @@ def sampled_observer(
     return SampledObserver(
         form=used, solver=solver, hold=hold, regression=regression, like=first,
         start=begin.extension(first.split.dual, begin.offset + begin.basis @ xi),
-        initial_dual=begin.dual, xi_a0=xi,
-        parameters=(*system.unknowns, *begin.names), note=note,
+        initial_dual=begin.dual, xi_a0=xi, parameters=(*system.unknowns, *begin.names), note=note,
     )
 
 

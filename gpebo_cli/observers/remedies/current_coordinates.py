@@ -116,7 +116,6 @@ def _with_kernel(a: Assembled, kernel: Array, q: int) -> Assembled:
     scale = a.column_scale.max(initial=0.0)
     rows = np.concatenate([np.zeros((count, n, q)), scale * kernel], axis=2)
     return replace(
-        a,
-        Y=np.concatenate([a.Y, np.zeros((count, n))], axis=1),
+        a, Y=np.concatenate([a.Y, np.zeros((count, n))], axis=1),
         psi=np.concatenate([a.psi, rows], axis=1),
     )

@@ -133,8 +133,7 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     V = V * units_along(V, reduced.units)
     S0 = kappa * V @ V.T
     S = run_filter(
-        model, np.zeros((n, 0)), S0, mesh, tol=_TOLERANCE,
-        max_elements=reduced.solver.max_elements,
+        model, np.zeros((n, 0)), S0, mesh, tol=_TOLERANCE, max_elements=reduced.solver.max_elements,
         name=f"output injection for plant {reduced.system.name}",
     )
 

@@ -27,18 +27,8 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._observation import (
-    Observation,
-    error_of_extension,
-    log_norm,
-)
-from gpebo_cli.observers.reduced.extension import (
-    Extension,
-    ReducedSystem,
-    Start,
-    extend,
-    joined,
-)
+from gpebo_cli.observers._observation import Observation, error_of_extension, log_norm
+from gpebo_cli.observers.reduced.extension import Extension, ReducedSystem, Start, extend, joined
 from gpebo_cli.observers.reduced.split import comparable
 from gpebo_cli.observers.remedies.plain import observation
 from gpebo_cli.regression.linear import outer_products
