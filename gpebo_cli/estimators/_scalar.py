@@ -86,26 +86,24 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
 def law_variation(energy: Array, quotient: Array, gain: float) -> tuple[float, float]:
     """How much η̄ (K, s + 1, p) varies from a point to the next, weighted by what that can do.
 
-    The weight is the share min(1, γδI) of a step of I (K, s + 1) that η̂ goes to meet η̄.
-
     Returns:
         the largest variation, and the largest |η̄| of the last element.
     """
-    length = np.maximum(np.diff(energy, axis=1), 0.0)
-    weight = np.minimum(1.0, gain * length)
-    change = np.abs(np.diff(quotient, axis=1))
+    weight, change = _changes(energy, quotient, gain)
     return (
-        float((weight[..., None] * change).max(initial=0.0)),
-        float(np.abs(quotient[-1]).max(initial=0.0)),
+        float((weight * change).max(initial=0.0)), float(np.abs(quotient[-1]).max(initial=0.0))
     )
+
+
+def _changes(energy: Array, quotient: Array, gain: float) -> tuple[Array, Array]:
+    """Shares min(1, γδI) of a step of I that η̂ goes to meet η̄, and by how much η̄ changes in it."""
+    length = np.maximum(np.diff(energy, axis=1), 0.0)
+    return np.minimum(1.0, gain * length)[..., None], np.abs(np.diff(quotient, axis=1))
 
 
 def _known_variation(path: ScalarPath, gain: float, size: float) -> float:
     """:func:`law_variation` of what is more than the rounding of 𝐘/Δ, where there is much of it."""
-    mesh = path.mesh
-    length = np.maximum(np.diff(path.energy, axis=1), 0.0)
-    weight = np.minimum(1.0, gain * length)[..., None]
-    change = np.abs(np.diff(path.quotient, axis=1))
+    mesh, (weight, change) = path.mesh, _changes(path.energy, path.quotient, gain)
     much = (weight * change > _CONSTANT * size).any(axis=(1, 2))
     points, inside = mesh.points[much], mesh.inside[much]
     digits = path.signals(points.ravel(), inside.ravel())[2].reshape(points.shape)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpebo_cli.estimators._base import GainEstimator
+from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
@@ -14,7 +16,7 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Trajectory, joined
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.linear import with_realisations
+from gpebo_cli.regression.linear import LinearRegression, with_realisations
 from gpebo_cli.regression.resets import ExtensionState
 
 _MAX_ELEMENTS = 200_000
@@ -131,6 +133,19 @@ class VectorEstimates:
             for gain, own in zip(gains, starts, strict=True)
         ])
         return eta.reshape(*eta.shape[:3], *self.realisations)
+
+
+def vector_estimates(
+    settings: GainEstimator, regression: LinearRegression, law: VectorLaw, information: Trajectory,
+    t: Array,
+) -> VectorEstimates:
+    """A law with the gains γ of the settings at the times t (M,), for MᵀN or its mean (p, p)."""
+    names = regression.parameters
+    gains = settings.gains("gamma", names)
+    requirement = persistent(information, float(gains.min()))
+    return VectorEstimates(
+        law, settings.start(names), gains, np.asarray(t), requirement, regression.realisations
+    )
 
 
 class VectorRecursion:

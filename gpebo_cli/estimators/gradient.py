@@ -9,9 +9,12 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw, VectorRecursion
-from gpebo_cli.evidence.excitation import persistent
-from gpebo_cli.findings import Requirement
+from gpebo_cli.estimators._vector import (
+    VectorEstimates,
+    VectorLaw,
+    VectorRecursion,
+    vector_estimates,
+)
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
@@ -41,15 +44,8 @@ class Gradient(ResumableEstimator):
     ) -> VectorEstimates:
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         information = Trajectory(regression.mesh, regression.outer.values[..., : regression.p])
-        gains = self._gains(regression)
-        return VectorEstimates(
-            law=VectorLaw(regression.psi, regression.psi, regression.Y, regression.floor),
-            start=self.start(regression.parameters),
-            gains=gains,
-            t=np.asarray(t),
-            realisations=regression.realisations,
-            requirement=persistent(information, float(gains.min())),
-        )
+        law = VectorLaw(regression.psi, regression.psi, regression.Y, regression.floor)
+        return vector_estimates(self, regression, law, information, t)
 
     def errors(
         self, regression: LinearRegression, known: Sequence[ExtensionState] = (),  # noqa: ARG002
@@ -62,15 +58,12 @@ class Gradient(ResumableEstimator):
             into = gain[:, None] * transpose(psi)
             return ErrorSystem(-into @ psi, into, np.eye(p)[None], np.zeros((1, p, psi.shape[1])))
 
-        gains = self._gains(regression)
+        gains = self.gains("gamma", regression.parameters)
         return tuple(partial(at, np.broadcast_to(gain, p)) for gain in gains)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveGradient:
         """The estimator at samples: exact for a ψ that is held between them."""
-        return RecursiveGradient(self, parameters)
-
-    def _gains(self, regression: LinearRegression) -> Array:
-        return self.gains("gamma", regression.parameters)
+        return RecursiveGradient(self.start(parameters), self.gains("gamma", parameters))
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
@@ -80,24 +73,20 @@ class Gradient(ResumableEstimator):
         return replace(plain, law=replace(plain.law, dynamics=dynamics))
 
 
-class RecursiveGradient:
+class RecursiveGradient(VectorRecursion):
     """The law over each sample, for ψ and Y as the hold rule has them between samples."""
-
-    def __init__(self, settings: Gradient, parameters: Sequence[str]) -> None:
-        gains = settings.gains("gamma", parameters)
-        self._law = VectorRecursion(settings.start(parameters), gains)
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each.
 
         With ψΓ^½√h = U Σ Vᵀ a step is η̂ + Γ^½ V (1 − e^{−Σ²})/Σ Uᵀ √h (Y − ψη̂).
         """
-        rows, p, roots = regression.weighted(), regression.p, self._law.roots[:, None, None]
+        rows, p, roots = regression.weighted(), regression.p, self.roots[:, None, None]
         U, sigma, Vt = np.linalg.svd(rows[..., :p] * roots, full_matrices=False)
         done = -np.expm1(-np.minimum(sigma, _ALL) ** 2)
         done = np.divide(done, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
         L = transpose((U * done[..., None, :]) @ Vt * roots)
-        eta, shrunk = self._law.advance(L, rows[..., :p], rows[..., p])
+        eta, shrunk = self.advance(L, rows[..., :p], rows[..., p])
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δη̂' = (I − LN) δη̂ + L δY, of every case."""
@@ -109,11 +98,6 @@ class RecursiveGradient:
             )
 
         return SampledEstimates(eta, None, errors)
-
-    @property
-    def requirement(self) -> Requirement:
-        """How far errors have shrunk so far."""
-        return self._law.requirement
 
 
 ESTIMATOR = Gradient

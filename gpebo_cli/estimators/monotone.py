@@ -89,19 +89,18 @@ class Monotone(GainEstimator):
         if S is None:
             raise ConfigError("estimator=monotone is for a regression with S and box; it has none")
         start = 0.5 * (S.low + S.high)
-        T = np.linalg.pinv(S.jacobian(start[None])[0]) if self.T is None else self._matrix(S)
+        if self.T is None:
+            T = np.linalg.pinv(S.jacobian(start[None])[0])
+        elif [len(row) for row in self.T] == [len(S.tape.outputs)] * len(S.names):
+            T = np.array(self.T)
+        else:
+            raise ConfigError(
+                f"estimator.T must have {len(S.names)} rows of {len(S.tape.outputs)} numbers, not "
+                f"{shown(self.T)}"
+            )
         if self.initial is not None:
             start = per_name(self.initial, S.names, "unknown", "estimator.initial", "finite")
         return S, T, 0.5 * S.monotone(T), start
-
-    def _matrix(self, S: Parametrisation) -> Array:
-        shape = (len(S.names), len(S.tape.outputs))
-        rows = self.T or []
-        if [len(row) for row in rows] != [shape[1]] * shape[0]:
-            raise ConfigError(
-                f"estimator.T must have {shape[0]} rows of {shape[1]} numbers, not {shown(self.T)}"
-            )
-        return np.array(rows)
 
     def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
         """δ𝒴' = −Λ(δ𝒴 − ψᵀδY), δθ̂' = γΔT(adj(Ω) δ𝒴 − Δ∇S δθ̂), δη̂ = ∇S δθ̂, of every case."""

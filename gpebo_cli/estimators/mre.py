@@ -16,9 +16,12 @@ from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import reached
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, over_steps
-from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw, VectorRecursion
-from gpebo_cli.evidence.excitation import persistent
-from gpebo_cli.findings import Requirement
+from gpebo_cli.estimators._vector import (
+    VectorEstimates,
+    VectorLaw,
+    VectorRecursion,
+    vector_estimates,
+)
 from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
@@ -84,7 +87,7 @@ class MemoryExtension(ResumableEstimator):
     def recursive(self, parameters: Sequence[str]) -> RecursiveMemoryExtension:
         """The estimator at samples."""
         return RecursiveMemoryExtension(
-            self.gains("gamma", parameters), self._rates(len(parameters)), self.start(parameters)
+            self.start(parameters), self.gains("gamma", parameters), self._rates(len(parameters))
         )
 
     def _rates(self, p: int) -> Array:
@@ -93,30 +96,19 @@ class MemoryExtension(ResumableEstimator):
     def _estimates(
         self, regression: LinearRegression, extended: Trajectory, t: Array
     ) -> VectorEstimates:
-        p = regression.p
-        mesh, values = extended.mesh, extended.values
-        omega = Trajectory(mesh, values[..., :p])
-        identity = np.broadcast_to(np.eye(p), values[..., :p].shape)
-        gains = self.gains("gamma", regression.parameters)
-        return VectorEstimates(
-            law=VectorLaw(
-                M=Trajectory(mesh, identity), N=omega, b=Trajectory(mesh, values[..., p:]),
-                floor=regression.floor,
-            ),
-            start=self.start(regression.parameters),
-            gains=gains,
-            t=np.asarray(t),
-            realisations=regression.realisations,
-            requirement=persistent(omega, float(gains.min())),
-        )
+        mesh, values, p = extended.mesh, extended.values, regression.p
+        identity = Trajectory(mesh, np.broadcast_to(np.eye(p), values[..., :p].shape))
+        omega, rhs = Trajectory(mesh, values[..., :p]), Trajectory(mesh, values[..., p:])
+        law = VectorLaw(identity, omega, rhs, regression.floor)
+        return vector_estimates(self, regression, law, omega, t)
 
 
-class RecursiveMemoryExtension:
+class RecursiveMemoryExtension(VectorRecursion):
     """Filters of held signals, and the law over each sample for Ω and 𝒴 as they are on average."""
 
-    def __init__(self, gains: Array, rates: Array, start: Array) -> None:
+    def __init__(self, start: Array, gains: Array, rates: Array) -> None:
+        super().__init__(start, gains)
         self._filter = KreisselmeierFilter(rates)
-        self._law = VectorRecursion(start, gains)
         self._before = np.zeros((1, len(start), len(start) + 1))
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
@@ -127,12 +119,12 @@ class RecursiveMemoryExtension:
         extended, p = self._filter.update(regression), regression.p
         whole = over_steps(regression, extended, self._before)
         self._before = extended[-1:]
-        omega, roots = whole[..., :p], self._law.roots[:, None]
+        omega, roots = whole[..., :p], self.roots[:, None]
         M, V = np.linalg.eigh(roots[..., None] * omega * roots[..., None, :])
         V = roots[..., None] * V
         # It is the mean of e^{−x} over 0 to M.
         L = (V * mean_decay(np.maximum(M, 0.0))[..., None, :]) @ transpose(V)
-        eta, shrunk = self._law.advance(L, omega, whole[..., p])
+        eta, shrunk = self.advance(L, omega, whole[..., p])
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δ𝒴 of the filters, δη̂' = (I − L∫Ω) δη̂ + L ∫δ𝒴, of every case."""
@@ -150,11 +142,6 @@ class RecursiveMemoryExtension:
             return tuple(out)
 
         return SampledEstimates(eta, None, errors)
-
-    @property
-    def requirement(self) -> Requirement:
-        """How far errors have shrunk so far."""
-        return self._law.requirement
 
 
 ESTIMATOR = MemoryExtension

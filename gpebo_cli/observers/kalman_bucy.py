@@ -45,6 +45,7 @@ from gpebo_cli.observers.reduced.split import Split
 from gpebo_cli.observers.remedies.current_coordinates import CurrentState
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.regression.estimator import Unmixed
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings, SolverSettings
@@ -436,15 +437,11 @@ class Filter:
 
 
 @dataclass(frozen=True, eq=False)
-class KalmanBucyEstimates:
+class KalmanBucyEstimates(Unmixed):
     """ζ̂ at fixed times."""
 
     values: Array  # (1, M, n)
     requirement: Requirement
-
-    def delta(self, t: Array) -> None:  # noqa: ARG002  protocol
-        """Nothing is mixed at any time (M,)."""
-        return
 
     def parameters(self, cases: slice) -> Array:
         """ζ̂ of some cases, (g, M, n)."""

@@ -20,7 +20,7 @@ from gpebo_cli.errors import ModelError
 from gpebo_cli.evidence.uncertainty import error_steps
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import solve
+from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
@@ -123,40 +123,42 @@ class SampledObserver:
             ModelError: the rank of E changes, or Assumption 1 fails.
             SolverError: a step cannot be resolved.
         """
-        if state is None:
-            k, signals = len(self.start), u.shape[1] + y.shape[1]
-            known = np.eye(k, k + 2 * signals)[None] if self.errors else None
-            first = self._block(self.start[None], t[:1], u[:1], y[:1], None, known)
-            if len(t) == 1:
-                return first
-            state, block = first
-            state, rest = self.advance(state, t[1:], u[1:], y[1:])
-            return state, _joined(block, rest)
-        times = np.concatenate([[state.t], t])
-        signals = np.concatenate([np.append(state.u, state.y)[None], np.hstack([u, y])])
+        own = np.hstack([u, y])
+        times, signals, start, error = t, own, self.start, 0.0
+        z, steps = [], []
+        if state is None:  # the extension starts at the first sample
+            z.append(start[None])
+            steps.append(np.eye(len(start), len(start) + 2 * own.shape[1])[None])
+        else:
+            times = np.concatenate([[state.t], t])
+            signals = np.concatenate([np.append(state.u, state.y)[None], own])
+            start, error = state.extension, state.error_estimate
+        if len(times) > 1:
+            solution = self._carried(times, signals, start)
+            mesh, error = solution.trajectory.mesh, max(error, solution.error_estimate)
+            ends = np.searchsorted(mesh.edges, times[1:]) - 1  # every sample is an edge
+            z.append(solution.trajectory.values[ends, -1])
+            if self.errors:
+                steps.append(error_steps(mesh, times, self.hold, *solution.extras))
+        step = np.concatenate(steps) if self.errors else None
+        return self._block(np.concatenate(z), t, own, state, step, error)
+
+    def _carried(self, times: Array, signals: Array, start: Array) -> LinearSolution:
+        """[ξ_a | ξ_b | Φ] from ``start`` (k, ·) at the first to the last of the times (N,)."""
         signal = held(times, signals, self.hold)
 
         def coefficients(at: Array, inside: Array) -> LinearEquation:
             o, driving = self._matrices(at, inside, signal(at, inside))
-            f = o.forcing(driving, self.start.shape[1])
+            f = o.forcing(driving, start.shape[1])
             noise = (o.dynamics, o.of_noise(o.from_signals, self.system.m)) if self.errors else ()
             return LinearEquation(None, o.dynamics, f, noise)
 
         cuts = self.system.coefficients.breakpoints(float(times[0]), float(times[-1]))
-        solution = solve(
-            LinearProblem(
-                coefficients, state.extension, name=f"observer of plant {self.system.name}"
-            ),
-            Mesh(edges(times, cuts), radau_rule(_STAGES)),
-            tol=max(self.solver.tol, TOLERANCE),
-            max_elements=self.solver.max_elements,
+        problem = LinearProblem(coefficients, start, name=f"observer of plant {self.system.name}")
+        return solve(
+            problem, Mesh(edges(times, cuts), radau_rule(_STAGES)),
+            tol=max(self.solver.tol, TOLERANCE), max_elements=self.solver.max_elements,
         )
-        mesh = solution.trajectory.mesh
-        ends = np.searchsorted(mesh.edges, t) - 1  # every sample is an edge
-        error = max(state.error_estimate, solution.error_estimate)
-        after = replace(state, error_estimate=error)
-        step = error_steps(mesh, times, self.hold, *solution.extras) if self.errors else None
-        return self._block(solution.trajectory.values[ends, -1], t, u, y, after, step)
 
     def _matrices(
         self, t: Array, inside: Array, signals: Array
@@ -177,15 +179,12 @@ class SampledObserver:
         return o, np.concatenate([driving, signals[:, m:]], axis=1)[:, :, None]
 
     def _block(
-        self, z: Array, t: Array, u: Array, y: Array, before: SampledState | None,
-        step: Array | None,
+        self, z: Array, t: Array, signals: Array, before: SampledState | None, step: Array | None,
+        error: float,
     ) -> tuple[SampledState, SampledBlock]:
-        """Regression and state map from [ξ_a | ξ_b | Φ] at the samples, z (K, k, ·).
-
-        With what errors become on the way there, ``step`` (K, k, k + 2 (m + r)).
-        """
+        """Regression and state map from [ξ_a | ξ_b | Φ], z (K, k, ·), and what errors become."""
         system = self.system
-        o, driving = self._matrices(t, t, np.hstack([u, y]))
+        o, driving = self._matrices(t, t, signals)
         equations = o.equations(driving)
         assembled = regression_signals(z, system.q, self.basis, equations)
         Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
@@ -203,8 +202,8 @@ class SampledObserver:
             rows = rows[:, -system.r :]
         previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
         state = SampledState(
-            float(t[-1]), u[-1], y[-1], z[-1], rows[-1], scale[-1], growth, smallest,
-            0.0 if before is None else before.error_estimate,
+            float(t[-1]), signals[-1, : system.m], signals[-1, system.m :], z[-1], rows[-1],
+            scale[-1], growth, smallest, error,
         )
         regression = SampledRegression(
             t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]), self.hold
@@ -220,25 +219,6 @@ class SampledObserver:
         return state, SampledBlock(
             regression, offset, gain, z, scale, errors, self.form.units.states
         )
-
-
-def _joined(first: SampledBlock, rest: SampledBlock) -> SampledBlock:
-    """One block of the first sample and those after it."""
-    a, b = first.regression, rest.regression
-    return SampledBlock(
-        SampledRegression(
-            np.concatenate([a.t, b.t]), np.concatenate([a.steps, b.steps]),
-            np.concatenate([a.rows[:1], b.rows]), b.hold,
-        ),
-        np.concatenate([first.offset, rest.offset]),
-        np.concatenate([first.gain, rest.gain]),
-        np.concatenate([first.extension, rest.extension]),
-        np.concatenate([first.scale, rest.scale]),
-        None if first.errors is None or rest.errors is None else ErrorSteps(
-            *map(np.concatenate, zip(first.errors, rest.errors, strict=True))
-        ),
-        first.units,
-    )
 
 
 def sampled_observer(
