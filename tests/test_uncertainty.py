@@ -15,6 +15,7 @@ from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence.metrics import standing_since
 from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
 from gpebo_cli.experiment.pipeline import stream
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.results.report import run_lines
@@ -140,6 +141,28 @@ def test_at_samples_they_are_what_each_error_by_itself_does(hold, estimator):
         for sigma, signals in ((0.3, (u, y + one)), (0.2, (u + one, y))):
             variance += (sigma * (fed(system, estimator, t, *signals, hold)[0] - base)) ** 2
     np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5, atol=1e-7)
+
+
+def test_at_samples_matrices_may_follow_an_input_without_noise():
+    """A pump's gain: F follows u, whose samples are exact; y alone is noisy."""
+    system = plant_from_mapping({
+        "name": "tank", "states": ["h"], "inputs": {"u": 0}, "unknowns": {"gain": 1, "leak": 1},
+        "outputs": ["y"], "E": [[1]], "A": [["-1 - 0.3*u"]], "F": [["u", -1]], "C": [[1]],
+        "initial_state": {"h": 0},
+    }, "tank")
+    t = np.linspace(0.0, 4.0, 12)
+    u, y = np.sin(3 * t)[:, None] + 1.0, np.cos(t)[:, None]
+    noise, law = NoiseSettings(name="gaussian", outputs=0.3), {"name": "least_squares"}
+    base, std, _ = fed(system, law, t, u, y, "linear", noise, cut=5)
+    variance = np.zeros_like(std)
+    for j in range(len(t)):
+        one = np.zeros((len(t), 1))
+        one[j] = 0.3
+        variance += (fed(system, law, t, u, y + one, "linear")[0] - base) ** 2
+    np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5, atol=1e-7)
+    noisy = NoiseSettings(name="gaussian", outputs=0.3, inputs=0.1)
+    with pytest.raises(TypeError):  # there are none
+        fed(system, law, t, u, y, "linear", noisy)
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])

@@ -417,6 +417,7 @@ class SampledDeviations:
             relative: whether they have to be multiplied by what :meth:`update` finds.
         """
         self._deviations, self._number, self._relative = np.sqrt(variances), number, relative
+        self.noisy = variances > 0.0  # (m + r,)
         self._factors: list[Array] = []  # L of [ζ; e; s] of each case
         self._before: tuple[Array, Array] | None = None  # C and D of the last sample
         self._last = -np.inf

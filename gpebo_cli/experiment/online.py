@@ -149,7 +149,7 @@ class Online:
         self._system = system
         self._deviations = None if len(self.cases) > MOST_CASES else deviations
         if self._deviations is not None and isinstance(self._observer, observers.Responding):
-            self._observer = self._observer.responding()
+            self._observer = self._observer.responding(self._deviations.noisy)
         self.count = 0
 
     def feed(self, t: Array, u: Array, y: Array) -> OnlineEstimates:

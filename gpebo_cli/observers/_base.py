@@ -13,7 +13,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers._observation import Observation, SampledBlock, Truth
 from gpebo_cli.reduction.form import InputDerivatives
@@ -137,8 +137,8 @@ class Recursion(Protocol):
 class Responding(Recursion, Protocol):
     """A recursion that can tell how errors of the signals become errors of Y and of the state."""
 
-    def responding(self) -> Recursion:
-        """The same, whose blocks have ``errors`` where those are linear."""
+    def responding(self, noisy: BoolArray) -> Recursion:
+        """The same with ``errors`` where those of the noisy ones of [u; y] (m + r,) are linear."""
         ...
 
 

@@ -136,6 +136,12 @@ class EquationForm:
             return ()
         return tuple(sorted({j for _, j in self.derivatives}))
 
+    def noise_enters(self, noisy: BoolArray) -> bool:
+        """Whether noise of the ``noisy`` ones of [u; y] (m + r,) is in matrices or in slopes."""
+        names = frozenset[str]().union(*self.system.coefficients.signals.values())
+        signals = (*self.system.inputs, *self.system.outputs)
+        return any(signals[j] in names or j in self.interpolated for j in np.flatnonzero(noisy))
+
     def driving(self, t: Array, inside: Array, u: Array) -> Array:
         """v (N, ·) at the times t (N,), from the measured inputs u (N, m)."""
         if not (self.derivatives or self.known_term):

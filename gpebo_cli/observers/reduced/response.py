@@ -75,15 +75,3 @@ def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) 
         )
     algebraic, direct = solution.extras
     return np.asarray(algebraic @ solution.trajectory.values + direct)
-
-
-def noisy_matrices(reduced: ReducedSystem) -> bool:
-    """Whether noise is in matrices or in slopes of inputs, where the response is not computed."""
-    system, noise = reduced.system, reduced.signals.noise
-    if not reduced.form.follows_signals:
-        return False
-    names = frozenset[str]().union(*system.coefficients.signals.values())
-    noisy = np.flatnonzero(np.zeros(0) if noise is None else noise.inputs)
-    return system.depends_on_outputs or any(
-        system.inputs[j] in names or j in reduced.form.interpolated for j in noisy
-    )

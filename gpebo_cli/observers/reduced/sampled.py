@@ -19,7 +19,7 @@ import numpy as np
 from gpebo_cli.errors import ModelError
 from gpebo_cli.evidence.uncertainty import error_steps
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
@@ -78,9 +78,9 @@ class SampledObserver:
     note: str  # which form of the equations is used, where that was not said, and why
     errors: bool = False  # whether blocks say what errors of u and y do
 
-    def responding(self) -> SampledObserver:
-        """The same with ``errors``, unless matrices or slopes of inputs follow the signals, too."""
-        return replace(self, errors=not (self.form.follows_signals or self.form.interpolated))
+    def responding(self, noisy: BoolArray) -> SampledObserver:
+        """The same with ``errors``, unless noise of [u; y] (m + r,) is in matrices or slopes."""
+        return replace(self, errors=not self.form.noise_enters(noisy))
 
     @property
     def system(self) -> DescriptorSystem:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation, Truth
 from gpebo_cli.observers.reduced.extension import Extension, ReducedSystem, assumptions, extend
-from gpebo_cli.observers.reduced.response import errors_of, noisy_matrices, respond
+from gpebo_cli.observers.reduced.response import errors_of, respond
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import Reset
 
@@ -54,7 +54,11 @@ def observation(
     some = slice(None) if len(kept) == final.Y.shape[1] else kept  # a slice copies nothing
     start, stop = reduced.signals.span
     # Along noisy signals the matrices change, too, and Y is not affine in the noise.
-    errors = None if noisy_matrices(reduced) else errors_of(reduced, kept)
+    system, noise = reduced.system, reduced.signals.noise
+    noisy = np.arange(system.m + system.r) >= system.m  # of a recording, unless levels are said
+    if noise is not None and noise.variances.any():
+        noisy = noise.variances > 0.0
+    errors = None if reduced.form.noise_enters(noisy) else errors_of(reduced, kept)
     return Observation(
         regression=LinearRegression(
             Y=mesh.trajectory(final.Y[:, some]), psi=mesh.trajectory(final.psi[:, some]),
