@@ -70,7 +70,10 @@ def error(values: Array) -> float:
 
 
 def ours(tol: float, gammas: list[float] | None = None) -> Solve:
-    """The whole experiment, evidence and metrics included; what it returns is compared."""
+    """The whole experiment, evidence at the end and metrics included; what it returns is compared.
+
+    What only a reader asks for, such as t_c and the last line, is not computed.
+    """
     settings = Settings(
         plant={},
         estimator={"name": "drem", "gamma": gammas or GAMMA},

@@ -208,7 +208,8 @@ def _circuit(_: Data, rows: list[Row]) -> list[str]:
     return [
         ("Plant, dynamic extension, Kreisselmeier filters, mixing and gradient (`drem`, γ = 1e10) "
         "over 20 s. Ours is the whole numerical part of a run: index reduction, consistent start, "
-        "observer, evidence of excitation and metrics are in it. Peers integrate one ODE of 29 "
+        "observer, evidence of excitation at the end and metrics are in it; t_c and the last line, "
+        "computed when they are read, are not. Peers integrate one ODE of 29 "
         "states, the plant reduced by hand: as a script would have it, with matrices built at "
         "every call, and with a right-hand side optimised down to plain numbers; jax compiles the "
         "script's. The error is the largest of e2, il and η̂ at eleven times, against values from "

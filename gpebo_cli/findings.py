@@ -30,7 +30,10 @@ class OnDemand(Generic[T]):
             return self._default
         values: dict[str, Any] = instance.__dict__
         if callable(values[self._name]):
-            values[self._name] = values[self._name]()
+            import numpy as np  # the command line's help does without
+
+            with np.errstate(all="ignore"):  # as in a run
+                values[self._name] = values[self._name]()
         found: T = values[self._name]
         return found
 

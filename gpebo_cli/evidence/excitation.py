@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from gpebo_cli.evidence.knowledge import (
     Knowledge,
     knowledge,
     least_share,
-    tells_nothing,
 )
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
@@ -34,7 +34,6 @@ _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as r
 _STEPS = 0.25 ** np.array([0.0, 1.0, 2.0, 4.0, 6.0, 9.0])
 _AROUND = np.concatenate([-_STEPS, [0.0], _STEPS[::-1]])
 _BLOCK = 16  # times that are looked at together, from the end on, of more parameters than that
-_MANY = 64  # parameters, from which on spectra are not asked whether there is anything to know
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -43,17 +42,17 @@ class Excitation:
     """Interval and persistent excitation, as evidence and not a bare yes.
 
     The verdict rests on what is known (:class:`Knowledge`) and on no unit, unless a level ρ of
-    λ_min(G) is asked for. ``gram_eigenvalues[i]`` are those of G(t_i), ascending. Spectra at all
-    times may be most of a run with many parameters: they are computed when they are looked at.
+    λ_min(G) is asked for. ``gram_eigenvalues[i]`` are those of G(t_i), ascending. Spectra, and when
+    they were reached, may be most of a run: they are computed when they are looked at.
     """
 
     t: Array  # (N,)
     window: float
-    t_c: float | None  # first time at which all parameters can be told apart
     rho: float | None  # level asked of lambda_min(G); None: the verdict is free of units
-    lambda_min: float  # at the horizon
     parameters: tuple[str, ...]
     final: Knowledge  # at the last of the times
+    t_c: OnDemand[float | None] = OnDemand()  # first time at which all can be told apart
+    lambda_min: OnDemand[float] = OnDemand()  # at the horizon
     # (N,) of all parameters' ``known.share``, 0 some time before it is ``WELL`` for good
     least_share: OnDemand[Array] = OnDemand()
     known: OnDemand[Knowledge] = OnDemand()
@@ -112,24 +111,32 @@ def assess(
     mesh = regression.mesh
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     window = settings.window if settings.window is not None else horizon / WINDOWS
-    rho, p = settings.rho, regression.p
-    gram = regression.gram  # of parameters that move, on a mesh of its own
     evidence = _Evidence(regression, t, window, tol)
+    # What is looked at later must not keep what is known of this regression by now.
+    later = replace(evidence, regression=replace(regression))
+    return Excitation(
+        t, window, settings.rho, regression.parameters, evidence.known(t[-1:]),
+        partial(_t_c, later, settings.rho), later.lambda_min, later.least_share, later.known,
+        later.eigenvalues, later.levels,
+    )
+
+
+def _t_c(evidence: _Evidence, rho: float | None) -> float | None:
+    """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``."""
+    regression, p = evidence.regression, evidence.regression.p
+    gram = regression.gram  # of parameters that move, on a mesh of its own
     ends = gram.mesh.edges[1:]
-    at_ends = gram.values[:, -1], *evidence.beside(ends)
-    of_ends, enough = None, 0.0
-    if p < _MANY or rho is not None or not tells_nothing(*at_ends):
-        of_ends = knowledge(*at_ends)
-        # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
-        # or half as well as they ever are.
-        told = of_ends.smallest[of_ends.margin >= 1.0]
-        enough = min(WELL, 0.5 * float(told.max(initial=0.0)))
+    of_ends = knowledge(gram.values[:, -1], *evidence.beside(ends))
+    # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
+    # or half as well as they ever are.
+    told = of_ends.smallest[of_ends.margin >= 1.0]
+    enough = min(WELL, 0.5 * float(told.max(initial=0.0)))
 
     def reached(at: Array, matrices: Array) -> Array:
         """A number that is at least 0 where ψ is exciting: a distance from that in logarithms."""
         if rho is not None:
             level = symmetric_eigenvalues(matrices)[:, 0] / rho
-        elif of_ends is not None and enough:
+        elif enough:
             known = of_ends if at is ends else knowledge(matrices, *evidence.beside(at))
             level = np.minimum(known.smallest / enough, known.margin)
         else:
@@ -141,7 +148,7 @@ def assess(
 
         G grows: inside, λ_min(N) is at most that at the end times the largest growth of a G_jj.
         """
-        if of_ends is None or rho is not None or not enough or regression.dynamics is not None:
+        if rho is not None or not enough or regression.dynamics is not None:
             return np.zeros(gram.mesh.points.shape, dtype=bool)
         before = np.einsum("ksjj->ksj", gram.values[..., :p])
         last = np.broadcast_to(before[:, -1:], before.shape)
@@ -149,17 +156,8 @@ def assess(
             growth = np.divide(last, before, out=np.ones_like(before), where=last > 0.0)
             return np.asarray(of_ends.smallest[:, None] * growth.max(axis=2, initial=1.0) < enough)
 
-    # What is looked at later must not keep what is known of this regression by now.
-    later = replace(evidence, regression=replace(regression))
     doubt = p * _EPS / (enough or 1.0)  # that rounding of G leaves in the level
-    final, t_c = evidence.known(t[-1:]), _first_time(gram, ends, reached, hopeless, doubt)
-    # From when on parameters are well determined a run says in any case.
-    said = t_c is not None and (final.share >= WELL).all()
-    return Excitation(
-        t, window, t_c, rho, float(evidence.eigenvalues(t[-1:])[0, 0]) if p else 0.0,
-        regression.parameters, final, evidence.least_share() if said else later.least_share,
-        later.known, later.eigenvalues, later.levels,
-    )
+    return _first_time(gram, ends, reached, hopeless, doubt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +197,10 @@ class _Evidence:
         """Those of G, (M, p)."""
         gram = self.regression.gram(self.t if at is None else at)
         return np.maximum(symmetric_eigenvalues(gram), 0.0)
+
+    def lambda_min(self) -> float:
+        """The smallest of G at the last of the times."""
+        return float(self.eigenvalues(self.t[-1:])[0, 0]) if self.regression.p else 0.0
 
     def levels(self) -> Array:
         """The smallest eigenvalue over each trailing window, (N,)."""

@@ -9,7 +9,6 @@ no such size: its parameter is not seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -91,6 +90,8 @@ class Knowledge:
         The others, set to zero, change nothing that is determined: along the kernel of N the
         regression is the same.
         """
+        if self.parameters[-1].all():
+            return np.arange(self.parameters.shape[1])
         V, spectrum, level = self.vectors[-1], self.eigenvalues[-1], self.level[-1]
         normalised = (V * np.maximum(spectrum, 0.0)) @ V.T
         chosen = np.flatnonzero(self.parameters[-1]).tolist()
@@ -163,17 +164,6 @@ def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> 
     normalised, sizes, level = _normalised(gram, terms, elapsed, tol)
     spectrum, vectors = np.linalg.eigh(normalised)
     return Knowledge(sizes, spectrum, vectors, level)
-
-
-def tells_nothing(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> bool:
-    """Whether the ``margin`` of :func:`knowledge` of G (N, p, p) is surely below 1: by Cholesky."""
-    normalised, _, level = _normalised(gram, terms, elapsed, tol)
-    normalised -= 0.9 * level.max(axis=1)[:, None, None] * np.eye(normalised.shape[1])
-    for N in normalised[::-1]:  # what is told at all is told at the end
-        with suppress(np.linalg.LinAlgError):
-            np.linalg.cholesky(N)
-            return False
-    return True
 
 
 def least_share(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Array:

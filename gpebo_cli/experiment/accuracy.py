@@ -23,7 +23,6 @@ from gpebo_cli.experiment.sources import Source
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Observation, StateMap
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.regression.linear import LinearRegression, least_squares
@@ -43,7 +42,8 @@ def natural_sizes(regression: LinearRegression, p: int) -> Array:
     energy = np.einsum("jj->j", regression.gram.final[:, : regression.p])
     if len(energy) != p:
         return np.zeros(p)
-    square = Trajectory(regression.mesh, (regression.Y.values**2).sum(axis=-1)).integral().final
+    mesh, squares = regression.mesh, (regression.Y.values[:, 1:] ** 2).sum(axis=-1)
+    square = mesh.steps @ squares @ mesh.rule.integration[-1]
     return np.asarray(np.sqrt(np.divide(square, energy, out=np.zeros(p), where=energy > 0.0)))
 
 

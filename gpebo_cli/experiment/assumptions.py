@@ -112,7 +112,8 @@ def _of_observer(
         excitation.known, t, observation.regression.parameters, system.states,
         visible(observation, t, system.states)(excitation.known),
     )
-    found += of_observation(observation, excitation, system)
+    growth = observation.growth, observation.growth_rate
+    found += of_observation(observation.assumptions, growth, excitation, system)
     if both and isinstance(observer, Gpebo) and observer.form == "auto":
         found = [_with_other_form(a, observer, system, seen, settings) for a in found]
     return Examination(
@@ -281,12 +282,13 @@ def designable(system: DescriptorSystem) -> str:
 
 
 def of_observation(
-    observation: Observed, excitation: Excitation, system: DescriptorSystem
+    own: Sequence[Assumption], growth: tuple[float | None, float | None], excitation: Excitation,
+    system: DescriptorSystem,
 ) -> list[Assumption]:
-    """The observer's own assumptions, excitation, and the growth of Φ."""
-    number = 5 if any(a.name == "Assumption 3" for a in observation.assumptions) else 2
+    """The observer's ``own`` assumptions, excitation, and the growth of Φ and its rate."""
+    number = 5 if any(a.name == "Assumption 3" for a in own) else 2
     found = [
-        *observation.assumptions,
+        *own,
         Assumption(
             f"Assumption {number}",
             "interval excitation: ∫ψᵀψ ≥ ρ I at some t_c",
@@ -301,13 +303,14 @@ def of_observation(
             },
         ),
     ]
-    if observation.growth is not None:
+    largest, rate = growth
+    if largest is not None:
         found.append(
             Assumption(
                 "Growth of Φ",
                 "Φ stays bounded, so that θ̂ → θ implies x̂ → x",
-                observation.growth < _GROWTH,
-                {"largest_entry": observation.growth, "rate": observation.growth_rate},
+                largest < _GROWTH,
+                {"largest_entry": largest, "rate": rate},
             )
         )
     return found

@@ -104,7 +104,8 @@ def continuous(
     with stage("estimate") as pace:
         known, seen_at = excitation.final, visible(observation, t, system.states)
         seen, names = seen_at(known), (regression.parameters, system.states)
-        unknown = _never(estimable(known, t[-1:], *names, seen))
+        told = dict(zip(system.states, seen[-1], strict=True))
+        told |= dict(zip(regression.parameters, known.parameters[-1], strict=True))
         estimator = estimators.tuned(estimator, regression)
 
         def times() -> dict[str, float | None]:
@@ -142,7 +143,10 @@ def continuous(
         )
     return Estimated(
         observation, sampled, excitation, estimation, metrics,
-        fit, times, [name for name in unknown if name not in observation.unseen],
+        fit, times, [
+            name for name, is_known in told.items()
+            if not (is_known or name in observation.unseen)
+        ],
         observation.unseen, noise,
         observation.estimator is not None, note,
     )
@@ -389,17 +393,17 @@ def _estimate(
         parameters=parameters,
         true_parameters=truth[chosen],
         states=estimated,
-        delta=estimates.delta(kept),
+        delta=lambda: estimates.delta(kept),
         checks=checks,
         requirement=requirement,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
         explaining=explaining,
-        warnings=accuracy.astray(
+        warnings=(lambda: accuracy.astray(
             regression.root, explaining,
             lambda eta: state_map.at(kept)(eta[:, None].repeat(len(kept), axis=1)),
             [*regression.parameters, *system.states], np.concatenate(sizes),
             np.append(determined, seen), columns,
-        ) if requirement.holds and about_own and _settles(observation) else (),
+        )) if requirement.holds and about_own and _settles(observation) else (),
         still=accuracy.still(parameters, requirement, natural),
     )
     return estimator, result, accuracy.metrics_of(numbers, observation.parameters, system)

@@ -252,10 +252,10 @@ class Online:
         )
         known, eigenvalues = known.at(shown), eigenvalues[shown]
         return Excitation(
-            t[shown], window, self._t_c[0] if self._t_c[1] is None else self._t_c[1], self._rho,
-            float(eigenvalues[-1, 0]) if self.parameters else 0.0, tuple(self.parameters),
-            known.at(_NEWEST), lambda: known.share.min(axis=1, initial=1.0), known, eigenvalues,
-            pe_level,
+            t[shown], window, self._rho, tuple(self.parameters), known.at(_NEWEST),
+            self._t_c[0] if self._t_c[1] is None else self._t_c[1],
+            float(eigenvalues[-1, 0]) if self.parameters else 0.0,
+            lambda: known.share.min(axis=1, initial=1.0), known, eigenvalues, pe_level,
         )
 
     @property

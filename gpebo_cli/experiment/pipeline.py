@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from time import perf_counter
 from typing import Self
 
@@ -114,11 +115,12 @@ def _experiment(
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
         source = several.joined_source([read(one, system, levels, samples) for one in each])
-    unbounded = functions_note(system, source.simulation)
+    unbounded, of_source = functions_note(system, source.simulation), source.assumptions
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
-        excitation=None, estimation=None, metrics=None, assumptions=source.assumptions,
-        timings=stage.seconds, verdict=source.verdict + unbounded, recording=source.recording,
+        excitation=None, estimation=None, metrics=None, timings=stage.seconds,
+        assumptions=lambda: tuple(of_source()), verdict=source.verdict + unbounded,
+        recording=source.recording,
     )
     if observer is None or estimator is None:
         refuse_seeds(settings.noise)
@@ -128,23 +130,21 @@ def _experiment(
         if samples is None
         else at_samples(settings, system, source, levels, samples, estimator, stage)
     )
-    warned = (*warnings(found.observed), *found.estimation.warnings)
-    told = verdict(
-        found.excitation, found.estimation.cases, found.estimation.requirement, found.metrics,
-        found.fit, found.unknown, found.left_out, found.estimation.active,
+    observed, excitation, estimation = found.observed, found.excitation, found.estimation
+    # A result that is kept for what it has to tell must not keep what the observer made.
+    growth = observed.growth, observed.growth_rate
+    of_observer = partial(of_observation, observed.assumptions, growth, excitation, system)
+    warned, told = warnings(observed), partial(
+        verdict, excitation, estimation.cases, estimation.requirement, found.metrics, found.fit,
+        found.unknown, found.left_out, estimation.active,
     )
+    notes = found.note + simulation_note(source.simulation, settings.solver.tol) + unbounded
     return replace(
-        result, regression=found.regression, excitation=found.excitation,
-        estimation=found.estimation, metrics=found.metrics, noise=found.noise, fit=found.fit,
-        estimable=found.estimable, left_out=found.left_out,
-        assumptions=(
-            *source.assumptions, *of_observation(found.observed, found.excitation, system)
-        ),
-        verdict="; ".join([
-            told + found.note + simulation_note(source.simulation, settings.solver.tol) + unbounded,
-            *warned,
-        ]),
-        warnings=warned,
+        result, regression=found.regression, excitation=excitation, estimation=estimation,
+        metrics=found.metrics, noise=found.noise, fit=found.fit, estimable=found.estimable,
+        left_out=found.left_out, assumptions=lambda: (*of_source(), *of_observer()),
+        verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
+        warnings=lambda: (*warned, *estimation.warnings),
         # What the result is labelled with is what estimated.
         settings=replace(settings, estimator={"name": settings.observer["name"]})
         if found.by_observer else settings,

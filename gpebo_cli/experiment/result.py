@@ -121,15 +121,19 @@ class EstimationResult:
     parameters: Array  # (G, M, p)
     true_parameters: Array  # (M, p), NaN where nobody knows
     states: Array  # (G, M, n), NaN for a state the observer does not see
-    delta: Array | None  # (D, M), D = 1 if it is the same for every case, else G; None: no mixing
     checks: Mapping[str, Array]  # further estimates by column name, (G, M) each
     requirement: Requirement
     still: BoolArray  # (G,) cases that are where they began: it was not met at all
+    # (D, M), D = 1 if it is the same for every case, else G; None: no mixing
+    delta: OnDemand[Array | None] = OnDemand()
     parameters_std: Array | None = None  # (G, M, p) standard deviations; None: nobody knows
     states_std: Array | None = None  # (G, M, n)
     active: Mapping[int, tuple[ActiveBound, ...]] = field(default_factory=dict)  # bounds, by case
     explaining: Array | None = None  # (G, p) at the end; one value of many where not determined
-    warnings: tuple[str, ...] = ()  # what spoils the estimates though enough was there
+    # What spoils the estimates though enough was there.
+    warnings: OnDemand[tuple[str, ...]] = OnDemand(tuple)
+
+    __getstate__ = evaluated
 
     @cached_property
     def gains(self) -> dict[str, Array]:
@@ -183,7 +187,8 @@ class Fit:
 class RunResult:
     """Everything one run produced; the later stages are None when ``observer=none``.
 
-    Signals are from a simulation or from a recording; the other one of the two is None.
+    What is there for readers only is computed when it is first read. Signals are from a simulation
+    or from a recording; the other one of the two is None.
     """
 
     settings: Settings
@@ -193,16 +198,17 @@ class RunResult:
     excitation: Excitation | None
     estimation: EstimationResult | None
     metrics: Metrics | None
-    assumptions: tuple[Assumption, ...]
     timings: Mapping[str, float]  # stage -> seconds
-    verdict: str  # the last line a person reads
+    assumptions: OnDemand[tuple[Assumption, ...]] = OnDemand()
+    verdict: OnDemand[str] = OnDemand()  # the last line a person reads
     noise: NoiseStatistics | None = None  # where more than one seed was asked for
     recording: RecordingResult | None = None
     fit: Fit | None = None  # of a recording
     # From when on each parameter and state is determined by the data, None: never.
     estimable: OnDemand[Mapping[str, float | None]] = OnDemand(dict)
     left_out: tuple[str, ...] = ()  # states that the observer does not estimate
-    warnings: tuple[str, ...] = ()  # what does not stop a run and spoils its result, one line each
+    # What does not stop a run and spoils its result, one line each.
+    warnings: OnDemand[tuple[str, ...]] = OnDemand(tuple)
 
     __getstate__ = evaluated
 

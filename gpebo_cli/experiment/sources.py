@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class Source:
     states: Trajectory  # (n,) the truth, NaN where nobody knows
     theta: Callable[[Array], Array]  # times (M,) -> (M, q), likewise
     judged: slice  # parameters that count when estimates are compared with the truth
-    assumptions: tuple[Assumption, ...]
+    assumptions: Callable[[], Sequence[Assumption]]  # of the plant, when they are asked for
     verdict: str
     derivatives: InputDerivatives | None = None  # of the inputs, as far as they are known
     true: Signals | None = None  # of a simulation, without noise
@@ -72,7 +73,7 @@ def simulated(
     return Source(
         t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
         theta=system.theta_at, judged=_judged(system),
-        assumptions=tuple(of_simulation(system, simulation)),
+        assumptions=partial(of_simulation, system, simulation),
         verdict=simulation_verdict(simulated),
         derivatives=InputDerivatives.of_plant(system, ~levels.noisy_inputs),
         true=simulation.signals, simulation=simulated,
@@ -88,7 +89,7 @@ def recorded(
     return Source(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
-        assumptions=(), verdict="", derivatives=recording.derivatives,
+        assumptions=tuple, verdict="", derivatives=recording.derivatives,
         recording=_sample_recording(system, recording, t),
     )
 

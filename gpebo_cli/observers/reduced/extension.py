@@ -77,7 +77,7 @@ def start_at(
 
     Args:
         form: of the plant.
-        o: the matrices at one time.
+        o: the matrices at this time and perhaps others after it.
         driving: v there (1, ·).
         y: there (1, r).
     """
@@ -87,7 +87,7 @@ def start_at(
     n, q = form.system.n, form.system.q
     if form.structure is None or form.structure.d == rank:
         return Start(*initial_basis(own, rank, states, units), np.zeros(n), np.zeros((n, q)))
-    V1 = initial_basis(own, rank, states, np.ones(n))[0]
+    o, V1 = o.at_first, initial_basis(own, rank, states, np.ones(n))[0]
     exact = slice(0, o.algebraic.shape[1] - o.outputs)
     seen = o.equations(np.concatenate([driving, y], axis=1)[:, :, None])
     R = o.residual[0][exact]
@@ -279,22 +279,15 @@ def reduced_system(
         note = f"; {_reason(error)}: what it touches is not estimated"
     whole = ReducedSystem(
         used, signals, solver, mesh, first,
-        start_at(used, *_beginning(used, first, signals)), np.zeros(0), regression, note,
-        lost,
+        start_at(
+            used, first, used.driving(t[:1], inside[:1], signals.inputs.values[0, :1]),
+            signals.outputs.values[0, :1],
+        ), np.zeros(0), regression, note, lost,
     )
     begin, start = whole.begin, begin_at(xi_a0, system, used.units.states, first, whole.begin)
     if unknown is not None:
         begin, start = with_unknown(begin, start, unknown, xi_a0, system)
     return replace(whole, begin=begin, xi_a0=start)
-
-
-def _beginning(
-    form: EquationForm, first: ObserverMatrices, signals: Measurements
-) -> tuple[ObserverMatrices, Array, Array]:
-    """The matrices at the first time, and v and y there."""
-    t, inside = signals.mesh.points.ravel()[:1], signals.mesh.inside.ravel()[:1]
-    u, y = signals.inputs.values[0, :1], signals.outputs.values[0, :1]
-    return first.at_first, form.driving(t, inside, u), y
 
 
 def choose_form(
