@@ -126,25 +126,16 @@ def standing_since(t: Array, away: Array, deviation: Array) -> Array:
 
 
 def settling_time(
-    t: Array, error: Array, fraction: float = SETTLED, level: Array | None = None,
-    last: Array | None = None,
+    t: Array, error: Array, level: Array | None = None, last: Array | None = None
 ) -> Array:
-    """Time after which a nonnegative error stays below a fraction of its initial value.
+    """Time (g,) after which a nonnegative error (g, M) stays below 1 % of its initial value.
 
-    Between two times the logarithm of the error is taken as linear, which is exact where it
-    decays exponentially.
-
-    Args:
-        t: times (M,), ascending; the result counts from t[0].
-        error: (g, M).
-        fraction: of the first value.
-        level: instead of that (g,).
-        last: index of the last time at which it is above that (g,), −1 for none; None: not known.
-
-    Returns:
-        (g,), NaN if it is never reached; 0 if the error is zero from the start.
+    Or below a ``level`` (g,); NaN if that is never reached, 0 if the error is zero from the start.
+    It counts from the first of the times t (M,). Between two of them the logarithm of the error is
+    taken as linear, which is exact where it decays exponentially. ``last`` (g,) is the index of the
+    last one at which it is above the level, −1 for none; None: not known.
     """
-    level = fraction * error[:, :1] if level is None else level[:, None]
+    level = SETTLED * error[:, :1] if level is None else level[:, None]
     if last is None:
         last = last_above(error[:, :, None], level[:, None])[:, 0]
     rows = np.arange(len(last))

@@ -67,7 +67,7 @@ def plant_from_mapping(
         raise ConfigError(f"{plant}: states is empty; a plant has at least one state")
     inputs = _named_values(plant, "inputs", mapping.get("inputs"), "{V: sin(t)}")
     unknowns = _named_values(plant, "unknowns", mapping.get("unknowns"), "{theta1: 1.5}")
-    outputs = _names(plant, "outputs", _or_empty(mapping.get("outputs"), ()))
+    outputs = _names(plant, "outputs", mapping.get("outputs"))
     kinds = {
         "a state": states,
         "an input": tuple(inputs),
@@ -187,11 +187,6 @@ def _check_signals(
             )
 
 
-def _or_empty(value: object, empty: object) -> object:
-    """The value, or ``empty`` where the key is absent or has nothing behind it."""
-    return empty if value is None else value
-
-
 def _required(mapping: Mapping[str, object], key: str, plant: str) -> object:
     value = mapping.get(key)
     if value is None:
@@ -220,7 +215,9 @@ def _line(plant: str, key: str, value: object) -> str:
 
 
 def _mapping(plant: str, key: str, mapping: Mapping[str, object]) -> Mapping[str, object]:
-    value = _or_empty(mapping.get(key), {})
+    value = mapping.get(key)
+    if value is None:
+        return {}
     if not isinstance(value, Mapping):
         raise ConfigError(f"{plant}: {key} must be a mapping, not {brief(value)}")
     return value
@@ -247,7 +244,7 @@ def _name(plant: str, key: str, value: object) -> str:
 
 
 def _names(plant: str, key: str, value: object) -> tuple[str, ...]:
-    items = items_of(value)
+    items = [] if value is None else items_of(value)
     if items is None:
         raise ConfigError(
             f"{plant}: {key} must be a list of names such as [x1, x2], not {brief(value)}"

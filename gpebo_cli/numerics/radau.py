@@ -17,7 +17,6 @@ from gpebo_cli.model.descriptor import Array
 
 ComplexArray = NDArray[np.complex128]
 
-_QR_STEPS = 100
 _LAST = 4  # Legendre coefficients, at most, from which the next one is predicted
 
 
@@ -98,24 +97,12 @@ def radau_rule(stages: int) -> RadauRule:
 
 @lru_cache(maxsize=16)
 def differentiation_schur(stages: int) -> tuple[ComplexArray, ComplexArray]:
-    """D = U T Uᴴ with unitary U and upper triangular T, by shifted QR iteration.
+    """D = U T Uᴴ with unitary U and upper triangular T.
 
     Eigenvectors of D would do the same with a diagonal T, but they are nearly dependent: their
     condition number grows exponentially with the stages.
     """
-    T = radau_rule(stages).differentiation.astype(np.complex128)
-    U = np.eye(stages, dtype=np.complex128)
-    size = float(np.linalg.norm(T))
-    for last in range(stages - 1, 0, -1):
-        part = slice(0, last + 1)
-        for _ in range(_QR_STEPS):
-            if np.abs(T[last, :last]).max() <= np.finfo(float).eps * size:
-                break
-            values = np.linalg.eigvals(T[part, part])
-            shift = values[np.argmin(np.abs(values - T[last, last]))] * np.eye(last + 1)
-            Q, R = np.linalg.qr(T[part, part] - shift)
-            T[part, part] = R @ Q + shift
-            T[part, last + 1 :] = Q.conj().T @ T[part, last + 1 :]
-            U[:, part] = U[:, part] @ Q
-        T[last, :last] = 0.0
+    from scipy.linalg import schur
+
+    T, U = schur(radau_rule(stages).differentiation, output="complex")
     return U, T
