@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.importers.draft import PlantDraft
+from gpebo_cli.importers.draft import Entry, PlantDraft
 from gpebo_cli.importers.netlist import GROUND, Element, Netlist, read_netlist, split_names
 from gpebo_cli.model.expressions import RESERVED, record
 from gpebo_cli.model.plant import read_parameters
@@ -276,15 +276,15 @@ class _Builder:
             raise ConfigError(f"{self.file}: {shown(text)} is neither v(node) nor i(element)")
         if match[1].lower() == "i":
             name = match[2].lower()
-            if name not in self._current:
-                what = "no element" if name not in self.elements else "an element whose current "
+            if name not in self.elements:
                 raise ConfigError(
-                    f"{self.file}: i({match[2]}): there is {what}"
-                    + (
-                        f"{match[2]}" + nearest(name, self.elements)
-                        if name not in self.elements
-                        else "is not an unknown; measure that of a resistor, inductor or source"
-                    )
+                    f"{self.file}: i({match[2]}): there is no element {match[2]}"
+                    + nearest(name, self.elements)
+                )
+            if name not in self._current:
+                raise ConfigError(
+                    f"{self.file}: i({match[2]}): there is an element whose current is not an "
+                    "unknown; measure that of a resistor, inductor or source"
                 )
             return [(self._current[name], 1.0)]
         out = []
@@ -310,25 +310,22 @@ class _Builder:
     def _initial(self, quantity: str) -> float:
         return self.netlist.initial.get(quantity, 0.0)
 
-    def _value(self, e: Element) -> tuple[str, bool]:
-        """A parameter that stands for the element's value; whether it varies with time."""
+    def _value(self, e: Element) -> str:
+        """A parameter that stands for the element's value."""
         name = self._called[e.name.lower()] = self._claim(e.name, f"{e.name}_")
         self.draft.parameters[name] = e.value
-        return name, isinstance(e.value, str) and self._varies(e.value)
+        return name
 
-    def _varies(self, text: str) -> bool:
-        words = set(re.findall(r"[A-Za-z_]\w*", text))
-        if "t" in words:
-            return True
+    def _varies(self, value: Entry) -> bool:
+        """Whether a value depends on time, by itself or by way of parameters."""
+        words = set(re.findall(r"[A-Za-z_]\w*", str(value) if isinstance(value, str) else ""))
         known = self.draft.parameters
-        return any(isinstance(known.get(w), str) and self._varies(str(known[w])) for w in words)
+        return "t" in words or any(self._varies(known[w]) for w in words & known.keys())
 
     def _between(self, matrix: str, row: int | None, a: str, b: str, text: str) -> None:
         """Add text · (v_a − v_b) to a row."""
-        if row is None:
-            return
         for node, sign in ((a, ""), (b, "-")):
-            if node != GROUND:
+            if node != GROUND and row is not None:
                 self.draft.add(matrix, row, self._node[node], sign + text)
 
     def _admittance(
@@ -339,122 +336,103 @@ class _Builder:
         ``across`` are c and d, by default the ``ends`` a and b.
         """
         a, b = ends[:2]
-        c, d = across or (a, b)
+        c, d = across[:2] or (a, b)
         self._between(matrix, self._row.get(a), c, d, text)
         self._between(matrix, self._row.get(b), d, c, text)
 
-    def _branch(self, nodes: tuple[str, str], column: str, factor: str = "") -> None:
+    def _branch(
+        self, nodes: Sequence[str], column: str, factor: str = "", matrix: str = "A"
+    ) -> None:
         """A current that leaves its first node and enters its second."""
-        for node, sign in ((nodes[0], "-"), (nodes[1], "")):
+        for node, sign in zip(nodes, ("-", ""), strict=False):
             if node != GROUND:
-                term = f"{sign}{factor}" if factor else (-1.0 if sign else 1.0)
-                self.draft.add("A", self._row[node], column, term)
+                term = f"{sign}{factor}" if factor else float(f"{sign}1")
+                self.draft.add(matrix, self._row[node], column, term)
 
     def _stamp_R(self, e: Element) -> None:
-        name, _ = self._value(e)
-        column = self._current.get(e.name.lower())
-        if column is None:
+        name = self._value(e)
+        if e.name.lower() not in self._current:
             self._admittance("A", e.nodes, f"1/{name}", e.nodes[::-1])
             return
-        row = self._voltage_row(e, f"{e.name}: Ohm's law")
+        row, column = self._voltage_row(e, "Ohm's law")
         self.draft.add("A", row, column, f"-{name}")
-        self._branch((e.nodes[0], e.nodes[1]), column)
 
     def _stamp_S(self, e: Element) -> None:
-        name, _ = self._value(e)
-        column = self._current.get(e.name.lower())
+        name, column = self._value(e), self._current.get(e.name.lower())
         if column is None:
             self._admittance("A", e.nodes, name, e.nodes[::-1])
             return
         row = self.draft.equation(f"{e.name}: current of the switch, a conductance")
         self._between("A", row, e.nodes[0], e.nodes[1], name)
         self.draft.add("A", row, column, -1.0)
-        self._branch((e.nodes[0], e.nodes[1]), column)
+        self._branch(e.nodes, column)
 
     def _stamp_C(self, e: Element) -> None:
-        name, varies = self._value(e)
+        name = self._value(e)
         self._admittance("E", e.nodes, name)
-        if varies:
+        if self._varies(e.value):
             self._admittance("A", e.nodes, f"d({name})", e.nodes[::-1])
 
     def _stamp_L(self, e: Element) -> None:
-        name, varies = self._value(e)
-        column = self._current[e.name.lower()]
-        row = self._voltage_row(e, f"{e.name}: voltage is the change of flux")
+        row, column = self._voltage_row(e, "voltage is the change of flux")
         self._row[f"coil {e.name.lower()}"] = row
+        self._change_of_flux(row, column, self._value(e))
+
+    def _change_of_flux(self, row: int, column: str, name: str) -> None:
+        """(L i)' = L i' + L' i of an inductance."""
         self.draft.add("E", row, column, name)
-        if varies:
+        if self._varies(self.draft.parameters[name]):
             self.draft.add("A", row, column, f"-d({name})")
-        self._branch((e.nodes[0], e.nodes[1]), column)
 
     def _stamp_K(self, e: Element) -> None:
-        coils = [self.elements.get(name) for name in e.controls]
-        for name, coil in zip(e.controls, coils, strict=True):
-            if coil is None or coil.kind != "L":
+        for name in e.controls:
+            if name not in self.elements or self.elements[name].kind != "L":
                 raise e.place.error(f"{e.name} couples {name}, which is no inductor")
-        value, _ = self._value(e)
-        first, second = (coil for coil in coils if coil is not None)
+        value, (first, second) = self._value(e), e.controls
         mutual = self._claim(f"M_{e.name}", f"M_{e.name}_")
-        own, other = (self._called[coil.name.lower()] for coil in (first, second))
+        own, other = self._called[first], self._called[second]
         self.draft.parameters[mutual] = f"{value}*sqrt({own}*{other})"
-        varies = self._varies(str(self.draft.parameters[mutual]))
         for coil, by in ((first, second), (second, first)):
-            row = self._row[f"coil {coil.name.lower()}"]
-            column = self._current[by.name.lower()]
-            self.draft.add("E", row, column, mutual)
-            if varies:
-                self.draft.add("A", row, column, f"-d({mutual})")
+            self._change_of_flux(self._row[f"coil {coil}"], self._current[by], mutual)
 
     def _stamp_V(self, e: Element) -> None:
-        column = self._current[e.name.lower()]
-        row = self._voltage_row(e, f"{e.name}: voltage of the source")
+        row, _ = self._voltage_row(e, "voltage of the source")
         self.draft.add("B", row, self._input(e, "V"), -1.0)
-        self._branch((e.nodes[0], e.nodes[1]), column)
 
     def _stamp_I(self, e: Element) -> None:
-        name = self._input(e, "A")
-        for node, sign in ((e.nodes[0], -1.0), (e.nodes[1], 1.0)):
-            if node != GROUND:
-                self.draft.add("B", self._row[node], name, sign)
+        self._branch(e.nodes, self._input(e, "A"), matrix="B")
 
     def _stamp_E(self, e: Element) -> None:
-        name, _ = self._value(e)
-        row = self._voltage_row(e, f"{e.name}: controlled voltage")
-        self._between("A", row, e.nodes[3], e.nodes[2], name)
-        self._branch((e.nodes[0], e.nodes[1]), self._current[e.name.lower()])
+        row, _ = self._voltage_row(e, "controlled voltage")
+        self._between("A", row, e.nodes[3], e.nodes[2], self._value(e))
 
     def _stamp_H(self, e: Element) -> None:
-        name, _ = self._value(e)
-        row = self._voltage_row(e, f"{e.name}: voltage controlled by a current")
-        self.draft.add("A", row, self._controlling(e), f"-{name}")
-        self._branch((e.nodes[0], e.nodes[1]), self._current[e.name.lower()])
+        row, _ = self._voltage_row(e, "voltage controlled by a current")
+        self.draft.add("A", row, self._controlling(e), f"-{self._value(e)}")
 
     def _stamp_G(self, e: Element) -> None:
-        name, _ = self._value(e)
-        self._admittance("A", e.nodes, name, (e.nodes[3], e.nodes[2]))
+        self._admittance("A", e.nodes, self._value(e), (e.nodes[3], e.nodes[2]))
 
     def _stamp_F(self, e: Element) -> None:
-        name, _ = self._value(e)
-        self._branch((e.nodes[0], e.nodes[1]), self._controlling(e), name)
+        self._branch(e.nodes, self._controlling(e), self._value(e))
 
     def _stamp_T(self, e: Element) -> None:
-        name, _ = self._value(e)
-        column = self._current[e.name.lower()]
-        row = self._voltage_row(e, f"{e.name}: ideal transformer, v_1 = n v_2")
-        self._between("A", row, e.nodes[3], e.nodes[2], name)
-        self._branch((e.nodes[0], e.nodes[1]), column)
-        self._branch((e.nodes[3], e.nodes[2]), column, name)
+        row, column = self._voltage_row(e, "ideal transformer, v_1 = n v_2")
+        name, back = self._value(e), (e.nodes[3], e.nodes[2])
+        self._between("A", row, *back, name)
+        self._branch(back, column, name)
 
-    def _voltage_row(self, e: Element, says: str) -> int:
-        """A row that begins with v_a − v_b, or is turned to begin with a minus."""
-        row = self.draft.equation(says)
+    def _voltage_row(self, e: Element, says: str) -> tuple[int, str]:
+        """A row that begins with v_a − v_b, or is turned to begin with a minus, and its current."""
+        row, column = self.draft.equation(f"{e.name}: {says}"), self._current[e.name.lower()]
         ends = {node: sign for node, sign in zip(e.nodes, (1.0, -1.0), strict=False)
                 if node != GROUND and e.nodes[0] != e.nodes[1]}
         for node, sign in ends.items():
             self.draft.add("A", row, self._node[node], sign)
         if e.kind != "L" and ends and ends[min(ends, key=self._row.__getitem__)] > 0.0:
             self._turned.add(row)
-        return row
+        self._branch(e.nodes, column)
+        return row, column
 
     def _input(self, e: Element, unit: str) -> str:
         name = self._claim(e.name, f"{e.name}_source")
@@ -476,19 +454,16 @@ class _Builder:
         for node in self._node:
             if f"v({node})" in self.netlist.initial:
                 known[node] = self.netlist.initial[f"v({node})"]
-        given = [e for e in self.netlist.elements if e.kind == "C" and e.initial is not None]
-        changed = True
-        while changed:
-            changed = False
-            for e in given:
-                a, b = e.nodes
-                assert e.initial is not None  # noqa: S101
-                if (a in known) != (b in known):
-                    if b in known:
-                        known[a] = known[b] + e.initial
-                    else:
-                        known[b] = known[a] - e.initial
-                    changed = True
+        given = [(e.nodes, e.initial) for e in self.netlist.elements
+                 if e.kind == "C" and e.initial is not None]
+        before = 0
+        while len(known) > before:
+            before = len(known)
+            for (a, b), across in given:
+                if b in known:
+                    known.setdefault(a, known[b] + across)
+                elif a in known:
+                    known[b] = known[a] - across
         for node, value in known.items():
             if node != GROUND:
                 label = self._node[node]
