@@ -34,15 +34,20 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     return stream
 
 
-def read_text(path: str | os.PathLike[str], limit: int) -> str:
-    """The text of a regular file of at most ``limit`` bytes in UTF-8 (ConfigError)."""
+def read_bytes(path: str | os.PathLike[str], limit: int) -> bytes:
+    """The content of a regular file of at most ``limit`` bytes (ConfigError)."""
     with open_regular(path) as stream:
-        content = stream.read(limit + 1)
         size = os.fstat(stream.fileno()).st_size
-    if len(content) > limit:
-        raise ConfigError(f"{path} has {size} bytes; at most {limit} are read")
+        content = stream.read(limit + 1) if size <= limit else b""
+    if size <= limit and len(content) <= limit:
+        return content
+    raise ConfigError(f"{path} has {max(size, len(content))} bytes; at most {limit} are read")
+
+
+def read_text(path: str | os.PathLike[str], limit: int) -> str:
+    """The same as text in UTF-8 (ConfigError)."""
     try:
-        return content.decode("utf-8")
+        return read_bytes(path, limit).decode("utf-8")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not text in UTF-8 (byte {error.start})") from error
 

@@ -29,31 +29,18 @@ _NINES = re.compile(r"-?9{3,}[.,]?[09]*")  # what loggers write where they have 
 
 @dataclass
 class Guess:
-    """How a file is written, and what is said about it.
-
-    Attributes:
-        separator: between cells.
-        decimal: ``.`` or ``,``.
-        time_unit: as ``data.time_unit`` has it.
-        columns: what each signal is called in the file.
-        scale: factors from the file's units to the plant's.
-        missing: cells that are empty in the columns that are read, or hold one of
-        gaps: numbers that are nines alone, and farther from all others than these are apart.
-        reasons: why, by key or signal.
-        doubts: what was not understood, a line each.
-        lacking: signals without a column.
-    """
+    """How a file is written, and what is said about it."""
 
     separator: str = ","
     decimal: str = "."
-    time_unit: str = "s"
-    columns: dict[str, str] = field(default_factory=dict)
-    scale: dict[str, float] = field(default_factory=dict)
-    missing: int = 0
-    gaps: list[float] = field(default_factory=list)
-    reasons: dict[str, str] = field(default_factory=dict)
-    doubts: list[str] = field(default_factory=list)
-    lacking: list[str] = field(default_factory=list)
+    time_unit: str = "s"  # as data.time_unit has it
+    columns: dict[str, str] = field(default_factory=dict)  # what each signal is called in the file
+    scale: dict[str, float] = field(default_factory=dict)  # from the file's units to the plant's
+    missing: int = 0  # cells that are empty in the columns that are read, or hold one of
+    gaps: list[float] = field(default_factory=list)  # nines alone, far from all other numbers
+    reasons: dict[str, str] = field(default_factory=dict)  # why, by key or signal
+    doubts: list[str] = field(default_factory=list)  # what was not understood, a line each
+    lacking: list[str] = field(default_factory=list)  # signals without a column
 
 
 def guess(path: str, system: DescriptorSystem) -> Guess:

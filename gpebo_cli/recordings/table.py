@@ -23,7 +23,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import read_mat
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.reading import open_regular
+from gpebo_cli.reading import read_bytes
 from gpebo_cli.schema import LARGEST, nearest, shown
 from gpebo_cli.settings import DataSettings
 
@@ -108,13 +108,9 @@ def read_file(path: str) -> bytes:
     if os.path.isdir(path):
         raise ConfigError(f"data.file: {path} is a folder, not a file")
     try:
-        with open_regular(path) as stream:
-            size = os.fstat(stream.fileno()).st_size
-            if size <= _MOST_BYTES:
-                return stream.read(_MOST_BYTES)
+        return read_bytes(path, _MOST_BYTES)
     except ConfigError as error:
         raise ConfigError(f"data.file: {error}") from None
-    raise ConfigError(f"data.file: {path} has {size} bytes; at most {_MOST_BYTES} are read")
 
 
 def check_text(path: str, content: bytes) -> None:

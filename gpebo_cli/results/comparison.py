@@ -13,7 +13,7 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
-from gpebo_cli.results.finished import Case, read_errors, span
+from gpebo_cli.results.finished import Case, ErrorCurves, read_errors, span
 from gpebo_cli.results.names import METRICS, WORDS, ranking, shown_metrics
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line
 from gpebo_cli.results.symbols import number_text, symbol, with_unit
@@ -113,23 +113,27 @@ def error_panels(cases: Sequence[Case]) -> list[Panel]:
     places = np.linspace(0, count - 1, min(count, _MOST_CURVES)).round().astype(int)
     chosen = [cases[int(place)] for place in places]
     label = _labels(cases)
-    curves = read_errors(chosen)
-    labels = [label(case) for case in chosen]
     note = f"{len(chosen)} of {count} cases:" if len(chosen) < count else ""
-    of_parameters, of_states = (
-        tuple(
-            Curve(c.t, getattr(c, part), text, line(k))
-            for k, (c, text) in enumerate(zip(curves, labels, strict=True))
+    panels = norm_panels(read_errors(chosen), [label(case) for case in chosen])
+    return [replace(panel, note=note if panel.legend else "") for panel in panels]
+
+
+def norm_panels(
+    curves: Sequence[ErrorCurves], labels: Sequence[str], *, log: bool = True
+) -> list[Panel]:
+    """Norms of the errors of parameters and of states over time; without curves, no panel."""
+    panels: list[Panel] = []
+    for part in ("parameter", "state"):
+        norms = [getattr(each, f"{part}s") for each in curves]
+        drawn = tuple(
+            Curve(each.t, norm, text, line(k))
+            for k, (each, norm, text) in enumerate(zip(curves, norms, labels, strict=True))
+            if len(norm)
         )
-        for part in ("parameters", "states")
-    )
-    return [
-        Panel(
-            "‖parameter error‖", of_parameters, log=True, legend=True, note=note,
-            size=max(c.parameter_size for c in curves),
-        ),
-        Panel("‖state error‖", of_states, log=True, size=max(c.state_size for c in curves)),
-    ]
+        if drawn:
+            size = max(getattr(each, f"{part}_size") for each in curves)
+            panels.append(Panel(f"‖{part} error‖", drawn, log=log, size=size, legend=not panels))
+    return panels
 
 
 def metric_panels(cases: Sequence[Case], name: str) -> list[Panel]:

@@ -67,7 +67,7 @@ def _run(name: str, folder: Path) -> str:
         assumptions = _assumptions(summary)
         facts = _facts(summary)
         made_with = _pairs(summary.get("versions")), _pairs(summary.get("git"))
-        estimates, cases = _estimates(folder, summary), _cases(folder)
+        estimates, cases = _estimates(summary), _cases(folder)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise GpeboError(f"{folder / 'summary.json'}: not the summary of a run") from error
     pictures = "".join(
@@ -139,32 +139,26 @@ def _value(value: object) -> str:
     return number_text(value)
 
 
-def _estimates(folder: Path, summary: Mapping[str, Any]) -> list[list[str]]:
+def _estimates(summary: Mapping[str, Any]) -> list[list[str]]:
     """The last estimate of everything, with its deviation and the truth where they are known."""
-    if summary.get("estimator") is None or not (folder / "estimates.csv").is_file():
-        return []
-    columns = read_columns(folder / "estimates.csv", "case", "t")
-    signals = read_columns(folder / "signals.csv", "t")
-    truth = {name: values[-1] for name, values in signals.items() if name not in ("case", "t")}
-    truth |= summary.get("parameters") or {}
-    last = np.flatnonzero(np.diff(columns["case"], append=np.inf))[:_MOST_CASES]
     found = summary.get("estimates") or {}
-    units = {name: entry.get("unit") for name, entry in found.get("0", found).items()}
-    names = [name.removesuffix("_hat") for name in columns if name.endswith("_hat")]
-    known = any(truth.get(name) is not None for name in names)
+    cases = list(found.items())[:_MOST_CASES] if "0" in found else [("0", found)]
+    known = any(one["true"] is not None for one in cases[0][1].values())
+    head = ["", *(f"case {number}" for number, _ in cases), *(["truth"] if known else [])]
     rows = []
-    for name in names:
-        std = columns.get(f"{name}_std")
+    for name, first in cases[0][1].items():
+        own = [case[name] for _, case in cases]
         cells = [
-            number_text(columns[f"{name}_hat"][k])
-            + (f" ± {number_text(std[k])}" if std is not None else "")
-            for k in last
+            _text(one["value"]) + ("" if one["std"] is None else f" ± {_text(one['std'])}")
+            for one in own
         ]
-        true = truth.get(name)
-        shown = "" if true is None else number_text(float(true))
-        rows.append([with_unit(name, units.get(name) or ""), *cells, *([shown] if known else [])])
-    head = ["", *(f"case {int(columns['case'][k])}" for k in last), *(["truth"] if known else [])]
-    return [head, *rows]
+        truth = "" if first["true"] is None else _text(first["true"])
+        rows.append([with_unit(name, first["unit"] or ""), *cells, *([truth] if known else [])])
+    return [head, *rows] if rows else []
+
+
+def _text(value: float | None) -> str:
+    return number_text(np.nan if value is None else value)
 
 
 def _cases(folder: Path) -> list[list[str]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import wraps
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,8 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
+from gpebo_cli.results.comparison import norm_panels
+from gpebo_cli.results.finished import ErrorCurves
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
 from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
@@ -73,31 +76,27 @@ def regressor(result: RunResult) -> list[Panel]:
     return _with_legend(panels)
 
 
-def estimates(result: RunResult) -> list[Panel]:
-    """All states and their estimates, where the parameters do not tell x_a from x_b."""
-    differential, other = _split(result)
-    return [] if differential else _state_estimates(result, other)
+def _of_estimates(
+    figure: Callable[[RunResult, EstimationResult], list[Panel]]
+) -> FigureFunction:
+    """A figure of estimates, with the legend of all its panels above the first one."""
+
+    @wraps(figure)
+    def of_run(result: RunResult) -> list[Panel]:
+        estimation = result.estimation
+        return [] if estimation is None else _with_legend(
+            figure(result, estimation), _note(estimation)
+        )
+
+    return of_run
 
 
-def estimates_a(result: RunResult) -> list[Panel]:
-    """Fig. 4: the differential states x_a and their estimates."""
-    return _state_estimates(result, _split(result)[0])
-
-
-def estimates_b(result: RunResult) -> list[Panel]:
-    """Fig. 5: the other states x_b and their estimates."""
-    differential, other = _split(result)
-    return _state_estimates(result, other) if differential else []
-
-
-def parameters(result: RunResult) -> list[Panel]:
+@_of_estimates
+def parameters(result: RunResult, estimation: EstimationResult) -> list[Panel]:
     """Estimates of the parameters over time, with the truth where it is known.
 
     Where θ varies the components of e₀ are left out: they are what makes up for it, of any size.
     """
-    estimation = result.estimation
-    if estimation is None:
-        return []
     varies = result.system.theta_varies
     truth = estimation.true_parameters
     panels = []
@@ -107,10 +106,9 @@ def parameters(result: RunResult) -> list[Panel]:
         curve = _truth(result, name, estimation.t, truth[:, i])
         if varies and _known_by_data(result, name):
             curve = replace(curve, style=style.VARYING)
-        panels.append(
-            _estimate(result, name, estimation.parameters[:, :, i], curve, behind=not varies)
-        )
-    return _with_legend(panels, _note(estimation))
+        values = estimation.parameters[:, :, i]
+        panels.append(_estimate(result, estimation, name, values, curve, behind=not varies))
+    return panels
 
 
 def fit(result: RunResult) -> list[Panel]:
@@ -150,42 +148,23 @@ def whiteness(result: RunResult) -> list[Panel]:
     return [Panel("autocorrelation of the residual", curves, axis=axis, legend=True)]
 
 
-def parameter_error(result: RunResult) -> list[Panel]:
+@_of_estimates
+def parameter_error(result: RunResult, estimation: EstimationResult) -> list[Panel]:
     """Fig. 6: error of every parameter (for the circuit, the initial conditions).
 
     Where θ varies, of the unknowns only, as in ``parameters``.
     """
-    estimation = result.estimation
-    if estimation is None:
-        return []
     truth = estimation.true_parameters
     size = np.nan_to_num(np.max(np.abs(truth), axis=0))
     largest = float(np.max(size, initial=0.0))
     size = np.where(size > 1e-12 * largest, size, largest)  # of one that is zero but for rounding
-    panels = [
-        _error(result, name, estimation.parameters[:, :, i] - truth[:, i], float(size[i]))
+    errors = estimation.parameters - truth
+    return [
+        _error(result, estimation, name, errors[:, :, i], float(size[i]))
         for i, name in enumerate(estimation.names)
         if not np.isnan(truth[:, i]).any()
         and (not result.system.theta_varies or name in result.system.unknowns)
     ]
-    return _with_legend(panels, _note(estimation))
-
-
-def state_error(result: RunResult) -> list[Panel]:
-    """Error of all states, where the parameters do not tell x_a from x_b."""
-    differential, other = _split(result)
-    return [] if differential else _state_errors(result, other)
-
-
-def state_error_a(result: RunResult) -> list[Panel]:
-    """Fig. 7: error of the differential states x_a."""
-    return _state_errors(result, _split(result)[0])
-
-
-def state_error_b(result: RunResult) -> list[Panel]:
-    """Fig. 8: error of the other states x_b."""
-    differential, other = _split(result)
-    return _state_errors(result, other) if differential else []
 
 
 def gram(result: RunResult) -> list[Panel]:
@@ -212,19 +191,16 @@ def gram(result: RunResult) -> list[Panel]:
     return _with_legend([panel])
 
 
-def delta(result: RunResult) -> list[Panel]:
+@_of_estimates
+def delta(result: RunResult, estimation: EstimationResult) -> list[Panel]:
     """Δ, the determinant that mixing leaves as a scalar regressor, logarithmic."""
-    estimation = result.estimation
-    if estimation is None or estimation.delta is None:
+    if estimation.delta is None:
         return []
     values = np.abs(estimation.delta)
     size = float(np.max(values[np.isfinite(values)], initial=0.0))
-    if len(values) > 1:
-        curves = _per_case(result, values)
-        panel = Panel("|Δ|", curves, text=r"$|\Delta|$", log=True, size=size)
-        return _with_legend([panel], _note(estimation))
-    curve = Curve(estimation.t, values[0], "", line(0))
-    return [Panel("|Δ|", (curve,), text=r"$|\Delta|$", log=True, size=size)]
+    alone = (Curve(estimation.t, values[0], "", line(0)),)
+    curves = _per_case(result, estimation, values) if len(values) > 1 else alone
+    return [Panel("|Δ|", curves, text=r"$|\Delta|$", log=True, size=size)]
 
 
 def gains(result: RunResult) -> list[Panel]:
@@ -263,23 +239,19 @@ def gains(result: RunResult) -> list[Panel]:
     ])
 
 
-def error_norms(result: RunResult) -> list[Panel]:
+@_of_estimates
+def error_norms(result: RunResult, estimation: EstimationResult) -> list[Panel]:
     """Norms of the errors of all parameters and of all states for a few of at least three cases."""
-    estimation = result.estimation
-    if estimation is None or len(estimation.cases) < MIN_GAINS:
+    if len(estimation.cases) < MIN_GAINS:
         return []
     chosen = _shown_cases(estimation)
     labels = _case_labels(result, estimation, chosen)
-    named = [(label, result, case) for label, case in zip(labels, chosen, strict=True)]
-    return _norm_panels(named, _note(estimation))
+    return _norm_panels([(text, result, case) for text, case in zip(labels, chosen, strict=True)])
 
 
 def overlay(results: Mapping[str, RunResult]) -> list[Panel]:
     """Norms of the errors of runs that have one case each, by the name each run goes by."""
-    return _norm_panels([(label, result, 0) for label, result in results.items()], "")
-
-
-FIGURES: dict[str, FigureFunction] = {name: globals()[name] for name in FIGURE_NAMES}
+    return _norm_panels([(label, result, 0) for label, result in results.items()])
 
 
 def check_names(names: Iterable[str]) -> None:
@@ -330,15 +302,24 @@ def _with_legend(panels: list[Panel], note: str = "") -> list[Panel]:
     return [replace(panel, legend=True, note=note) for panel in panels[:1]] + panels[1:]
 
 
-def _split(result: RunResult) -> tuple[list[int], list[int]]:
-    """Numbers of the states x_a, whose initial value is a parameter ``e0_<state>``, and the rest.
+def _of_states(
+    figure: Callable[[RunResult, EstimationResult, Sequence[int]], list[Panel]], part: str
+) -> FigureFunction:
+    """A figure of the states x_a, whose initial value is a parameter ``e0_<state>``, or the rest.
 
-    Where the kernel of E(t) rotates the parameters are ``e0_1…``, of no single state: none is x_a.
+    Where the kernel of E(t) rotates the parameters are ``e0_1…``, of no single state: none is x_a,
+    and there is one figure of all states, whose ``part`` is empty.
     """
-    parameters = result.estimation.names if result.estimation else ()
-    names = result.system.states
-    differential = [i for i, name in enumerate(names) if _INITIAL + name in parameters]
-    return differential, [i for i in range(len(names)) if i not in differential]
+
+    def of_part(result: RunResult, estimation: EstimationResult) -> list[Panel]:
+        """The states x_a, the states x_b, or all where the parameters do not tell them apart."""
+        names = result.system.states
+        a = [i for i, name in enumerate(names) if _INITIAL + name in estimation.names]
+        b = [i for i in range(len(names)) if i not in a]
+        members = {"": [] if a else b, "a": a, "b": b if a else []}
+        return figure(result, estimation, members[part])
+
+    return _of_estimates(of_part)
 
 
 def _unit(result: RunResult, name: str) -> str:
@@ -437,11 +418,10 @@ def _state_size(result: RunResult) -> float:
     return float(np.max(np.linalg.norm(seen, axis=1), initial=0.0))
 
 
-def _norm_panels(named: Sequence[tuple[str, RunResult, int]], note: str) -> list[Panel]:
+def _norm_panels(named: Sequence[tuple[str, RunResult, int]]) -> list[Panel]:
     """Norms of the errors of parameters and of states: a curve per label, run and case."""
-    of_parameters: list[Curve] = []
-    of_states: list[Curve] = []
-    for k, (label, result, case) in enumerate(named):
+    labels, curves = [], []
+    for label, result, case in named:
         estimation = result.estimation
         if estimation is None:
             continue
@@ -449,17 +429,16 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]], note: str) -> list
         parameters = parameters[:, ~np.isnan(estimation.true_parameters).any(axis=0)]
         seen = _seen(result, _known(result))
         states = (estimation.states[case] - truth_at(result, estimation.t))[:, seen]
-        for curves, errors in ((of_parameters, parameters), (of_states, states)):
-            if errors.shape[1]:
-                curves.append(Curve(estimation.t, np.linalg.norm(errors, axis=1), label, line(k)))
-    sizes = [max((size(r) for _, r, _ in named), default=0.0)
-             for size in (_parameter_size, _state_size)]
+        of_eta, of_x = (
+            np.linalg.norm(errors, axis=1) if errors.shape[1] else np.zeros(0)
+            for errors in (parameters, states)
+        )
+        labels.append(label)
+        curves.append(ErrorCurves(
+            estimation.t, of_eta, of_x, _parameter_size(result), _state_size(result)
+        ))
     log = all(result.settings.output.error == "log" for _, result, _ in named)
-    panels = [
-        Panel("‖parameter error‖", tuple(of_parameters), log=log, size=sizes[0]),
-        Panel("‖state error‖", tuple(of_states), log=log, size=sizes[1]),
-    ]
-    return _with_legend([panel for panel in panels if panel.curves], note)
+    return norm_panels(curves, labels, log=log)
 
 
 def _case_labels(
@@ -478,11 +457,10 @@ def _case_labels(
     ]
 
 
-def _per_case(result: RunResult, values: Array) -> tuple[Curve, ...]:
+def _per_case(
+    result: RunResult, estimation: EstimationResult, values: Array
+) -> tuple[Curve, ...]:
     """A curve for each case that is shown, of values (G, M) at the times of the estimates."""
-    estimation = result.estimation
-    if estimation is None:
-        return ()
     chosen = _shown_cases(estimation)
     labels = _case_labels(result, estimation, chosen)
     return tuple(
@@ -491,10 +469,9 @@ def _per_case(result: RunResult, values: Array) -> tuple[Curve, ...]:
     )
 
 
-def _deviation(result: RunResult, name: str) -> Array | None:
+def _deviation(result: RunResult, estimation: EstimationResult, name: str) -> Array | None:
     """The standard deviation (M,) of an estimate, where there is one case."""
-    estimation = result.estimation
-    if estimation is None or len(estimation.cases) != 1:
+    if len(estimation.cases) != 1:
         return None
     for names, found in (
         (estimation.names, estimation.parameters_std), (result.system.states, estimation.states_std)
@@ -505,13 +482,12 @@ def _deviation(result: RunResult, name: str) -> Array | None:
 
 
 def _estimate(
-    result: RunResult, name: str, values: Array, truth: Curve, *, behind: bool = True
+    result: RunResult, estimation: EstimationResult, name: str, values: Array, truth: Curve, *,
+    behind: bool = True,
 ) -> Panel:
     """Estimates (G, M) of ``name`` with their ± 2σ, and the truth if it is known."""
-    estimation = result.estimation
-    assert estimation is not None  # noqa: S101  the callers looked
-    curves = _per_case(result, values)
-    deviation = _deviation(result, name)
+    curves = _per_case(result, estimation, values)
+    deviation = _deviation(result, estimation, name)
     if deviation is not None:
         low, high = values[0] - 2 * deviation, values[0] + 2 * deviation
         band = Curve(estimation.t, high, "± 2σ", style.SPREAD, r"$\pm\,2\sigma$", down_to=low)
@@ -529,22 +505,21 @@ def _estimate(
                  limits=limits)
 
 
-def _state_estimates(result: RunResult, members: Sequence[int]) -> list[Panel]:
-    estimation, signals = result.estimation, result.signals
-    if estimation is None:
-        return []
-    seen, panels = _seen(result, members), []
+def _state_estimates(
+    result: RunResult, estimation: EstimationResult, members: Sequence[int]
+) -> list[Panel]:
+    signals, seen, panels = result.signals, _seen(result, members), []
     for i in members:
         name = result.system.states[i]
         truth = _truth(result, name, signals.t, signals.states[:, i])
         if i in seen:
-            panels.append(_estimate(result, name, estimation.states[:, :, i], truth))
+            panels.append(_estimate(result, estimation, name, estimation.states[:, :, i], truth))
         elif not (_known_by_data(result, name) or name in result.left_out) and np.isfinite(
             truth.y
         ).any():
             panels.append(Panel(name, (truth,), _unit(result, name),
                                 typeset(name, result.system.labels), legend=True))
-    return _with_legend(panels, _note(estimation))
+    return panels
 
 
 def _known_by_data(result: RunResult, name: str) -> bool:
@@ -577,30 +552,29 @@ def _estimate_limits(
     return max(lowest, low - room), min(highest, high + room)
 
 
-def _state_errors(result: RunResult, members: Sequence[int]) -> list[Panel]:
-    estimation, known = result.estimation, _known(result)
-    if estimation is None:
-        return []
-    truth = truth_at(result, estimation.t)
-    panels = [
-        _error(result, result.system.states[i], estimation.states[:, :, i] - truth[:, i],
+def _state_errors(
+    result: RunResult, estimation: EstimationResult, members: Sequence[int]
+) -> list[Panel]:
+    known, truth = _known(result), truth_at(result, estimation.t)
+    return [
+        _error(result, estimation, result.system.states[i],
+               estimation.states[:, :, i] - truth[:, i],
                float(np.max(np.abs(truth[:, i]), initial=0.0)))
         for i in _seen(result, members)
         if i in known
     ]
-    return _with_legend(panels, _note(estimation))
 
 
-def _error(result: RunResult, name: str, error: Array, size: float) -> Panel:
+def _error(
+    result: RunResult, estimation: EstimationResult, name: str, error: Array, size: float
+) -> Panel:
     """The error (G, M) of an estimate with its 2σ; ``size`` is that of the truth.
 
     It is the absolute value on a logarithmic axis, or has its sign on a linear one.
     """
-    estimation = result.estimation
-    assert estimation is not None  # noqa: S101  the callers looked
     signed = result.settings.output.error == "linear"
-    curves = _per_case(result, error if signed else np.abs(error))
-    deviation = _deviation(result, name)
+    curves = _per_case(result, estimation, error if signed else np.abs(error))
+    deviation = _deviation(result, estimation, name)
     if deviation is not None:
         up, down = 2 * deviation, -2 * deviation if signed else None
         label, text = ("± 2σ", r"$\pm\,2\sigma$") if signed else ("2σ", r"$2\sigma$")
@@ -608,3 +582,10 @@ def _error(result: RunResult, name: str, error: Array, size: float) -> Panel:
     labels = result.system.labels
     return Panel(f"error of {name}", curves, _unit(result, name),
                  error_of(name, labels, signed=signed), log=not signed, size=size)
+
+
+# In the paper x_a and x_b are Figs. 4 and 5, their errors Figs. 7 and 8.
+_PARTS = ("", "a", "b")
+estimates, estimates_a, estimates_b = (_of_states(_state_estimates, part) for part in _PARTS)
+state_error, state_error_a, state_error_b = (_of_states(_state_errors, part) for part in _PARTS)
+FIGURES: dict[str, FigureFunction] = {name: globals()[name] for name in FIGURE_NAMES}

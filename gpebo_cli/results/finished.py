@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -17,13 +17,12 @@ from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.reading import open_regular, strict_json
+from gpebo_cli.reading import read_bytes, strict_json
 from gpebo_cli.results.sweep_folder import PLAN, JobRecord, job_folder, read_plan, read_records
 from gpebo_cli.schema import shown
 
 _NUMBER = re.compile(r"-?(?:[0-9]+(?:\.[0-9]+)?(?:e[+-]?[0-9]+)?)")
 _MOST_BYTES = 200_000_000  # of a file; as cells they take eight times as many
-_TAIL = 1 << 16  # bytes in which the last row of a table is
 
 
 @dataclass(frozen=True)
@@ -143,12 +142,8 @@ def span(folder: Path) -> tuple[float, float]:
     """First and last time of a finished run's signals (GpeboError)."""
     path = folder / "signals.csv"
     try:
-        with _opened(path) as stream:
-            names = stream.readline().decode().rstrip().split(",")
-            first = stream.readline()
-            stream.seek(max(0, path.stat().st_size - _TAIL))
-            last = stream.read().splitlines()[-1]
-        k = names.index("t")
+        names, first, *_, last = _bytes(path).splitlines()
+        k = names.decode().split(",").index("t")
         return float(first.split(b",")[k]), float(last.split(b",")[k])
     except (ValueError, IndexError):
         raise GpeboError(f"{path}: not the signals of a run") from None
@@ -232,20 +227,12 @@ def _estimator(summary: Mapping[str, Any]) -> str:
 
 def _bytes(path: Path) -> bytes:
     """The content of a regular file; a pipe under its name would be waited for."""
-    with _opened(path) as stream:
-        content = stream.read(_MOST_BYTES + 1)
-    if len(content) > _MOST_BYTES:
-        size = path.stat().st_size
-        raise GpeboError(f"{path} has {size} bytes; at most {_MOST_BYTES} are read")
-    return content
-
-
-def _opened(path: Path) -> BinaryIO:
     try:
-        return open_regular(path)
+        return read_bytes(path, _MOST_BYTES)
     except ConfigError as error:  # no user wrote this file: a run should have
-        reason = getattr(error.__cause__, "strerror", None) or "not a regular file"
-        raise GpeboError(f"{path}: {reason}") from error
+        reason = getattr(error.__cause__, "strerror", None)
+        text = f"{path}: {reason}" if reason else str(error).replace(" is not a", ": not a")
+        raise GpeboError(text) from error
 
 
 def read_columns(path: Path, *filled: str, present: Sequence[str] = ()) -> dict[str, Array]:
