@@ -34,7 +34,13 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import Measurements, initial_extension, output_scale
-from gpebo_cli.observers._observation import InitialError, Observation, Reconstruction, log_norm
+from gpebo_cli.observers._observation import (
+    InitialError,
+    Observation,
+    Reconstruction,
+    StateMap,
+    log_norm,
+)
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.schema import unknown
 from gpebo_cli.settings import SolverSettings
@@ -65,16 +71,14 @@ def canonical_blocks(system: DescriptorSystem, t: Array, inside: Array) -> Block
     """
     c = system.coefficients.taylor(t, 1, inside)
     E, A, F = c.E[0], c.A[0], c.F[0]
-    n, n_a = system.n, _differential_size(E[0])
-    expected_E, expected_A = np.zeros((n, n)), np.zeros((n, n))
-    expected_E[:n_a, :n_a] = np.eye(n_a)
-    expected_A[n_a:, n_a:] = np.eye(n - n_a)
+    n, ones = system.n, np.abs(np.diag(E[0]) - 1.0) <= _ZERO
+    n_a = n if ones.all() else int(np.argmin(ones))  # leading ones on the diagonal of E
+    one, n_b = np.eye(n), n - n_a
+    expected_E, expected_A = np.diag(one[:n_a].sum(axis=0)), np.diag(one[n_a:].sum(axis=0))
     free_E, free_A = np.zeros((n, n), bool), np.zeros((n, n), bool)
-    free_E[n_a:, n_a:] = np.tril(np.ones((n - n_a, n - n_a), bool), -1)
-    free_A[:n_a, :n_a] = True
-    for name, matrix, expected, free in (
-        ("E", E, expected_E, free_E), ("A", A, expected_A, free_A),
-    ):
+    free_E[n_a:, n_a:], free_A[:n_a, :n_a] = np.tri(n_b, k=-1, dtype=bool), True
+    known = ("E", E, expected_E, free_E), ("A", A, expected_A, free_A)
+    for name, matrix, expected, free in known:
         wrong = (np.abs(matrix - expected) > _ZERO) & ~free
         if wrong.any():
             k, i, j = np.argwhere(wrong)[0]
@@ -90,12 +94,6 @@ def canonical_blocks(system: DescriptorSystem, t: Array, inside: Array) -> Block
             "of z_a only"
         )
     return Blocks(A[:, :n_a, :n_a], F[:, :n_a], c.B[0], E[:, n_a:, n_a:], c.C[0], c.C[1])
-
-
-def _differential_size(E: Array) -> int:
-    """n_a: how many leading diagonal entries of E are one."""
-    ones = np.abs(np.diag(E) - 1.0) <= _ZERO
-    return int(np.argmin(ones)) if not ones.all() else len(E)
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,6 @@ class Canonical:
         blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())
         scale = output_scale(self.weights, system)
         n_a, q = blocks.A_a.shape[1], system.q
-        n_b = system.n - n_a
         suitable = _outputs_without_zb(system, blocks, n_a)
         names = tuple(f"e0_{state}" for state in system.states[:n_a])
         xi_a0 = initial_extension(self.xi_a0, system, names)
@@ -160,9 +157,8 @@ class Canonical:
             # Y may vanish identically (if ξ_a is perfect), so its size is that of its terms.
             size = 1e-3 * float(np.abs(outputs.values[:, :, suitable]).max(initial=0.0))
             level = float(np.abs(psi).max(initial=0.0))
-            kinds = (
-                (Y, size), (psi, 0.0), (products[..., :-1], 0.0), (products[..., -1], level * size),
-            )
+            kinds = [(Y, size), (psi, 0.0), (products[..., :-1], 0.0)]
+            kinds.append((products[..., -1], level * size))
             return [(signal.reshape(*shape, -1), floor) for signal, floor in kinds]
 
         problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
@@ -170,6 +166,7 @@ class Canonical:
         solution = integrate(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
         mesh, values = solution.trajectory.mesh, solution.trajectory.values
         Y, psi = regress(values, *solution.extras)
+        first_states = np.eye(n_a, system.n)
         xi, xi_b, Phi = values[..., 0], values[..., 1 : 1 + q], values[..., 1 + q :]
         zb = _unknown_input_observer(self, system, mesh, signals, n_a)
         return Observation(
@@ -179,11 +176,10 @@ class Canonical:
             ),
             state_map=CanonicalStateMap(
                 xi_a=Trajectory(mesh, xi),
-                gain=Trajectory(mesh, np.concatenate([xi_b, -Phi], axis=-1)), zb=zb, n_b=n_b,
+                gain=Trajectory(mesh, np.concatenate([xi_b, -Phi], axis=-1)),
+                zb=zb, n_b=system.n - n_a,
             ),
-            truth=InitialError(
-                np.eye(n_a, system.n), xi_a0, np.eye(n_a, system.n), solution.trajectory
-            ),
+            truth=InitialError(first_states, xi_a0, first_states, solution.trajectory),
             error_estimate=solution.error_estimate,
             assumptions=(
                 Assumption(
@@ -237,7 +233,7 @@ class UnknownInputObserver:
     y: Trajectory  # () y_ℓ
     C_a: Trajectory  # (n_a,) C^a_ℓ
     algebraic: Trajectory  # (2,) (−f_b1, c1 f_b1/c2), to which (0, y_w/c2) is added
-    third: Trajectory | None  # (n + 1,) [C_j row without z_b3, y_j] / C^b_j3 of an output j
+    third: Trajectory | None  # (n,) [C_j row without z_b3, y_j] / C^b_j3 of an output j
     start: Array  # (2,) r(start)
     names: tuple[str, str]  # of z_b1 and z_b2
     assumptions: tuple[Assumption, ...]
@@ -277,10 +273,8 @@ def diagonalising_gain(c: Array, dc: Array, N: Array) -> Array:
 
 def remark_4_gain(c: Array, N: Array) -> Array:
     """L_w = a1 c1 (c1/c2, 1), the paper's choice for constant coefficients (Remark 4), (…, 2)."""
-    a1 = 1.0 / N[..., 1, 0]
-    return (a1 * c[..., 0])[..., None] * np.stack(
-        [c[..., 0] / c[..., 1], np.ones_like(a1)], axis=-1
-    )
+    first = 1.0 / N[..., 1, 0] * c[..., 0]  # a1 c1
+    return np.stack([first * (c[..., 0] / c[..., 1]), first], axis=-1)
 
 
 def _unknown_input_observer(
@@ -294,7 +288,9 @@ def _unknown_input_observer(
     b = canonical_blocks(system, t, inside)
     f_b = np.einsum("nij,nj->ni", b.B[:, n_a:], signals.inputs(t, inside))
     y = signals.outputs(t, inside)
-    ell = _output_for_zw(system, settings, b, n_a)
+    start, ell = np.array(settings.r0, dtype=np.float64), _output_for_zw(system, settings, b, n_a)
+    if start.shape != (2,) or not np.isfinite(start).all():
+        raise ConfigError(f"observer.r0: got {settings.r0}; accepted: two finite numbers")
     c, dc = b.C[:, ell, n_a : n_a + 2], b.dC[:, ell, n_a : n_a + 2]
     L = _gain(settings, c, dc, b.N, t, inside)
     M, from_y, forcing = unknown_input_matrices(c, dc, b.N, f_b, L)
@@ -315,7 +311,7 @@ def _unknown_input_observer(
         C_a=mesh.trajectory(b.C[:, ell, :n_a]),
         algebraic=mesh.trajectory(np.stack([-f_b[:, 0], c[:, 0] * f_b[:, 0] / c[:, 1]], axis=1)),
         third=third,
-        start=_start(settings),
+        start=start,
         names=(system.states[n_a], system.states[n_a + 1]),
         assumptions=_assumptions(system, b.N, c, mesh.trajectory(M), ell),
     )
@@ -323,8 +319,7 @@ def _unknown_input_observer(
 
 def _apart_from_zero(entries: Array, size: Array) -> BoolArray:
     """Which of the entries (N, …) keep their sign and are, beside ``size``, never small."""
-    low, high = entries.min(axis=0), entries.max(axis=0)
-    return np.asarray(np.maximum(low, -high) > _SMALL * size)
+    return np.asarray(np.maximum(entries.min(axis=0), -entries.max(axis=0)) > _SMALL * size)
 
 
 def _output_for_zw(
@@ -368,13 +363,6 @@ def _gain(
     return np.asarray(taylor(parsed, t, 0, inside)[0])
 
 
-def _start(settings: Canonical) -> Array:
-    start = np.array(settings.r0, dtype=np.float64)
-    if start.shape != (2,) or not np.isfinite(start).all():
-        raise ConfigError(f"observer.r0: got {settings.r0}; accepted: two finite numbers")
-    return start
-
-
 def _assumptions(
     system: DescriptorSystem, N: Array, c: Array, M: Trajectory, ell: int
 ) -> tuple[Assumption, ...]:
@@ -392,15 +380,12 @@ def _assumptions(
             {"smallest": float(np.abs(divided).min())},
         ),
         Assumption(
-            "Assumption 6",
-            "an output sees z_b1 and z_b2 but not z_b3",
-            True,
+            "Assumption 6", "an output sees z_b1 and z_b2 but not z_b3", True,
             {"output": system.outputs[ell], "smallest_c1": float(np.abs(c[:, 0]).min()),
              "smallest_c2": float(np.abs(c[:, 1]).min())},
         ),
         Assumption(
-            "Assumption 7",
-            "M_w is stable over the horizon: its transition matrix decays",
+            "Assumption 7", "M_w is stable over the horizon: its transition matrix decays",
             decay < 1.0,
             {"transition_norm": decay, "integral_M11": float(diagonal[0]),
              "integral_M22": float(diagonal[1])},
@@ -422,7 +407,7 @@ def transition_decay(M: Trajectory) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class CanonicalStateMap:
+class CanonicalStateMap(StateMap):
     """ẑ_a = ξ_a + ξ_b θ̂ − Φ_a ê₀, then ẑ_w driven by it, then ẑ_b3 where an output sees it."""
 
     xi_a: Trajectory  # (n_a,)
@@ -442,10 +427,9 @@ class CanonicalStateMap:
 
         def reconstruct(eta: Array) -> Array:
             za = xi_a + np.matmul(gain, eta[..., None])[..., 0]  # (g, M, n_a)
-            if self.zb is None:
-                unseen = np.full((*za.shape[:2], self.n_b), np.nan)
-                return np.concatenate([za, unseen], axis=2)
-            return np.concatenate([za, estimate_zb(self.zb, t, za)], axis=2)
+            unseen = np.full((*za.shape[:2], self.n_b), np.nan)
+            zb = unseen if self.zb is None else estimate_zb(self.zb, t, za)
+            return np.concatenate([za, zb], axis=2)
 
         return reconstruct
 
@@ -482,10 +466,9 @@ def estimate_zb(zb: UnknownInputObserver, t: Array, za: Array) -> Array:
     zw = r.values.copy()
     zw[:, :, 1] += zb.G2.values[..., None] * y_w
     sampled = np.moveaxis(mesh.sampler(t)(zw), -1, 0)  # (g, M, 2)
-    if zb.third is None:
-        third = np.full((*sampled.shape[:2], 1), np.nan)
-    else:
-        row = mesh.sampler(t)(zb.third.values)  # (M, n_a + 3): C row / C_b3, then y / C_b3
+    third = np.full((*sampled.shape[:2], 1), np.nan)
+    if zb.third is not None:
+        row = zb.third(t)
         known = np.concatenate([za, sampled], axis=2)
-        third = (row[:, -1] - np.sum(row[:, :-1] * known, axis=2))[..., None]
+        third[..., 0] = row[:, -1] - np.sum(row[:, :-1] * known, axis=2)
     return np.concatenate([sampled, third], axis=2)

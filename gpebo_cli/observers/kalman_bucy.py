@@ -35,7 +35,7 @@ from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers._base import ByName, Measurements, SignalNoise
+from gpebo_cli.observers._base import Measurements, SignalNoise
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
 from gpebo_cli.observers._observation import AffineStateMap, Filtering, Observation, Reconstruction
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
@@ -257,7 +257,8 @@ class KalmanBucy:
             )
         w0 = split.dual @ known.xi_a
         start = np.concatenate([np.zeros(q), w0])
-        P0 = _initial_covariance(self.P0, names, known)
+        variances = per_name(self.P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
+        P0 = _initial_covariance(variances, known)
         process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
         known_of = reduced(mesh.points.ravel(), mesh.inside.ravel())
         model_noise = noise_model(known_of, noise, process, self.regularisation)
@@ -306,35 +307,26 @@ class KalmanBucy:
                 Assumption(
                     observability.name,
                     "the observability Gramian over windows of a tenth of the horizon stays away "
-                    "from singular",
-                    observability.holds,
-                    observability.evidence,
+                    "from singular", observability.holds, observability.evidence,
                 ),
             ),
             growth=None,
             estimator=Filter(filtered, observability),
             names=names,
-            note=note + _note(model_noise, self.regularisation),
+            note=note + (
+                f"; measurement noise regularised: {self.regularisation:g} of each equation's size "
+                "(observer.regularisation)"
+            ) * bool(model_noise.rows.any()),
         )
 
 
 OBSERVER = KalmanBucy
 
 
-def _note(model: NoiseModel, regularisation: float) -> str:
-    if not model.rows.any():
-        return ""
-    return (
-        f"; measurement noise regularised: {regularisation:g} of each equation's size "
-        "(observer.regularisation)"
-    )
-
-
-def _initial_covariance(P0: ByName, names: tuple[str, ...], known: ReducedSystem) -> Array:
+def _initial_covariance(variances: Array, known: ReducedSystem) -> Array:
     """P(start) (n, n) of what is possible: w = offset + from_unknowns θ + V z."""
-    variances = per_name(P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
-    q, dual = known.system.q, known.first.split.dual
-    inside = np.zeros((len(names), len(names)))
+    q, n, dual = known.system.q, len(variances), known.first.split.dual
+    inside = np.zeros((n, n))
     inside[:q, :q], inside[q:, :q] = np.eye(q), dual @ known.begin.from_unknowns
     inside[q:, q:] = dual @ known.begin.basis @ known.begin.dual @ known.basis
     return np.asarray((inside * variances) @ inside.T)

@@ -16,10 +16,10 @@ from gpebo_cli.model.descriptor import (
     DescriptorSystem,
     IntArray,
 )
-from gpebo_cli.numerics.mesh import SHARE, Mesh, unresolved
-from gpebo_cli.numerics.radau import RadauRule
+from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, SHARE, Mesh, initial_mesh, unresolved
+from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.numerics.refinement import wanted_parts
-from gpebo_cli.settings import SolverSettings
+from gpebo_cli.settings import SolverSettings, TimeSettings
 
 _LOOKS = 40  # times within each first element at which known functions are looked at once more
 _MOST_LOOKS = 1 << 16
@@ -30,6 +30,18 @@ _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resol
 MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
 SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
+
+
+def first_mesh(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings,
+    elements: int = FIRST_ELEMENTS,
+) -> tuple[Mesh, Array, bool]:
+    """A mesh without anything narrow between its nodes, jumps (B,), and whether that is sure."""
+    start, stop = time.start, time.start + time.horizon
+    cuts = system.coefficients.breakpoints(start, stop)
+    mesh = initial_mesh(start, stop, cuts, elements, radau_rule(solver.stages))
+    edges, bounded = system.coefficients.resolved(mesh.edges)
+    return Mesh(edges, mesh.rule), cuts, bounded
 
 
 def inputs_resolved(

@@ -17,7 +17,6 @@ from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.mesh import (
-    FIRST_ELEMENTS,
     SHARE,
     Kind,
     Mesh,
@@ -40,7 +39,7 @@ from gpebo_cli.reduction.explicit import (
 )
 from gpebo_cli.reduction.structure import Structure, analyse, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
-from gpebo_cli.simulation.known import MARGIN, SHORT, inputs_resolved, known_joined
+from gpebo_cli.simulation.known import MARGIN, SHORT, first_mesh, inputs_resolved, known_joined
 from gpebo_cli.simulation.signals import Signals, Simulation
 
 SMALL = 8  # states, up to which dense matrices are faster in any case
@@ -152,11 +151,7 @@ def large_simulation(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> Simulation | None:
     """:func:`gpebo_cli.simulation.simulate.simulate`, or None where elimination or sweeps fail."""
-    start, stop = time.start, time.start + time.horizon
-    cuts = system.coefficients.breakpoints(start, stop)
-    mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
-    edges, bounded = system.coefficients.resolved(mesh.edges)
-    mesh = Mesh(edges, mesh.rule)
+    mesh, cuts, bounded = first_mesh(system, time, solver)
     plant = _Plant(system, solver.max_strangeness_index + 1)
     try:
         with np.errstate(all="ignore"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import isfinite
 from typing import cast
 
 import numpy as np
@@ -15,15 +14,14 @@ from gpebo_cli.model.text import TextCoefficients
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
-from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, SHARE, Kind, Mesh, Trajectory, initial_mesh
+from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
-from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
 from gpebo_cli.reduction.strangeness_free import StrangenessFree, direct_part, strangeness_free_form
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.simulation.known import MARGIN, SHORT, inputs_resolved, known_joined
+from gpebo_cli.simulation.known import MARGIN, SHORT, first_mesh, inputs_resolved, known_joined
 from gpebo_cli.simulation.large import SMALL, large_simulation
 from gpebo_cli.simulation.linearised import Linearised, looked_along
 from gpebo_cli.simulation.newton import follow
@@ -94,13 +92,10 @@ def _simulate_linear(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> Simulation:
     """:func:`simulate` for a plant whose matrices depend on time and inputs only."""
-    start, stop = time.start, time.start + time.horizon
-    cuts = system.coefficients.breakpoints(start, stop)
-    mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
-    edges, bounded = system.coefficients.resolved(mesh.edges)
-    mesh = Mesh(edges, mesh.rule)
+    start, (mesh, cuts, bounded) = time.start, first_mesh(system, time, solver)
     structure = analyse(
-        system, start, stop, max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol
+        system, start, start + time.horizon, max_mu=solver.max_strangeness_index,
+        rank_tol=solver.rank_tol,
     )
     mesh, c, terms = _known_resolved(
         system, structure, mesh, cuts, solver, bounded=bounded
@@ -111,7 +106,11 @@ def _simulate_linear(
         x0 = ivp.consistent_start(system, structure, start, inside)
     else:
         x0 = consistent_state(first, system.initial_state, structure.scaling.weights)
-    _check_start(system, x0)
+    if not np.isfinite(x0).all():
+        raise ModelError(
+            f"plant {system.name}: no finite consistent state at the start; look for entries that "
+            "are huge or infinite there"
+        )
 
     happened: dict[float, tuple[Array, Jump]] = {}
     restarts: dict[float, Callable[[Array], Array]] = {}
@@ -260,14 +259,6 @@ def _equations(reduced: StrangenessFree) -> LinearEquation:
         return LinearEquation(reduced.E1, reduced.A1, f1, extras)
     constraints = Constraints(reduced.basis, reduced.offset[:, :, None])
     return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints)
-
-
-def _check_start(system: DescriptorSystem, x0: Array) -> None:
-    if not all(map(isfinite, x0.tolist())):
-        raise ModelError(
-            f"plant {system.name}: no finite consistent state at the start; look for entries that "
-            "are huge or infinite there"
-        )
 
 
 def _restart(
