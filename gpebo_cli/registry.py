@@ -41,11 +41,6 @@ class Registry(Generic[T]):
 
     noun: str  # estimator
 
-    @property
-    def group(self) -> str:
-        """The entry points under which other packages offer theirs."""
-        return f"gpebo.{self.noun}s"
-
     @cached_property
     def ours(self) -> frozenset[str]:
         """Names of the modules here."""
@@ -55,6 +50,11 @@ class Registry(Generic[T]):
             path.stem for folder in folders or () for path in Path(folder).glob("*.py")
             if path.stem[0] != "_"
         )
+
+    @property
+    def group(self) -> str:
+        """The entry points under which other packages offer theirs."""
+        return f"gpebo.{self.noun}s"
 
     @property
     def _theirs(self) -> dict[str, EntryPoint]:

@@ -26,7 +26,7 @@ VALUES = {
 
 _WITH_VALUE = {
     **{flag: f"one of {', '.join(accepted)}" for flag, accepted in VALUES.items()},
-    **dict.fromkeys(("--package", "--config-dir", "--config-name"), "a value"),
+    **dict.fromkeys(("--config-dir", "--config-name"), "a value"),
 }
 _SWITCHES = (
     "--multirun", "--dry-run", "--quiet", "--verbose", "--resolve", "--hydra-help", "--version",
@@ -119,7 +119,7 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
     sweep = {key: text for key, _, text in (word.partition("=") for word in given.words)
              if key in _SWEEP_WORDS}
     overrides = [_stored(w) for w in given.words if w.partition("=")[0] not in _SWEEP_WORDS]
-    config_dir = checked_folder(given.config_dir)
+    config_dir = given.config_dir
     config_name = _config_name(given.values.get("--config-name"), config_dir)
     overrides = _with_data(overrides, config_name)
     multirun = "--multirun" in given.switches
@@ -143,9 +143,8 @@ def _check_questions(given: Options) -> None:
         raise ConfigError(f"only one of {', '.join(asked)} at a time")
     if given.quiet and given.loud:
         raise ConfigError("-q and -v: one of them")
-    for flag in ("--resolve", "--package"):
-        if (flag in given.switches or flag in given.values) and "--cfg" not in given.values:
-            raise ConfigError(f"{flag} is for what --cfg prints; add --cfg job")
+    if "--resolve" in given.switches and "--cfg" not in given.values:
+        raise ConfigError("--resolve is for what --cfg prints; add --cfg job")
 
 
 def _stored(word: str) -> str:
@@ -233,16 +232,6 @@ def _fail_fast(given: str | None) -> str:
     if given.lower() not in ("true", "false"):
         raise ConfigError(f"fail_fast: expected true or false, got {shown(given)}")
     return given.lower()
-
-
-def checked_folder(given: str | None) -> str | None:
-    """The folder that ``--config-dir`` names, absolute; None: none was given (ConfigError)."""
-    if given is None:
-        return None
-    folder = os.path.abspath(os.path.expanduser(given))
-    if not os.path.isdir(folder):
-        raise ConfigError(f"--config-dir {given}: there is no such folder")
-    return folder
 
 
 def _config_name(given: str | None, config_dir: str | None) -> str:

@@ -120,17 +120,14 @@ def _sensors(tried: Sequence[Sensor]) -> list[str]:
 def _json(examined: Examination, tried: Sequence[Sensor]) -> str:
     from gpebo_cli.results.summary import plain
 
-    rows = [
-        {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
-        for a in examined.assumptions
-    ]
-    holds = all(a.holds for a in examined.assumptions)
-    content = {"holds": holds, "assumptions": rows, "estimable": examined.estimable,
-               "deviations": examined.deviations}
+    found = examined.assumptions
+    content: dict[str, object] = {
+        "holds": all(a.holds for a in found), "assumptions": [vars(a) for a in found],
+        "estimable": examined.estimable, "deviations": examined.deviations,
+    }
     if tried:
         content["sensors"] = [vars(sensor) for sensor in tried]
-    text = json.dumps(plain(content), indent=2, ensure_ascii=False)
-    return text + "\n"
+    return json.dumps(plain(content), indent=2, ensure_ascii=False) + "\n"
 
 
 def _table(title: str, found: Sequence[Assumption], more: Sequence[str]) -> str:

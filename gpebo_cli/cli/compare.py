@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from datetime import datetime
-from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +33,7 @@ def main(words: list[str]) -> int:
         raise ConfigError("gpebo compare needs folders of runs or sweeps; see gpebo compare --help")
 
     from gpebo_cli.results import comparison
-    from gpebo_cli.results.files import csv_text, make_folder, write_text
+    from gpebo_cli.results.files import cell, csv_text, make_folder, write_text
     from gpebo_cli.results.names import ranking, shown_metrics
 
     cases = [case for name in arguments.words for case in _cases(name)]
@@ -56,7 +56,12 @@ def main(words: list[str]) -> int:
     if sort not in seen:
         seen.insert(1, sort)
     seen, known = asked or seen, asked or known
-    shown = [[_cell(row.get(name), 5) for name in seen] for row in rows[:_SHOWN_ROWS]]
+
+    def cells(row: Mapping[str, Value], columns: Sequence[str], digits: int) -> list[str]:
+        values = [row.get(name) for name in columns]
+        return [value if isinstance(value, str) else cell(value, digits) for value in values]
+
+    shown = [cells(row, seen, 5) for row in rows[:_SHOWN_ROWS]]
     lines = columns([seen, *shown])
     if len(rows) > _SHOWN_ROWS:
         lines.append(f"… {len(rows) - _SHOWN_ROWS} more; --csv FILE has all")
@@ -65,7 +70,7 @@ def main(words: list[str]) -> int:
     if "--csv" in arguments.values:
         path = Path(arguments.values["--csv"])
         make_folder(path.parent)
-        exact = [[_cell(row.get(name), 17) for name in known] for row in rows]
+        exact = [cells(row, known, 17) for row in rows]
         write_text(path, csv_text([known, *exact]))
         sys.stdout.write(f"{path}\n")
     if "--no-figures" not in arguments.switches:
@@ -102,10 +107,3 @@ def _cases(name: str) -> list[Case]:
 def _new_folder() -> str:
     stamp = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S-%f")
     return os.path.join("outputs", "comparisons", stamp)
-
-
-def _cell(value: Value | None, digits: int) -> str:
-    if isinstance(value, float):
-        return "" if isnan(value) else f"{value:.{digits}g}"
-    return value or ""
-

@@ -215,8 +215,8 @@ def show(hydra: Hydra, arguments: Arguments) -> bool:
         parser = get_args_parser()
         hydra.hydra_help(name, parser, parser.parse_args(words))
     elif "--cfg" in options:
-        package, resolve = options.get("--package"), "--resolve" in arguments.given.switches
-        hydra.show_cfg(name, words, options["--cfg"], package, resolve)
+        resolve = "--resolve" in arguments.given.switches
+        hydra.show_cfg(name, words, options["--cfg"], None, resolve)
     elif "--info" in options:
         hydra.show_info(options["--info"], name, words)
     else:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpebo_cli.cli.arguments import Arguments, checked_folder
+from gpebo_cli.cli.arguments import Arguments
 from gpebo_cli.cli.options import CONFIG_DIR, PLAIN, VOLUME, Options, no_option, parse
 from gpebo_cli.configs.locations import PRIMARY
 from gpebo_cli.errors import ConfigError, GpeboError
@@ -31,7 +31,7 @@ _FOLDERS = {"--output": "a folder", "--check": "a folder", "--update": "a folder
 def main(words: list[str]) -> int:
     """Regenerate the figures; the exit code (ConfigError, GpeboError)."""
     options = parse("figures", words, {**_FOLDERS, **CONFIG_DIR}, VOLUME)
-    config_dir = checked_folder(options.config_dir)
+    config_dir = options.config_dir
     names, formats = _asked(options, config_dir)
     update, check = options.values.get("--update"), options.values.get("--check")
     if check is not None and not os.path.isdir(check):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,12 +74,9 @@ def run_job(job: Job, folder: str, *, quiet: bool = False, loud: bool = False) -
 
 def remove_if_empty(folder: str) -> None:
     """Remove the folder of a run that wrote nothing, unless it is where the user stands."""
-    if os.path.realpath(folder) == os.path.realpath(os.curdir):
-        return
-    try:
-        os.rmdir(folder)
-    except OSError:  # not empty: somebody's, or useful
-        return
+    if os.path.realpath(folder) != os.path.realpath(os.curdir):
+        with suppress(OSError):  # not empty: somebody's, or useful
+            os.rmdir(folder)
 
 
 def described_in(chosen: Mapping[str, Any], arguments: Arguments) -> str:

@@ -7,7 +7,6 @@ import sys
 
 from gpebo_cli.cli.options import CONFIG_DIR, parse
 from gpebo_cli.configs.locations import choices, conf_folder, outline
-from gpebo_cli.errors import ConfigError
 
 KINDS = {
     "plants": "plant",
@@ -26,11 +25,7 @@ def main(words: list[str]) -> int:
         ConfigError: there is no such kind, option or folder.
     """
     options = parse("list", words, CONFIG_DIR)
-    folders = [conf_folder()]
-    if options.config_dir is not None:
-        if not os.path.isdir(options.config_dir):
-            raise ConfigError(f"--config-dir {options.config_dir}: there is no such folder")
-        folders.append(options.config_dir)
+    folders = list(filter(None, (conf_folder(), options.config_dir)))
     kinds = list(dict.fromkeys(map(_kind, options.words))) or list(KINDS)
     for position, kind in enumerate(kinds):
         if len(kinds) > 1:

@@ -46,7 +46,7 @@ to use it, install it, then run it: pip install -e {folder}
 def main(words: list[str]) -> int:
     """Write the file; the exit code."""
     kind, name, options = _parse(words)
-    folder = os.path.expanduser(options.config_dir or ".")
+    folder = os.path.expanduser(options.values.get("--config-dir", "."))
     if kind == RECORDING:
         from gpebo_cli.cli.new_recording import write
 

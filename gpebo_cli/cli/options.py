@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 from gpebo_cli.errors import ConfigError
 
 TYPE_CHECKING = False
@@ -15,7 +17,7 @@ CONFIG_DIR = {"--config-dir": "a folder"}
 """Where files of one's own are, for those commands that look for some."""
 
 _SHORT = {
-    "-m": "--multirun", "-q": "--quiet", "-v": "--verbose", "-c": "--cfg", "-p": "--package",
+    "-m": "--multirun", "-q": "--quiet", "-v": "--verbose", "-c": "--cfg",
     "-cd": "--config-dir", "-cn": "--config-name", "-i": "--info",
 }
 
@@ -38,8 +40,13 @@ class Options:
 
     @property
     def config_dir(self) -> str | None:
-        """The folder given with ``--config-dir``."""
-        return self.values.get("--config-dir")
+        """The folder given with ``--config-dir``, absolute (ConfigError: there is none)."""
+        if (given := self.values.get("--config-dir")) is None:
+            return None
+        folder = os.path.abspath(os.path.expanduser(given))
+        if not os.path.isdir(folder):
+            raise ConfigError(f"--config-dir {given}: there is no such folder")
+        return folder
 
     @property
     def quiet(self) -> bool:

@@ -11,25 +11,24 @@ from gpebo_cli.cli import interrupts
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Display
+    from rich.progress import ProgressColumn
 
 _DELAY = 1.0  # seconds: what is quicker than this needs no progress
 
 
-def display(*more: object) -> Display:
+def display(*more: ProgressColumn) -> Display:
     """A bar on stderr that is gone at the end: what, how far, how long still."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
         Progress,
-        ProgressColumn,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
 
-    extra = [column for column in more if isinstance(column, ProgressColumn)]
     return Progress(
-        TextColumn("{task.description}"), BarColumn(24), *extra, TimeElapsedColumn(),
+        TextColumn("{task.description}"), BarColumn(24), *more, TimeElapsedColumn(),
         TextColumn("left:"), TimeRemainingColumn(),
         console=Console(stderr=True), transient=True, speed_estimate_period=3600.0,
     )

@@ -9,16 +9,16 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.experiment.threads import one_thread
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.recordings.table import LineReader, samples
+from gpebo_cli.results.tables import rows_text
 from gpebo_cli.settings import Settings
 
 _PIECE = 1 << 15  # bytes read at once, some 600 rows: as fast as larger ones
@@ -48,8 +48,8 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
                 std = made.std[0] * made.level[:, None]  # NaN: the estimates explain any rows
                 untouched = ~made.std[0, :, : len(online.parameters)].any(axis=1, keepdims=True)
                 columns.append(np.where(untouched | np.isnan(std), np.inf, std))
-            head = ",".join(header) + "\n" if first else ""
-            _write(head + _text(np.column_stack(columns)))
+            head = [",".join(header).encode() + b"\n"] if first else []
+            _write([*head, *rows_text(np.column_stack(columns))])
         if wrong:
             raise ConfigError(wrong)
         if not piece:
@@ -61,23 +61,11 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
     return 0
 
 
-def _text(table: Array) -> str:
-    line = ",".join(["%.17g"] * table.shape[1]) + "\n"
-    text = line * len(table) % tuple(table.ravel().tolist())
-    return text.replace("nan", "") if np.isnan(table).any() else text
-
-
-def _write(text: str) -> None:
-    with _uninterrupted():  # Ctrl-C leaves whole rows behind
-        sys.stdout.write(text)
-        sys.stdout.flush()
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits for the end of the block."""
+def _write(texts: Iterable[bytes]) -> None:
+    """To standard output; Ctrl-C waits meanwhile, and leaves whole rows behind."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield
+        sys.stdout.write(b"".join(texts).decode())
+        sys.stdout.flush()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

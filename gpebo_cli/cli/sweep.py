@@ -171,7 +171,9 @@ def _launch(
     one_by_one = isinstance(launcher, BasicLauncher)  # fail_fast can stop between any two
     size = 1 if one_by_one else orders.max_batch_size or max(len(waiting), 1)
     where = f"hydra.sweep.dir={quoted(str(folder))}"
-    _quiet_ray()
+    # What Ray is told by variables: workers' output is in Ray's own logs, no usage report.
+    os.environ.setdefault("RAY_LOG_TO_DRIVER", "0")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     forks = type(launcher).__name__ == "JoblibLauncher"
     if forks:
         how = {"initializer": workers.follow_or_end, "initargs": (os.getpid(),)}
@@ -193,12 +195,6 @@ def _launch(
         if orders.fail_fast and (folder / STOP).exists():
             break
     return ""
-
-
-def _quiet_ray() -> None:
-    """What Ray is told by variables: workers' output is in Ray's own logs, no usage report."""
-    os.environ.setdefault("RAY_LOG_TO_DRIVER", "0")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 
 def _overrides(job: Sequence[str]) -> dict[str, str]:
@@ -247,14 +243,13 @@ def _check_composition(
     seen = set()
     for job in jobs:
         pairs = [text.partition("=") for text in job]
-        kind = tuple((key, value if _is_group(key) else "") for key, _, value in pairs)
+        kind = tuple(
+            (key, value if "/" in key or key.lstrip("+~") in GROUPS else "")
+            for key, _, value in pairs
+        )
         if kind not in seen:
             seen.add(kind)
             loader.load_sweep_config(config, list(job))
-
-
-def _is_group(key: str) -> bool:
-    return "/" in key or key.lstrip("+~") in GROUPS
 
 
 def _check_folder(folder: Path, plan: Plan, *, resume: bool) -> None:
@@ -293,13 +288,9 @@ def _check_folder(folder: Path, plan: Plan, *, resume: bool) -> None:
 def _print_plan(records: Sequence[JobRecord], *, resumed: bool) -> None:
     keys = list(dict.fromkeys(k for record in records for k in record.overrides))
     state = {"done": "done", "failed": "again", "missing": "to run"}
-    head = ["job", *keys, *(["state"] if resumed else [])]
+    head = ["job", *keys, "state"][: len(keys) + 1 + resumed]
     rows = [
-        [
-            str(r.job),
-            *(r.overrides.get(k, "") for k in keys),
-            *([state[r.status]] if resumed else []),
-        ]
+        [str(r.job), *(r.overrides.get(k, "") for k in keys), state[r.status]][: len(head)]
         for r in records
     ]
     done = sum(record.status == "done" for record in records)

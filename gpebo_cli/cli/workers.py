@@ -112,11 +112,9 @@ def _follow(starter: int) -> None:
 def ancestors() -> list[int]:
     """Parent of this process, its parent, and so on; where there is no ``/proc``, the first."""
     found = [os.getppid()]
-    try:
+    with suppress(OSError, ValueError):
         while found[-1] > 1:
             found.append(_status(found[-1])[1])
-    except (OSError, ValueError):
-        pass
     return found
 
 
@@ -143,7 +141,5 @@ def _status(pid: int) -> tuple[str, int]:
 def end_children() -> None:
     """Ask all living children to end."""
     for pid in children("RSDT"):
-        try:
+        with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGTERM)
-        except ProcessLookupError:
-            continue

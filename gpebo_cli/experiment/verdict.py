@@ -65,7 +65,7 @@ def verdict(
         )
     if active and active.get(best):
         parts.append("held by bounds: " + ", ".join(map(str, active[best])))
-    label = _case_label(cases[best])
+    label = ", ".join(f"{name} = {value:.6g}" for name, value in cases[best].items())
     line = "; ".join(parts) + (f" ({label})" if label else "")
     if not requirement.holds:
         line += f"; {requirement.name} not met: {requirement.text}"
@@ -158,7 +158,3 @@ def _least(values: Array) -> int | None:
         return 0 if isfinite(values[0]) else None
     place = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
     return place if isfinite(values[place]) else None
-
-
-def _case_label(case: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} = {value:.6g}" for name, value in case.items())

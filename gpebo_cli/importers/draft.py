@@ -58,11 +58,11 @@ class PlantDraft:
         """Add a term to the entry of a matrix (E, A, B, F, C, D or H) in a row and a column."""
         self._terms[matrix].setdefault((row, column), []).append(term)
 
-    def add_matrix(self, matrix: str, values: object, first: int = 0) -> None:
-        """Add all entries of a matrix that are not zero, its rows from ``first`` on."""
+    def add_matrix(self, matrix: str, values: object) -> None:
+        """Add all entries of a matrix that are not zero."""
         columns = list(self._columns(matrix))
         for i, j, value in _nonzero(values):
-            self.add(matrix, first + i, columns[j], value)
+            self.add(matrix, i, columns[j], value)
 
     def negate(self, rows: Collection[int]) -> None:
         """Multiply equations by −1."""

@@ -61,7 +61,7 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
         comments=["M q'' + D q' + K q = G' lambda + B u + F theta,  G q = r"],
         parameters=_named(model, "parameters", where),
     )
-    units = _units(model, where)
+    units = {label: str(unit) for label, unit in _mapping(model, "units", where, "texts").items()}
     start = [
         *_start(model, "initial_positions", positions, where),
         *_start(model, "initial_velocities", positions, where), *[0.0] * len(forces),
@@ -164,10 +164,17 @@ def _list(value: object, where: str) -> list[str]:
 
 
 def _named(model: Mapping[str, object], key: str, where: str) -> dict[str, Entry]:
+    given = _mapping(model, key, where)
+    return {label: _entry(item, f"{where}{key}.{label}") for label, item in given.items()}
+
+
+def _mapping(
+    model: Mapping[str, object], key: str, where: str, to: str = "values"
+) -> dict[str, object]:
     value = model.get(key) or {}
     if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}{key} maps names to values, got {shown(value)}")
-    return {str(label): _entry(item, f"{where}{key}.{label}") for label, item in value.items()}
+        raise ConfigError(f"{where}{key} maps names to {to}, got {shown(value)}")
+    return {str(label): item for label, item in value.items()}
 
 
 def _entry(value: object, where: str) -> Entry:
@@ -221,10 +228,3 @@ def _start(
     value = list(value) if isinstance(value, np.ndarray) else value
     found = per_name(value, positions, "position", f"{where}{key}", "finite", absent=0.0)
     return [float(number) for number in found]
-
-
-def _units(model: Mapping[str, object], where: str) -> dict[str, str]:
-    value = model.get("units") or {}
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}units maps names to texts, got {shown(value)}")
-    return {str(label): str(unit) for label, unit in value.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -54,18 +54,15 @@ def varying(cases: Sequence[Case]) -> list[str]:
 
 def ordered(cases: Sequence[Case], by: str, *, reverse: bool = False) -> list[Case]:
     """Cases sorted by a column; those without a value are last either way."""
+    values = [row(case).get(by, math.nan) for case in cases]
 
-    def missing(case: Case) -> bool:
-        value = row(case).get(by)
-        return value is None or (isinstance(value, float) and math.isnan(value))
+    def key(k: int) -> tuple[bool, float, str]:
+        number = _as_number(values[k])
+        return math.isnan(number), 0.0 if math.isnan(number) else number, str(values[k])
 
-    def key(case: Case) -> tuple[bool, float, str]:
-        value = row(case)[by]
-        number = _as_number(value)
-        return math.isnan(number), 0.0 if math.isnan(number) else number, str(value)
-
-    present = sorted((c for c in cases if not missing(c)), key=key, reverse=reverse)
-    return [*present, *(c for c in cases if missing(c))]
+    missing = [k for k, v in enumerate(values) if isinstance(v, float) and math.isnan(v)]
+    present = [k for k in range(len(cases)) if k not in missing]
+    return [cases[k] for k in (*sorted(present, key=key, reverse=reverse), *missing)]
 
 
 def figures(cases: Sequence[Case], metric: str = "") -> Iterator[tuple[str, Figure]]:
@@ -112,9 +109,8 @@ def error_panels(cases: Sequence[Case]) -> list[Panel]:
     count = len(cases)
     places = np.linspace(0, count - 1, min(count, _MOST_CURVES)).round().astype(int)
     chosen = [cases[int(place)] for place in places]
-    label = _labels(cases)
     note = f"{len(chosen)} of {count} cases:" if len(chosen) < count else ""
-    panels = norm_panels(read_errors(chosen), [label(case) for case in chosen])
+    panels = norm_panels(read_errors(chosen), _labels(cases, chosen))
     return [replace(panel, note=note if panel.legend else "") for panel in panels]
 
 
@@ -262,18 +258,15 @@ def _groups(cases: Sequence[Case], without: tuple[str, ...]) -> dict[str, list[C
     return groups
 
 
-def _labels(cases: Sequence[Case]) -> Callable[[Case], str]:
-    """A function from a case to its shortest name that tells it from the others."""
-    others = varying(cases)
-    words = [_words(case, others) for case in cases]
-    runs = {case.run for case in cases}
-    if len(set(words)) == len(cases):
-        return lambda case: _words(case, others)
+def _labels(cases: Sequence[Case], chosen: Sequence[Case]) -> list[str]:
+    """The shortest name of each of those chosen that tells it from all others."""
+    others, runs = varying(cases), {case.run for case in cases}
+    if len({_words(case, others) for case in cases}) == len(cases):
+        return [_words(case, others) for case in chosen]
     if len(runs) == len(cases):
-        return lambda case: case.run
-    return lambda case: ", ".join(
-        filter(None, (case.run if len(runs) > 1 else "", _words(case, others)))
-    )
+        others = []
+    parts = [[case.run if len(runs) > 1 else "", _words(case, others)] for case in chosen]
+    return [", ".join(filter(None, each)) for each in parts]
 
 
 def _words(case: Case, chosen: Sequence[str]) -> str:

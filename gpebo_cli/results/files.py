@@ -6,6 +6,7 @@ import csv
 import io
 import os
 from collections.abc import Iterable
+from math import isnan
 from pathlib import Path
 
 from gpebo_cli.errors import GpeboError
@@ -43,6 +44,11 @@ def csv_text(rows: Iterable[Iterable[str]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
+
+
+def cell(value: float | None, digits: int = 17) -> str:
+    """A number as CSV has it; nothing is known of None and NaN."""
+    return "" if value is None or isnan(value) else f"{value:.{digits}g}"
 
 
 def make_folder(path: Path) -> None:

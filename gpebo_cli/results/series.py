@@ -85,12 +85,8 @@ def csv_text(table: Sequence[Block], digits: int = 17) -> str:
     """A header and rows; blocks stand side by side, the shorter ones end in empty cells."""
     header = [name for block in table for name in (block.name, *(c.name for c in block.columns))]
     columns = [v for block in table for v in (block.x, *(c.values for c in block.columns))]
-    cells = ([_cell(value, digits) for value in column.tolist()] for column in columns)
+    cells = ([files.cell(value, digits) for value in column.tolist()] for column in columns)
     return files.csv_text([header, *zip_longest(*cells, fillvalue="")])
-
-
-def _cell(value: float, digits: int) -> str:
-    return "" if np.isnan(value) else f"{value:.{digits}g}"
 
 
 def reference_text(panels: Sequence[Panel]) -> str:

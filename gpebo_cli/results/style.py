@@ -55,14 +55,10 @@ RC: dict[str, Any] = {
     "axes.grid": False,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "xtick.labelsize": TEXT - 1,
-    "ytick.labelsize": TEXT - 1,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "xtick.major.pad": 2.0,
-    "ytick.major.pad": 2.0,
+    **{
+        f"{axis}tick.{key}": size for axis in "xy" for key, size in
+        {"labelsize": TEXT - 1, "major.width": 0.6, "major.size": 2.5, "major.pad": 2.0}.items()
+    },
     "legend.fontsize": TEXT,
     "legend.title_fontsize": TEXT,
     "legend.labelspacing": 0.25,

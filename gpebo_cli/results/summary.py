@@ -58,13 +58,13 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "estimates": _estimates(result),
         "active_bounds": _active_bounds(estimation),
         "estimable": {name: since is not None for name, since in result.estimable.items()},
-        "assumptions": [
-            {"name": a.name, "statement": a.statement, "holds": a.holds, "evidence": a.evidence}
-            for a in result.assumptions
-        ],
+        "assumptions": [vars(assumption) for assumption in result.assumptions],
         "warnings": result.warnings,
         "excitation": _excitation(result.excitation),
-        "estimator_requirement": _requirement(estimation),
+        "estimator_requirement": None if estimation is None else {
+            key: getattr(estimation.requirement, key)
+            for key in ("name", "holds", "evidence", "text")
+        },
         "cases": _cases(estimation, result.metrics),
         "error_estimate": {
             "states": simulation.error_estimate if simulation else None,
@@ -209,12 +209,6 @@ def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:
         "pe_level_min": levels.min() if levels.size else None,
         "window": excitation.window,
     }
-
-
-def _requirement(estimation: EstimationResult | None) -> dict[str, Any] | None:
-    if estimation is None:
-        return None
-    return {k: getattr(estimation.requirement, k) for k in ("name", "holds", "evidence", "text")}
 
 
 def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> object:

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import finite, open_regular, strict_json
-from gpebo_cli.results.files import csv_text, remove_files, write_text
+from gpebo_cli.results.files import cell, csv_text, remove_files, write_text
 
 PLAN = "sweep.json"
 RESULT = "result.json"
@@ -137,12 +137,8 @@ def table(records: Sequence[JobRecord]) -> list[list[str]]:
                 *(record.overrides.get(key, "") for key in keys),
                 record.status,
                 str(index) if record.cases else "",
-                *(_number(case.get(name)) for name in numbers),
+                *(cell(case.get(name)) for name in numbers),
                 "" if record.seconds is None else repr(record.seconds),
                 record.error,
             ])
     return rows
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.17g}"

@@ -178,7 +178,7 @@ def frame(result: RunResult, name: str) -> DataFrame:
 def write_table(path: Path, table: Table) -> None:
     """Write a table as CSV; NaN is an empty cell."""
     first = "%d" if table.header[0] == "case" else "%.17g"
-    pieces = (text for piece in table.pieces for text in _rows(piece, first))
+    pieces = (text for piece in table.pieces for text in rows_text(piece, first))
     write_file(path, chain([_header(table.header)], pieces))
 
 
@@ -210,8 +210,8 @@ def _header(names: Sequence[str]) -> bytes:
     return csv_text([names]).encode()  # a name may need quotes; the numbers below never do
 
 
-def _rows(table: Array, first: str) -> Iterator[bytes]:
-    """Format ``table`` (rows, columns), its first column by a format of its own."""
+def rows_text(table: Array, first: str = "%.17g") -> Iterator[bytes]:
+    """A table (rows, columns) as CSV, its first column in a format of its own; NaN is empty."""
     line = ",".join([first] + ["%.17g"] * (table.shape[1] - 1)) + "\n"
     for start in range(0, len(table), _CHUNK_ROWS):
         chunk = table[start : start + _CHUNK_ROWS]
