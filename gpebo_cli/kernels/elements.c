@@ -348,15 +348,13 @@ typedef double Nodes[MOST_STAGES];
 typedef struct {
     npy_intp s, d, columns, forced; /* forced: 0 where f is zero, and only its first one is read */
     const npy_intp *row, *column;   /* of the entries of A */
-    const Nodes *R;                 /* h Rᵀ */
-    const Nodes *A, *f;             /* entries; (d, columns) forcing */
+    const Nodes *R, *A, *f;         /* h Rᵀ; entries; (d, columns) forcing */
     Nodes *X;                       /* (d, columns) */
     const double *left, *weight;    /* (d, columns) at the left end; (d,) */
     double *size, *change;          /* (d,) */
 } Swept;
 
-/* What is not a number is left out: the caller looks for that. */
-#define MAXIMUM(a, b) ((a) > (b) ? (a) : (b))
+#define MAXIMUM(a, b) ((a) > (b) ? (a) : (b)) /* or b where a is no number */
 
 /* Row i of a sweep in `count` columns from c on; their sums are independent, and done together. */
 INLINE void sweep_row(const Swept *q, npy_intp i, npy_intp c, const npy_intp count)
@@ -386,18 +384,20 @@ INLINE void sweep_row(const Swept *q, npy_intp i, npy_intp c, const npy_intp cou
         EACH_NODE size[j] = MAXIMUM(fabs(next[k][j]), size[j]);
         EACH_NODE X[j] = next[k][j];
     }
-    for (npy_intp j = 0; j < q->s; j++) {
-        q->change[i] = larger(change[j], q->change[i]);
-        q->size[i] = larger(size[j], q->size[i]);
-    }
+    for (int width = MOST_STAGES / 2; width; width /= 2)
+        for (int j = 0; j < width; j++) {
+            change[j] = MAXIMUM(change[j + width], change[j]);
+            size[j] = MAXIMUM(size[j + width], size[j]);
+        }
+    q->change[i] = MAXIMUM(change[0], q->change[i]);
+    q->size[i] = MAXIMUM(size[0], q->size[i]);
 }
 
 /* One sweep over all rows, from the last to the first if `back`: X_i = x_i + h R (A_i X + f_i). */
 EVERY_WIDTH static void sweep(const Swept *q, int back)
 {
     for (npy_intp row = 0; row < q->d; row++) {
-        const npy_intp i = back ? q->d - 1 - row : row;
-        npy_intp c = 0;
+        npy_intp c = 0, i = back ? q->d - 1 - row : row;
         q->change[i] = 0.0;
         for (; c + AT_ONCE <= q->columns; c += AT_ONCE)
             sweep_row(q, i, c, AT_ONCE);

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,8 @@ from gpebo_cli.numerics.linalg import largest_over_time
 _KEPT = 64  # states, up to which what the pattern of E and A alone decides is kept
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 _ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
-_OPEN = 1e-11  # added to squares of sparse terms: directions that they leave open come to nothing
+_OPEN = 1e-11  # added to squares of terms: directions that they leave open come to nothing
+_FULL = 400  # factors, up to which their equations are solved as full ones
 _BESIDE_TIES = 0.1234  # decades: where factors are rounded, halves and thirds are not at an edge
 
 
@@ -110,10 +111,10 @@ def units_at(c: Coefficients) -> Units:
     order = (entries > 0.0).argmax(axis=0).astype(np.int8)
     sizes = np.choose(order, entries)
     factors, there = _factors(sizes, order, 1.0)
-    terms, logs = _terms(there, order), np.log(sizes[there])
+    terms, logs = _Terms.of(there, order), np.log(sizes[there])
     for _ in range(_ROUNDS):
         counts = np.minimum(np.maximum(np.exp(2.0 * (terms @ factors + logs)), _LITTLE), 1.0)
-        factors = -_squares(terms, counts)((logs * counts) @ terms)
+        factors = -terms.solving(counts)(terms.transposed(logs * counts))
     factors /= np.log(10.0)
     linked = there[0] | there[1]
     outputs_first = np.array([*range(n, n + r), *range(n)], dtype=np.intp)
@@ -135,7 +136,7 @@ def _factors(sizes: Array, order: NDArray[np.int8], mass: float) -> tuple[Array,
         balancing = _balancing if few else _balancing.__wrapped__
         terms, solve, counts = balancing(there.tobytes(), order.tobytes(), sizes.shape, mass)
         logs = np.log(sizes[there])
-        factors = -solve((logs * counts) @ terms)
+        factors = -solve(terms.transposed(logs * counts))
         entries = np.exp(terms @ factors + logs)
         if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
             return factors, there
@@ -149,51 +150,65 @@ def _factors(sizes: Array, order: NDArray[np.int8], mass: float) -> tuple[Array,
         there = rest  # once more without what turned out to be rounding
 
 
+class _Terms(NamedTuple):
+    """What r, c and τ contribute to the logarithms of e entries that are there."""
+
+    rows: IntArray  # (e,) of each entry
+    columns: IntArray  # (e,) after all rows
+    of_time: Array  # (e,)
+    total: int  # a + b + 1 factors
+
+    @classmethod
+    def of(cls, there: BoolArray, order: NDArray[np.int8]) -> _Terms:
+        """For the entries that are ``there``, derivatives of this ``order`` (2, a, b)."""
+        (kind, i, j), (_, a, b) = there.nonzero(), there.shape
+        of_time = np.asarray(kind + order[kind, i, j] - 1, dtype=np.float64)
+        return cls(i, a + j, of_time, a + b + 1)
+
+    def __matmul__(self, factors: Array) -> Array:
+        """What the factors (a + b + 1,) add to each logarithm, (e,)."""
+        found: Array = factors[self.rows] + factors[self.columns] + self.of_time * factors[-1]
+        return found
+
+    def transposed(self, values: Array) -> Array:
+        """The product of the transpose with values (e,), (a + b + 1,)."""
+        both = np.concatenate([self.rows, self.columns])
+        found = np.bincount(both, np.tile(values, 2), self.total).astype(np.float64)
+        found[-1] = self.of_time @ values
+        return found
+
+    def solving(self, counts: Array) -> Callable[[Array], Array]:
+        """The solution of termsᵀ diag(counts) terms x = b, nearly the one with the least norm.
+
+        Singular values of a thousand states would take longer than a run.
+        """
+        n, last = self.total, np.full(self.total, self.total - 1)
+        with_time = self.transposed(self.of_time * counts)
+        own = self.transposed(counts)
+        own[-1], with_time[-1] = with_time[-1] + _OPEN, 0.0
+        own[:-1] += _OPEN
+        every = np.arange(n)
+        i = np.concatenate([self.rows, self.columns, every, every, last])
+        j = np.concatenate([self.columns, self.rows, every, last, every])
+        values = np.concatenate([counts, counts, own, with_time, with_time])
+        if n <= _FULL:
+            return partial(np.linalg.solve, np.bincount(i * n + j, values, n * n).reshape(n, n))
+        from scipy.sparse import csc_array
+        from scipy.sparse.linalg import splu
+
+        solve: Callable[[Array], Array] = splu(csc_array((values, (i, j)), shape=(n, n))).solve
+        return solve
+
+
 @lru_cache(maxsize=64)
 def _balancing(
     there: bytes, order: bytes, shape: tuple[int, int, int], mass: float
-) -> tuple[Any, Callable[[Array], Array], Array]:
-    """:func:`_terms`, the solution of their least squares, and how much each entry counts."""
+) -> tuple[_Terms, Callable[[Array], Array], Array]:
+    """The terms, the solution of their least squares, and how much each entry counts."""
     present = np.frombuffer(there, dtype=np.bool_).reshape(shape)
-    terms = _terms(present, np.frombuffer(order, np.int8).reshape(shape))
+    terms = _Terms.of(present, np.frombuffer(order, np.int8).reshape(shape))
     counts = np.where(present.nonzero()[0], 1.0, mass)
-    if isinstance(terms, np.ndarray):  # with the least norm
-        inverse = np.linalg.pinv((counts * terms.T) @ terms, rcond=1e-12, hermitian=True)
-        return terms, inverse.dot, counts
-    return terms, _squares(terms, counts), counts
-
-
-def _terms(there: BoolArray, order: NDArray[np.int8]) -> Any:
-    """What r, c and τ contribute to the logarithm of each entry that is there; sparse if many."""
-    (kind, i, j), (_, a, b) = there.nonzero(), there.shape
-    every, of_time = np.arange(len(i)), kind - 1.0 + order[kind, i, j]
-    if a + b > 2 * _KEPT:
-        from scipy.sparse import csr_array
-
-        values = np.concatenate([np.ones(2 * len(i)), of_time])
-        columns = np.concatenate([i, a + j, np.full(len(i), a + b)])
-        return csr_array((values, (np.tile(every, 3), columns)), shape=(len(i), a + b + 1))
-    terms = np.zeros((len(i), a + b + 1))
-    terms[every, i] = terms[every, a + j] = 1.0
-    terms[:, -1] = of_time
-    return terms
-
-
-def _squares(terms: Any, counts: Array) -> Callable[[Array], Array]:
-    """The solution of termsᵀ diag(counts) terms x = b, nearly the one with the least norm.
-
-    Singular values of a thousand states would take longer than a run.
-    """
-    if isinstance(terms, np.ndarray):
-        return partial(
-            np.linalg.solve, (counts * terms.T) @ terms + _OPEN * np.eye(terms.shape[1])
-        )
-    from scipy.sparse import diags_array, eye_array
-    from scipy.sparse.linalg import splu
-
-    matrix = terms.T @ diags_array(counts) @ terms + _OPEN * eye_array(terms.shape[1])
-    solve: Callable[[Array], Array] = splu(matrix.tocsc()).solve
-    return solve
+    return terms, terms.solving(counts), counts
 
 
 def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:
