@@ -331,11 +331,7 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
 
 
 def between(signal: Trajectory, a: Array, b: Array) -> Array:
-    """∫ of a signal (rows, c) from a to b ≥ a (N,) within its mesh, whole elements summed afresh.
-
-    Returns:
-        shape (N, rows, c).
-    """
+    """∫ of a signal (rows, c) from a to b ≥ a (N,) in its mesh, whole elements summed afresh."""
     mesh = signal.mesh
     return _window_sums(signal, mesh.sampler(a), mesh.sampler(b), signal.values.shape[3])
 

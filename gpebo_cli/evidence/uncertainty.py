@@ -316,17 +316,10 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
 
 
 def error_steps(mesh: Mesh, times: Array, hold: str, A: Array, B: Array) -> Array:
-    """ζ at every time but the first from that at the one before and from the errors e at both.
+    """ζ at each time but the first from that before and from the errors e at both, (K, k, k + 2 c).
 
-    Args:
-        mesh: of elements between the times, (K + 1,).
-        times: of the samples.
-        hold: what is assumed between them, zoh or linear.
-        A: of ζ' = A ζ + B e at the points of the mesh, (elements or 1, s + 1 or 1, k, k).
-        B: at the same points, (…, k, signals).
-
-    Returns:
-        (K, k, k + 2 signals)
+    Of elements between the times (K + 1,) of samples; between them e is held or linear. Of ζ' = A ζ
+    + B e, A (elements or 1, s + 1 or 1, k, k) and B (…, k, c) are at the points of the mesh.
     """
     points = mesh.points[:, 1:]
     after = np.searchsorted(times, mesh.edges[1:] - 0.5 * mesh.steps)  # whose step it is part of
@@ -411,10 +404,9 @@ class SampledDeviations:
     ) -> None:
         """Prepare for the first sample.
 
-        Args:
-            variances: of each sample of [u; y], (m + r,).
-            number: times (K,) to which errors are theirs; None: each sample has errors of its own.
-            relative: whether they have to be multiplied by what :meth:`update` finds.
+        With variances of each sample of [u; y], (m + r,), and the ``number`` of the sample whose
+        errors times (K,) have; None: each its own. If ``relative``, what :meth:`update` finds is a
+        factor.
         """
         self._deviations, self._number, self._relative = np.sqrt(variances), number, relative
         self.noisy = variances > 0.0  # (m + r,)

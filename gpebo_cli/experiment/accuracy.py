@@ -203,16 +203,10 @@ def astray(
     """A warning of final estimates that are not what least squares makes of the same data.
 
     Gains and rounding can do that. There is none if the estimates explain the data nearly as well,
-    because noise makes such a difference too.
-
-    Args:
-        root: R (k, p + 1) with |R [−η; 1]|² = ∫‖Y − ψη‖².
-        final: η̂ of all cases at the end (G, p).
-        states: from parameters (g, p) to x̂ (g, M, n) at times of which the last is the end.
-        quantities: names of parameters and states (p + n,).
-        sizes: of these (p + n,), NaN for a state that nobody knows: least squares' own one counts.
-        determined: which of them are.
-        columns: the parameters that are estimated (k,), the others being zero.
+    because noise makes such a difference too. ``root`` R (k, p + 1) has |R [−η; 1]|² = ∫‖Y − ψη‖²,
+    ``final`` are η̂ of all cases at the end (G, p), ``states`` makes x̂ (g, M, n) of parameters (g,
+    p), at times of which the last is the end. Of ``quantities``, names of parameters and states (p
+    + n,), a size that is NaN counts as least squares' own one. Only ``columns`` (k,) are estimated.
     """
     final, eta = final[np.isfinite(final).all(axis=1)], np.zeros(final.shape[1])
     if not len(final) or not len(columns):

@@ -16,11 +16,11 @@ def element_maps(
     offset: Array | None, group: IntArray, groups: int,
     solve: Callable[..., Array] | None = None,
 ) -> tuple[Array, Array]:
-    """X at the nodes of each element = homogeneous X(left end) + particular.
+    """X at the nodes = homogeneous (groups, s, n, n) X(left end) + particular (K, s, n, c).
 
-    Block systems (D_ij/h E_i T_j − δ_ij A_i T_i) z_j = (D𝟙)_i/h E_i x_0 + f_i + A_i p_i − E_i
-    (D p)_i/h with X_i = T_i z_i + p_i. Elements of one group, all of one length and with constant
-    E, A and T, share the system of the first of them.
+    Block systems (D_ij/h E_i T_j − δ_ij A_i T_i) z_j = (D𝟙)_i/h E_i x_0 + f_i + A_i p_i − E_i (D
+    p)_i/h with X_i = T_i z_i + p_i. Elements of one group, all of one length and with constant E, A
+    and T, share the system of the first of them.
 
     Args:
         D: the differentiation matrix of the rule (s, s).
@@ -34,9 +34,6 @@ def element_maps(
         group: of each element (K,), 0 … groups − 1.
         groups: how many there are, K where each element has a system of its own.
         solve: what takes the place of :func:`solve_blocks`.
-
-    Returns:
-        homogeneous (groups, s, n, n) and particular (K, s, n, c).
 
     Raises:
         LinAlgError: a system is singular.
@@ -263,22 +260,10 @@ def substituted(
     """Values of (D/h ⊗ I − A) X = D𝟙/h x_0 + f by elimination, one element after the other.
 
     With a right-hand side b, and x = 0, in each step x_t += B b_t and then b_t = 0, where the
-    target t is the source; else b_t += B x_s.
-
-    Args:
-        left: D𝟙/h (K, s).
-        place: of each element among the G factors (K,).
-        target: of each step (m,).
-        source: likewise.
-        block: B of each step (m,): so many in ``full``, and counted on in
-        full: transposed (G, F, s, s), and
-        diagonal: (G, T, s).
-        f: as of :func:`sweeps`, and
-        kicks: likewise.
-        start: at the first left end (d, c).
-
-    Returns:
-        (K, s + 1, d, c), before what is added.
+    target t is the source; else b_t += B x_s. With ``left`` D𝟙/h (K, s), the ``place`` of each
+    element (K,) among the G factors, the target, source and B of each step (m,), where B are so
+    many in ``full``, transposed (G, F, s, s), and counted on in ``diagonal`` (G, T, s); the rest is
+    as of :func:`sweeps`.
     """
     (K, s), (d, columns), F = left.shape, start.shape, full.shape[1]
     values, state = np.empty((K, s + 1, d, columns)), start

@@ -64,13 +64,8 @@ def matrix(
 ) -> list[list[tuple[int, object]]]:
     """The entries of a matrix by row, each with its column; of a sparse one those that it has.
 
-    Args:
-        plant: what the file is, for messages.
-        key: of the matrix.
-        value: rows, a mapping of places, an array (rows, columns) or one of SciPy's sparse ones.
-        down: what its rows stand for.
-        across: what its columns stand for.
-        needed: whether it has to be there; if not, there may be no entries.
+    ``value`` is a list of rows, a mapping of places, an array (rows, columns) or one of SciPy's
+    sparse ones. If it is not ``needed``, there may be no entries.
 
     Raises:
         ConfigError: anything else, or a size that is not that of ``down`` and ``across``.

@@ -279,11 +279,8 @@ def read_parameters(
 ) -> dict[str, Expression]:
     """The named expressions of a file, each of which may use those above it.
 
-    Args:
-        plant: what the file is, for messages.
-        value: of its key ``parameters``.
-        signals: inputs and outputs by name.
-        elsewhere: names that may not be used, with what they are.
+    Inputs and outputs are ``signals``; names that may not be used are ``elsewhere``, with what they
+    are.
 
     Raises:
         ConfigError: a value that is no expression of the language, or a name that cannot be one.

@@ -183,10 +183,8 @@ def _tail_of_numbers(
 ) -> Array:
     """:func:`unresolved_signals`; where not all is finite, of the elements before, else zero.
 
-    So many elements in front are finite as ``whole`` says.
-
-    Elements that are too long may seem to grow, and many of them multiply to anything: those in
-    front are resolved first.
+    The first ``whole`` elements are finite. Elements that are too long may seem to grow, and many
+    of them multiply to anything: those in front are resolved first.
     """
     count = mesh.size if whole == mesh.size else _modest(values)
     tail = np.zeros(mesh.size)

@@ -104,10 +104,7 @@ def _residual(
 
 
 def eliminated(D: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array) -> Factors:
-    """Of G elements of lengths ``h`` (G,) with the entries (G, s, e) of A at their nodes.
-
-    Raises:
-        StiffError: there are too many, or an inverse does not exist.
+    """Of G elements of lengths ``h`` (G,) with entries (G, s, e) of A at their nodes; StiffError: not.
     """
     s, d = len(D), len(rows) - 1
     own = dict.fromkeys(range(d), D / h[:, None, None])

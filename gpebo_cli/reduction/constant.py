@@ -41,10 +41,7 @@ class ConstantForm:
     known: Array | float = 0.0
 
     def along(self, f: Array) -> ConstantForm:
-        """With what is known in the equations, Taylor coefficients (orders, N, n).
-
-        Raises:
-            MoreOrdersError: they end too early.
+        """With what is known in the equations (orders, N, n); MoreOrdersError: these are too few.
         """
         if len(f) < len(self.constraints):
             raise MoreOrdersError

@@ -292,16 +292,11 @@ def strangeness_free(
 ) -> EquationForm:
     """The strangeness-free form, for a horizon that the times t (N,) span.
 
-    Args:
-        given: the model as given.
-        t: times by which to judge which derivatives of inputs there are.
-        inside: where functions that jump are decided.
-        signals: [u; y] there (N, m + r), for matrices that follow them.
-        max_mu: largest strangeness index.
-        rank_tol: singular values below this, relative, are zero.
+    By these times is judged which derivatives of inputs there are. ``signals`` are [u; y] there (N,
+    m + r), for matrices that follow them.
 
     Raises:
-        ModelError: not uniquely solvable, or the index is too high.
+        ModelError: not uniquely solvable, or the index is above ``max_mu``.
         ConfigError: a derivative is needed of an input, or of an output, of which it is not known.
     """
     system, inputs = given.system, given.inputs
@@ -351,11 +346,7 @@ def strangeness_free(
 def _refuse_slopes(
     form: EquationForm, found: HiddenConstraints, t: Array, inside: Array, signals: Array
 ) -> None:
-    """Refuse hidden constraints that change with the derivatives of an output.
-
-    Raises:
-        ConfigError: names the output.
-    """
+    """Refuse hidden constraints that change with the derivatives of an output."""
     system, structure = form.system, form.structure
     followed = frozenset[str]().union(*system.coefficients.signals.values())
     for j, name in enumerate(system.outputs):

@@ -50,15 +50,11 @@ def in_stages(
     E: Array, A: Array, f: Array, rank_tol: float, every: int,
     ranks: Sequence[int] | None = None,
 ) -> Stages:
-    """Constraints of E x' = A x + f from Taylor coefficients (orders, N or 1, n, ·).
+    """Constraints of E x' = A x + f from scaled Taylor coefficients (orders, N or 1, n, c).
 
-    Args:
-        E: in scaled rows and states, as the other two.
-        A: see above.
-        f: columns of it (orders, N, n, c).
-        rank_tol: relative singular values below this are zero, and those that rounding explains.
-        every: at every how many times rounding is looked at.
-        ranks: that have to be found; None: whatever is found at the first time.
+    Relative singular values below ``rank_tol``, and those that rounding explains, are zero.
+    Rounding is looked at at ``every`` so many times. ``ranks`` have to be found; None: whatever the
+    first time has.
 
     Raises:
         UnclearError: they are not, or the system is not uniquely solvable, or takes more orders.

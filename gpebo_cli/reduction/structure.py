@@ -185,10 +185,7 @@ def _analysed(
 def _in_stages(
     system: DescriptorSystem, t: Array, max_mu: int, rank_tol: float, least: float = 0.0
 ) -> Structure | None:
-    """What :mod:`.stages` find, if that is clearer than a smallest singular value.
-
-    Raises:
-        ModelError: a rank changes between the times t (N,).
+    """What :mod:`.stages` find at the times t (N,), if that is clearer than a smallest singular value.
     """
     # Nothing of A stands beside E here, and rates in A say nothing about it.
     s = balance(system.coefficients.taylor(t, 0), _MASS)
@@ -274,11 +271,7 @@ def unclear_ranks(system: DescriptorSystem, t: Array, unclear: UnclearError) -> 
 def _refuse_overflow(
     system: DescriptorSystem, c: Coefficients, scaling: Scaling, mu: int
 ) -> None:
-    """LAPACK's singular values of what is not finite may take for ever.
-
-    Raises:
-        ModelError: entries or their derivatives, scaled, are beyond all numbers.
-    """
+    """LAPACK's singular values of what is not finite may take for ever."""
     with np.errstate(all="ignore"):
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
         whole = [(distinct(matrix) * weight).ravel() for matrix in (c.E, c.A)]
@@ -445,9 +438,7 @@ def _follow_dips(
     system: DescriptorSystem, t: Array, smallest: Array, mu: int, rank_tol: float,
     lines: Callable[[Array, Coefficients, IntArray, IntArray], Array],
 ) -> bool:
-    """Follow local minima of the decisive singular values (N, 3) between the probes.
-
-    Returns whether there is none between the ends. ``lines`` are as :func:`_lines` says.
+    """Follow local minima of the decisive singular values (N, 3); whether there is none inside.
 
     A rank that drops at an isolated time is never hit by a grid: |sin t| is 1e-2 at the nearest
     probe and looks harmless. Each deep local minimum is bracketed and cut by 8 per round, for as

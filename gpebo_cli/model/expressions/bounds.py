@@ -43,17 +43,10 @@ class Bounds:
 
     def of(self, low: Array, high: Array, order: int, inside: Array | None = None
            ) -> tuple[Array, Array]:
-        """Bounds of the Taylor coefficients of all outputs, for all t of each cell.
+        """Least and largest Taylor coefficients (order + 1, N, outputs), for all t of each cell (N,).
 
-        Args:
-            low: where cells begin, (N,).
-            high: where they end.
-            order: highest coefficient wanted.
-            inside: times in the cells at which jumps are decided, where no function jumps within
-                its cell; None: functions may jump, and derivatives of those that do mean nothing.
-
-        Returns:
-            least and largest values, (order + 1, N, number of outputs).
+        Jumps are decided at times ``inside`` of the cells, where no function jumps within its cell;
+        None: functions may jump, and derivatives of those that do mean nothing.
         """
         key = order, inside is not None
         if kernels.expressions.RUNS_PROGRAMS and self.signals is None:
@@ -79,7 +72,7 @@ class Bounds:
 
 
 def resolved(bounds: Bounds, edges: Array, most: int = 0) -> tuple[Array, bool]:
-    """Edges of cells that are few times longer than what hides nothing.
+    """Edges of cells that are few times longer than what hides nothing, and whether all are.
 
     In cells 2**COARSER times shorter every expression is nearly a polynomial of degree ORDER.
     "Nearly" is RESOLVED of the largest value that the expression can have anywhere: with
@@ -87,17 +80,10 @@ def resolved(bounds: Bounds, edges: Array, most: int = 0) -> tuple[Array, bool]:
         f(t) = Σ_{k<K} f_k(m) (t − m)^k + f_k(τ) (t − m)^K      for some τ of a cell around m,
 
     the bounds of f_K over the cell say by how much f can differ from such a polynomial. What is
-    looked at a dozen times between these edges cannot hide a pulse. What has no finite bound, as
-    a quotient while its divisor might vanish, is cut until it has one, and at a pole to rounding.
-
-    Args:
-        bounds: of expressions of time alone.
-        edges: (K + 1,) where cells have to end, jumps and kinks among them.
-        most: so many cells are enough; 0: as many as _MOST_CELLS and _MOST_VALUES let.
-
-    Returns:
-        these edges and more, sorted; and whether all cells are short enough. There are too many
-        of those where not.
+    looked at a dozen times between these edges cannot hide a pulse. What has no finite bound, as a
+    quotient while its divisor might vanish, is cut until it has one, and at a pole to rounding. The
+    edges asked for (K + 1,), jumps and kinks among them, stay. ``most`` cells are enough; 0: as
+    many as _MOST_CELLS and _MOST_VALUES let.
     """
     low, high = edges[:-1], edges[1:]
     depth = np.zeros(len(low), dtype=np.intp)  # how often each has been halved
@@ -167,12 +153,9 @@ class _Cells:
 def breakpoints(tape: Tape, start: float, stop: float) -> Array:
     """Times strictly between ``start`` and ``stop`` where some expression jumps or has a kink.
 
-    Instants of ``step`` and zeros of affine arguments of ``abs``, ``sign``, ``min`` and ``max`` are
-    exact, changes of sign of other arguments isolated by bounds, see :func:`roots`, and bisected to
-    rounding.
-
-    Returns:
-        Sorted, without repetitions, seconds, shape (number,).
+    They are sorted, without repetitions, in seconds (number,). Instants of ``step`` and zeros of
+    affine arguments of ``abs``, ``sign``, ``min`` and ``max`` are exact, changes of sign of other
+    arguments isolated by bounds, see :func:`roots`, and bisected to rounding.
 
     Raises:
         ConfigError: an argument that is not finite at some time.
