@@ -12,7 +12,7 @@ from plants import shipped
 
 from gpebo_cli import run
 from gpebo_cli.estimators import ErrorSystem, LinearRegression
-from gpebo_cli.evidence.metrics import standing_since
+from gpebo_cli.evidence.metrics import settling_times
 from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.plant import plant_from_mapping
@@ -235,8 +235,8 @@ def test_settled_is_within_two_deviations_of_the_end_from_then_on():
     assert max(found) < 19.0
     silent = run("descriptor", estimator="ls_drem", time={"horizon": 5}).details.metrics
     assert silent.seconds_to_settled is None
-    assert standing_since(
-        np.array([0.0, 1.0, 2.0]), np.array([[[5.0], [1.0], [0.5]]]), np.array([[0.5]])
+    assert settling_times(
+        np.array([0.0, 1.0, 2.0]), np.array([[[5.0], [1.0], [0.5]]]), np.array([[1.0]])
     )[0, 0] == 1.0
 
 

@@ -322,39 +322,29 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
     whole = (start >= mesh.edges[0] - 1e-12 * max(1.0, window)).nonzero()[0]
     if len(whole) == 0:
         return level
-    from_there = mesh.sampler(np.maximum(start[whole], mesh.edges[0]))
-    to_there = mesh.sampler(t)
-    to_there = Sampler(to_there.element[whole], to_there.weights[whole])
-    sums = _window_sums(outer, from_there, to_there, outer.values.shape[2])
+    sums = between(outer, np.maximum(start[whole], mesh.edges[0]), t[whole])
     level[whole] = np.maximum(symmetric_eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
     return level
 
 
 def between(signal: Trajectory, a: Array, b: Array) -> Array:
     """∫ of a signal (rows, c) from a to b ≥ a (N,) in its mesh, whole elements summed afresh."""
-    mesh = signal.mesh
-    return _window_sums(signal, mesh.sampler(a), mesh.sampler(b), signal.values.shape[3])
-
-
-def _window_sums(signal: Trajectory, start: Sampler, stop: Sampler, columns: int) -> Array:
-    """:func:`between` of the first columns, with the times where these samplers look."""
     mesh, R = signal.mesh, signal.mesh.rule.integration
+    start, stop = mesh.sampler(a), mesh.sampler(b)
     totals = mesh.steps[:, None, None] * np.tensordot(signal.values[:, 1:], R[-1], axes=(1, 0))
 
     def within(places: Sampler) -> Array:
         """Integrals from the left ends of elements to places in them."""
         weights = np.zeros_like(places.weights)
         weights[:, 1:] = mesh.steps[places.element, None] * (places.weights[:, 1:] @ R)
-        found: Array = Sampler(places.element, weights)(signal.values)
-        return found[..., :columns]
+        return Sampler(places.element, weights)(signal.values)
 
-    totals, head, tail = totals[..., :columns], within(start), within(stop)
     # Sums of totals[first:last] for every window: pairs of indices to reduceat.
     padded = np.concatenate([totals, np.zeros_like(totals[:1])])
     pairs = np.stack([start.element, stop.element], axis=1).ravel().astype(np.intp)
     whole = np.add.reduceat(padded, pairs, axis=0)[::2]
     several = (start.element < stop.element)[:, None, None]
-    return np.asarray(np.where(several, whole, 0.0) + tail - head)
+    return np.asarray(np.where(several, whole, 0.0) + within(stop) - within(start))
 
 
 def sampled_window_level(regression: SampledRegression, window: float) -> Array:

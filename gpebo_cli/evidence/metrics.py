@@ -2,8 +2,8 @@
 
 If e is the norm of an error, the settling time is the least T with e(t) ≤ e(0)/100 for all t ≥ T.
 Under noise it is chance when an error is small, and an estimate has settled where it is within ±2σ
-of what it is at the end from then on, σ being its deviation at the end (:func:`standing_since`;
-``experiment.accuracy.standing`` says how that is meant of what moves).
+of what it is at the end from then on, σ being its deviation at the end
+(``experiment.accuracy.standing`` says how that is meant of what moves).
 The root mean square over time is √(∫e² dt / horizon).
 """
 
@@ -104,25 +104,14 @@ def levels(first: Array, size: Array) -> Array:
     return np.asarray(SETTLED * np.where(absolute > _NOTHING * size, absolute, size))
 
 
-def settling_times(t: Array, error: Array, size: Array) -> Array:
-    """:func:`settling_time` of each of c errors (g, M, c) against :func:`levels`, shape (g, c)."""
-    absolute = np.abs(np.moveaxis(error, 2, 1))  # (g, c, M)
-    level = levels(absolute[..., 0], size)
-    out = settling_time(t, absolute.reshape(-1, len(t)), level=level.ravel()).reshape(level.shape)
-    out[np.isnan(absolute[..., -1])] = np.nan
-    return out
+def settling_times(t: Array, error: Array, level: Array) -> Array:
+    """:func:`settling_time` of each of c errors (g, M, c) against levels (g, c), shape (g, c).
 
-
-def standing_since(t: Array, away: Array, deviation: Array) -> Array:
-    """From when on c estimates are within ±2σ of the final ones, (g, c), in seconds.
-
-    ``away`` (g, M, c) is how far at the times t (M,) they are from what they are by the data up to
-    the end, the deviation (g, c) is σ at the end, NaN where it is not known.
+    NaN where the last error or the level is not known.
     """
-    away = np.abs(np.moveaxis(away, 2, 1))
-    level = 2.0 * deviation
-    since = settling_time(t, away.reshape(-1, len(t)), level=level.ravel()).reshape(level.shape)
-    return np.where(np.isnan(level), np.nan, since)
+    absolute = np.abs(np.moveaxis(error, 2, 1))  # (g, c, M)
+    out = settling_time(t, absolute.reshape(-1, len(t)), level=level.ravel()).reshape(level.shape)
+    return np.where(np.isnan(absolute[..., -1] + level), np.nan, out)
 
 
 def settling_time(

@@ -16,7 +16,6 @@ from gpebo_cli.evidence.metrics import (
     measure_squares,
     settled,
     settling_times,
-    standing_since,
 )
 from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics
 from gpebo_cli.experiment.sources import Source
@@ -98,7 +97,10 @@ def numbers_of(
         np.einsum("gmj,j->gm", error[..., some] ** 2, _weights(size, some)[some])
         for error, size, some in ((of_eta, sizes[0], seen), (of_x, sizes[1], known))
     ]
-    times = [settling_times(t, of_eta, sizes[0]), settling_times(t, of_x, sizes[1])]
+    times = [
+        settling_times(t, error, levels(error[:, 0], size))
+        for error, size in zip((of_eta, of_x), sizes, strict=True)
+    ]
     times[0][:, ~judged] = np.nan
     of_all = _of_all(t, squares, of_eta[:, -1], of_x[:, -1], judged)
     return np.concatenate([of_all, times[0].T, times[1].T])
@@ -264,7 +266,7 @@ def standing(
         at_end = over_seeds.deviation[:, : eta.shape[2]]
     else:
         return replace(metrics, seconds_to_settled={})
-    since = standing_since(estimation.t, away, at_end).T
+    since = settling_times(estimation.t, away, 2.0 * at_end).T
     return replace(metrics, seconds_to_settled=dict(zip(names, since, strict=False)))
 
 

@@ -143,7 +143,8 @@ def _entries(
         "H": (measured, sought, _OF_INPUTS),
         "B": (rows, driven, _OF_ALL),
     }
-    known = _known_term(plant, mapping.get("phi"), rows)
+    phi, of = mapping.get("phi"), f"{counted(len(states), 'entry')}, one for each row of E"
+    known = [] if is_empty(phi) else _one_each(plant, "phi", phi, rows, f"be a list of {of}")
     entries: dict[str, MatrixEntries] = {
         "phi": (
             (len(states),),
@@ -304,19 +305,16 @@ def read_parameters(
     return parameters
 
 
-def _known_term(plant: str, value: object, rows: Side) -> list[object]:
-    """φ, one entry for each equation."""
-    if is_empty(value):
-        return [0] * len(rows.names)
-    entries = items_of(value)
-    if entries is None:
-        raise ConfigError(
-            f"{plant}: phi must be a list of {counted(len(rows.names), 'entry')}, one for each row "
-            f"of E, not {brief(value)}"
-        )
-    if len(entries) != len(rows.names):
-        raise ConfigError(f"{plant}: phi has {counted(len(entries), 'entry')} but {rows}")
-    return entries
+def _one_each(
+    plant: str, key: str, value: object, rows: Side, must: str, noun: str = "entry"
+) -> list[object]:
+    """A list with as many items as there are rows."""
+    items = items_of(value)
+    if items is None:
+        raise ConfigError(f"{plant}: {key} must {must}, not {brief(value)}")
+    if len(items) != len(rows.names):
+        raise ConfigError(f"{plant}: {key} has {counted(len(items), noun)} but {rows}")
+    return items
 
 
 def _initial_values(plant: str, value: object, states: tuple[str, ...]) -> dict[str, object]:
@@ -332,17 +330,8 @@ def _initial_values(plant: str, value: object, states: tuple[str, ...]) -> dict[
         if missing:
             raise ConfigError(f"{plant}: initial_state lacks {listed(missing)}")
         return {state: value[state] for state in states}
-    values = items_of(value)
-    if values is None:
-        raise ConfigError(
-            f"{plant}: initial_state must map states to numbers or list "
-            f"{counted(len(states), 'number')}, not {brief(value)}"
-        )
-    if len(values) != len(states):
-        raise ConfigError(
-            f"{plant}: initial_state has {counted(len(values), 'value')} but "
-            f"{Side('state', states)}"
-        )
+    must = f"map states to numbers or list {counted(len(states), 'number')}"
+    values = _one_each(plant, "initial_state", value, Side("state", states), must, "value")
     return dict(zip(states, values, strict=True))
 
 

@@ -104,8 +104,7 @@ def _residual(
 
 
 def eliminated(D: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array) -> Factors:
-    """Of G elements of lengths ``h`` (G,) with entries (G, s, e) of A at their nodes; StiffError: not.
-    """
+    """Of G elements of lengths ``h`` (G,), entries (G, s, e) of A at their nodes, or StiffError."""
     s, d = len(D), len(rows) - 1
     own = dict.fromkeys(range(d), D / h[:, None, None])
     # Beyond the own ones, with the sign that they have on the right: (G, s, 1) if diagonal.

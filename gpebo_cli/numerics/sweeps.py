@@ -324,8 +324,7 @@ def _swept(
     march: March, A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, units: Array, tol: float,
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, Array]:
-    """Values (K, s + 1, d, c), and the last change in each element (K,); StiffError: it is too large.
-    """
+    """Values (K, s + 1, d, c), and the last change in each element (K,), or StiffError."""
     edges, state = mesh.edges.tolist(), problem.start
     cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
     pieces = []

@@ -189,9 +189,12 @@ class EquationForm:
             D = np.concatenate([D, np.zeros((len(D), system.r, extra + phi.shape[2]))], axis=2)
         hidden = None
         if self.structure is not None:
-            hidden = self._kept(
-                hidden_constraints(system, self.structure, self.units.states, t, c)
-            )
+            hidden = hidden_constraints(system, self.structure, self.units.states, t, c)
+            # Of all driving signals [u_0 … u_μ, 1] those that this form has.
+            chosen = [*range(system.m), *(k * system.m + j for k, j in self.derivatives)]
+            if self.known_term:
+                chosen.append(hidden.driving.shape[2] - 1)
+            hidden = hidden._replace(driving=hidden.driving[:, :, chosen])
         return Equations(
             value("E"), value("A"), B, value("F"), value("C"), D, value("H"), hidden
         )
@@ -220,14 +223,6 @@ class EquationForm:
             along[:, :, : self.system.m] = self.inputs.taylor(t, inside, order)
         along[0] = signals
         return along
-
-    def _kept(self, found: HiddenConstraints) -> HiddenConstraints:
-        """Of all driving signals [u_0 … u_μ, 1] those that this form has."""
-        m = self.system.m
-        chosen = [*range(m), *(k * m + j for k, j in self.derivatives)]
-        if self.known_term:
-            chosen.append(found.driving.shape[2] - 1)
-        return found._replace(driving=found.driving[:, :, chosen])
 
 
 def hidden_constraints(

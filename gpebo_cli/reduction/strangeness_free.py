@@ -171,34 +171,20 @@ def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
     """D u + H θ at N times, (N, r): what no state has part in; None: there is nothing."""
     if {"D", "H"} <= zero:
         return None
-    return _apply(c.D[0], c.u[0]) + _apply(c.H[0], c.theta[0])
+    terms = (c.D[0], c.u[0]), (c.H[0], c.theta[0])
+    return np.asarray(sum(np.matmul(matrix, v[:, :, None])[:, :, 0] for matrix, v in terms))
 
 
 def _by_singular_vectors(
     system: DescriptorSystem, structure: Structure, E: Array, M: Array, N: Array, t: Array
 ) -> tuple[Array, Array]:
     """Orthonormal Z1 (N, n, d) and Z2 (N, ·, a) where the reference pivots will not do."""
-    a = structure.a
+    a, tol = structure.a, structure.rank_tol
     r = M.shape[1] - a
     U, sigma, _ = np.linalg.svd(M)
-    _check_gap(system, structure, sigma, r, t)
-    Z2 = U[:, :, r:]
-    T2 = transpose(np.linalg.svd(transpose(Z2) @ N)[2])[:, :, a:]
-    return np.linalg.svd(E @ T2, full_matrices=False)[0], Z2
-
-
-def _apply(matrix: Array, vectors: Array) -> Array:
-    """matrix (N or 1, i, j) times vectors (N, j)."""
-    return np.asarray(np.matmul(matrix, vectors[:, :, None])[:, :, 0])
-
-
-def _check_gap(
-    system: DescriptorSystem, structure: Structure, sigma: Array, r: int, t: Array
-) -> None:
     size = sigma[:, 0]
-    zero = sigma[:, r:].max(axis=1, initial=0.0) > 1e3 * structure.rank_tol * size
-    lost = sigma[:, r - 1] <= structure.rank_tol * size if r else np.zeros(len(sigma), bool)
-    bad = zero | lost
+    zero = sigma[:, r:].max(axis=1, initial=0.0) > 1e3 * tol * size
+    bad = zero | (sigma[:, r - 1] <= tol * size) if r else zero
     if bad.any():
         k = int(np.argmax(bad))
         value = sigma[k, r] if zero[k] else sigma[k, r - 1]
@@ -206,3 +192,6 @@ def _check_gap(
             f"{who(system)}: the rank of the derivative array changes near t = {t[k]:.9g} "
             f"(singular value {value / size[k]:.1e}); choose a horizon that avoids this time"
         )
+    Z2 = U[:, :, r:]
+    T2 = transpose(np.linalg.svd(transpose(Z2) @ N)[2])[:, :, a:]
+    return np.linalg.svd(E @ T2, full_matrices=False)[0], Z2

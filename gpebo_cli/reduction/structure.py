@@ -185,8 +185,7 @@ def _analysed(
 def _in_stages(
     system: DescriptorSystem, t: Array, max_mu: int, rank_tol: float, least: float = 0.0
 ) -> Structure | None:
-    """What :mod:`.stages` find at the times t (N,), if that is clearer than a smallest singular value.
-    """
+    """What :mod:`.stages` find at the times t (N,), if that is clearer than a singular value."""
     # Nothing of A stands beside E here, and rates in A say nothing about it.
     s = balance(system.coefficients.taylor(t, 0), _MASS)
     mu, ranks = 0, None

@@ -43,7 +43,7 @@ class Bounds:
 
     def of(self, low: Array, high: Array, order: int, inside: Array | None = None
            ) -> tuple[Array, Array]:
-        """Least and largest Taylor coefficients (order + 1, N, outputs), for all t of each cell (N,).
+        """Least and largest Taylor coefficients (order + 1, N, outputs) for all t of cells (N,).
 
         Jumps are decided at times ``inside`` of the cells, where no function jumps within its cell;
         None: functions may jump, and derivatives of those that do mean nothing.
