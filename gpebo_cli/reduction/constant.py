@@ -41,8 +41,7 @@ class ConstantForm:
     known: Array | float = 0.0
 
     def along(self, f: Array) -> ConstantForm:
-        """With what is known in the equations (orders, N, n); MoreOrdersError: these are too few.
-        """
+        """With what is known in the equations (orders, N, n); MoreOrdersError: too few."""
         if len(f) < len(self.constraints):
             raise MoreOrdersError
         offset = sum(
