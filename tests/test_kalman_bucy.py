@@ -60,7 +60,8 @@ def assumption(result: RunResult, name: str):
 
 def in_basis(system: DescriptorSystem, t: Array, inside: Array, u: Array, y: Array, like=None):
     o = observer_matrices(EquationForm(system, Units.plain(system)), t, inside, 1e-10, like)
-    return filter_model(o, u, y, EquationForm(system, Units.plain(system))), o.split.basis, o
+    signals = np.concatenate([u, y], axis=1)[:, :, None]
+    return filter_model(o, signals, EquationForm(system, Units.plain(system))), o.split.basis, o
 
 
 @pytest.mark.parametrize("name", ["circuit", "descriptor", "rotating"])

@@ -157,15 +157,10 @@ def information(
     regression: LinearRegression, alpha: float, f0: float, beta: float, bound: float | None,
     known: ExtensionState | None = None,
 ) -> Information:
-    """G_z, h_z and z for one set of gains.
+    """G_z, h_z and z for one set of gains, from those ``known`` at the start; None: 0, 0 and 1.
 
-    Args:
-        regression: Y = ψη.
-        alpha: α > 0, matters only with a bound.
-        f0: f₀ > 0, matters only with a bound.
-        beta: forgetting rate, β₀ ≥ 0.
-        bound: M of β = β₀ (1 − ‖F‖/M), at least 1/f₀; None: constant β = β₀.
-        known: G_z, h_z and z at the start; None: 0, 0 and 1.
+    With a bound M ≥ 1/f₀ forgetting is β = β₀ (1 − ‖F‖/M), else β = β₀ ≥ 0, where α and f₀ do not
+    matter.
     """
     level = largest(regression.gram.final)
     if known is not None:

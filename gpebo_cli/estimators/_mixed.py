@@ -112,12 +112,8 @@ def scalar_errors(
 ) -> ErrorSystem:
     """Errors of filters behind Y and of the scalar law behind them, δη̂' = γΔ(adj δf − Δ δη̂).
 
-    Args:
-        filters: as of ``filtered_errors``, with s states.
-        into: what the filters take of Y, (N, s, rows).
-        delta: Δ (N,).
-        adjugate: adj(Ω), or what else makes δ𝐘 of the filters' errors, (N, p, s).
-        gain: γ, (1,) or (p,).
+    The filters are as of ``filtered_errors``, with s states; Δ is (N,), γ (1,) or (p,), and what
+    makes δ𝐘 of the filters' errors (N, p, s).
     """
     weighted = delta[:, None, None] * gain[:, None]
     law = weighted * delta[:, None, None] * np.eye(adjugate.shape[1])

@@ -97,15 +97,9 @@ class ScalarLaw:
         self, regression: SampledRegression, delta: Array, quotient: Array, usable: BoolArray,
         behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]] | None = None,
     ) -> SampledEstimates:
-        """One closed-form step per sample.
+        """One closed-form step per sample, for what :class:`Mixed` has, (K, D) and (K, D, p).
 
-        Args:
-            regression: its steps and its hold rule.
-            delta: Δ (K, D).
-            quotient: η̄ = 𝐘/Δ (K, D, p).
-            usable: where η̄ is more than rounding (K, D); elsewhere its weight Δ² is nothing.
-            behind: of each group the filter of 𝒴, and what η̄ is of 𝒴 (K, p, p), zero where it is
-                rounding.
+        Where η̄ is rounding its weight Δ² is nothing.
         """
         energy, previous, had = self._steps.update(regression, delta**2, quotient, usable)
         x = self.gains * energy[:, :, None, None]  # (K, D, g, 1 or p)
@@ -161,6 +155,7 @@ class Mixed(NamedTuple):
     delta: Array  # Δ (K, D)
     quotient: Array  # η̄ = 𝐘/Δ (K, D, p)
     usable: BoolArray  # where η̄ is more than rounding (K, D)
+    # Of each group the filter of 𝒴, and what η̄ is of 𝒴 (K, p, p), zero where it is rounding.
     behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]]
 
 

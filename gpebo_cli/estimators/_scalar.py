@@ -51,15 +51,9 @@ class ScalarPath:
 
 
 def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
-    """Estimates at the times of the path.
+    """Estimates (g, M, p) at the times of the path.
 
-    Args:
-        path: the mixed regression.
-        start: η̂ at the start, shape (p,), or (g, p) for each gain its own.
-        gains: γ, shape (g, p) or (g, 1).
-
-    Returns:
-        η̂, shape (g, M, p).
+    From η̂ = ``start``, (p,), or (g, p) for each gain its own, with the gains γ (g, p or 1).
 
     Raises:
         SolverError: the law cannot be resolved.
@@ -174,15 +168,9 @@ def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
 def _resolved(
     path: ScalarPath, mesh: Mesh, ends: Array, start: Array, gains: Array, size: float
 ) -> tuple[Mesh, Array]:
-    """Point values (K, s + 1, g, p) on a mesh refined until every gain is resolved.
+    """Point values (K, s + 1, g, p) on a stretch of the path's mesh, refined for every gain.
 
-    Args:
-        path: the mixed regression.
-        mesh: a stretch of its mesh.
-        ends: η̄ at the end of each of its elements, (K, p).
-        start: η̂ at its start, (g, p).
-        gains: γ, (g, p or 1).
-        size: below which η̂ is rounding.
+    From η̂ at its start (g, p), with η̄ at the end of each of its elements (K, p).
     """
     maps, noise = _element_maps(path, mesh, ends, gains)
     while True:

@@ -49,12 +49,8 @@ def window_gramians(
 ) -> WindowGramians:
     """M over windows of a tenth of the horizon, from every edge that leaves room for one.
 
-    Args:
-        model: A (N, n, n) and W (N, n, n) at times (N,).
-        n: number of states.
-        mesh: where to start.
-        tol: relative to the size of Ψ and of what is integrated.
-        max_elements: refuse to go beyond.
+    ``model`` gives A and W (N, n, n) at times (N,); ``tol`` is relative to the size of Ψ and of
+    what is integrated.
 
     Raises:
         SolverError: the tolerance cannot be reached.

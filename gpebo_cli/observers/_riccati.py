@@ -110,14 +110,10 @@ class _Restart:
 
 
 def _in_front(lost: BoolArray, found: list[Kind]) -> list[Kind]:
-    """The signals to resolve where elements that lose conditioning have to be cut first.
+    """The signals to resolve where elements (K,) that lose conditioning have to be cut first.
 
     What comes after such an element is rounding, and would be cut without end. It is not cut
     until the front has passed, a few elements at a time.
-
-    Args:
-        lost: which elements, (K,).
-        found: signals (K, s + 1, c) with their floors.
     """
     size = len(lost)
     if not lost.any():
@@ -161,18 +157,10 @@ def run_filter(
 ) -> Filtered:
     """Solve Riccati equation and filter on ``mesh``, refined until P and ζ̂ are resolved.
 
-    Args:
-        model: at times (N,), and where functions that jump are decided: the model, and whatever
-            ``monitor`` needs.
-        start: ζ̂ at the start, (n, g).
-        P0: its covariance, (n, n).
-        mesh: where to start; its edges stay edges.
-        tol: relative to each signal's own size; P relative to its own of each element, so that
-            it is as accurate where it has become small.
-        max_elements: refuse to go beyond.
-        monitor: further signals to resolve, from ζ̂ and the model's extras.
-        name: of the filter, for messages.
-        floor: sizes (n,) below which ζ̂ is not resolved for its own sake.
+    From ζ̂ = ``start`` (n, g) with the covariance ``P0`` (n, n). The model at times (N,) comes with
+    whatever ``monitor`` needs, which gives further signals to resolve from that and ζ̂. ``tol`` is
+    relative to each signal's own size, to that of each element for P, which so is as accurate where
+    it has become small. Below sizes ``floor`` (n,) ζ̂ is not resolved for its own sake.
 
     Raises:
         SolverError: the tolerance cannot be reached, or P is not positive semidefinite.

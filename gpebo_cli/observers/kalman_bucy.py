@@ -75,20 +75,13 @@ class FilterModel:
     projector: Array  # (N, states, states) P
 
 
-def filter_model(
-    o: ObserverMatrices, v: Array, y: Array, form: EquationForm
-) -> FilterModel:
+def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> FilterModel:
     """The linear system of the filter, w in coordinates of the observer's basis.
 
-    Args:
-        o: at N times.
-        v: driving signals (N, ·).
-        y: (N, r).
-        form: of the equations.
+    Matrices are those at N times, signals are [v; y] (N, · + r, 1).
     """
-    count, r, basis, dual = len(v), y.shape[1], o.split.basis, o.split.dual
+    count, r, basis, dual = len(signals), o.outputs, o.split.basis, o.split.dual
     q, k = o.from_unknowns.shape[2], basis.shape[1]
-    signals = np.concatenate([v, y], axis=1)
     A = np.zeros((count, q + k, q + k))
     # w = P w. The range of P(t) turns; rounding outside of it is damped, or it would grow.
     off = np.eye(k) - dual @ o.projector @ basis
@@ -120,13 +113,13 @@ def filter_model(
     m = form.system.m
     return FilterModel(
         A=A,
-        b=np.einsum("nij,nj->ni", inward, signals),
+        b=(inward @ signals)[:, :, 0],
         c=c,
         rows=np.broadcast_to(Z, (count, *Z.shape[1:])),
-        g_y=np.einsum("nij,nj->ni", g, signals),
+        g_y=(g @ signals)[:, :, 0],
         from_noise=-o.of_noise(inward, m),
         in_measurement=-o.of_noise(g, m),
-        offset=-np.einsum("nij,nj->ni", K_g, signals),
+        offset=-(K_g @ signals)[:, :, 0],
         gain=gain,
         direct=-o.of_noise(K_g, m),
         projector=np.broadcast_to(o.projector, (count, *o.projector.shape[1:])),
@@ -246,8 +239,7 @@ class KalmanBucy:
             return np.asarray((edges[k] - edges[k - 1]) / noise.sample_time)
 
         def reduced(t: Array, inside: Array) -> FilterModel:
-            o = known.matrices(t, inside)
-            return filter_model(o, *known.driving(t, inside), known.form)
+            return filter_model(known.matrices(t, inside), known.measured(t, inside), known.form)
 
         names = (*system.unknowns, *(f"w_{label}" for label in known.labels))
         if not names:

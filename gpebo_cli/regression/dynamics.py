@@ -33,14 +33,8 @@ def filtered(
         Ω' = −(Λ + ρI)Ω − 𝔸ᵀΩ − Ω𝔸 + Γψᵀψ,    𝒴' = −(Λ + ρI)𝒴 − 𝔸ᵀ𝒴 + Ω𝕓 + Γψᵀy
 
     Nothing in it grows as solutions of η' = 𝔸η do; in directions that decay, Ω would grow as the
-    square of their inverse, which the forgetting ρ makes up for.
-
-    Args:
-        outer: [ψᵀψ | ψᵀy] (p, p + 1).
-        rates: diagonal of Λ, (p,).
-        gains: diagonal of Γ, (p,).
-        dynamics: 𝔸, 𝕓 and ρ.
-        start: [Ω | 𝒴] at the start; None: 0.
+    square of their inverse, which the forgetting ρ makes up for. ``outer`` is [ψᵀψ | ψᵀy]
+    (p, p + 1), and Λ and Γ have the diagonals ``rates`` and ``gains`` (p,).
 
     Raises:
         SolverError: not resolved.

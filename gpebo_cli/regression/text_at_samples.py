@@ -42,15 +42,10 @@ class TextState:
 def advance(
     text: TextRegression, hold: str, state: TextState | None, t: Array, signals: Array, Y: Array
 ) -> tuple[TextState, SampledRegression, Array]:
-    """Carry the operators over the samples at the times t (K,).
+    """Carry the operators over the samples at the times t (K,), ascending, after ``state.t``.
 
-    Args:
-        text: the regression.
-        hold: zoh or linear.
-        state: None before the first sample.
-        t: ascending, after ``state.t``.
-        signals: (K, m).
-        Y: (K, rows) where the text has none; else not looked at.
+    The state is None before the first sample; signals are (K, m), and Y (K, rows), which is not
+    looked at where the text has one.
 
     Returns:
         Where it stands, the regression at the samples, and the scale of ψ's columns (K, p) so far.

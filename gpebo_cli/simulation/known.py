@@ -51,15 +51,9 @@ def inputs_resolved(
 ) -> tuple[Mesh, Coefficients]:
     """The mesh on which nothing is overlooked and inputs are resolved, and the model there.
 
-    Args:
-        system: the plant.
-        evaluated: the model at the points of a mesh, and
-        looked_at: its values at any times.
-        mesh: where to begin.
-        c: the model there.
-        beside: what each input has to compare with (m,).
-        solver: the tolerance.
-        bounded: nothing narrow hides between the nodes.
+    It begins with a mesh and the model ``c`` there; ``evaluated`` gives it on others, ``looked_at``
+    its values at any times. Inputs compare with sizes ``beside`` them (m,). ``bounded``: nothing
+    narrow hides between the nodes.
     """
     for _ in range(0 if bounded else _LOOK_ROUNDS):
         overlooked = _overlooked(system, c, looked_at, mesh, solver.tol, beside)
@@ -143,10 +137,8 @@ def _overlooked(
 def _missed_between(between: Array, *pairs: Array) -> Array:
     """How far functions are from the polynomials through their nodes, (pairs, K), relative.
 
-    Args:
-        between: the polynomial at the places between, from its points (s + 1, looks).
-        pairs: values (orders, K (s + 1), ...) at the points and (orders, K looks, ...) between, of
-            one function after the other; the first order counts, of entries that move the worst.
+    Of each function values at the points (orders, K (s + 1), …) and ``between`` (orders, K looks,
+    …), to which (s + 1, looks) leads; the first order counts, of entries that move the worst.
     """
     points, looks = between.shape
     found = []

@@ -54,12 +54,6 @@ def follow(
 ) -> Effort:
     """Follow the solution from ``system.initial_state``; the last thing solved is all of it.
 
-    Args:
-        system: the plant.
-        time: the horizon.
-        solver: tolerance of the states.
-        solve: for linear plants.
-
     Raises:
         SolverError: the solution ends within the horizon; names the time and the reason.
         ConfigError: an entry that has no finite value at the start.

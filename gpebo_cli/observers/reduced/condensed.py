@@ -61,13 +61,9 @@ def thinned(
 def condensed(
     found: Observation, signals: Measurements, few: Measurements, solver: SolverSettings
 ) -> Observation:
-    """What is ``found`` along the thinned signals, along all of them.
+    """What is ``found`` along ``few`` signals, those of :func:`thinned`, along all of them.
 
-    Args:
-        found: its regression has no resets and is affine in the signals, and so is the state.
-        signals: as measured.
-        few: what was observed, of :func:`thinned`.
-        solver: tolerances.
+    Its regression has no resets and is affine in the signals, and so is the state.
 
     Raises:
         SolverError: the tolerance cannot be reached.

@@ -67,19 +67,16 @@ class Start(NamedTuple):
         return np.asarray(dual @ whole)
 
 
-def start_at(
-    form: EquationForm, o: ObserverMatrices, driving: Array, y: Array
-) -> Start:
-    """The start at one time, from the matrices there.
+def measured(form: EquationForm, t: Array, inside: Array, u: Array, y: Array) -> Array:
+    """[v; y] (N, · + r, 1) from u (N, m) and y (N, r) at the times t (N,), v as the form has it."""
+    return np.concatenate([form.driving(t, inside, u), y], axis=1)[:, :, None]
+
+
+def start_at(form: EquationForm, o: ObserverMatrices, signals: Array) -> Start:
+    """The start at one time, from matrices there (and perhaps later) and [v; y] (1, · + r, 1).
 
     With 0 = N_c w + g_c + G_c θ the residual of the equations without outputs,
     w = −N_c⁺(g_c + G_c θ) + V z, V of the kernel of N_c.
-
-    Args:
-        form: of the plant.
-        o: the matrices at this time and perhaps others after it.
-        driving: v there (1, ·).
-        y: there (1, r).
     """
     rank, states = o.split.rank, form.system.states
     units = form.units.states
@@ -89,7 +86,7 @@ def start_at(
         return Start(*initial_basis(own, rank, states, units), np.zeros(n), np.zeros((n, q)))
     o, V1 = o.at_first, initial_basis(own, rank, states, np.ones(n))[0]
     exact = slice(0, o.algebraic.shape[1] - o.outputs)
-    seen = o.equations(np.concatenate([driving, y], axis=1)[:, :, None])
+    seen = o.equations(signals)
     R = o.residual[0][exact]
     U, sigma, Vt = np.linalg.svd(R @ o.algebraic[0] @ (units[:, None] * V1))
     d = form.structure.d
@@ -123,17 +120,10 @@ def with_unknown(
     begin: Start, xi_a0: Array, unknown: Sequence[str], given: ByName | None,
     system: DescriptorSystem,
 ) -> tuple[Start, Array]:
-    """The start with errors of some states only, and ξ_a0 of these.
+    """The start with errors of the ``unknown`` states only, and ξ_a0 of these, from those of all.
 
-    The others start where the plant's ``initial_state`` says, or ``observer.xi_a0``, and e₀ has no
-    component for them: Φ has fewer columns.
-
-    Args:
-        begin: the start with all of them.
-        xi_a0: of all of them (d,).
-        unknown: names of states.
-        given: ``observer.xi_a0``.
-        system: the plant.
+    The others start where the plant's ``initial_state`` says, or ``observer.xi_a0`` as ``given``
+    (ξ_a0 (d,) of all), and e₀ has no component for them: Φ has fewer columns.
 
     Raises:
         ConfigError: no differential state, or errors that are not those of single states.
@@ -206,15 +196,15 @@ class ReducedSystem:
         )
         return o if self.injection is None else o.injected(self.injection(o, t, inside))
 
-    def driving(self, t: Array, inside: Array) -> tuple[Array, Array]:
-        """v (N, ·) and y (N, r) at the times t (N,)."""
-        u = self.form.driving(t, inside, self.signals.inputs(t, inside))
-        return u, self.signals.outputs(t, inside)
+    def measured(self, t: Array, inside: Array) -> Array:
+        """[v; y] (N, · + r, 1) at the times t (N,)."""
+        u, y = self.signals.inputs(t, inside), self.signals.outputs(t, inside)
+        return measured(self.form, t, inside, u, y)
 
     def start_at(self, time: float, inside: float) -> Start:
         """The start of an extension that begins at a later time."""
         t, t_in = np.array([time]), np.array([inside])
-        return start_at(self.form, self.matrices(t, t_in), *self.driving(t, t_in))
+        return start_at(self.form, self.matrices(t, t_in), self.measured(t, t_in))
 
     def start(self) -> Array:
         """[ξ_a | ξ_b | Φ] at the start, (k, 1 + q + d)."""
@@ -227,35 +217,18 @@ class ReducedSystem:
 
 
 def reduced_system(
-    system: DescriptorSystem,
-    signals: Measurements,
-    solver: SolverSettings,
-    *,
-    xi_a0: Mapping[str, float] | list[float] | None = None,
-    weights: ByName | None = None,
-    regression: str = "projected",
-    form: str = "auto",
-    unknown: Sequence[str] | None = None,
-    in_part: bool = False,
-    units: Units | None = None,
+    system: DescriptorSystem, signals: Measurements, solver: SolverSettings, *,
+    xi_a0: Mapping[str, float] | list[float] | None = None, weights: ByName | None = None,
+    regression: str = "projected", form: str = "auto", unknown: Sequence[str] | None = None,
+    in_part: bool = False, units: Units | None = None,
 ) -> ReducedSystem:
-    """The reduced system on measured signals.
+    """The reduced system on measured signals, with settings of the observer.
 
-    Args:
-        system: the model.
-        signals: u and y.
-        solver: tolerances.
-        xi_a0: ``observer.xi_a0``.
-        weights: of the outputs, ``observer.weights``.
-        regression: which rows of the residual to keep.
-        form: given, strangeness_free, or auto: as given where Assumption 1 holds.
-        unknown: ``observer.unknown_initial``, None for all.
-        in_part: where Assumption 1 fails on the form chosen, without what that touches.
-        units: in which everything counts; None: those of the plant at the start.
+    ``unknown`` is ``observer.unknown_initial``. ``in_part`` asks for what is left without that
+    which a failure of Assumption 1 touches.
 
     Raises:
-        ModelError: rank of E not constant, or Assumption 1 violated.
-        ConfigError: no outputs, or a setting that does not fit.
+        ModelError, ConfigError: as :func:`choose_form`, and a setting that does not fit.
     """
     mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
@@ -277,17 +250,14 @@ def reduced_system(
             signals=at, frame=frame,
         )
         note = f"; {_reason(error)}: what it touches is not estimated"
-    whole = ReducedSystem(
-        used, signals, solver, mesh, first,
-        start_at(
-            used, first, used.driving(t[:1], inside[:1], signals.inputs.values[0, :1]),
-            signals.outputs.values[0, :1],
-        ), np.zeros(0), regression, note, lost,
-    )
-    begin, start = whole.begin, begin_at(xi_a0, system, used.units.states, first, whole.begin)
+    u, y = signals.inputs.values[0, :1], signals.outputs.values[0, :1]
+    begin = start_at(used, first, measured(used, t[:1], inside[:1], u, y))
+    start = begin_at(xi_a0, system, used.units.states, first, begin)
     if unknown is not None:
         begin, start = with_unknown(begin, start, unknown, xi_a0, system)
-    return replace(whole, begin=begin, xi_a0=start)
+    return ReducedSystem(
+        used, signals, solver, mesh, first, begin, start, regression, note, lost
+    )
 
 
 def choose_form(
@@ -297,18 +267,10 @@ def choose_form(
 ) -> tuple[EquationForm, ObserverMatrices, str]:
     """The form of the equations, its matrices at the times t (N,), and why it is this one.
 
-    Args:
-        system: the model.
-        t: times, the first one that of the start.
-        inside: where functions that jump are decided.
-        signals: [u; y] there (N, m + r), for a plant whose matrices follow them.
-        derivatives: of the inputs, as far as they are known.
-        solver: tolerances.
-        form: given, strangeness_free or auto.
-        weights: of the outputs, ``observer.weights``.
-        units: as for :func:`reduced_system`.
-        piecewise: the matrices are looked at piece by piece, and those of the first times are
-            enough, unless E moves.
+    The first time is that of the start. A plant whose matrices follow signals needs [u; y]
+    (N, m + r) there, and hidden constraints the derivatives of inputs, as far as they are known.
+    ``units`` are those in which everything counts; None: of the plant at the start. ``piecewise``
+    the matrices are looked at piece by piece, and those of the first times do, unless E moves.
 
     Raises:
         ModelError: rank of E not constant, Assumption 1 violated, not uniquely solvable.
@@ -412,16 +374,15 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     units = of_rows[:, None] / of_columns
     plain = bool((units == 1.0).all())
 
-    def equations(o: ObserverMatrices, v: Array, y: Array) -> LinearEquation:
-        measured = np.concatenate([v, y], axis=1)[:, :, None]
-        f, seen = o.forcing(measured, 1 + q if large else columns), o.equations(measured)
+    def equations(o: ObserverMatrices, signals: Array) -> LinearEquation:
+        f, seen = o.forcing(signals, 1 + q if large else columns), o.equations(signals)
         if plain:
             return LinearEquation(None, o.dynamics, f, seen)
         A = o.dynamics * of_rows / of_rows[:, None]
         return LinearEquation(None, A, f / units[:, : f.shape[2]], seen)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
-        return equations(reduced.matrices(t, inside), *reduced.driving(t, inside))
+        return equations(reduced.matrices(t, inside), reduced.measured(t, inside))
 
     name = f"observer of plant {system.name}"
     # Along axes offset and gain are these components, each compared with its own state's size.
@@ -436,7 +397,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     if windows[0] is signals.mesh and reduced.injection is None and solver.name != "ivp":
         u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
         points, inside = _over_time(mesh.points), _over_time(mesh.inside)
-        known = equations(reduced.first, reduced.form.driving(points, inside, u), y)
+        known = equations(reduced.first, measured(reduced.form, points, inside, u, y))
     swept = sweeps.solve_dense(problem, mesh, **limits, known=known) if large else None
     if swept is not None:
         return _assembled(reduced, _in_units(swept, units), monitor.latest, as_found=True)

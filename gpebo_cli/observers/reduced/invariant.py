@@ -35,14 +35,7 @@ def invariant_observer(
     system: DescriptorSystem, solver: SolverSettings, form: str, weights: ByName | None,
     start: float,
 ) -> Invariant:
-    """The observer's matrices.
-
-    Args:
-        system: the plant.
-        solver: its tolerance of ranks.
-        form: ``observer.form``.
-        weights: ``observer.weights``.
-        start: of the experiment, seconds.
+    """The observer's matrices, with ``observer.form`` and ``.weights``, at ``start`` seconds.
 
     Raises:
         ConfigError: a plant that varies with time, or an observer that needs derivatives of inputs.

@@ -137,17 +137,11 @@ def observer_matrices(
     like: ObserverMatrices | None = None, *,
     output_scale: Array | None = None, signals: Array | None = None, frame: Frame | None = None,
 ) -> ObserverMatrices:
-    """Evaluate the observer's matrices at the times t (N,).
+    """Evaluate the observer's matrices at the times t (N,), those of the start first.
 
-    Args:
-        form: of the plant, in whose units equations and outputs count.
-        t: times, those of the start first.
-        inside: where functions that jump are decided.
-        rank_tol: singular values below this, relative, are zero.
-        like: those of other times, whose basis and weights are kept.
-        output_scale: √w (r,) of the outputs' weights; default: those of ``like``, else ones.
-        signals: [u; y] at these times (N, m + r), for a plant whose matrices follow them.
-        frame: in place of that of ``like``.
+    Equations and outputs count in the form's units, outputs with √w = ``output_scale`` (r,), else
+    as in ``like``, the matrices of other times, whose basis is kept. A ``frame`` stands in place of
+    theirs. A plant whose matrices follow signals needs [u; y] (N, m + r).
 
     Raises:
         ModelError: the rank of E is not constant, or Assumption 1 fails; names the time and the
@@ -366,12 +360,8 @@ def _eliminate_in_part(
 def weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
     """The smallest singular value over all times, relative to ‖𝒜‖, and where it is.
 
-    ‖H‖_F took the place of ‖H‖_2 = 1/σ_min. Only times whose bound is below the true value at
-    the time of the smallest bound can be weaker.
-
-    Args:
-        injectivity: (N,) and
-        elimination: H (N or 1, n, n_b), as in ``ObserverMatrices``.
+    ‖H‖_F took the place of ‖H‖_2 = 1/σ_min in the bounds (N,), H (N or 1, n, n_b). Only times whose
+    bound is below the true value at the time of the smallest bound can be weaker.
     """
     if not np.isfinite(injectivity).all():
         return float(np.inf), 0

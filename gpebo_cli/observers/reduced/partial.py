@@ -35,15 +35,8 @@ def untouched(
 ) -> tuple[Frame, BoolArray] | None:
     """The frame of E without what is given up, and which states are lost (n,).
 
-    Args:
-        form: as given.
-        t: times (N,).
-        inside: where functions that jump are decided.
-        signals: [u; y] there (N, m + r), for matrices that follow them.
-        rank_tol: singular values below this, relative, are zero.
-
-    Returns:
-        None where no state is left, where the kernel of E turns, or where a rank changes or may.
+    At the times t (N,), for matrices that follow [u; y] (N, m + r) there. None where no state is
+    left, where the kernel of E turns, or where a rank changes or may.
     """
     model, states = form.equations(t, inside, signals), form.system.states
     units, plain = form.units, np.ones(len(states))

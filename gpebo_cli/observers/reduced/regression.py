@@ -104,11 +104,7 @@ def regression_signals(
 ) -> Assembled:
     """All rows of Y and ψ, and the state's offset and gain, at N times.
 
-    Args:
-        z: [ξ_a | ξ_b | Φ] in the coordinates of ``basis``, (N, k, 1 + q + n_a).
-        q: number of unknown parameters.
-        basis: B (n, k).
-        equations: at the same times.
+    From z = [ξ_a | ξ_b | Φ] (N, k, 1 + q + n_a) in the coordinates of the basis B (n, k).
     """
     algebraic, g_y, G, Q1, H, _ = equations
     Y, psi, offset, gain, sizes = kernels.observer.regression_signals(
@@ -130,12 +126,7 @@ def resolved(
 
     Hidden constraints 0 = M x + … hold but for what has gathered in z, which is taken from the
     state; entries of the gain that are rounding of their terms are zero. Whether a state is
-    determined must not hang on noise.
-
-    Args:
-        found: what :func:`regression_signals` gave.
-        terms: sizes of those of the gain, (N, n, p).
-        form: of the equations.
+    determined must not hang on noise. The sizes of the gain's terms are (N, n, p).
     """
     n, r, offset, gain = form.system.n, form.system.r, found.offset, found.gain
     if form.structure is not None:

@@ -43,17 +43,9 @@ def _stacked(upper: Array, lower: Array) -> Array:
 
 
 def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) -> Array:
-    """What errors of the signals add to Y, all columns in one solve on the mesh that is given.
+    """What errors e_u (K, s + 1, m, c) and e_y (K, s + 1, r, c) add to Y, (K, s + 1, rows, c).
 
-    Args:
-        mesh: of the regression; errors are smooth within its elements.
-        errors_at: :func:`errors_of` the observer.
-        rows: of Y.
-        e_u: of the inputs at the points of the mesh, (K, s + 1, m, c).
-        e_y: of the outputs, (K, s + 1, r, c).
-
-    Returns:
-        δY (K, s + 1, rows, c).
+    All columns in one solve on the mesh of the regression, in whose elements errors are smooth.
 
     Raises:
         SolverError: the mesh does not resolve the response.

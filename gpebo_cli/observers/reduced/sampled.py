@@ -26,7 +26,7 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import ByName
 from gpebo_cli.observers._observation import InitialError, SampledBlock, largest_entry
-from gpebo_cli.observers.reduced.extension import begin_at, choose_form, needed, start_at
+from gpebo_cli.observers.reduced.extension import begin_at, choose_form, measured, needed, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import (
     VANISHING,
@@ -175,8 +175,7 @@ class SampledObserver:
                 f"before t = {t[-1]:.6g}; the observer needs it constant"
             )
         m = self.system.m
-        driving = self.form.driving(t, inside, signals[:, :m])
-        return o, np.concatenate([driving, signals[:, m:]], axis=1)[:, :, None]
+        return o, measured(self.form, t, inside, signals[:, :m], signals[:, m:])
 
     def _block(
         self, z: Array, t: Array, signals: Array, before: SampledState | None, step: Array | None,
@@ -227,19 +226,9 @@ def sampled_observer(
     xi_a0: Mapping[str, float] | list[float] | None, weights: ByName | None, regression: str,
     form: str,
 ) -> SampledObserver:
-    """The observer in discrete time, whose first sample is at ``start``.
+    """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start`` seconds.
 
-    Args:
-        system: the model.
-        solver: tolerances.
-        hold: zoh or linear.
-        start: seconds.
-        sample: [u; y] there, (m + r,).
-        derivatives: of the inputs, as far as they are known.
-        xi_a0: ``observer.xi_a0``.
-        weights: of the outputs, ``observer.weights``.
-        regression: which rows of the residual to keep.
-        form: given, strangeness_free, or auto: as given where Assumption 1 holds at the start.
+    Settings are those of the observer; auto is as given where Assumption 1 holds at the start.
 
     Raises:
         ConfigError: no outputs, or a setting that does not fit.
@@ -251,8 +240,8 @@ def sampled_observer(
         eye = np.eye(system.n)
         split = replace(first.split, basis=eye, dual=eye, frame=None)
         first = replace(first, split=split, on_basis=first.algebraic)
-    m = system.m
-    begin = start_at(used, first, used.driving(t, t, sample[None, :m]), sample[None, m:])
+    u, y = np.split(sample[None], [system.m], axis=1)
+    begin = start_at(used, first, measured(used, t, t, u, y))
     xi = begin_at(xi_a0, system, used.units.states, first, begin)
     return SampledObserver(
         form=used, solver=solver, hold=hold, regression=regression, like=first,

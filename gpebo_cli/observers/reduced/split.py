@@ -79,12 +79,9 @@ class Frame:
 
 
 def axes_frame(entries: Array) -> Frame | None:
-    """Coordinate axes where E has columns and rows that are exactly zero.
+    """Coordinate axes where E, of entries up to (n, n), has columns and rows that are exactly zero.
 
     E = diag(E_a(t), 0) is such a case; None where their numbers differ.
-
-    Args:
-        entries: the size of each entry of E over the times, (n, n).
     """
     used = entries != 0.0  # NaN is not zero
     rows, columns = used.any(axis=1), used.any(axis=0)
@@ -146,13 +143,8 @@ def fits(
 ) -> bool:
     """Whether E has this frame and full rank in it, beyond what singular values could change.
 
-    Args:
-        outside: largest entry of E outside the frame.
-        size: largest entry of E.
-        rank: of the frame.
-        inner: largest norm of UᵀE B over the times.
-        inverse: largest norm of its inverse.
-        rank_tol: singular values below this, relative, are zero.
+    That is told by the largest entries of E ``outside`` the frame and at all (``size``), and by the
+    largest norms over the times of UᵀE B and of its inverse.
     """
     if outside > _TURNED * size:
         return False
@@ -182,14 +174,8 @@ def split_by_svd(
 ) -> Split:
     """The general case: singular vectors at every time, and Ṗ = S + Sᵀ with S = E⁺ Ė Q.
 
-    Args:
-        system: for messages.
-        E: (N, n, n).
-        dE: its derivative (N, n, n).
-        t: (N,).
-        units: of the states (n,).
-        rank_tol: singular values below this, relative, are zero.
-        like: another split, whose basis is kept.
+    E and Ė (N, n, n) are those at the times t (N,), the states have units (n,), and a split that is
+    given keeps its basis.
 
     Raises:
         ModelError: the rank changes, or the kernel turns where that of the basis did not.
@@ -256,13 +242,7 @@ def initial_basis(
 
     Coordinate axes where they span the range (E diagonal, or zero columns): e0_<state>. Else a
     basis that is orthonormal in comparable units, from the columns of P in the order of the states:
-    e0_1, e0_2, …
-
-    Args:
-        P: orthogonal projector in comparable units.
-        rank: n_a.
-        states: their names.
-        units: theirs (n,).
+    e0_1, e0_2, … P is an orthogonal projector of rank n_a in comparable units (n,) of the states.
     """
     on_axes = P.diagonal() > 0.5
     exact = np.diag(on_axes.astype(np.float64))

@@ -62,7 +62,7 @@ class CurrentCoordinates:
 
         def assembled(t: Array, inside: Array) -> tuple[Assembled, Array, Array, tuple[Array, ...]]:
             o = reduced.matrices(t, inside)
-            signals = np.concatenate(reduced.driving(t, inside), axis=1)[:, :, None]
+            signals = reduced.measured(t, inside)
             A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
             A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
             b[:, q:] = (o.from_signals @ signals)[:, :, 0]

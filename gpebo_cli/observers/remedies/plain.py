@@ -39,15 +39,9 @@ def observation(
     reduced: ReducedSystem, extension: Extension, growth: float, logarithm: float, truth: Truth,
     resets: tuple[Reset, ...] = (),
 ) -> Observation:
-    """What an extension gives, perhaps of several segments.
+    """What an extension gives, perhaps of several segments with resets between them.
 
-    Args:
-        reduced: the reduced system.
-        extension: from start to end.
-        growth: largest entry of Φ, shape ().
-        logarithm: that of ‖Φ‖ over the horizon.
-        truth: what the parameters are.
-        resets: between the segments.
+    ``growth`` is the largest entry of Φ, and ``logarithm`` that of ‖Φ‖ over the horizon, ().
     """
     mesh, final = extension.mesh, extension.assembled
     kept = final.kept_rows(reduced.system, reduced.regression)
