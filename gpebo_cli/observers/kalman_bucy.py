@@ -78,7 +78,7 @@ class FilterModel:
 def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> FilterModel:
     """The linear system of the filter, w in coordinates of the observer's basis.
 
-    Matrices are those at N times, signals are [v; y] (N, · + r, 1).
+    Matrices are those at N times, signals are [v; y] (N, v + r, 1).
     """
     count, r, basis, dual = len(signals), o.outputs, o.split.basis, o.split.dual
     q, k = o.from_unknowns.shape[2], basis.shape[1]

@@ -68,12 +68,12 @@ class Start(NamedTuple):
 
 
 def measured(form: EquationForm, t: Array, inside: Array, u: Array, y: Array) -> Array:
-    """[v; y] (N, · + r, 1) from u (N, m) and y (N, r) at the times t (N,), v as the form has it."""
+    """[v; y] (N, v + r, 1) from u (N, m) and y (N, r) at the times t (N,), v as the form has it."""
     return np.concatenate([form.driving(t, inside, u), y], axis=1)[:, :, None]
 
 
 def start_at(form: EquationForm, o: ObserverMatrices, signals: Array) -> Start:
-    """The start at one time, from matrices there (and perhaps later) and [v; y] (1, · + r, 1).
+    """The start at one time, from matrices there (and perhaps later) and [v; y] (1, v + r, 1).
 
     With 0 = N_c w + g_c + G_c θ the residual of the equations without outputs,
     w = −N_c⁺(g_c + G_c θ) + V z, V of the kernel of N_c.
@@ -197,7 +197,7 @@ class ReducedSystem:
         return o if self.injection is None else o.injected(self.injection(o, t, inside))
 
     def measured(self, t: Array, inside: Array) -> Array:
-        """[v; y] (N, · + r, 1) at the times t (N,)."""
+        """[v; y] (N, v + r, 1) at the times t (N,)."""
         u, y = self.signals.inputs(t, inside), self.signals.outputs(t, inside)
         return measured(self.form, t, inside, u, y)
 
