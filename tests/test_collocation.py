@@ -13,6 +13,7 @@ from gpebo_cli.numerics.collocation import merged, solve, solve_constant
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
+from gpebo_cli.numerics.refinement import resolve
 
 
 @pytest.mark.parametrize("stages", range(2, 13))
@@ -294,3 +295,34 @@ def test_what_was_constant_before_a_cut_need_not_be_so_after_it(turned):
     constant, other = ([0, 2], [1]) if turned else ([1], [0, 2])
     assert (found[constant] == 3.0).all()
     assert (found[other] == many[[0]] if turned else found[other] == many).all()
+
+
+def noisy(t, share):
+    """A function whose last digits depend on those of t, as an ill-conditioned elimination's do."""
+    return np.cos(3 * t) + share * np.sin(1e17 * t)
+
+
+def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
+    """A wave that is as small and fast is resolved: cuts change nothing first, and then they do."""
+    rule = radau_rule(14)
+
+    def evaluate(signal):
+        sizes = []
+
+        def on(mesh):
+            sizes.append(mesh.size)
+            return None, [(signal(mesh.points)[..., None], 0.0)]
+
+        return on, sizes
+
+    limits = {"tol": 1e-12, "max_elements": 200_000, "name": "signal"}
+    on, sizes = evaluate(lambda t: noisy(t, 1.0))
+    with pytest.raises(SolverError, match=r"rounding in its equations is .*solver\.tol above"):
+        resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)
+    assert max(sizes) < 5000
+    on, sizes = evaluate(lambda t: noisy(t, 1e-5))
+    assert 1e-6 < resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)[2] < 1e-3
+    assert max(sizes) < 5000
+    on, sizes = evaluate(lambda t: np.sin(3 * t) + 1e-4 * np.sin(3e4 * t))
+    assert resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)[2] < 1e-12
+    assert len(sizes) > len(set(sizes))  # with the look at whether it is rounding

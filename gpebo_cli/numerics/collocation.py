@@ -46,6 +46,7 @@ _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _AMPLIFIED = 1e3  # times the tolerance: errors beyond that are looked at once more
+_COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
 _MODEST = 1e100  # values up to here may be multiplied with each other
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.
@@ -124,7 +125,10 @@ def solve(
     )
     if lost == mesh.size and errors.max(initial=0.0) > _AMPLIFIED * tol:
         errors = np.maximum(errors, _rounded_otherwise(problem, mesh, values, restarts or {}))
-    estimate = max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0)))
+    left = float(tail.max(initial=0.0))
+    if left > _COARSE:
+        errors = np.maximum(errors, left)
+    estimate = max(left, float(errors.max(initial=0.0)))
     return LinearSolution(
         Trajectory(mesh, values), estimate, rounds, errors,
         None if lost == mesh.size else float(mesh.edges[lost + 1]), maps.extras, last,

@@ -7,13 +7,17 @@ from typing import TypeVar
 
 import numpy as np
 
-from gpebo_cli.errors import SolverError
+from gpebo_cli.errors import ElementsError, SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.mesh import Mesh, unresolved_kinds
 
 _MAX_PARTS = 8  # an element is cut into at most this many at once
 _ROUNDING = 1e-6  # a tail below may be rounding, which cutting does not make smaller
+_SOME = 20  # elements that cuts did not make better: whether that is rounding is looked at,
+_OTHER = 0.05  # which changes their tails by so much at times a rounding away.
+_LOST = 1e-3  # of a signal: rounding beyond that leaves too little of it
+_MANY = 200  # elements: rounding in fewer may be due to their length
 
 Found = TypeVar("Found")
 # (mesh, what was found on the mesh before, the old element of each new one or −1)
@@ -41,7 +45,8 @@ def refine(
         The mesh, what was found on it, the tails (K,) and the number of rounds.
 
     Raises:
-        SolverError: if ``max_elements`` do not reach ``tol``; names the time.
+        SolverError: if ``max_elements`` do not reach ``tol``, or rounding leaves fewer than
+            three digits; names the time.
     """
     found: Found | None = None
     kept = np.full(mesh.size, -1)
@@ -53,10 +58,25 @@ def refine(
         # An element that was cut and is no better than the one it comes from shows rounding.
         poor = tail > tol
         if poor.any():
-            missed = np.where((tail <= 0.25 * floor) | (tail >= _ROUNDING), 0, missed + 1)
-            poor &= missed < patience
+            missed = np.where(tail <= 0.25 * floor, 0, missed + 1)
+            poor &= (missed < patience) | (tail >= _ROUNDING)
         if not poor.any():
             return mesh, found, tail, rounds
+        stuck = poor & (missed > 1)
+        if stuck.sum() > max(_SOME, 0.02 * mesh.size):
+            moved = Mesh(mesh.edges + 64 * EPS * np.abs(mesh.edges).max(), mesh.rule)
+            there, other = evaluate(moved, found, np.full(mesh.size, -1))
+            left = float(other[stuck].max())
+            if np.mean(np.minimum(np.abs(other / tail - 1.0), 1.0)[stuck]) > _OTHER:
+                if left <= _LOST and (missed > 1).sum() > _MANY:
+                    return mesh, there, other, rounds
+                if left * stuck.sum() > _SOME:
+                    t = mesh.edges[int(np.argmax(np.where(stuck, other, 0.0)))]
+                    raise SolverError(
+                        f"the {name} cannot be resolved near t = {t:.6g}: rounding in its "
+                        f"equations is {left:.1e} of it, whatever the elements; accepted is a "
+                        "solver.tol above that, or equations that lose fewer digits"
+                    )
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         _check_budget(mesh, tail, parts, max_elements, name)
         before, cut = floor.repeat(parts), tail.repeat(parts)
@@ -107,7 +127,7 @@ def _check_budget(
     worst = int(np.argmax(tail))
     t = mesh.edges[worst]
     if parts.sum() > max_elements:
-        raise SolverError(
+        raise ElementsError(
             f"the {name} is not resolved with {max_elements} elements; worst near "
             f"t = {t:.6g} (tail {tail[worst]:.1e}); raise solver.max_elements or solver.tol"
         )
