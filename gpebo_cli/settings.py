@@ -1,7 +1,7 @@
 """Everything a run can be told, as frozen dataclasses with their defaults.
 
 These are the only description of a run below the command layer: no Hydra, no files. The reader
-in ``reading.py`` builds them from a plain mapping and refuses keys that are not fields here.
+in ``schema.py`` builds them from a plain mapping and refuses keys that are not fields here.
 The plant, the observer and the estimator are described by their own modules, found by name.
 """
 

@@ -22,8 +22,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import figures, html
 from gpebo_cli.results.figures import truth_at
 from gpebo_cli.results.folder import write_run
-from gpebo_cli.results.page import case_table as case_cells
-from gpebo_cli.results.report import case_rows, run_lines
+from gpebo_cli.results.report import case_cells, case_rows, run_lines
 from gpebo_cli.results.style import draw_on
 from gpebo_cli.results.tables import frame
 from gpebo_cli.schema import shown, unknown

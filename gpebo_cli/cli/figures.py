@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from gpebo_cli.experiment.result import RunResult
-    from gpebo_cli.results.gallery import Recipe
-    from gpebo_cli.results.page import Section
+    from gpebo_cli.results.gallery import Recipe, Section
 
 _OUTPUT = "outputs/paper"
 _FORMATS = "figures.formats"
@@ -40,7 +39,6 @@ def main(words: list[str]) -> int:
     # Only now, when the words are known to be good: half a second of imports.
     from gpebo_cli.results import gallery
     from gpebo_cli.results.files import make_folder, write_text
-    from gpebo_cli.results.page import page
     from gpebo_cli.results.provenance import provenance
     from gpebo_cli.results.studies import STUDIES
 
@@ -61,7 +59,7 @@ def main(words: list[str]) -> int:
             gallery.write_references(Path(update), recipe.name, figures)
         if check is not None:
             differences += gallery.check_references(Path(check), recipe.name, figures)
-    write_text(folder / "index.html", page(sections, provenance()))
+    write_text(folder / "index.html", gallery.page(sections, provenance()))
     if not options.quiet:
         sys.stdout.write(f"{folder / 'index.html'}\n")
     if differences:

@@ -55,17 +55,17 @@ def candidates(settings: Settings, system: DescriptorSystem) -> list[Sensor]:
         raise ConfigError("sensors=all needs a simulation of a plant (data=none) and an observer")
     rows = _Rows(settings, system)
     base, n = rows.found(()), system.n
-    before = base.names
     chosen: list[int] = []
     out = []
     while len(chosen) < n:
         tried = {i: rows.found((*chosen, i)) for i in range(n) if i not in chosen}
-        best = max(tried, key=lambda i: (len(tried[i].names), tried[i].log_det))
+        best = max(tried, key=lambda i: (len(tried[i].deviations), tried[i].log_det))
         chosen.append(best)
         alone, together = rows.found((best,)), tried[best]
         out.append(Sensor(
-            system.states[best], alone.names,
-            tuple(name for name in alone.names if name not in before), together.log_det,
+            system.states[best], tuple(alone.deviations),
+            tuple(name for name in alone.deviations if name not in base.deviations),
+            together.log_det,
             _fall(base, alone), _fall(base, together),
         ))
     return out
@@ -78,15 +78,10 @@ class _Found:
     deviations: Mapping[str, float]  # in one unit for all choices
     log_det: float
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """What is determined."""
-        return tuple(self.deviations)
-
 
 def _fall(before: _Found, after: _Found) -> float:
     """By how much deviations fall."""
-    ratios = [before.deviations[name] / after.deviations[name] for name in before.names
+    ratios = [before.deviations[name] / after.deviations[name] for name in before.deviations
               if min(before.deviations[name], after.deviations.get(name, 0.0)) > 0.0]
     # No row takes information away: what is less than 1 is rounding.
     return float(np.exp(np.log(np.maximum(ratios, 1.0)).mean())) if ratios else 1.0

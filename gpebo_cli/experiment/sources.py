@@ -110,10 +110,10 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
             "noise.seeds and noise.quantisation are for simulations; a recording (data=csv) has "
             "its own noise, of which noise.outputs and noise.inputs say how large it is"
         )
-    if not levels.silent and not recorded:
-        check_samples(time.horizon, settings.noise.sample_time, settings.solver.max_elements)
     if recorded:
         return
+    if not levels.silent:
+        check_samples(time.horizon, settings.noise.sample_time, settings.solver.max_elements)
     if not time.horizon >= max(abs(time.start) * _RESOLVED, 1.0 / LARGEST):
         raise ConfigError(
             f"time.horizon = {time.horizon:g} s is too short to be resolved beside time.start = "

@@ -155,15 +155,12 @@ def _path(branches: Sequence[Element], start: str, stop: str) -> list[str] | Non
         near.setdefault(a, []).append((b, e.name))
         near.setdefault(b, []).append((a, e.name))
     reached: dict[str, list[str]] = {start: []}
-    front = [start]
-    while front:
-        following = []
-        for node in front:
-            for other, name in near.get(node, []):
-                if other not in reached:
-                    reached[other] = [*reached[node], name]
-                    following.append(other)
-        front = following
+    queue = [start]
+    for node in queue:  # it grows meanwhile
+        for other, name in near.get(node, []):
+            if other not in reached:
+                reached[other] = [*reached[node], name]
+                queue.append(other)
     return reached.get(stop)
 
 

@@ -28,7 +28,9 @@ MAX_DEPTH = 20  # of subcircuits in subcircuits
 NODES = {"R": 2, "L": 2, "C": 2, "V": 2, "I": 2, "E": 4, "G": 4, "F": 2, "H": 2, "S": 2, "T": 4}
 """Kinds of elements with the number of their nodes; K couples two inductors and has none."""
 
-_NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)([a-zA-Z]*)")
+_NUMBER = re.compile(
+    r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(meg|mil|[tgxkmunpf]?)[a-z]*", re.IGNORECASE
+)
 _SUFFIXES = {
     "t": 1e12, "g": 1e9, "meg": 1e6, "x": 1e6, "k": 1e3, "mil": 25.4e-6, "m": 1e-3, "u": 1e-6,
     "n": 1e-9, "p": 1e-12, "f": 1e-15,
@@ -124,13 +126,7 @@ def read_netlist(text: str, file: str = "netlist") -> Netlist:
 def number(text: str) -> float | None:
     """A number with a SPICE suffix (4.7k, 10uF, 1meg), or None."""
     match = _NUMBER.fullmatch(text)
-    if match is None:
-        return None
-    tail = match[2].lower()
-    for suffix in ("meg", "mil"):
-        if tail.startswith(suffix):
-            return float(match[1]) * _SUFFIXES[suffix]
-    return float(match[1]) * (_SUFFIXES.get(tail[:1], 1.0) if tail else 1.0)
+    return None if match is None else float(match[1]) * _SUFFIXES.get(match[2].lower(), 1.0)
 
 
 def _logical_lines(text: str, file: str) -> tuple[str, list[tuple[Place, str]]]:
@@ -466,13 +462,9 @@ class _Reader:
     def _source(
         self, rest: list[str], scope: Mapping[str, str], place: Place, name: str
     ) -> float | str:
-        words = list(rest)
-        if words and words[0].lower() == "dc":
-            words = words[1:]
-        for k, word in enumerate(words):
-            if word.lower() == "ac":  # of another analysis
-                words = words[:k]
-                break
+        words = rest[1:] if rest and rest[0].lower() == "dc" else rest
+        # What stands behind AC is for another analysis.
+        words = list(itertools.takewhile(lambda word: word.lower() != "ac", words))
         text = " ".join(words)
         shape = re.fullmatch(r"(?is)(?:\S+\s+)?(sin|pulse|pwl|exp)\s*\((.*)\)", text)
         if shape is not None:

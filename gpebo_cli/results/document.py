@@ -14,7 +14,7 @@ from gpebo_cli.results import html
 from gpebo_cli.results.comparison import figures
 from gpebo_cli.results.finished import Found, read_columns, read_summary
 from gpebo_cli.results.names import METRICS
-from gpebo_cli.results.page import case_table
+from gpebo_cli.results.report import case_cells
 from gpebo_cli.results.style import file_content
 from gpebo_cli.results.symbols import number_text, with_unit
 
@@ -169,7 +169,7 @@ def _cases(folder: Path) -> list[list[str]]:
     count = len(columns.pop("case"))
     shown = dict.fromkeys(METRICS, np.full(count, np.nan)) | columns
     rows = [{k: float(v[i]) for k, v in shown.items()} for i in range(min(count, _MOST_CASES))]
-    return case_table([("", row) for row in rows])
+    return case_cells([("", row) for row in rows])
 
 
 def _picture(path: Path) -> bytes:

@@ -6,15 +6,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.results import circuit, html
 from gpebo_cli.results.figures import describe, overlay
 from gpebo_cli.results.files import make_folder, remove_files, write_text
 from gpebo_cli.results.names import FORMATS
-from gpebo_cli.results.page import Section, case_table
-from gpebo_cli.results.report import case_rows
+from gpebo_cli.results.provenance import Provenance
+from gpebo_cli.results.report import case_cells, case_rows
 from gpebo_cli.results.series import blocks, csv_text, differences, reference_text
 from gpebo_cli.results.studies import CAPTIONS, REFERENCE, STUDIES, Study, heading, stem
 from gpebo_cli.results.style import Panel, compose, save
@@ -31,6 +31,15 @@ class Recipe:
     title: str
     reference: str
     runs: Mapping[str, RunResult]
+
+
+class Section(NamedTuple):
+    """A recipe on the page; all texts are HTML."""
+
+    name: str
+    title: str
+    content: str
+    pictures: int
 
 
 def figures_of(recipe: Recipe) -> dict[str, list[Panel]]:
@@ -59,7 +68,7 @@ def write_recipe(
     runs = recipe.runs
     verdicts = [f"{_sentence(run.verdict)}." for run in runs.values()] if len(runs) == 1 else []
     words = "".join(map(html.paragraph, (recipe.reference, study.note, *verdicts)))
-    cases = case_table([(name, row) for name, run in runs.items() for row in case_rows(run)])
+    cases = case_cells([(name, row) for name, run in runs.items() for row in case_rows(run)])
     drawn = f'<div class="figures">\n{"".join(pictures)}</div>\n'
     name, title = escape(recipe.name), escape(_sentence(recipe.title))
     return Section(name, title, words + html.table(cases) + drawn, len(pictures))
@@ -96,6 +105,26 @@ def check_references(
             yield f"{where}: there is a reference, but no such figure any more"
         else:
             yield from (f"{where}, {text}" for text in differences(panels, path))
+
+
+def page(sections: Sequence[Section], made_by: Provenance) -> str:
+    """``index.html``: figures in a folder per section, with captions and the numbers under them."""
+    contents = "".join(
+        f'<li><a href="#{s.name}"><code>{s.name}</code></a>: {s.title}</li>\n'
+        for s in sections
+    )
+    text = html.paragraph(
+        "Ortega, Bobtsov, Castaños, Nikolaev, arXiv:2407.14373. Everything here was computed and "
+        "drawn by gpebo figures. Beside every picture is a CSV file with exactly what is drawn."
+    )
+    body = "".join(
+        f'<section id="{s.name}">\n<h2>{s.title}</h2>\n'
+        f"<p><code>gpebo run experiment={s.name}</code></p>\n{s.content}</section>\n"
+        for s in sections
+    )
+    nav = f"<nav><ul>\n{contents}</ul></nav>\n"
+    title = "The paper’s figures, regenerated"
+    return html.document(title, text + nav + body + html.footer(made_by), embedded=False)
 
 
 def _save(

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.results.names import SETTLED, known_by, shown_metrics
+from gpebo_cli.results.symbols import number_text, symbol
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import NoiseStatistics, RunResult
@@ -59,6 +61,41 @@ def case_table(result: RunResult) -> list[str]:
     if not few:
         lines.insert(1 + half, f"… {count - 2 * half} more in cases.csv")
     return lines
+
+
+def case_cells(named: Sequence[tuple[str, dict[str, float]]]) -> list[list[str]]:
+    """Header and rows, for HTML, of what distinguishes cases, and their metrics.
+
+    Each has the name of its run, empty if there is only one, and gains and metrics by the names
+    of ``cases.csv``.
+    """
+    if not named:
+        return []
+    gains = list(dict.fromkeys(key for _, row in named for key in row if not is_metric(key)))
+    several = any(name for name, _ in named)
+    # Gains that are the same everywhere tell nothing; those of other estimators are not theirs.
+    shown = [g for g in gains if len({row.get(g) for _, row in named}) > 1] or gains
+    # Without the truth nothing is known of errors, nor from when on they are small.
+    known = {
+        key: words for key, words in shown_metrics([row for _, row in named]).items()
+        if any(math.isfinite(row.get(known_by(key), math.nan)) for _, row in named)
+    }
+    head = [*(["estimator"] if several else []), *map(symbol, shown), *known.values()]
+    rows = [
+        [
+            *([name] if several else []),
+            *(number_text(row[gain]) if gain in row else "" for gain in shown),
+            *(_metric(key, row.get(key, math.nan)) for key in known),
+        ]
+        for name, row in named
+    ]
+    return [head, *rows]
+
+
+def _metric(name: str, value: float) -> str:
+    if name.startswith("seconds"):
+        return f"{value:.3f} s" if math.isfinite(value) else "never"
+    return number_text(value) if math.isfinite(value) else "unknown"
 
 
 def noise_table(noise: NoiseStatistics) -> list[str]:
