@@ -143,13 +143,49 @@ def test_at_samples_they_are_what_each_error_by_itself_does(hold, estimator):
     np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5, atol=1e-7)
 
 
+TANK = {
+    "name": "tank", "states": ["h"], "inputs": {"u": 0}, "unknowns": {"gain": 1, "leak": 1},
+    "outputs": ["y"], "E": [[1]], "A": [["-1 - 0.3*u"]], "F": [["u", -1]], "C": [[1]],
+    "initial_state": {"h": 0},
+}
+
+
+@pytest.mark.parametrize("t", [
+    [0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 4.0, 4.2, 4.4, 4.6],  # a pause, most of the horizon
+    np.linspace(0.0, 3.0, 8),  # fewer rows than the mesh has elements
+])
+def test_of_a_recording_every_row_counts_as_one_error(t):
+    """What each row's error does by itself; held instead of interpolated it may do a bit more."""
+    t = np.array(t)
+    data = {"t": t, "u": 1.0 + np.sin(3 * t), "y": np.cos(t)}
+    noise = {"name": "gaussian", "outputs": 0.1}
+
+    def final(**changes):
+        found = run(TANK, data=data | changes, noise=noise, estimator="least_squares").details
+        of = found.estimation
+        return np.append(of.parameters[0, -1], of.states[0, -1]), np.append(
+            of.parameters_std[0, -1], of.states_std[0, -1]
+        )
+
+    base, std = final()
+    each = [final(y=data["y"] + 0.1 * (np.arange(len(t)) == j))[0] - base for j in range(len(t))]
+    ratio = std / np.linalg.norm(each, axis=0)
+    assert (ratio > 0.85).all(), ratio
+    assert (ratio < 1.8).all(), ratio
+
+
+@pytest.mark.parametrize("rows", [2, 3])
+def test_rows_that_any_estimates_explain_do_not_tell_their_noise(rows):
+    t = np.linspace(0.0, 1.0, rows)
+    data = {"t": t, "u": 1.0 + np.sin(3 * t), "y": np.cos(t)}
+    found = run(TANK, data=data, estimator="least_squares")
+    assert found.details.estimation.parameters_std is None
+    assert "no standard deviations: the samples are so few" in found.verdict
+
+
 def test_at_samples_matrices_may_follow_an_input_without_noise():
     """A pump's gain: F follows u, whose samples are exact; y alone is noisy."""
-    system = plant_from_mapping({
-        "name": "tank", "states": ["h"], "inputs": {"u": 0}, "unknowns": {"gain": 1, "leak": 1},
-        "outputs": ["y"], "E": [[1]], "A": [["-1 - 0.3*u"]], "F": [["u", -1]], "C": [[1]],
-        "initial_state": {"h": 0},
-    }, "tank")
+    system = plant_from_mapping(TANK, "tank")
     t = np.linspace(0.0, 4.0, 12)
     u, y = np.sin(3 * t)[:, None] + 1.0, np.cos(t)[:, None]
     noise, law = NoiseSettings(name="gaussian", outputs=0.3), {"name": "least_squares"}

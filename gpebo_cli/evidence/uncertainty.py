@@ -257,7 +257,8 @@ def noise_level(
         t, starts,
     )
     duration = float(mesh.edges[-1] - mesh.edges[0])
-    expected = duration * float((of_rows**2).sum(axis=1).mean()) - float((of_fit[-1] ** 2).sum())
+    whole = duration * float((of_rows**2).sum(axis=1).mean())
+    left = whole - float((of_fit[-1] ** 2).sum())
     eta = root.T @ (root @ final[:, p])
     # The noise is taken at the instants, where it does not depend on what the hold rule assumes.
     if regression.factor is not None:
@@ -265,7 +266,8 @@ def noise_level(
     else:
         residual = regression.Y(instants) - regression.psi(instants) @ eta
         square = duration * float((residual**2).sum(axis=-1).mean())
-    return float(np.sqrt(square / expected)) if expected > 0.0 else np.nan
+    more = (len(instants) + 1) * np.count_nonzero(outputs) > known.sum()  # numbers than estimates
+    return float(np.sqrt(square / left)) if more and left > _LEFT * whole else np.nan
 
 
 def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, Array]:

@@ -72,7 +72,8 @@ def examine(
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
-        seen = Measurements(recording.inputs, recording.outputs, derivatives=recording.derivatives)
+        noise = signal_noise(settings.noise, levels, recording.cells)
+        seen = Measurements(recording.inputs, recording.outputs, noise, recording.derivatives)
         return Examination(()) if observer is None else _of_observer(
             observer, settings, system, seen, [], both
         )
@@ -150,11 +151,8 @@ def _per_unit(
     plain = not regression.resets and regression.dynamics is None and observation.names is None
     if observation.errors is None or not plain or not isinstance(state_map, AffineStateMap):
         return {}
-    start, stop = seen.span
-    instants = (
-        seen.mesh.edges[:-1] if settings.data.name == "csv"
-        else np.arange(start, stop, settings.noise.sample_time)
-    )
+    (start, stop), cells = seen.span, None if seen.noise is None else seen.noise.cells
+    instants = np.arange(start, stop, settings.noise.sample_time) if cells is None else cells[:-1]
     of_eta, of_x = of_least_squares(
         observation.errors, regression, known, state_map.gain(np.array([stop]))[0], instants,
         np.concatenate([np.zeros(system.m), np.ones(system.r)]),

@@ -81,9 +81,8 @@ def continuous(
 
     def observe(signals: Source | Signals) -> Observation:
         known = signals if isinstance(signals, Source) else source
-        instants = signals.inputs.mesh.edges if known.recording else None
         seen = Measurements(
-            signals.inputs, signals.outputs, signal_noise(settings.noise, levels, instants),
+            signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.cells),
             known.derivatives, known.t if known.recording else None,
         )
         return observer.observe(system, seen, settings.solver)

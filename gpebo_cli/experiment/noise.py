@@ -85,15 +85,15 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
 
 
 def signal_noise(
-    settings: NoiseSettings, levels: NoiseLevels, instants: Array | None = None
+    settings: NoiseSettings, levels: NoiseLevels, cells: Array | None = None
 ) -> SignalNoise:
     """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12.
 
-    A recording has samples of its own, at ``instants`` (N,).
+    A recording has samples of its own, whose errors are held in ``cells`` (N + 1,).
     """
     outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
-    step = settings.sample_time if instants is None else float(np.diff(instants).mean())
-    return SignalNoise(levels.inputs, outputs, step, instants is not None)
+    step = settings.sample_time if cells is None else float(np.diff(cells).mean())
+    return SignalNoise(levels.inputs, outputs, step, cells)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,7 @@ class Source:
     true: Signals | None = None  # of a simulation, without noise
     simulation: SimulationResult | None = None
     recording: RecordingResult | None = None
+    cells: Array | None = None  # of a recording, see Recording.cells
     pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
@@ -90,7 +91,7 @@ def recorded(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
         assumptions=tuple, verdict="", derivatives=recording.derivatives,
-        recording=_sample_recording(system, recording, t),
+        recording=_sample_recording(system, recording, t), cells=recording.cells,
     )
 
 

@@ -29,6 +29,7 @@ from gpebo_cli.settings import NoiseSettings
 MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not of a measurement
 # Why there are no deviations.
 _MANY = f"each of {{}} cases would take a pass of its own, which up to {MOST_CASES} do"
+_FEW = "the samples are so few that the estimates leave nothing of them to tell their noise"
 _NOT_SAID = "the estimator does not say what errors of Y do to it"
 _IN_MATRICES = (
     "noise of the signals is in the matrices or differentiated, or this remedy cannot tell what it "
@@ -44,14 +45,13 @@ def sampled_deviations(
     Levels that are zero are unknown but for a simulation. Without a source the samples are a
     stream, each of whose rows has errors of its own.
     """
-    recorded = source is None or source.recording is not None
+    recorded = source is None or source.cells is not None
     if levels.silent and not recorded:
         return None
     variances = _variances(noise, levels)
     if source is None:
         return SampledDeviations(variances, None, relative=levels.silent)
-    edges = source.inputs.mesh.edges
-    instants = edges[:-1] if recorded else np.arange(edges[0], edges[-1], noise.sample_time)
+    instants = _instants(source, noise)
     near = 1e-6 * float(np.diff(instants).min(initial=np.inf))
 
     def number(t: Array) -> Array:
@@ -72,14 +72,23 @@ def residual_ratio(
 
     One where the sensors' noise is all that the estimates leave; None: nobody can tell.
     """
-    if observation.errors is None or levels.silent or source.recording is None:
+    if observation.errors is None or levels.silent or source.cells is None:
         return None
     if observation.regression.resets or observation.regression.dynamics is not None:
         return None
-    return noise_level(
-        observation.errors, observation.regression, source.inputs.mesh.edges[:-1],
-        _variances(noise, levels), observation.starts,
+    found = noise_level(
+        observation.errors, observation.regression, source.cells[:-1], _variances(noise, levels),
+        observation.starts,
     )
+    return None if np.isnan(found) else found
+
+
+def _instants(source: Source, noise: NoiseSettings) -> Array:
+    """Times (N,) from each of which to the next the errors of the signals are the same."""
+    if source.cells is not None:
+        return source.cells[:-1]
+    start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
+    return np.arange(start, stop, noise.sample_time)
 
 
 def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
@@ -113,14 +122,13 @@ def standard_deviations(
         return _NOT_SAID
     if len(estimator.cases) > MOST_CASES:
         return _MANY.format(len(estimator.cases))
-    edges = regression.mesh.edges
-    instants = (
-        source.inputs.mesh.edges[:-1] if source.recording
-        else np.arange(edges[0], edges[-1], noise.sample_time)
-    )
+    edges, instants = regression.mesh.edges, _instants(source, noise)
     variances = _variances(noise, levels)
     if levels.silent:
-        variances *= _level(errors, regression, instants, variances, observation.starts) ** 2
+        level = _level(errors, regression, instants, variances, observation.starts)
+        if np.isnan(level):
+            return _FEW
+        variances *= level**2
     gains = state_map.gains(t, states)[..., columns]
     if regression.resets and isinstance(estimator, ResumableEstimator):
         found = list(_over_resets(errors, estimator, regression, gains, instants, variances, t))

@@ -30,7 +30,7 @@ class SignalNoise:
     inputs: Array  # (m,) standard deviation of every sample
     outputs: Array  # (r,)
     sample_time: float  # seconds, on the average
-    recorded: bool = False  # each element of the signals' mesh is from one sample to the next
+    cells: Array | None = None  # of a recording: between which errors are those of one sample
 
     @property
     def variances(self) -> Array:

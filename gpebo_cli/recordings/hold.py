@@ -22,6 +22,7 @@ Held = Callable[[Array, Array], Array]
 _STAGES = (3, 4, 6, 9, 12, 16)  # candidates for the mesh of a recording
 _FIRST_ELEMENTS = 24  # at least this many, as for a simulation
 _PROBED = 64  # elements on which the plant's matrices are looked at
+_GAP = 2.0  # times the median step: a longer one is a gap
 _SAME = 1e-13  # slopes that differ by less than this share of the signal's size are the same
 _SMALLEST = 1e-9  # an edge nearer than this share of a step to a sample is that sample
 
@@ -72,7 +73,8 @@ def recording_mesh(
     """
     start, stop = span
     inner = (t > start) & (t < stop)
-    cuts = source.breakpoints(start, stop)
+    middles = np.setdiff1d(cells(t, hold, span), [*t, *span])
+    cuts = np.union1d(source.breakpoints(start, stop), middles)
     signal = held(t, values, hold)
     candidates = []
     for rule in map(radau_rule, _STAGES):
@@ -86,6 +88,18 @@ def recording_mesh(
         parts = _parts(source, signal, mesh, tol)
         candidates.append((mesh.size * (rule.stages + 1) * parts, mesh))
     return min(candidates, key=lambda candidate: candidate[0])[1]
+
+
+def cells(t: Array, hold: str, span: tuple[float, float]) -> Array:
+    """Times (C + 1,) of the span between which errors of samples at ``t`` (N,) are those of one.
+
+    What a straight line between two samples makes of their errors is as large as if each were held
+    for half of it. Where steps are alike that is the same as from one sample to the next.
+    """
+    t = np.unique(np.append(t[(t > span[0]) & (t < span[1])], span))
+    step = np.diff(t)
+    long = (step > _GAP * np.median(step)) & (hold != "zoh")
+    return np.union1d(t, t[:-1][long] + 0.5 * step[long])
 
 
 def bends(t: Array, values: Array, hold: str) -> BoolArray:

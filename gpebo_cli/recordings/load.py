@@ -11,7 +11,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.recordings.hold import held, recording_mesh
+from gpebo_cli.recordings.hold import cells, held, recording_mesh
 from gpebo_cli.recordings.table import Samples, Table, read_table
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
@@ -34,6 +34,11 @@ class Recording:
     def derivatives(self) -> InputDerivatives | None:
         """Derivatives of the inputs: only a cubic interpolant has any."""
         return InputDerivatives.of_signal(self.inputs) if self.hold == "cubic" else None
+
+    @property
+    def cells(self) -> Array:
+        """Times (N + 1,) between which errors of the signals are those of one sample."""
+        return cells(self.table.samples.t, self.hold, self.span)
 
     def sampled(self, t: Array) -> Samples:
         """All signals at the times t (N,) of the span.
