@@ -93,6 +93,9 @@ class Arguments:
         return [name for folder in self.folders for name in choices(folder, group)]
 
 
+NO_WORDS = Arguments()
+
+
 def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> Arguments:
     """Sort the words of the command line.
 

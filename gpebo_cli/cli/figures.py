@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpebo_cli.cli.arguments import Arguments
-from gpebo_cli.cli.options import CONFIG_DIR, PLAIN, VOLUME, Options, no_option, parse
+from gpebo_cli.cli.arguments import NO_WORDS, Arguments
+from gpebo_cli.cli.options import CONFIG_DIR, VOLUME, no_option, parse
 from gpebo_cli.configs.locations import PRIMARY
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.schema import shown, unknown
@@ -30,8 +30,8 @@ _FOLDERS = {"--output": "a folder", "--check": "a folder", "--update": "a folder
 def main(words: list[str]) -> int:
     """Regenerate the figures; the exit code (ConfigError, GpeboError)."""
     options = parse("figures", words, {**_FOLDERS, **CONFIG_DIR}, VOLUME)
-    config_dir = options.config_dir
-    names, formats = _asked(options, config_dir)
+    arguments = Arguments(options, config_dir=options.config_dir)
+    names, formats = _asked(arguments)
     update, check = options.values.get("--update"), options.values.get("--check")
     if check is not None and not os.path.isdir(check):
         raise ConfigError(f"--check {check}: there is no such folder")
@@ -49,7 +49,7 @@ def main(words: list[str]) -> int:
     make_folder(folder)
     sections: list[Section] = []
     differences: list[str] = []
-    for recipe in run_recipes(names, options, config_dir):
+    for recipe in run_recipes(names, arguments):
         figures = gallery.figures_of(recipe)
         section = gallery.write_recipe(folder / recipe.name, recipe, figures, formats)
         sections.append(section)
@@ -71,12 +71,11 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def _asked(options: Options, config_dir: str | None) -> tuple[list[str], list[str]]:
+def _asked(arguments: Arguments) -> tuple[list[str], list[str]]:
     """Names of recipes, and formats."""
     names: list[str] = []
-    formats = ["png"]
-    known = Arguments(config_dir=config_dir).known("experiment")
-    for word in options.words:
+    formats, known = ["png"], arguments.known("experiment")
+    for word in arguments.given.words:
         key, equals, value = word.partition("=")
         if key == _FORMATS:
             formats = _formats(value)
@@ -108,26 +107,20 @@ def _formats(text: str) -> list[str]:
     return [name for name in FORMATS if name == "png" or name in given]
 
 
-def run_recipes(
-    names: list[str], options: Options = PLAIN, config_dir: str | None = None
-) -> Iterator[Recipe]:
+def run_recipes(names: list[str], arguments: Arguments = NO_WORDS) -> Iterator[Recipe]:
     """Compose and run recipes, one at a time, those of a folder of one's own included."""
     from omegaconf import OmegaConf
 
     from gpebo_cli.cli.composition import session
     from gpebo_cli.results.gallery import Recipe
 
-    given = Arguments(config_dir=config_dir)
     for name in names:
         runs: dict[str, RunResult] = {}
-        with session(given) as hydra:
+        with session(arguments) as hydra:
             jobs = list(recipe_jobs(name, hydra.config_loader))
         for label, cfg in jobs:
-            try:
-                runs[label] = run_recipe_job(cfg, given, options)
-            except GpeboError as error:
-                where = f"experiment {name}" + (f", {label}" if label else "")
-                raise type(error)(f"{where}: {error}") from error
+            where = f"experiment {name}" + (f", {label}" if label else "")
+            runs[label] = run_recipe_job(cfg, arguments, where)
         words = {key: str(OmegaConf.select(cfg, key) or "") for key in ("title", "reference")}
         yield Recipe(name, runs=runs, **words)
 
@@ -156,12 +149,16 @@ def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConf
         yield ", ".join(chosen), loader.load_configuration(PRIMARY, words, RunMode.RUN)
 
 
-def run_recipe_job(cfg: DictConfig, arguments: Arguments, options: Options) -> RunResult:
-    """Run one composed configuration; nothing is written."""
+def run_recipe_job(cfg: DictConfig, arguments: Arguments, where: str) -> RunResult:
+    """Run one composed configuration, that of ``where``; nothing is written (GpeboError)."""
     from gpebo_cli.cli.job import read_job
     from gpebo_cli.cli.progress import Progress
     from gpebo_cli.experiment.pipeline import run_experiment
 
-    job = read_job(cfg, arguments, draw=False)
-    with Progress(quiet=options.quiet, loud=options.loud) as progress:
-        return run_experiment(job.settings, job.system, progress)
+    given = arguments.given
+    try:
+        job = read_job(cfg, arguments, draw=False)
+        with Progress(quiet=given.quiet, loud=given.loud) as progress:
+            return run_experiment(job.settings, job.system, progress)
+    except GpeboError as error:
+        raise type(error)(f"{where}: {error}") from error

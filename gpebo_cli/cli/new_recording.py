@@ -43,9 +43,8 @@ def write(file: str, plant: str, folder: str) -> int:
     lines = [str(path), *(f"  {signal}: column {column!r} ({found.reasons[signal]})"
                           for signal, column in found.columns.items())]
     lines += [f"not understood: {doubt}" for doubt in found.doubts]
-    where = "" if folder == "." else f" --config-dir {shlex.quote(folder)}"
-    where = where or " --config-dir ."
-    lines.append(f"look at the guesses in it, then: gpebo run{where} plant={plant} data={name}")
+    run = f"gpebo run --config-dir {shlex.quote(folder)} plant={plant} data={name}"
+    lines.append(f"look at the guesses in it, then: {run}")
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     return 0
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gpebo_cli.cli.arguments import NO_WORDS, Arguments
 from gpebo_cli.cli.figures import known_recipe, recipe_jobs, run_recipe_job
 from gpebo_cli.cli.options import PLAIN, VOLUME, Options, parse
 from gpebo_cli.configs.locations import choices, conf_folder
-from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.schema import read, shown
 
 if TYPE_CHECKING:
@@ -86,20 +87,16 @@ def reproduced(
     """
     from omegaconf import OmegaConf
 
-    from gpebo_cli.cli.arguments import Arguments
     from gpebo_cli.cli.composition import session
 
     where = f"experiment published/{name}"
-    with session(Arguments()) as hydra:
+    with session(NO_WORDS) as hydra:
         ((_, config),) = recipe_jobs(f"published/{name}", hydra.config_loader)
     file, result = OmegaConf.select(config, "data.file"), None
     if file is not None and not Path(file).exists():
         sys.stderr.write(f"{name}: not run, there is no {file} here; see {config.reference}\n")
     else:
-        try:
-            result = run_recipe_job(config, Arguments(), options)
-        except GpeboError as error:
-            raise type(error)(f"{where}: {error}") from error
+        result = run_recipe_job(config, Arguments(options), where)
         if pictures is not None:
             _draw(result, pictures / f"{name}.png")
     notes = {key: str(config[key]).strip() for key in _NOTES if config.get(key)}

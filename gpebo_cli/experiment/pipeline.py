@@ -69,6 +69,7 @@ class _Clock:
 
 
 @one_thread
+@np.errstate(all="ignore")  # what is not finite is found where it matters, with reason and time
 def run_experiment(
     settings: Settings,
     system: DescriptorSystem,
@@ -89,16 +90,6 @@ def run_experiment(
         ModelError: the plant cannot be simulated, or Assumption 1 fails.
         SolverError: a tolerance cannot be reached.
     """
-    # What is not finite is found where it matters, with its reason and its time.
-    with np.errstate(all="ignore"):
-        return _experiment(settings, system, progress, estimator)
-
-
-def _experiment(
-    settings: Settings, system: DescriptorSystem, progress: Callable[[str], None],
-    estimator: estimators.Estimator | None,
-) -> RunResult:
-    """:func:`run_experiment`, wherever numbers are not finite."""
     levels = noise_levels(settings.noise, system)
     sources.check(settings, levels)
     observer = build(settings.observer)
