@@ -8,12 +8,13 @@ import pytest
 from plants import shipped
 from test_remedies import UNBOUNDED
 
-from gpebo_cli import run
+from gpebo_cli import run, system_from_functions
 from gpebo_cli.errors import ConfigError, GpeboError, ModelError
 from gpebo_cli.experiment.online import Online
+from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers.reduced.invariant import invariant_observer
-from gpebo_cli.settings import Settings, SolverSettings
+from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 
 # a' = b with 0 = a + u: b = −u'.
 HIDDEN = {
@@ -51,6 +52,20 @@ def canonical(**changes):
         ),
         (canonical(unknowns={"q": 1}, F=[[0], [0], [1], [0], [0]]), "in the equations of z_a only"),
         (canonical(D=[[1, 0, 0, 0], [0, 0, 0, 0]]), "and it has D; use observer=gpebo"),
+        (
+            {"estimator": {"name": "least_squares", **dict.fromkeys(
+                ("alpha", "f0"), "logspace(0, 9, 1001)")}},
+            "the gains make 1002001 cases; at most",
+        ),
+        (
+            {"observer": {"name": "gpebo", "remedy": "output_injection", "injection": [[1.0], []]}},
+            "observer.injection has 2 rows of 0 or 1 entries; plant circuit needs 6 (states) of 1",
+        ),
+        (
+            {"observer": {"name": "gpebo", "remedy": "reset", "reset_interval": 1e-6}},
+            "observer.reset_interval = 1e-06 makes 20000000 resets; at most",
+        ),
+        ({"data": ROWS.assign(V=[True, False, True])}, "data, column V: bool is not numbers"),
     ],
 )
 def test_of_runs(settings, message):
@@ -68,12 +83,93 @@ def test_of_runs(settings, message):
         ({"matrices": 3}, "matrices is the name of an .npz file, not 3"),
         ({"A": [["(" * 300 + "t" + ")" * 300, 1], [1, 0]]}, "it is nested too deeply"),
         ({"A": [["-" * 3000 + "t", 1], [1, 0]]}, "it is nested too deeply"),
+        ({"A": [[None, 1], [1, 0]]}, "A[0][0] is empty; write a number or an expression"),
+        ({"A": [[[1], 1], [1, 0]]}, "A[0][0] is a list; write a number or an expression"),
+        ({"A": [[" ", 1], [1, 0]]}, "A[0][0] = ' ': it is empty; write a number"),
+        ({"A": [["t" + " " * 10**6 + "t", 1], [1, 0]]}, "it has 1000002 characters, more than"),
+        ({"A": [["sin(t, t)", 1], [1, 0]]}, "sin takes one argument, not 2"),
+        ({"A": [["max(t)", 1], [1, 0]]}, "max takes two arguments, not 1"),
+        ({"A": [["sin(t, **t)", 1], [1, 0]]}, "sin takes one argument, not keywords"),
+        ({"A": [["d(" * 99 + "sin(t)" + ")" * 99, 1], [1, 0]]}, "d(.) inside each other"),
+        ({"A": [[1, 1]]}, "A has 1 row but"),
+        ({"A": [[1], [1]]}, "A has 1 column but"),
+        ({"A": {"a,b": 1, "a": {"b": 2}}}, "A has the entry a,b twice"),
+        ({"A": np.eye(3)}, "A is 3 × 3, and"),
+        ({"states": None}, "states is missing"),
+        ({"initial_state": 3}, "must map states to numbers or list 2 numbers, not '3'"),
+        ({"initial_state": [0]}, "initial_state has 1 value but"),
+        ({"initial_state": {"a": 0}}, "initial_state lacks b"),
     ],
 )
 def test_of_plants(changes, message):
     with pytest.raises(ConfigError) as caught:
         plant_from_mapping({**HIDDEN, **changes})
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"A": [[1e155, 1], [1, 0]]}, "A[0][0] is 1e+155 at t = 0; numbers go up to 1e+"),
+        ({"E": [[1e-155, 0], [0, 0]]}, "E[0][0] is 1e-155 at t = 0; numbers of E go down to 1e-"),
+        ({"initial_state": [1e155, 0]}, "initial_state.a is 1e+155; numbers go up to"),
+    ],
+)
+def test_of_numbers_whose_products_or_quotients_overflow(changes, message):
+    with pytest.raises(ConfigError, match="use other units") as caught:
+        run({**HIDDEN, **changes}, observer="none")
+    assert message in str(caught.value)
+
+
+def constant(**matrices):
+    """A plant of functions: x' = −x, y = x, with other matrices."""
+    given = {"E": [[1.0]], "A": [[-1.0]], "C": [[1.0]], **matrices}
+    return system_from_functions("constant", initial_state=[1.0], **given)
+
+
+@pytest.mark.parametrize(
+    ("matrices", "message"),
+    [
+        ({"A": [[1.0, 2.0]]}, "A has shape (1, 2), expected (1, 1) (the initial state has 1 entr"),
+        ({"A": lambda t: np.ones((len(t), 2, 1))}, "A returned shape ("),
+    ],
+)
+def test_of_functions(matrices, message):
+    with pytest.raises(ConfigError) as caught:
+        run(constant(**matrices), time={"horizon": 1.0})
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "message"),
+    [
+        ("", {}, " is empty; expected a header and rows"),
+        ('t,"V,y\n0,1,2\n1,2,3\n', {}, ", line 1: not CSV: "),
+        ("t,V,y\n0,1,2\n1,2,3\n", {"separator": "ab"}, "data.separator: expected one character"),
+        ("t,V,y\nnoon,1,2\n1,2,3\n", {"time_unit": "datetime"}, "'noon' is not "),
+    ],
+)
+def test_of_recordings(tmp_path, text, settings, message):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        run("circuit", data={"name": "csv", "file": str(path), **settings})
+    assert message in str(caught.value)
+
+
+def test_of_streams():
+    def settings(**changes):
+        return Settings({}, {"name": "gradient", "gamma": changes.pop("gamma", 1.0)},
+                        changes.pop("time", TimeSettings(np.nan, np.nan)),
+                        observer={"name": "gpebo"}, **changes)
+
+    plant = shipped("circuit")
+    with pytest.raises(ConfigError, match=r"make 2 cases; a stream has room for one"):
+        stream(settings(gamma=[1.0, 2.0]), plant)
+    with pytest.raises(ConfigError, match=r"ends with its last; leave time\.start and time\.hori"):
+        stream(settings(time=TimeSettings(0.0, 1.0)), plant)
+    with pytest.raises(ValueError, match="there have been no samples"):
+        _ = Online(settings(), plant, "zoh", 0.0, np.zeros(2)).reached
 
 
 def test_of_several_recordings_with_an_observer_of_later_states(tmp_path):
