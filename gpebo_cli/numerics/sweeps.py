@@ -23,7 +23,6 @@ from gpebo_cli.numerics.collocation import (
     LinearSolution,
     at_points,
     decoupled,
-    merged,
     unresolved_signals,
 )
 from gpebo_cli.numerics.elimination import Eliminated, StiffError
@@ -68,16 +67,6 @@ class Sparse(NamedTuple):
         d = len(self.rows) - 1
         out = np.zeros((len(self.entries), d, d))
         out[:, np.repeat(np.arange(d), np.diff(self.rows)), self.columns] = self.entries
-        return out
-
-    def within(self, other: Sparse) -> Array:
-        """The entries at the places of another one, which has all of these."""
-        d = len(self.rows) - 1
-        own, theirs = (
-            np.repeat(np.arange(d), np.diff(x.rows)) * d + x.columns for x in (self, other)
-        )
-        out = np.zeros((len(self.entries), len(theirs)))
-        out[:, np.searchsorted(theirs, own)] = self.entries
         return out
 
     def growth(self, units: Array, enough: float) -> float:
@@ -127,11 +116,9 @@ class Sparse(NamedTuple):
 Equation = tuple[Sparse, Array, tuple[Array, ...]]
 
 
-def sparse(A: Array, more: Sparse | None = None) -> Sparse | None:
-    """Matrices (N or 1, d, d) by their entries, at ``more`` places, too; None if most are there."""
+def sparse(A: Array) -> Sparse | None:
+    """Matrices (N or 1, d, d) by their entries; None if most are there."""
     there = (A != 0.0).any(axis=0)
-    if more is not None:
-        there |= more._replace(entries=np.ones((1, len(more.columns)))).full()[0] != 0.0
     i, j = np.nonzero(there)
     if len(i) > _DENSE * there.size:
         return None
@@ -139,21 +126,20 @@ def sparse(A: Array, more: Sparse | None = None) -> Sparse | None:
 
 
 def solve(
-    problem: LinearProblem, equation: Callable[[Mesh, IntArray], Equation], mesh: Mesh, *,
+    problem: LinearProblem, equation: Callable[[Mesh], Equation], mesh: Mesh, *,
     units: Array, tol: float, max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None, stiff: bool = False,
 ) -> LinearSolution | None:
     """As :func:`gpebo_cli.numerics.collocation.solve`, or None where sweeps will not do.
 
     In place of the problem's coefficients the ``equation`` gives A, f (P or 1, d, ·) of the first
-    columns and what the monitor needs, at the points of a mesh, of which some elements (K,) are
-    those of the mesh before, else −1. Components have ``units`` (d,). Where it is ``stiff``,
-    elements are solved and not swept over.
+    columns and what the monitor needs, at the points of a mesh. Components have ``units`` (d,).
+    Where it is ``stiff``, elements are solved and not swept over.
 
     Raises:
         SolverError: ``max_elements`` do not reach ``tol``; names the time.
     """
-    A, _, _ = equation(mesh, np.full(mesh.size, -1))
+    A, _, _ = equation(mesh)
     march: March = elements.sweeps
     if stiff:
         full = len(A.columns) > _DENSE * len(A.rows) ** 2
@@ -167,8 +153,8 @@ def solve(
         if parts.max(initial=1.0) > 1.0:
             mesh = mesh.split(np.maximum(parts, 1.0).astype(np.intp))[0]
 
-    def evaluate(mesh: Mesh, _before: _Found | None, kept: IntArray) -> tuple[_Found, Array]:
-        A, f, extras = equation(mesh, kept)
+    def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
+        A, f, extras = equation(mesh)
         mapped = not stiff and len(A.entries) == 1 and problem.start.shape[1] > _MANY_COLUMNS
         mapped = mapped and _MANY_ALIKE * equal_lengths(mesh.steps)[0].max() < mesh.size
         values, change = _swept(
@@ -205,32 +191,19 @@ def solve_dense(
 
     ``f`` may be of the first columns only. None also where too few entries are zero.
     """
-    last: list[tuple[Mesh, Sparse, Array, tuple[Array, ...]]] = []
+    last: list[tuple[Mesh, Equation]] = []
 
-    def equation(mesh: Mesh, kept: IntArray) -> Equation:
-        if last and last[0][0] is mesh:
-            return last[0][1:]
-        fresh, s = kept < 0, mesh.rule.stages
-        points, count = mesh.points[fresh].ravel(), int(fresh.sum())
-        c = known if known is not None and not last else problem.coefficients(
-            points, mesh.inside[fresh].ravel()
-        )
-        before = None if fresh.all() else last[0]
-        A = sparse(c.A, None if before is None else before[1])
-        if A is None:
-            raise StiffError
-        f, extras = c.f, tuple(at_points(e, count, s) for e in c.extras)
-        if before is not None:
-            K = before[0].size
-            old, new = (before[1].within(A), before[2]), (A.entries, f)
-            entries, f, *more = merged(
-                [*(at_points(x, K, s) for x in old), *before[3]],
-                [*(at_points(x, count, s) for x in new), *extras], kept,
+    def equation(mesh: Mesh) -> Equation:
+        if not last or last[0][0] is not mesh:
+            c = known if known is not None and not last else problem.coefficients(
+                mesh.points.ravel(), mesh.inside.ravel()
             )
-            A = A._replace(entries=entries.reshape(-1, *entries.shape[2:]))
-            f, extras = f.reshape(-1, *f.shape[2:]), tuple(more)
-        last[:] = [(mesh, A, f, extras)]
-        return A, f, extras
+            A = sparse(c.A)
+            if A is None:
+                raise StiffError
+            extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in c.extras)
+            last[:] = [(mesh, (A, c.f, extras))]
+        return last[0][1]
 
     try:
         return solve(

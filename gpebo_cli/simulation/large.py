@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution
@@ -222,7 +222,7 @@ def _simulated(
     floor_z = SHARE * np.abs(form.reduced(x0))[:, None]
     floor = form.sizes_from(floor_z)
 
-    def equation(mesh: Mesh, _kept: IntArray) -> sweeps.Equation:
+    def equation(mesh: Mesh) -> sweeps.Equation:
         form = plant.eliminate(mesh)
         return plant.matrix(), form.f[:, :, None], ()
 
