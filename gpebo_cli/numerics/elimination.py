@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gpebo_cli.kernels import elements
+from gpebo_cli.kernels.elements_numpy import at_nodes
 from gpebo_cli.model.descriptor import Array, IntArray
 
 _SMALL = 1e-280  # terms below it have lost digits
@@ -48,10 +49,7 @@ class Eliminated:
         """Values (K, s + 1, d, c), and what is left of the equations (K,) if nothing is added."""
         K, s = len(h), len(R)
         D = np.asarray(np.linalg.inv(R), dtype=np.float64)
-        if len(entries) > 1:
-            entries = entries.reshape(K, s + 1, -1)[:, 1:]
-        else:
-            entries = np.broadcast_to(entries, (K, s, entries.shape[1]))
+        entries = at_nodes(entries, K, s)
         pattern = rows.tobytes() + columns.tobytes()
         keys = [
             blake2b(pattern + f"{step:.12e}".encode() + each.tobytes()).digest()
@@ -87,9 +85,9 @@ def _residual(
 
     No pivots are sought beyond the states' own unknowns: this says whether that did harm.
     """
-    K, points, d, _ = values.shape
+    K, points, _, _ = values.shape
     left, X, there = values[:, :1], values[:, 1:], np.diff(rows) > 0
-    f = f if len(f) == 1 else f.reshape(K, points, d, -1)[:, 1:]
+    f = at_nodes(f, K, points - 1)
 
     def total(Dh: Array, slopes: Array, entries: Array, X: Array, f: Array) -> Array:
         found = np.einsum("kij,kjdc->kidc", Dh, slopes)
@@ -142,7 +140,7 @@ def eliminated(D: Array, h: Array, rows: IntArray, columns: IntArray, entries: A
                 continue
             a = coupled[r].pop(i)
             forward.append((r, i, a))
-            through = _times(a, inverse)
+            through = a * inverse if a.shape[2] == 1 else a @ inverse
             for c, b in coupled[i].items():
                 more = through * np.swapaxes(b, 1, 2) if b.shape[2] == 1 else through @ b
                 if r == c:
@@ -166,8 +164,3 @@ def _packed(steps: list[tuple[int, int, Array]]) -> Factors:
         np.stack([b.swapaxes(1, 2) for b in full], axis=1),
         np.concatenate([full[0][:, :0], *(b.swapaxes(1, 2) for b in diagonal)], axis=1),
     )
-
-
-def _times(a: Array, b: Array) -> Array:
-    """Of a block that may be diagonal, (…, s, 1), with another."""
-    return a * b if a.shape[-1] == 1 else np.asarray(a @ b)

@@ -58,9 +58,8 @@ class Sparse(NamedTuple):
 
     def sizes(self, mesh: Mesh) -> Array:
         """The largest of each entry in each element, (K or 1, e)."""
-        if len(self.entries) == 1:
-            return np.abs(self.entries)
-        return np.asarray(np.abs(self.entries).reshape(*mesh.points.shape, -1).max(axis=1))
+        entries = at_points(self.entries, mesh.size, mesh.rule.stages)
+        return np.asarray(np.abs(entries).max(axis=1))
 
     def full(self) -> Array:
         """With every entry, (N or 1, d, d)."""
@@ -336,18 +335,16 @@ def _terms(
     A: Sparse, f: Array, mesh: Mesh, values: Array, sizes: Array
 ) -> tuple[Array, Array]:
     """What right ends are made of, and what rounding of the equation's terms moves, (K, d, c)."""
-    K, points, n, _ = values.shape
+    K, points = values.shape[:2]
     h, late = mesh.steps[:, None, None], np.abs(mesh.edges[1:, None, None])
     within = A.product(A.sizes(mesh), sizes)
     moved = np.zeros_like(within)
     if len(A.entries) > 1:
         moved += A.product(np.ptp(A.entries.reshape(K, points, -1), axis=1), sizes)
     forced = slice(0, f.shape[2])
-    if len(f) == 1:
-        within[:, :, forced] += np.abs(f)
-    else:
-        within[:, :, forced] += np.abs(f).reshape(K, points, n, -1).max(axis=1)
-        moved[:, :, forced] += np.ptp(f.reshape(K, points, n, -1), axis=1)
+    f = at_points(f, K, points - 1)
+    within[:, :, forced] += np.abs(f).max(axis=1)
+    moved[:, :, forced] += np.ptp(f, axis=1)
     return np.abs(values[:, 0]) + h * within, h * within + late * moved
 
 

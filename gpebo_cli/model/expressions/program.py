@@ -8,7 +8,7 @@ float there, so it is computed while recording and costs nothing later.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,14 +30,6 @@ _GIVEN = 2  # rows that are always given: the times, and those at which jumps ar
 Key = tuple[int, int, int]  # operation and operands: rows, or constants as ~index
 
 
-def _either_way(name: str) -> tuple[Callable[[Row, Any], Row], Callable[[Row, Any], Row]]:
-    """An operator and its reflection, past NumPy: most of a recording are these."""
-    return (
-        lambda row, other: row.recorder.operation(name, row, other),
-        lambda row, other: row.recorder.operation(name, other, row),
-    )
-
-
 class Row(NDArrayOperatorsMixin):
     """A number at each of the times, of which only the origin is known."""
 
@@ -50,11 +42,6 @@ class Row(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: np.ufunc, _method: str, *inputs: Any, **_options: Any) -> Any:
         """Record what NumPy was asked to compute."""
         return self.recorder.operation(ufunc.__name__, *inputs)
-
-    __add__, __radd__ = _either_way("add")
-    __sub__, __rsub__ = _either_way("subtract")
-    __mul__, __rmul__ = _either_way("multiply")
-    __truediv__, __rtruediv__ = _either_way("divide")
 
     def astype(self, _type: type) -> Row:
         """This row: truth is 0 or 1 in a row."""
