@@ -195,8 +195,8 @@ def check_sizes(system: DescriptorSystem, t: Array) -> None:
             source = source.of_time if system.depends_on_outputs else source
             if system.n <= _FEW:
                 entries |= source.taylor(t, 0)._asdict()
-        flat = {name: distinct(values)[0].ravel() for name, values in entries.items()}
-        whole, E = np.concatenate([*flat.values()]), np.abs(flat.get("E", initial[:0]))
+        whole = np.concatenate([distinct(values)[0].ravel() for values in entries.values()])
+        E = np.abs(distinct(entries["E"])[0]) if "E" in entries else initial[:0]
         if whole.dot(whole) <= LARGEST and E[E > 0.0].min(initial=1.0) >= 1.0 / LARGEST:
             return  # no need to look at each
     named = {"initial_state": ("initial_state", system.states), "u": ("inputs", system.inputs),

@@ -339,10 +339,11 @@ def equal_lengths(h: Array) -> tuple[IntArray, Array]:
     """
     group = np.zeros(len(h), dtype=np.intp)
     if h.max(initial=0.0) - h.min(initial=np.inf) > _EQUAL * h.max(initial=0.0):
-        order = np.argsort(h, kind="stable")
-        group[order] = np.append(0, np.cumsum(np.diff(h[order]) > _EQUAL * h.max()))
-        first = np.unique(group, return_index=True)[1]
-        group = np.argsort(np.argsort(first))[group]
+        order = h.argsort(kind="stable")
+        ascending, longer = h[order], np.ones(len(h), dtype=bool)
+        longer[1:] = ascending[1:] - ascending[:-1] > _EQUAL * ascending[-1]
+        first = np.minimum.reduceat(order, longer.nonzero()[0])
+        group[order] = first.argsort().argsort()[longer.cumsum() - 1]
     return group, np.asarray((np.bincount(group, weights=h) / np.bincount(group))[group])
 
 

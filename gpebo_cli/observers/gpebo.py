@@ -147,9 +147,9 @@ class Gpebo:
             xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=form,
             unknown=self.unknown_initial, in_part=isinstance(self.remedy, Plain),
         )
-        return replace(
-            self.remedy.observe(replace(reduced, note=note or reduced.note)), bounds=self.bounds
-        )
+        reduced = replace(reduced, note=note) if note else reduced
+        found = self.remedy.observe(reduced)
+        return replace(found, bounds=self.bounds) if self.bounds else found
 
     def sampling(self) -> Sampling | None:
         """The samples that ``sample_time`` asks for."""

@@ -117,7 +117,8 @@ class EquationForm:
         along = plain.along(t, inside, signals, 0)
         # Functions from Python need have no derivatives.
         order = 0 if isinstance(system.coefficients, FunctionCoefficients) else _SEEN
-        return replace(plain, units=units_at(system.coefficients.taylor(t, order, inside, along)))
+        units = units_at(system.coefficients.taylor(t, order, inside, along))
+        return cls(system, units, inputs=inputs)
 
     @property
     def follows_signals(self) -> bool:

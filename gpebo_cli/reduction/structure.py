@@ -388,17 +388,16 @@ def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
     A dip is a local minimum far below the column's maximum, given as its column and its place;
     the deepest of each column come first. There is none in columns that are not finite.
     """
-    steady, dips = True, []
-    for column in (smallest.min(axis=0) < _DIP * smallest.max(axis=0)).nonzero()[0].tolist():
-        values = smallest[:, column]
-        if not np.isfinite(values).all():
-            continue
-        padded = np.concatenate([[np.inf], values, [np.inf]])
-        is_minimum = (values <= padded[:-2]) & (values <= padded[2:])
-        deep = np.flatnonzero(is_minimum & (values < _DIP * values.max()))
-        inner = (deep > 0) & (deep < len(values) - 1)
-        steady &= not inner.any() and bool((values >= _FALL * values.max()).all())
-        dips += [(column, int(k)) for k in deep[np.argsort(values[deep])][:_MOST_DIPS]]
+    steady, dips, size, least = True, [], smallest.max(axis=0), smallest.min(axis=0)
+    for column in ((least < _DIP * size) & np.isfinite(size)).nonzero()[0].tolist():
+        values, last = smallest[:, column], len(smallest) - 1
+        rises = values[1:] >= values[:-1]
+        deep = values < _DIP * size[column]
+        deep[:-1] &= rises
+        deep[1:] &= values[1:] <= values[:-1]
+        places = deep.nonzero()[0]
+        steady &= not deep[1:last].any() and bool(least[column] >= _FALL * size[column])
+        dips += [(column, k) for k in places[values[places].argsort()][:_MOST_DIPS].tolist()]
     return steady, dips
 
 
