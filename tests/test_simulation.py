@@ -354,8 +354,10 @@ def test_a_narrow_feature_of_an_otherwise_smooth_plant_is_noticed(place, where):
     entries = {"u": "1", "A": "-1/10", "E": "1"}
     entries[place] += f" + 3*{pulse}" if place != "A" else f" - 3*{pulse}"
     system = plant(
-        states=["x", "z"], inputs={"u": entries["u"]}, E=[[entries["E"], 0], [0, 0]],
-        A=[[entries["A"], 0], [1, -1]], B=[[1], [1]], initial_state=[1, 2],
+        states=["x", "v", "w", "z"], inputs={"u": entries["u"]},
+        E=[[entries["E"], 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]],
+        A=[[entries["A"], 0, 0, 0], [0, "-1/10", 0, 0], [0, 0, "-1/10", 0], [1, 0, 0, -1]],
+        B=[[1], [0], [0], [1]], initial_state=[1, 1, 1, 2],
     )
 
     def right(t, x):
@@ -370,9 +372,10 @@ def test_a_narrow_feature_of_an_otherwise_smooth_plant_is_noticed(place, where):
 
 
 def test_smooth_plants_are_solved_on_few_elements():
+    one = np.eye(3, dtype=int)
     system = plant(
-        states=["x"], inputs={"u": "sin(t)"}, E=[["2 + t"]], A=[["-1"]], B=[["t"]],
-        initial_state=[1],
+        states=["x", "y", "z"], inputs={"u": "sin(t)"}, A=(-one).tolist(), B=[["t"]] * 3,
+        E=[["2 + t" if same else 0 for same in row] for row in one], initial_state=[1, 2, 3],
     )
     few = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-6))
     many = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-13))

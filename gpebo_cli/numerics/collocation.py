@@ -273,12 +273,14 @@ def _element_maps(
         part = slice(i, i + chunk)
         if known is None:
             c = problem.coefficients(t[part].ravel(), inside[part].ravel())
+        elif len(h) <= chunk:
+            c = known
         else:
             c = _at_points(known, slice(i * (s + 1), (i + chunk) * (s + 1)))
         maps = _solve_elements(problem, mesh.rule, h[part], t[part], c)
-        piece = [maps.homogeneous, maps.particular, maps.noise, *maps.extras]
         if len(h) <= chunk:
             return maps
+        piece = [maps.homogeneous, maps.particular, maps.noise, *maps.extras]
         if not whole:
             whole = [
                 values if values.shape[:2] == (1, 1) else np.empty((len(h), *values.shape[1:]))
@@ -323,13 +325,13 @@ def _solve_elements(
     k, s = len(h), rule.stages
     extras = tuple([at_points(extra, k, s) for extra in c.extras])
     basis, offset = (None, None) if c.constraints is None else c.constraints
-    group = np.arange(k)
+    group, groups = np.arange(k), k
+    solve: Callable[..., tuple[Array, Array]] = elements.element_maps
     if _is_constant(c):
         group, h = equal_lengths(h)
-    groups = int(group.max(initial=-1)) + 1
-    solve: Callable[..., tuple[Array, Array]] = elements.element_maps
-    if _is_constant(c) and s * c.A.shape[1] > _DIRECT:
-        solve = partial(elements_numpy.element_maps, solve=solve_constant)
+        groups = int(group.max(initial=-1)) + 1
+        if s * c.A.shape[1] > _DIRECT:
+            solve = partial(elements_numpy.element_maps, solve=solve_constant)
     try:
         homogeneous, particular = solve(
             rule.differentiation, h, c.E, c.A, c.f, basis, offset, group, groups

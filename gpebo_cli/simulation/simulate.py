@@ -31,6 +31,7 @@ _SHARES = np.linspace(0.0, 1.0, 9)  # of the horizon, where numbers may be too l
 _LOOKED_AT = 32  # times at which the mixing of states is looked at
 _MOST_ALIKE, _LOOKED_AT_FOR_GROWTH = 6000, 2000  # elements: more are cut only where it grows
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
+_QUICK = 2  # differential equations, up to which elements are not joined
 _TINY = float(np.finfo(float).tiny)
 _LOOKS = 4  # at what entries do along a solution that is found closer and closer
 _SAME = 1e3  # tolerances, by which a closer look moves nothing
@@ -173,6 +174,7 @@ def _known_resolved(
     for the state on elements that are too long. Where nothing needs the elements that short, they
     are joined again: what is narrow has been looked for on the short ones. But not where the state
     may grow or decay much within one of them: an element that does not resolve growth may hide it.
+    And not where elements are solved sooner than it is seen that they can be joined.
     """
     def evaluated(mesh: Mesh) -> Coefficients:
         return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
@@ -189,7 +191,7 @@ def _known_resolved(
         system, evaluated, lambda t: system.coefficients.taylor(t, 0), mesh, c, beside, solver,
         bounded=bounded,
     )
-    if mesh is given and structure.steady:
+    if mesh is given and structure.steady and structure.d > _QUICK:
         mesh, c = known_joined(system, evaluated, mesh, c, cuts, MARGIN * solver.tol, longest)
     return mesh, c, terms
 
