@@ -67,6 +67,9 @@ def gain(
 class GainEstimator(ABC):
     """Settings of an estimator: fields declared by :func:`gain`, and where η̂ starts.
 
+    A gain is a number, a list or ``logspace(a, b, n)`` (one case each), or, where it may be one by
+    parameter, a mapping (one gain each).
+
     Attributes:
         initial: η̂ at the start, a number, one per parameter, or a mapping by parameter.
     """
@@ -183,14 +186,9 @@ def filtered_errors(
 ) -> ErrorSystem:
     """Errors of filters with s states behind Y, and of a law with q behind the filters.
 
-        δf' = −filters δf + into δY,      δs' = −law δs + forcing δf,      δη̂ = out δs
+        δf' = −filters δf + into δY,      δs' = −law δs + forcing δf,      δη̂ = out δs or δs
 
-    Args:
-        filters: rates (s,) or (N, s), or matrices (N, s, s).
-        into: (N, s, rows).
-        law: (N, q, q).
-        forcing: (N, q, s).
-        out: (N, p, q); None: δη̂ = δs.
+    Filters are rates (s,) or (N, s), or matrices (N, s, s); the others are matrices (N, …, …).
     """
     (count, s, rows), q = into.shape, law.shape[-1]
     A = np.zeros((count, s + q, s + q))

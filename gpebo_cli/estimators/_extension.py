@@ -26,10 +26,7 @@ def kreisselmeier(
 def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Trajectory:
     """``signal.low_pass(rate)`` on a mesh fine enough for the filter's own transient.
 
-    Args:
-        signal: to be filtered.
-        rate: λ of the filters in 1/s, (p,) or any shape that broadcasts against the signal.
-        start: of the filtered signal, of the shape of one value; None: 0.
+    λ in 1/s is (p,) or whatever broadcasts against the signal. It starts at 0 or ``start``.
     """
     edges = signal.mesh.edges
     smallest = 1e-13 * max(1.0, abs(float(edges[0])), abs(float(edges[-1])))
@@ -79,12 +76,7 @@ def averaged(regression: LinearRegression, delay: float, settle: float) -> Traje
 
     What a disturbance of Y has in common with a factor stays in the mean of that row; the rest
     vanishes as the mean is taken over longer and longer times. The mesh has edges where the delayed
-    ψ has.
-
-    Args:
-        regression: Y = ψη.
-        delay: d in seconds.
-        settle: T₀ in seconds.
+    ψ has; d and T₀ are in seconds.
     """
     edges = regression.mesh.edges
     later = edges[edges + delay < edges[-1]] + delay

@@ -45,8 +45,7 @@ class FilteredEstimator(ResumableEstimator):
     """Filters as the extension, then mixing and the scalar law.
 
     Attributes:
-        gamma: γ, a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
-            parameter (one gain each).
+        gamma: γ, also by parameter.
         rates: λ of the filters, a number, one per parameter, or a mapping by parameter; None is
             0.1, 0.2, 0.3, …, for three parameters the paper's choice.
     """

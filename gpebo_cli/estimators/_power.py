@@ -92,13 +92,10 @@ class PowerLaw:
     def _step(
         self, h: Array, eta: Array, gamma: Array, delta: Array, Y: Array, digits: Array
     ) -> tuple[Array, BoolArray]:
-        """Collocation of n laws over steps h (n,) of their own, along signals (n, s) each.
+        """η̂ (n, s + 1) of n laws over steps h (n,) along signals (n, s), and which are resolved.
 
         Unknown are w = ⌈r⌋^α at the nodes: ⌈w_i⌋^{1/α} = 𝐘_i − Δ_i η̂_i is smooth in them where a
         power of r is not, and η̂ follows by integration.
-
-        Returns:
-            η̂ (n, s + 1), and which are resolved.
         """
         path, rule = self.path, self.path.mesh.rule
         # Where 𝐘/Δ is rounding nothing is known, and the estimate does not move.

@@ -79,10 +79,7 @@ def spread(
 ) -> Estimator:
     """The estimator of some settings, of which plain numbers may be lists or ``logspace(a, b, n)``.
 
-    Args:
-        cls: the dataclass; its fields annotated ``float`` or ``int`` may be axes.
-        settings: by key.
-        build: makes one estimator.
+    These are fields of the dataclass annotated ``float`` or ``int``; ``build`` makes one estimator.
 
     Raises:
         ConfigError: a value is not a number.

@@ -55,8 +55,7 @@ class Exciting(GainEstimator):
     """Kreisselmeier filters, mixing, the new regressor, and η̂_i' = γ Φ_21 (e_2 − Φ_21 η̂_i).
 
     Attributes:
-        gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
-            parameter (one gain each).
+        gamma: γ, also by parameter.
         kappa: κ of the rotation, of the size of 1/∫Δ²; with a larger one Φ_21 is there earlier, and
             what comes later counts less.
         rates: λ of the filters, as of ``drem``.

@@ -33,8 +33,7 @@ class Gradient(ResumableEstimator):
     """η̂' = γ ψᵀ(Y − ψη̂): converges exponentially if and only if ψ is persistently exciting.
 
     Attributes:
-        gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
-            parameter (one gain each).
+        gamma: γ, also by parameter.
     """
 
     gamma: object = gain(10.0, by_parameter=True)

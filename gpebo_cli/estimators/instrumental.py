@@ -38,8 +38,7 @@ class Instrumental(GainEstimator):
     """Means of products with a delayed ψ, mixing, and η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i).
 
     Attributes:
-        gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
-            parameter (one gain each).
+        gamma: γ, also by parameter.
         delay: d of the instrument in seconds.
         settle: T₀ of the means in seconds.
     """

@@ -42,9 +42,9 @@ class LeastSquares(ResumableEstimator):
     Without forgetting η̂ = (f₀ I + α G)⁻¹ (f₀ η̂₀ + α h): it converges as f₀/(α λ_min(G)).
 
     Attributes:
-        alpha: α > 0; a number, a list, or ``logspace(a, b, n)``.
-        f0: f₀ > 0, given in the same ways.
-        beta: forgetting rate ≥ 0, given in the same ways; 0 remembers everything.
+        alpha: α > 0.
+        f0: f₀ > 0.
+        beta: forgetting rate ≥ 0; 0 remembers everything.
         bound: M ≥ 1/f₀ of β (1 − ‖F‖/M), or None for constant forgetting.
     """
 

@@ -38,8 +38,8 @@ class LsDrem(ResumableEstimator):
     Δ is not square integrable: a γ of order 1 does what 1e10 does behind fading filters.
 
     Attributes:
-        gamma: γ; a number, a list, ``logspace(a, b, n)``, or a mapping by parameter; None: 10, or
-            ten times the least that turns out to be needed, where that is more.
+        gamma: γ, also by parameter; None: 10, or ten times the least that turns out to be needed,
+            where that is more.
         alpha, f0, beta, bound: of the least-squares part, see ``least_squares``.
         initial: η̂ (and ĝ) at the start.
     """

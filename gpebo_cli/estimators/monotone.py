@@ -52,7 +52,7 @@ class Monotone(GainEstimator):
     """Kreisselmeier filters, mixing, and the gradient law of the unknowns θ themselves.
 
     Attributes:
-        gamma: γ; a number, a list (one case each), or ``logspace(a, b, n)``.
+        gamma: γ.
         T: a row for each unknown, an entry for each of S; None: the pseudoinverse of ∇S in the
             middle of the box.
         rates: λ of the filters, as of ``drem``.

@@ -42,8 +42,7 @@ class MemoryExtension(ResumableEstimator):
     One λ for all rows: Ω is then symmetric and positive semidefinite, which the law needs.
 
     Attributes:
-        gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
-            parameter (one gain each).
+        gamma: γ, also by parameter.
         rate: λ of the filters.
     """
 

@@ -35,8 +35,7 @@ class Power(ResumableEstimator):
     """Kreisselmeier filters, mixing, and a power of each scalar residual.
 
     Attributes:
-        gamma: γ; a number, a list (one case each), ``logspace(a, b, n)``, or a mapping by
-            parameter (one gain each).
+        gamma: γ, also by parameter.
         alpha: α, between 0 and 1.
         gamma2: γ₂; 0 is the finite-time law, more than 0 the fixed-time one.
         beta: β, above 1.

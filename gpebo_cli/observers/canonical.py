@@ -244,12 +244,7 @@ def unknown_input_matrices(
 ) -> tuple[Array, Array, Array]:
     """M_w (…, 2, 2), M_w G_w + L_w − Ġ_w (…, 2) and [I − G_w c⊤] d_w (…, 2).
 
-    Args:
-        c: (c1, c2), shape (…, 2).
-        dc: its derivative, (…, 2).
-        N: (…, 3, 3).
-        f_b: (…, 3).
-        L: L_w, (…, 2).
+    From c = (c1, c2) and ċ (…, 2), N (…, 3, 3), f_b (…, 3) and L_w (…, 2).
     """
     c1, c2, dc1, dc2 = c[..., 0], c[..., 1], dc[..., 0], dc[..., 1]
     a1 = 1.0 / N[..., 1, 0]

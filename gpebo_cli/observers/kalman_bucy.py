@@ -168,11 +168,7 @@ def noise_model(
 ) -> NoiseModel:
     """Intensities; V is regularised if at some time it is below what regularises it.
 
-    Args:
-        s: at the times by which to judge.
-        noise: of the signals.
-        process: intensities (n,).
-        regularisation: standard deviation, relative to the size of each row.
+    That is a standard deviation relative to the size of each row. ``process`` is (n,).
     """
     size = np.abs(s.g_y).max(axis=0)
     # A row without data, 0 = c ζ, is as exact as the largest one.

@@ -48,14 +48,9 @@ class SampledRegression:
 
 
 def delayed(past: Past, t: Array, x: Array, delay: float, hold: str) -> tuple[Array, Past]:
-    """x(t − d) (K, c) as the hold has it, zero before the first sample of all.
+    """x(t − d) (K, c) as the hold has it, zero before the first sample of all, d in seconds.
 
-    Args:
-        past: what the last call gave; at first the first sample alone.
-        t: times of the samples (K,).
-        x: the samples (K, c).
-        delay: d in seconds.
-        hold: zoh or linear.
+    Samples (K, c) are at t (K,); the past is what the last call gave, at first the first one alone.
     """
     new, at = t > past[0][-1], t - delay
     times, values = np.append(past[0], t[new]), np.append(past[1], x[new], axis=0)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -107,16 +108,10 @@ class TextRegression:
     def on(
         self, signals: Trajectory, Y: Trajectory | None, tol: float, max_elements: int
     ) -> tuple[LinearRegression, float]:
-        """The regression along signals, on a mesh that resolves all that it is made of.
+        """The regression along signals (m,), on a mesh that resolves all that it is made of.
 
-        Args:
-            signals: (m,) by the system's inputs.
-            Y: (rows,) where the text has none.
-            tol: relative to each signal's own size.
-            max_elements: refuse to go beyond.
-
-        Returns:
-            The regression and the error estimate of its signals.
+        Y (rows,) is needed where the text has none. ``tol`` is relative to each signal's own size;
+        beside the regression comes the error estimate of its signals.
 
         Raises:
             ConfigError: an expression without a finite value; names it and the time.
@@ -153,7 +148,9 @@ class TextRegression:
         """The signals' mesh with an edge wherever a delayed signal jumps or has a kink."""
         mesh = signals.mesh
         start, stop = float(mesh.edges[0]), float(mesh.edges[-1])
-        found = [self.system.coefficients.breakpoints(start, stop), _jumps(signals)]
+        jumps, size = signals.values[1:, 0] - signals.values[:-1, -1], signals.values
+        jumped = (np.abs(jumps) > 1e-9 * largest_over_time(size, 2)).any(axis=1)
+        found = [self.system.coefficients.breakpoints(start, stop), mesh.edges[1:-1][jumped]]
         cuts = np.concatenate(found + [breakpoints(tape, start, stop) for tape in self.tapes])
         for operator in self.operators:
             if operator.name == "delay":
@@ -185,14 +182,6 @@ class TextRegression:
         return np.asarray(tape.taylor(mesh.points.ravel(), 0, mesh.inside.ravel(), columns)[0])
 
 
-def _jumps(signals: Trajectory) -> Array:
-    """Edges at which some signal jumps by more than rounding."""
-    left, right = signals.values[:-1, -1], signals.values[1:, 0]
-    size = largest_over_time(signals.values, 2)
-    found = (np.abs(right - left) > 1e-9 * size).any(axis=1)
-    return np.asarray(signals.mesh.edges[1:-1][found])
-
-
 class _Operators:
     """Collects the operators that are met while texts are parsed; equal ones are one."""
 
@@ -200,11 +189,9 @@ class _Operators:
         self.found: dict[tuple[object, ...], Operator] = {}
         self._signals = signals
         self.calls: dict[str, tuple[int, Callable[..., Node]]] = {
-            "lp": (2, lambda x, rate: self._node("lp", x, rate)),
-            "hp": (2, lambda x, rate: self._node("hp", x, rate)),
-            "delay": (2, lambda x, time: self._node("delay", x, time)),
-            "integral": (1, lambda x: self._node("integral", x, nodes.number(0.0))),
+            name: (2, partial(self._node, name)) for name in ("lp", "hp", "delay")
         }
+        self.calls["integral"] = 1, lambda x: self._node("integral", x, nodes.number(0.0))
 
     def _node(self, name: str, argument: Node, number: Node) -> Node:
         what = "its rate λ" if name in ("lp", "hp") else "the delay"
@@ -343,11 +330,7 @@ def _parametrisation(
 
 
 def system_from_mapping(mapping: Mapping[str, object], source: str = "") -> DescriptorSystem:
-    """The plant, or the regression in place of one, that a file describes.
-
-    Args:
-        mapping: of a plant file, or with ``psi`` of a regression file.
-        source: the file, for messages.
+    """The plant, or with ``psi`` the regression in place of one, that a file describes.
 
     Raises:
         ConfigError: whatever is wrong in it.

@@ -116,12 +116,8 @@ def _window(
 ) -> tuple[Trajectory, int, float, float]:
     """Newton's method over one window, from a state that does not move.
 
-    Returns:
-        the last iterate, how many there were, what they cost in solutions to the full tolerance,
-        and the change that one more is expected to make.
-
-    Raises:
-        SolverError: it does not converge.
+    What comes is the last iterate, how many there were, what they cost in solutions to the full
+    tolerance, and the change that one more is expected to make.
     """
     guess = _at_rest(system.initial_state, time.start, time.horizon, solver)
     before, work = np.inf, 0.0

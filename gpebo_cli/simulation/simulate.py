@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
 from gpebo_cli.model.text import TextCoefficients
-from gpebo_cli.numerics.collocation import LinearSolution, solve
+from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory
@@ -121,6 +122,12 @@ def _simulate_linear(
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         return _equations(strangeness_free_form(system, structure, t, inside))
 
+    def explicit(t: Array, inside: Array) -> LinearEquation:
+        A, f = ivp.underlying_ode(system, structure, t, inside)
+        c = system.coefficients.taylor(t, 0, inside)
+        seen = c.u[0], c.C[0], direct_part(c, system.coefficients.zero)
+        return LinearEquation(None, A, f[:, :, None], tuple(e for e in seen if e is not None))
+
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[Kind]:
         u, C, *direct = extras
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
@@ -139,13 +146,13 @@ def _simulate_linear(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
         _amplification(first, structure.scaling.columns, float(mesh.steps.max())), apart=True,
     )
-    if solver.name == "ivp":
-        solution = _integrate(system, structure, problem, mesh, solver, restarts)
-    else:
-        solution = solve(
-            problem, mesh, tol=solver.tol, max_elements=solver.max_elements, restarts=restarts,
-            known=_equations(first),
-        )
+    independent = solver.name == "ivp"  # the underlying ODE of the derivative array, by scipy
+    if independent:
+        problem = replace(problem, coefficients=explicit)
+    own = ivp.solve if independent else partial(solve, known=_equations(first))
+    solution = own(
+        problem, mesh, tol=solver.tol, max_elements=solver.max_elements, restarts=restarts
+    )
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
     u, C, *direct = solution.extras
@@ -304,21 +311,3 @@ def _outputs(C: Array, x: Array, direct: Array | None = None) -> Array:
     else:
         y = np.matmul(C, x[..., None])[..., 0]
     return np.asarray(y if direct is None else y + direct)
-
-
-def _integrate(
-    system: DescriptorSystem, structure: Structure, problem: LinearProblem, mesh: Mesh,
-    solver: SolverSettings, restarts: dict[float, Callable[[Array], Array]],
-) -> LinearSolution:
-    """The independent path: the underlying ODE of the derivative array, by scipy."""
-
-    def explicit(t: Array, inside: Array) -> LinearEquation:
-        A, f = ivp.underlying_ode(system, structure, t, inside)
-        c = system.coefficients.taylor(t, 0, inside)
-        seen = c.u[0], c.C[0], direct_part(c, system.coefficients.zero)
-        return LinearEquation(None, A, f[:, :, None], tuple(e for e in seen if e is not None))
-
-    ode = replace(problem, coefficients=explicit)
-    return ivp.solve(
-        ode, mesh, tol=solver.tol, max_elements=solver.max_elements, restarts=restarts
-    )
