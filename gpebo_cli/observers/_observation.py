@@ -111,6 +111,8 @@ class InitialError:
     Y = ψη still holds at every time:
 
         e₀(t) = Φ⁺ (ξ_a + ξ_b θ(t) − w),      e₀' = Φ⁺ ξ_b θ'.
+
+    Where the extension starts again later on, e₀ is that of the last start before a time.
     """
 
     initial_dual: Array  # (n_a, n) V1⁺P, V1 a basis of range P(start)
@@ -118,20 +120,23 @@ class InitialError:
     dual: Array  # (k, n) that gives the coordinates of the extension, k = n_a or n
     extension: Callable[[Array], Array]  # times (M,) -> [ξ_a | ξ_b | Φ], (M, k, 1 + p)
     units: Array | None = None  # (k,) of those, in which P is an orthogonal projector; None: ones
+    later: tuple[tuple[float, Array, Array], ...] = ()  # time, V1⁺P (n_a, n) and ξ_a0 (n_a,) there
 
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """η at the times t (M,), shape (M, p)."""
-        if _is_constant(theta) or np.isnan(theta).any():
-            start = states.values[0, 0]
-            # A state that nobody knows (NaN) does not spoil components it has no part in.
-            parts = np.where(self.initial_dual == 0.0, 0.0, self.initial_dual * start)
-            e0 = self.xi_a0 - parts.sum(axis=1)
-            eta = np.empty((len(t), theta.shape[1] + len(e0)))
-            eta[:, : theta.shape[1]], eta[:, theta.shape[1] :] = theta, e0
-            return eta
-        z = states(t) @ self.dual.T
-        e0 = error_of_extension(self.extension(t), theta, z, self.units)
-        return np.concatenate([theta, e0], axis=1)
+        if not (_is_constant(theta) or np.isnan(theta).any()):
+            z = states(t) @ self.dual.T
+            e0 = error_of_extension(self.extension(t), theta, z, self.units)
+            return np.concatenate([theta, e0], axis=1)
+        times = np.array([start[0] for start in self.later])
+        starts = [(self.initial_dual, self.xi_a0), *(start[1:] for start in self.later)]
+        x = [states.values[0, 0], *(states(times) if self.later else ())]
+        # A state that nobody knows (NaN) does not spoil components it has no part in.
+        e0 = np.array([
+            xi_a0 - np.where(dual == 0.0, 0.0, dual * own).sum(axis=1)
+            for (dual, xi_a0), own in zip(starts, x, strict=True)
+        ])
+        return np.concatenate([theta, e0[np.searchsorted(times, t, side="right")]], axis=1)
 
 
 def _is_constant(theta: Array) -> bool:

@@ -25,9 +25,9 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import largest
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._observation import Observation, error_of_extension, log_norm
+from gpebo_cli.observers._observation import InitialError, Observation, log_norm
 from gpebo_cli.observers.reduced.extension import Extension, ReducedSystem, Start, extend, joined
 from gpebo_cli.observers.reduced.split import comparable
 from gpebo_cli.observers.remedies.plain import observation
@@ -67,83 +67,40 @@ class Resets:
         mesh, times = _with_edges(reduced.mesh, reset_times(reduced, self))
         cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
         p = reduced.system.q + len(reduced.begin.names)
-        starts = [_Start(float(mesh.edges[0]), reduced.begin, reduced.xi_a)]
+        begin, xi_a, dual = reduced.begin, reduced.xi_a, reduced.first.split.dual
+        later: list[tuple[float, Array, Array]] = []
         extensions: list[Extension] = []
         resets: list[Reset] = []
         known = ExtensionState(np.zeros((p, p + 1)), 0.0)
         for first, last in pairwise(cuts):
             piece = Mesh(mesh.edges[first : last + 1], mesh.rule) if len(times) else mesh
-            start = starts[-1]
-            begun = start.begin.extension(reduced.first.split.dual, start.xi_a)
-            extensions.append(extend(reduced, piece, begun))
+            extensions.append(extend(reduced, piece, begin.extension(dual, xi_a)))
             if last == mesh.size:
                 break
-            known = _learned(extensions[-1], known)
+            shown = extensions[-1].assembled
+            learned = extensions[-1].mesh.trajectory(outer_products(shown.psi, shown.Y))
+            own = learned.integral().final
+            known = ExtensionState(known.values + own, max(known.level, largest(own)))
             time = float(mesh.edges[last])
             begin = reduced.start_at(time, float(mesh.inside[last, 0]))
-            reset, start = _restart(reduced, extensions[-1], known, time, begin)
-            reset = replace(reset, keep=self.keep)
-            known = known.after(reset)
-            resets.append(reset)
-            starts.append(start)
+            reset, xi_a = _restart(reduced, extensions[-1], known, time, begin)
+            resets.append(replace(reset, keep=self.keep))
+            known = known.after(resets[-1])
+            later.append((time, begin.dual, begin.dual @ xi_a))
         segments = joined(extensions, reduced.mesh.size)
         growth, logarithms = zip(*(e.growth(reduced.system.q) for e in extensions), strict=True)
-        truth = SegmentErrors(
-            tuple(starts), reduced.first.split.dual, reduced.units, segments.trajectory
+        at_start = reduced.begin.dual
+        truth = InitialError(
+            at_start, at_start @ reduced.xi_a, dual, segments.trajectory, reduced.units,
+            tuple(later),
         )
         return observation(reduced, segments, max(growth), sum(logarithms), truth, tuple(resets))
 
 
-@dataclass(frozen=True, eq=False)
-class _Start:
-    """Where a segment begins: e = V⁺(ξ_a − w(time))."""
-
-    time: float
-    begin: Start
-    xi_a: Array  # (n,)
-
-
-@dataclass(frozen=True, eq=False)
-class SegmentErrors:
-    """η = (θ, e) with e = V⁺P(ξ_a − x) at the start of the segment that a time belongs to.
-
-    If θ varies within segments, e does too, see ``InitialError``.
-    """
-
-    starts: tuple[_Start, ...]
-    dual: Array  # (k, n)
-    units: Array  # (k,)
-    extension: Trajectory  # [ξ_a | ξ_b | Φ] of all segments, (k, 1 + p)
-
-    def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
-        """η at the times t (M,), shape (M, p)."""
-        if (np.diff(theta, axis=0) != 0.0).any() and not np.isnan(theta).any():
-            z = states(t) @ self.dual.T
-            e = error_of_extension(self.extension(t), theta, z, self.units)
-            return np.concatenate([theta, e], axis=1)
-        first = np.array([start.time for start in self.starts])
-        x = states(first)
-        x[0] = states.values[0, 0]
-        # A state that nobody knows (NaN) does not spoil components it has no part in.
-        errors = np.array([
-            np.where(s.begin.dual == 0.0, 0.0, s.begin.dual * (s.xi_a - own)).sum(axis=1)
-            for s, own in zip(self.starts, x, strict=True)
-        ])
-        segment = np.searchsorted(first[1:], t, side="right")
-        return np.concatenate([theta, errors[segment]], axis=1)
-
-
-def _learned(extension: Extension, known: ExtensionState) -> ExtensionState:
-    """[G | h] at the end of a segment."""
-    a = extension.assembled
-    own = extension.mesh.trajectory(outer_products(a.psi, a.Y)).integral().final
-    return ExtensionState(known.values + own, max(known.level, largest(own)))
-
-
 def _restart(
     reduced: ReducedSystem, extension: Extension, known: ExtensionState, time: float, begin: Start
-) -> tuple[Reset, _Start]:
-    """T and τ from [ξ_a | ξ_b | Φ] at the end, and where the next segment begins."""
+) -> tuple[Reset, Array]:
+    """T and τ from [ξ_a | ξ_b | Φ] at the end, and ξ_a (n,) where the next segment begins."""
     q, dual = reduced.system.q, begin.dual
     end = reduced.basis @ extension.trajectory.final
     xi_a, xi_b, Phi = end[:, 0], end[:, 1 : 1 + q], end[:, 1 + q :]
@@ -156,7 +113,7 @@ def _restart(
     shift = np.concatenate([np.zeros(q), dual @ (after - xi_a)])
     floor = _FLOOR * max(float(np.abs(part).max(initial=0.0)) for part in (eta[:q], after))
     errors = np.concatenate([np.zeros((q, reduced.basis.shape[1])), dual @ reduced.basis])
-    return Reset(time, transform, shift, floor, errors=errors), _Start(time, begin, after)
+    return Reset(time, transform, shift, floor, errors=errors), after
 
 
 def reset_times(reduced: ReducedSystem, settings: Resets) -> Array:
