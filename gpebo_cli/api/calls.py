@@ -14,6 +14,7 @@ from gpebo_cli import observers
 from gpebo_cli.api.choice import choose, plain, primary
 from gpebo_cli.api.result import Result
 from gpebo_cli.configs import configuration
+from gpebo_cli.configs.files import is_file
 from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import Estimator, settings_of
@@ -253,7 +254,8 @@ def _configure(
     else:
         content, source = choose("plant", plant, config_dir)
         config["plant"] = plain(located(content, source))
-        ours = config_dir is None and isinstance(plant, str) and plant in _shipped_plants()
+        ours = config_dir is None and isinstance(plant, str)
+        ours = ours and is_file(conf_folder(), f"plant/{plant}")
         system = _shipped(str(plant)) if ours else system_from_mapping(content, source)
     for name in _CHOSEN:
         config[name], _ = choose(name, sections[name], config_dir)
@@ -262,11 +264,6 @@ def _configure(
     settings = configuration.settings(config, draw=True)
     config["data"].pop("frame", None)  # no data of a configuration
     return configuration.complete(config, settings), system, settings
-
-
-@cache
-def _shipped_plants() -> frozenset[str]:
-    return frozenset(choices(conf_folder(), "plant", inside=True))
 
 
 @cache

@@ -97,16 +97,10 @@ NO_WORDS = Arguments()
 
 
 def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> Arguments:
-    """Sort the words of the command line.
+    """Sort the words behind a command that takes those of ``gpebo run``, and ``more`` switches.
 
-    Args:
-        words: after the command.
-        command: its name, for messages.
-        more: switches that the command has besides those of ``gpebo run``.
-
-    Raises:
-        ConfigError: an unknown flag, a flag without its value, a folder or a primary
-            configuration that does not exist.
+    A ConfigError tells of an unknown flag, a flag without its value, a folder or a primary
+    configuration that does not exist.
     """
     for word in words:
         if any("\ud800" <= character <= "\udfff" for character in word):

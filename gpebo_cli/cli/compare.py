@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -76,7 +75,8 @@ def main(words: list[str]) -> int:
     if "--no-figures" not in arguments.switches:
         from gpebo_cli.results.style import save
 
-        folder = Path(arguments.values.get("--output") or _new_folder())
+        stamp = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S-%f")
+        folder = Path(arguments.values.get("--output", f"outputs/comparisons/{stamp}"))
         make_folder(folder)
         for name, figure in comparison.figures(cases, sort if sort in metrics else best):
             path = folder / f"{name}.png"
@@ -102,8 +102,3 @@ def _cases(name: str) -> list[Case]:
             )
         cases += found.cases
     return cases
-
-
-def _new_folder() -> str:
-    stamp = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S-%f")
-    return os.path.join("outputs", "comparisons", stamp)

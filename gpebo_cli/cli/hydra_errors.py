@@ -61,7 +61,12 @@ def _missing(error: MissingConfigException, arguments: Arguments) -> str:
     if not group:
         return _one_line(str(error))
     if group.partition("/")[0] in GROUPS and ("/" in group or name.endswith(".yaml")):
-        return _a_path((error.missing_cfg_file or "").partition("/"))
+        chosen, _, path = (error.missing_cfg_file or "").partition("/")
+        own = f"--config-dir {os.path.dirname(os.path.dirname(path)) or '.'}"
+        return (
+            f"{chosen}={path}: give the name of a file in the folder {chosen} of a --config-dir, "
+            f"not its path; write {own} {chosen}={os.path.basename(path).removesuffix('.yaml')}"
+        )
     if group == "hydra/launcher" and name in _EXTRAS:
         return f"{group}={name} is not installed; pip install 'gpebo[{_EXTRAS[name]}]'"
     folders = [folder for folder in arguments.folders if is_group(folder, group)]
@@ -77,17 +82,6 @@ def _missing(error: MissingConfigException, arguments: Arguments) -> str:
     if not hint and arguments.config_dir is None and group in GROUPS:
         hint = f" (yours: --config-dir DIR with DIR/{group}/{name}.yaml)"
     return text + hint
-
-
-def _a_path(parts: tuple[str, str, str]) -> str:
-    """The message for a choice that is the path of a file instead of its name."""
-    group, _, path = parts
-    name = os.path.basename(path).removesuffix(".yaml")
-    folder = os.path.dirname(os.path.dirname(path)) or "."
-    return (
-        f"{group}={path}: give the name of a file in the folder {group} of a --config-dir, not its "
-        f"path; write --config-dir {folder} {group}={name}"
-    )
 
 
 def _unparsable(error: OverrideParseException, arguments: Arguments) -> str:

@@ -33,10 +33,7 @@ class Job:
 
 
 def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
-    """The job that ``cfg`` describes, with or without Hydra's section.
-
-    ``draw``: whether figures are drawn unless the configuration says otherwise.
-    """
+    """The job that ``cfg`` describes; figures are drawn if it, or else ``draw``, says so."""
     config = composition.plain(cfg)
     settings = configuration.settings(config, draw=draw)
 

@@ -66,17 +66,10 @@ PLAIN = Options({}, frozenset(), ())
 def parse(
     command: str, words: Sequence[str], values: Mapping[str, str], switches: Collection[str] = ()
 ) -> Options:
-    """Sort the words of ``gpebo <command>``.
+    """Sort the words of ``gpebo <command>``, all options by their long names.
 
-    Args:
-        command: its name, for messages.
-        words: what follows it.
-        values: long names of options that have a value, ``--option VALUE`` or ``--option=VALUE``,
-            and what the value is: "a folder".
-        switches: long names of options that have none.
-
-    Raises:
-        ConfigError: an unknown option, or one without its value.
+    Those with a value, ``--option VALUE`` or ``--option=VALUE``, come with what it is: "a folder"
+    (ConfigError: an unknown option, or one without its value).
     """
     given: dict[str, str] = {}
     switched: set[str] = set()

@@ -217,8 +217,7 @@ def _unquoted(value: str) -> str:
 def _digest(config: DictConfig) -> str:
     """Digest of everything the jobs share: a resumed sweep must not mix two versions of a plant."""
     content = OmegaConf.to_container(config, resolve=False)
-    assert isinstance(content, dict)  # noqa: S101  for the type checker: a DictConfig is one
-    content.pop("hydra", None)
+    cast("dict[str, Any]", content).pop("hydra", None)
     text = OmegaConf.to_yaml(OmegaConf.create(content), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -92,8 +92,14 @@ def _wait(thread: Thread, patience: float) -> None:
 
 def follow(starter: int) -> None:
     """End this process as soon as ``starter``, which it descends from, has ended."""
+
+    def watch() -> None:
+        while starter in ancestors():
+            sleep(_INTERVAL)
+        os._exit(1)
+
     if starter != os.getpid() and starter in ancestors():
-        Thread(target=_follow, args=(starter,), daemon=True).start()
+        Thread(target=watch, daemon=True).start()
 
 
 def follow_or_end(starter: int) -> None:
@@ -101,12 +107,6 @@ def follow_or_end(starter: int) -> None:
     if starter not in ancestors():
         os._exit(1)
     follow(starter)
-
-
-def _follow(starter: int) -> None:
-    while starter in ancestors():
-        sleep(_INTERVAL)
-    os._exit(1)
 
 
 def ancestors() -> list[int]:

@@ -60,17 +60,13 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
         noise=read(NoiseSettings, _group(config, "noise"), "noise"),
         uncertainty=convert(config.get("uncertainty", True), bool, "uncertainty"),
     )
-    _check_no_noise(built.noise)
-    return built
-
-
-def _check_no_noise(noise: NoiseSettings) -> None:
-    """A recipe may set levels of a file that the command line then replaces by none."""
-    if noise.name == "none" and noise != NoiseSettings():
+    noise = built.noise
+    if noise.name == "none" and noise != NoiseSettings():  # a recipe sets a level, another none
         keys = [key for key, value in vars(noise).items() if value != getattr(NoiseSettings, key)]
         raise ConfigError(
             f"noise.{keys[0]}: noise=none has no noise; leave it out, or choose noise=gaussian"
         )
+    return built
 
 
 def _group(config: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -64,16 +64,9 @@ def bounded(
 ) -> BoundedEstimates:
     """The estimates of some parameters, moved to where they respect ``observer.bounds``.
 
-    Args:
-        given: the setting: of ``states`` and ``unknowns``, by name [low, high].
-        system: the plant.
-        observation: what the observer made of the signals, without resets.
-        columns: of its parameters that are estimated.
-        estimates: at the times t.
-        t: (M,), ascending.
-
-    Raises:
-        ConfigError: an unknown name, or a pair that is no range.
+    ``given`` is the setting: of ``states`` and ``unknowns``, by name [low, high]. The observation
+    has no resets; the estimates of some ``columns`` of its parameters are at ascending times t
+    (M,) (ConfigError: an unknown name, or a pair that is no range).
     """
     state_map, p = observation.state_map, observation.regression.p
     if not isinstance(state_map, AffineStateMap):
@@ -169,7 +162,11 @@ class BoundedEstimates:
                     np.array([row.level - row.normal @ free for row in rows]),
                 )
                 if z is None:
-                    raise ConfigError(_refusal(rows, float(self.t[k])))
+                    names = ", ".join(dict.fromkeys(row.side.name for row in rows))
+                    raise ConfigError(
+                        f"observer.bounds: no estimate respects those of {names} together with "
+                        f"the data up to t = {self.t[k]:.6g}"
+                    )
                 active = [rows[i] for i in used]
                 eta[k] = free + vectors @ (z / root)
                 new = self._violated(
@@ -268,11 +265,3 @@ def _least_distance(A: Array, b: Array) -> tuple[Array | None, IntArray]:
     # Again from the rows that hold it, to all digits.
     z = np.asarray(np.linalg.lstsq(A[used], b[used], rcond=None)[0], dtype=np.float64)
     return z, used
-
-
-def _refusal(rows: Sequence[_Row], t: float) -> str:
-    names = dict.fromkeys(row.side.name for row in rows)
-    return (
-        f"observer.bounds: no estimate respects those of {', '.join(names)} together with the data "
-        f"up to t = {t:.6g}"
-    )

@@ -70,15 +70,8 @@ def over_seeds(
 ) -> NoiseStatistics:
     """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, … of all cases.
 
-    Args:
-        observation: made from the noisy signals of ``seed``.
-        observe: makes one from measured signals.
-        signals: the true ones.
-        theta: true values of the unknowns at the horizon, (1, q).
-        estimator: of these cases.
-        settings: of the noise.
-        levels: of the noise.
-        pace: of the loop over seeds.
+    The observation is of the noisy signals of ``seed``, ``observe`` makes others, ``signals`` are
+    the true ones, and ``theta`` (1, q) is what the unknowns really are at the horizon.
     """
     horizon = observation.regression.mesh.edges[-1:]
     seeds = range(settings.seed, settings.seed + settings.seeds)

@@ -56,7 +56,7 @@ class Source:
 def simulated(
     settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None
 ) -> Source:
-    """Signals of the plant, for an observer that runs at ``samples`` or in continuous time."""
+    """Signals of the plant, for an observer at ``samples`` or in continuous time (ConfigError)."""
     start = settings.time.start
     t = _grid(settings, samples, start, start + settings.time.horizon)
     simulation = simulation_of(system, settings.time, settings.solver)
@@ -69,8 +69,13 @@ def simulated(
             measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
             measured_outputs=np.where(levels.noisy_outputs, measured.outputs(t), simulated.outputs),
         )
-    if settings.observer["name"] != "none":
-        _refuse_impulses(system, simulated)
+    if simulated.impulses and settings.observer["name"] != "none":
+        when, state = simulated.impulses[0]
+        raise ConfigError(
+            f"plant {system.name}: the jump of the input at t = {when:.6g} puts an impulse into "
+            f"{state}; an observer cannot be driven by it. Use a continuous input, or "
+            "observer=none to simulate only"
+        )
     return Source(
         t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
         theta=system.theta_at, judged=_judged(system),
@@ -247,16 +252,6 @@ def _changes(
         )
         if abs(new - old) > least
     ]
-
-
-def _refuse_impulses(system: DescriptorSystem, simulated: SimulationResult) -> None:
-    if simulated.impulses:
-        t, state = simulated.impulses[0]
-        raise ConfigError(
-            f"plant {system.name}: the jump of the input at t = {t:.6g} puts an impulse into "
-            f"{state}; an observer cannot be driven by it. Use a continuous input, or "
-            "observer=none to simulate only"
-        )
 
 
 def kept_samples(cases: int, samples: int, max_rows: int) -> IntArray:

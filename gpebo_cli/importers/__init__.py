@@ -72,7 +72,15 @@ def from_file(
     if file.suffix.lower() in NETLISTS:
         return from_netlist(file, name, measure=measure, unknown=unknown)
     if file.suffix.lower() in (".yaml", ".yml"):
-        draft = from_mechanics(_yaml(file), name, str(path))
+        import yaml
+
+        try:
+            content = yaml.safe_load(read_text(path, _MAX_TEXT))
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{path} is not YAML ({' '.join(str(error).split())})") from None
+        if not isinstance(content, dict):
+            raise ConfigError(f"{path}: expected a mapping with M, D, K, G")
+        draft = from_mechanics(content, name, str(path))
     else:
         found: dict[str, Any] = read_matrices(file)
         matrices = {key: found.pop(key) for key in "EABCD" if key in found}
@@ -81,15 +89,3 @@ def from_file(
         draft.measure(split_names(measure), f"{path}: ")
     draft.make_unknown(split_names(unknown))
     return draft
-
-
-def _yaml(path: Path) -> dict[str, object]:
-    import yaml
-
-    try:
-        content = yaml.safe_load(read_text(path, _MAX_TEXT))
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not YAML ({' '.join(str(error).split())})") from None
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path}: expected a mapping with M, D, K, G")
-    return content

@@ -121,10 +121,6 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
 
 
-def _place_in_plant(e: Element) -> tuple[int, list[tuple[int, int, str]]]:
-    return _ORDER.index(e.kind), _natural(e.name)
-
-
 def _reserved(name: str) -> bool:
     return name in RESERVED or keyword.iskeyword(name)
 
@@ -187,9 +183,10 @@ class _Builder:
     def __init__(self, netlist: Netlist, name: str, file: str, measured: Sequence[str]) -> None:
         self.file = file
         # The plant does not depend on the order of the lines, nor do roundings of its solution.
-        self.netlist = netlist = replace(
-            netlist, elements=tuple(sorted(netlist.elements, key=_place_in_plant))
+        elements = sorted(
+            netlist.elements, key=lambda e: (_ORDER.index(e.kind), _natural(e.name))
         )
+        self.netlist = netlist = replace(netlist, elements=tuple(elements))
         self.draft = PlantDraft(name, title=netlist.title or f"circuit {name}", reference=file)
         self.draft.comments.append(f"Modified nodal analysis of {file}.")
         self.elements = {e.name.lower(): e for e in netlist.elements}

@@ -145,7 +145,10 @@ class PlantDraft:
             for name, (_, unit) in group.items()
             if unit
         } | {name: unit for name, unit in self.outputs.items() if unit}
-        return {key: value for key, value in text.items() if not _is_nothing(value)}
+        return {
+            key: value for key, value in text.items()
+            if value is not None and (value or not isinstance(value, dict | list))
+        }
 
     def to_yaml(self, archive: str = "") -> str:
         """The text of the plant's file, with a comment for every equation.
@@ -258,10 +261,6 @@ def _nonzero(values: object) -> Iterable[tuple[int, int, Entry]]:
         for j, value in enumerate(row):
             if isinstance(value, str) or value != 0:
                 yield i, j, value if isinstance(value, str) else float(value)
-
-
-def _is_nothing(value: object) -> bool:
-    return value is None or (isinstance(value, dict | list) and not value)
 
 
 def _negative(term: Entry) -> Entry:

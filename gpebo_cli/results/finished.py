@@ -102,9 +102,10 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
     ``overrides`` distinguish it from others, where that is known (a job of a sweep).
     """
     summary = read_summary(folder)
-    if summary.get("estimator") is None:
+    if (estimator := summary.get("estimator")) is None:
         return []
-    chosen = {"plant": str(summary.get("plant")), "estimator": _estimator(summary)}
+    name = estimator.get("name") if isinstance(estimator, Mapping) else estimator
+    chosen = {"plant": str(summary.get("plant")), "estimator": str(name)}
     columns = read_columns(folder / "cases.csv", "case", present=METRICS)
     gains = [name for name in columns if name != "case" and not is_metric(name)]
     metrics = dict.fromkeys((*METRICS, *filter(is_metric, columns)))
@@ -220,11 +221,6 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return content
 
 
-def _estimator(summary: Mapping[str, Any]) -> str:
-    estimator = summary["estimator"]
-    return str(estimator.get("name")) if isinstance(estimator, Mapping) else str(estimator)
-
-
 def _bytes(path: Path) -> bytes:
     """The content of a regular file; a pipe under its name would be waited for."""
     try:
@@ -238,13 +234,8 @@ def _bytes(path: Path) -> bytes:
 def read_columns(path: Path, *filled: str, present: Sequence[str] = ()) -> dict[str, Array]:
     """A table of numbers that a run wrote, by column; NaN for an empty cell.
 
-    Args:
-        path: of the table.
-        filled: columns that have a number in every row.
-        present: others that it has.
-
-    Raises:
-        GpeboError: it is missing, or not such a table; the line and the column are named.
+    Columns that are ``filled`` have a number in every row; those ``present`` may have gaps
+    (GpeboError: they are missing, or it is not such a table; the line and the column are named).
     """
     try:
         content = _bytes(path)

@@ -221,13 +221,9 @@ def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> obje
             {"case": case, "gains": gains, **{name: col[case] for name, col in columns.items()}}
             for case, gains in enumerate(estimation.cases)
         ]
-    return {
-        "count": len(estimation.cases),
-        **{name: _range(column[np.isfinite(column)]) for name, column in columns.items()},
+    finite = {name: column[np.isfinite(column)] for name, column in columns.items()}
+    return {"count": len(estimation.cases)} | {
+        name: {"min": found.min() if found.size else None,
+               "max": found.max() if found.size else None, "finite": found.size}
+        for name, found in finite.items()
     }
-
-
-def _range(finite: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
-    """Give the smallest and largest of those that are finite, and how many those are."""
-    smallest, largest = (finite.min(), finite.max()) if finite.size else (None, None)
-    return {"min": smallest, "max": largest, "finite": finite.size}

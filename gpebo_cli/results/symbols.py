@@ -65,16 +65,13 @@ def math_of(name: str, labels: Mapping[str, str]) -> str:
     if match is None or len(name) > 12 or not all(rest):
         return ""
     letters, digits = match.groups()
-    below = [*([digits] if digits else []), *(_below(part, labels) for part in rest)]
+    below = [digits] if digits else []
+    below += [math_of(part, labels) or f"\\mathrm{{{part}}}" for part in rest]
     if letters in _LETTERS:
         letters = f"\\{letters}"
     elif len(letters) > 1:
         letters = f"\\mathrm{{{letters}}}"
     return f"{letters}_{{{','.join(below)}}}" if below else letters
-
-
-def _below(part: str, labels: Mapping[str, str]) -> str:
-    return math_of(part, labels) or f"\\mathrm{{{part}}}"
 
 
 def typeset(name: str, labels: Mapping[str, str]) -> str:
