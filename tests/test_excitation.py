@@ -115,7 +115,9 @@ def test_norms_that_start_at_rounding_have_settled_at_once():
     """A plant that starts where the observer does: its errors are rounding at all times."""
     t = np.linspace(0.0, 4.0, 5)
     squares = np.array([[0.0, 1e-30, 1e-32, 0.0, 1e-31], [0.0, 1.0, 1e-3, 1e-9, 1e-9]])
-    found = measure_squares(t, squares, np.zeros((2, 1)), squares, np.zeros((2, 1)))
+    found = measure_squares(
+        t, (squares, squares), np.zeros((2, 1)), np.zeros((2, 1)), np.ones(1, dtype=bool)
+    )
     np.testing.assert_array_equal(found[:2, 0], 0.0)
     assert (found[:2, 1] > 2.0).all()
     assert (found[:2, 1] < 3.0).all()

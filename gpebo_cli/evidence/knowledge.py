@@ -81,7 +81,7 @@ class Knowledge:
     def parameters(self) -> BoolArray:
         """Which parameters are determined, (M, p)."""
         kernel, slack = self._kernel
-        return np.asarray(_row_norms(kernel) <= slack[:, None])
+        return np.asarray(np.linalg.norm(kernel, axis=2) <= slack[:, None])
 
     @cached_property
     def independent(self) -> IntArray:
@@ -126,8 +126,8 @@ class Knowledge:
             whole = np.maximum.accumulate(whole)[-len(last) :, None]
             last = np.where(own[-len(last) :] <= _NOISE * whole, 0.0, last)
         scaled = last / self.sizes[:, None, :]
-        size = _row_norms(scaled)
-        return np.asarray(_row_norms(scaled @ kernel) <= slack[:, None] * size)
+        size = np.linalg.norm(scaled, axis=2)
+        return np.asarray(np.linalg.norm(scaled @ kernel, axis=2) <= slack[:, None] * size)
 
     def resolved(self, h: Array, offset: Array, gain: Array) -> BoolArray:
         """Of which states (n,) x = offset + gain η something is left beside errors, at the end.
@@ -148,11 +148,6 @@ class Knowledge:
         )
         x = offset + gain @ (z / self.sizes[-1])
         return np.asarray(error <= _LOST * np.abs(x).max(axis=0))
-
-
-def _row_norms(matrices: Array) -> Array:
-    """Norms of the rows of matrices (M, n, p), shape (M, n)."""
-    return np.asarray(np.sqrt(np.einsum("mij,mij->mi", matrices, matrices)))
 
 
 def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:

@@ -9,13 +9,13 @@ The root mean square over time is √(∫e² dt / horizon).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from gpebo_cli.kernels.laws_numpy import last_above
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 
 SETTLED = 0.01  # share of an error at the start, below which it has settled
 _NOTHING = 1e-6  # of a quantity's size: an error that starts below this is none
@@ -62,25 +62,25 @@ def is_metric(name: str) -> bool:
 
 
 def measure_squares(
-    t: Array, of_parameters: Array | None, last_parameters: Array, of_states: Array | None,
-    last_states: Array, last: Array | None = None,
+    t: Array, squares: Sequence[Array], of_eta: Array, of_x: Array, judged: BoolArray,
+    last: Array | None = None,
 ) -> Array:
     """The five of ``NAMES`` (5, G) from squared norms (G, M) and errors at the end, (G, p), (G, n).
 
-    ``last`` (G, 2) are the times, as indices, at which norms were above their levels last, where
-    these are known. NaN where the norms are None. Norms are of quantities in units of their own
-    size.
+    Norms are of quantities in units of their own size. ``last`` (G, 2) are the times, as indices,
+    at which they were above their levels last, where these are known. NaN where no quantity is
+    known, or no parameter that is ``judged`` (p,).
     """
-    out = np.full((5, len(last_parameters)), np.nan)
-    if of_parameters is not None:
-        known = None if last is None else last[:, 0]
-        out[0] = _norm_settled(t, of_parameters, known)
-        out[2] = np.abs(last_parameters).max(axis=1, initial=0.0)
-    if of_states is not None:
-        known = None if last is None else last[:, 1]
-        out[1] = _norm_settled(t, of_states, known)
-        out[4] = time_rms(t, of_states)
-        out[3] = np.abs(last_states).max(axis=1)
+    out = np.full((5, len(of_eta)), np.nan)
+    seen, known = judged & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
+    above = (None, None) if last is None else last.T
+    if seen.any() or not judged.any():
+        out[0] = _norm_settled(t, squares[0], above[0])
+        out[2] = np.abs(of_eta[:, seen]).max(axis=1, initial=0.0)
+    if known.any():
+        out[1] = _norm_settled(t, squares[1], above[1])
+        out[3] = np.abs(of_x[:, known]).max(axis=1)
+        out[4] = time_rms(t, squares[1])
     return out
 
 

@@ -423,12 +423,9 @@ class SampledDeviations:
     ) -> tuple[Array, Array]:
         """Deviations of η̂ and x̂ of every case at K samples (G, K, p + n), and their factor (K,).
 
-        Args:
-            observer: errors of [u; y] to those of Y and of the state's offset.
-            cases: errors of Y to those of η̂.
-            regression: at the samples.
-            gain: of x = offset + gain η, (K, n, p), or of each case its own, (G, K, n, p).
-            roots: S of all data so far, without forgetting, (K, p + 1, p + 1).
+        ``observer`` takes errors of [u; y] to those of Y and of the state's offset, ``cases`` those
+        of Y to those of η̂. The gain of x = offset + gain η is (K, n, p), or of each case its own,
+        (G, K, n, p), and ``roots`` are S of all data so far, without forgetting, (K, p + 1, p + 1).
         """
         count, n, p = gain.shape[-3:]
         gains = np.broadcast_to(gain, (len(cases), count, n, p))

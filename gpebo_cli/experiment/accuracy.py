@@ -102,23 +102,8 @@ def numbers_of(
         for error, size in zip((of_eta, of_x), sizes, strict=True)
     ]
     times[0][:, ~judged] = np.nan
-    of_all = _of_all(t, squares, of_eta[:, -1], of_x[:, -1], judged)
+    of_all = measure_squares(t, squares, of_eta[:, -1], of_x[:, -1], judged)
     return np.concatenate([of_all, times[0].T, times[1].T])
-
-
-def _of_all(
-    t: Array, squares: Sequence[Array], of_eta: Array, of_x: Array, judged: BoolArray,
-    last: Array | None = None,
-) -> Array:
-    """The first five of them from squared norms (g, M) and errors at the end (g, p) and (g, n).
-
-    ``last`` as in :func:`measure_squares`.
-    """
-    seen, known = judged & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
-    return measure_squares(
-        t, squares[0] if seen.any() or not judged.any() else None, of_eta[:, seen],
-        squares[1] if known.any() else None, of_x[:, known], last,
-    )
 
 
 def metrics_of(numbers: Array, parameters: Sequence[str], system: DescriptorSystem) -> Metrics:
@@ -181,7 +166,7 @@ def evaluation(
         *squares, last, of_norms = kernels.laws.squared_errors(
             eta, truth, in_eta, offset, gain, x, in_x, level, SETTLED**2
         )
-        numbers = _of_all(grid, squares, of_eta, of_x, judged, of_norms)
+        numbers = measure_squares(grid, squares, of_eta, of_x, judged, of_norms)
         if level is not None:
             k = np.clip(last, 0, max(len(grid) - 2, 0)).astype(np.intp)
             after = np.minimum(k + 1, len(grid) - 1)

@@ -32,19 +32,11 @@ def stepped_law(
 ) -> Array:
     """η̂ (g, M, p) where η̄ is linear in I over each step, and η̂ is continuous where η̄ jumps.
 
-    A step x = γ δI of the distance ε = η̂ − η̄, which stays accurate after convergence, is
-    ε₊ = e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄).
-
-    Args:
-        length: of the steps in I, δI ≥ 0, shape (S,).
-        left: η̄ at their left ends (S, p).
-        change: of η̄ over each (S, p).
-        jump: of η̄ at the end of each (S, p).
-        step: in which each time lies (M,).
-        partial: how far I is from its left end there (M,).
-        share: of the step that is (M,).
-        start: η̂ at the start (1 or g, p).
-        gains: γ (g, 1 or p).
+    A step x = γ δI of the distance ε = η̂ − η̄, which stays accurate after convergence, is ε₊ =
+    e^{−x} ε − (1 − e^{−x})/x · (η̄₊ − η̄). Of steps in I of a ``length`` δI ≥ 0 (S,), η̄ at their
+    left ends, its change over each and its jump at the end of each (S, p), in which ``step`` each
+    time lies (M,), how far I is from its left end there and the share of the step that is (M,), η̂
+    at the start (1 or g, p), and the gains γ (g, 1 or p).
     """
     count, p = left.shape
     distance = np.empty((count, len(gains), p))

@@ -16,19 +16,12 @@ def tails(
 ) -> Array:
     """What each element's polynomial leaves out (K,), as its last Legendre coefficients say.
 
-    A coefficient of degree j < s + 1 is taken relative to the largest value of its component so
-    far, which is floored at ``foot`` times its final one, ``share`` of the largest component, and
-    ``floor``; ρ^j predicts ρ^(s + 1), and the largest prediction of all components counts.
-
-    Args:
-        values: of signals of one kind at the points (K, s + 1, c).
-        to_legendre: (s + 1, s + 1).
-        used: how many of the last coefficients.
-        foot: of a component's final size.
-        share: of the largest component's size.
-        floor: size below which a signal is rounding.
-        least: components count as at least that large (c,), and are compared in units of their
-            size; None: as they are.
+    Of signals of one kind at the points (K, s + 1, c), a coefficient of degree j < s + 1, of which
+    the last ``used`` count, is taken relative to the largest value of its component so far, which
+    is floored at ``foot`` times its final one, ``share`` of the largest component, and ``floor``;
+    ρ^j predicts ρ^(s + 1), and the largest prediction of all components counts. Components count as
+    being at least as large as ``least`` (c,), and are compared in units of their size; None: as
+    they are.
     """
     if not values.size:
         return np.zeros(len(values))

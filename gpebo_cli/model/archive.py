@@ -37,11 +37,10 @@ _BROKEN = (ValueError, KeyError, OSError, EOFError, RuntimeError, NotImplemented
 
 
 def with_archive(mapping: Mapping[str, object], source: str, where: str) -> Mapping[str, object]:
-    """The mapping of a plant's file with the matrices of the archive that it names.
+    """The mapping of a plant's file with the matrices of the archive that it names, if any.
 
     Raises:
-        ConfigError: the archive lies outside of the plant's folders or is none, or a matrix is
-            in both.
+        ConfigError: it is none, lies outside of the plant's folders, or a matrix is in both.
     """
     file = mapping.get(ARCHIVE)
     if file is None:

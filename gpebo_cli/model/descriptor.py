@@ -66,17 +66,14 @@ class CoefficientSource(Protocol):
     @property
     def constant(self) -> frozenset[str]:
         """Those of ``MATRIX_NAMES`` that do not depend on time."""
-        ...
 
     @property
     def zero(self) -> frozenset[str]:
         """Those of ``constant`` that vanish: nothing needs to be computed with them."""
-        ...
 
     @property
     def signals(self) -> Mapping[str, frozenset[str]]:
         """Names of the inputs and outputs that a matrix depends on, by matrix; most have none."""
-        ...
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
@@ -92,20 +89,16 @@ class CoefficientSource(Protocol):
         ``u`` of the result is then that of the signals. None: u is the plant's own function of
         time, and nothing may depend on y.
         """
-        ...
 
     @property
     def of_time(self) -> CoefficientSource:
         """The same with zero for what depends on outputs, to be evaluated without signals."""
-        ...
 
     def truth(self, t: Array) -> Array:
         """True values of the unknowns at the times ``t`` (N,), shape (N, q)."""
-        ...
 
     def breakpoints(self, start: float, stop: float) -> Array:
         """Times strictly between ``start`` and ``stop`` where some entry jumps or has a kink."""
-        ...
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
         """Edges of cells in which every known function is nearly a polynomial of low degree.
@@ -115,7 +108,6 @@ class CoefficientSource(Protocol):
         functions come from Python, or need too many cells. What depends on outputs does not count
         here: it is looked at along a solution.
         """
-        ...
 
 
 @dataclass(frozen=True)

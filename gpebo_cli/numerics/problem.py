@@ -38,11 +38,9 @@ class Renewal(Protocol):
 
     def state(self, reached: Array) -> Array:
         """What (n, columns) replaces the limit from the left."""
-        ...
 
     def error(self, reached: Array, error: Array) -> Array:
         """What becomes of small errors (e, n, columns) of that limit."""
-        ...
 
 
 @dataclass(frozen=True)

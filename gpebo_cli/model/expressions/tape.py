@@ -86,13 +86,10 @@ class Tape:
     ) -> Array:
         """Taylor coefficients of all expressions, shape (order + 1, N, number of expressions).
 
-        Args:
-            t: times, shape (N,), seconds.
-            order: highest coefficient wanted.
-            inside: times, shape (N,), at which step, abs and sign are decided; by default ``t``.
-            signals: Taylor coefficients of the signals at t, (J + 1, N, number of signals), those
-                beyond J being zero; what depends on a signal is decided at t. None: inputs are the
-                functions of time that the tape has for them, and outputs are unknown.
+        At times t (N,), in seconds, where step, abs and sign are decided at ``inside`` (N,), by
+        default t. ``signals`` are Taylor coefficients of the signals at t, (J + 1, N, number of
+        signals), those beyond J being zero; what depends on a signal is decided at t. None: inputs
+        are the functions of time that the tape has for them, and outputs are unknown.
 
         Raises:
             ConfigError: a value that is not finite; names the entry, its text and the time.
