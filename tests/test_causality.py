@@ -1,0 +1,86 @@
+"""An observer is causal: the same run to a longer horizon has the same past."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_systems import random_system
+
+from gpebo_cli import run
+
+WAYS = {
+    "as it comes": {},
+    "at samples": {"sample_time": 0.05, "hold": "linear"},
+    "reset": {"remedy": "reset", "reset_interval": 0.4},
+    "current coordinates": {"remedy": "current_coordinates"},
+    "strangeness-free": {"form": "strangeness_free"},
+}
+STEP = 0.05
+
+
+def run_to(plant, count, **settings):
+    """A run of so many output steps, with least squares."""
+    return run(plant, time={"horizon": count * STEP, "samples": count + 1},
+               estimator={"name": "least_squares", "f0": 1e-4}, **settings).details
+
+
+def assert_same_past(one, other, tol=1e-8):
+    """Signals, Y and ψ; and estimates to the digits that little data leave.
+
+    At its end a run knows the limit from the left alone of what jumps there.
+    """
+    def same(a, b, tol):
+        a = a[:-1]
+        size = np.abs(a).max(axis=0, initial=0.0)
+        assert (np.abs(b[: len(a)] - a) <= tol * np.where(size > 1e-9, size, 1.0)).all()
+
+    for name in ("Y", "psi"):
+        same(getattr(one.regression, name), getattr(other.regression, name), tol)
+    same(one.signals.outputs, other.signals.outputs, tol)
+    if one.simulation is not None:
+        same(one.simulation.states, other.simulation.states, tol)
+    for name in ("parameters", "states"):
+        a, b = (getattr(found.estimation, name)[0] for found in (one, other))
+        told = ~(np.isnan(a) | np.isnan(b[: len(a)]))  # what is determined is so at the end
+        same(np.where(told, a, 0.0), np.where(told, b[: len(a)], 0.0), 1e3 * tol)
+
+
+@settings(deadline=None, max_examples=3)
+@given(st.integers(0, 99), st.integers(2, 4), st.sampled_from([{}, WAYS["at samples"]]))
+def test_of_any_plant(seed, times, way):
+    """Index 0 to 4; which form of the equations tells more depends on how long one looks."""
+    observer = {"name": "gpebo", "form": "strangeness_free", **way}
+    plant = random_system(seed)[0]
+    assert_same_past(*(run_to(plant, 10 * k, observer=observer) for k in (1, times)))
+
+
+@pytest.mark.parametrize("plant", ["circuit", "descriptor", "bioreactor"])  # the last: along y
+@pytest.mark.parametrize("way", WAYS)
+def test_of_shipped_plants(plant, way):
+    observer = {"name": "gpebo", **WAYS[way]}
+    one, other = (run_to(plant, count, observer=observer) for count in (20, 50))
+    # The first reset starts from estimates of which few digits are known.
+    assert_same_past(one, other, 1e-6 if way == "reset" else 1e-8)
+
+
+def test_with_bounds():
+    observer = {"name": "gpebo", "bounds": {"states": {"x1": [-0.5, 0.9]}}}
+    one, other = (run_to("descriptor", count, observer=observer) for count in (20, 50))
+    assert_same_past(one, other)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+@pytest.mark.parametrize("way", ["as it comes", "at samples"])
+def test_of_a_recording(hold, way):
+    t = np.linspace(0.0, 3.0, 61)
+    rows = pd.DataFrame({"t": t, "V": np.sin(t), "y": np.cos(3 * t) - t})
+    observer = {"name": "gpebo", **WAYS[way]} if way == "as it comes" else {
+        "name": "gpebo", "sample_time": 0.05, "hold": hold}
+    assert_same_past(*(
+        run_to("circuit", count, data={"name": "csv", "frame": rows[: count + 1], "hold": hold},
+               observer=observer)
+        for count in (20, 60)
+    ))
