@@ -58,11 +58,7 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     Raises:
         SolverError: the law cannot be resolved.
     """
-    largest = float(gains.max(initial=0.0))
-    variation, last = law_variation(path.energy, path.quotient, largest)
-    size = max(last, float(np.abs(start).max()), path.floor)
-    if variation > _CONSTANT * size:  # more than rounding?
-        variation = _known_variation(path, largest, size)
+    variation, size = _variation(path, float(gains.max(initial=0.0)), start)
     if variation <= _CONSTANT * size:
         return constant_law(path, start, gains)
     if variation <= _SMALL * size:
@@ -77,33 +73,24 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     ])
 
 
-def law_variation(energy: Array, quotient: Array, gain: float) -> tuple[float, float]:
-    """How much η̄ (K, s + 1, p) varies from a point to the next, weighted by what that can do.
+def _variation(path: ScalarPath, gain: float, start: Array) -> tuple[float, float]:
+    """How much η̄ varies from a point to the next, weighted by what that can do, and the size of η̂.
 
-    Returns:
-        the largest variation, and the largest |η̄| of the last element.
+    The weight is the share min(1, γδI) of a step of I that η̂ goes to meet η̄. Where the variation
+    is more than nothing, what is rounding of 𝐘/Δ does not count.
     """
-    weight, change = _changes(energy, quotient, gain)
-    return (
-        float((weight * change).max(initial=0.0)), float(np.abs(quotient[-1]).max(initial=0.0))
-    )
-
-
-def _changes(energy: Array, quotient: Array, gain: float) -> tuple[Array, Array]:
-    """Shares min(1, γδI) of a step of I that η̂ goes to meet η̄, and by how much η̄ changes in it."""
-    length = np.maximum(np.diff(energy, axis=1), 0.0)
-    return np.minimum(1.0, gain * length)[..., None], np.abs(np.diff(quotient, axis=1))
-
-
-def _known_variation(path: ScalarPath, gain: float, size: float) -> float:
-    """:func:`law_variation` of what is more than the rounding of 𝐘/Δ, where there is much of it."""
-    mesh, (weight, change) = path.mesh, _changes(path.energy, path.quotient, gain)
+    mesh, quotient = path.mesh, path.quotient
+    size = max(np.abs(quotient[-1]).max(initial=0.0), np.abs(start).max(), path.floor)
+    length = np.maximum(path.energy[:, 1:] - path.energy[:, :-1], 0.0)
+    weight = np.minimum(1.0, gain * length)[..., None]
+    change = np.abs(quotient[:, 1:] - quotient[:, :-1])
     much = (weight * change > _CONSTANT * size).any(axis=(1, 2))
-    points, inside = mesh.points[much], mesh.inside[much]
-    digits = path.signals(points.ravel(), inside.ravel())[2].reshape(points.shape)
-    rounding = _SLACK * _ROUNDING / np.maximum(digits, _ROUNDING)
-    change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
-    return float((weight * change).max(initial=0.0))
+    if much.any():
+        points, inside = mesh.points[much], mesh.inside[much]
+        digits = path.signals(points.ravel(), inside.ravel())[2].reshape(points.shape)
+        rounding = _SLACK * _ROUNDING / np.maximum(digits, _ROUNDING)
+        change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
+    return float((weight * change).max(initial=0.0)), float(size)
 
 
 def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from itertools import accumulate, pairwise
 
 import numpy as np
@@ -17,7 +16,7 @@ from gpebo_cli.model.descriptor import (
     IntArray,
 )
 from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, SHARE, Mesh, initial_mesh, unresolved
-from gpebo_cli.numerics.radau import RadauRule, radau_rule
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.settings import SolverSettings, TimeSettings
 
@@ -113,7 +112,8 @@ def _overlooked(
     found = np.zeros(mesh.size, dtype=bool)
     if looks == 0 or not names:
         return found
-    places, between = _looks(mesh.rule, looks)
+    places = (np.arange(looks) + 0.5) / looks
+    between = np.ascontiguousarray(mesh.rule.interpolation(places).T)
     t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
     seen = looked_at(t.ravel())
     least = max(tol, 1e-12)
@@ -152,13 +152,6 @@ def _missed_between(between: Array, *pairs: Array) -> Array:
         far = np.abs(between.T @ nodes - actual).max(axis=1) / size
         found.append(far.max(axis=1, initial=0.0))
     return np.array(found)
-
-
-@lru_cache(maxsize=16)
-def _looks(rule: RadauRule, looks: int) -> tuple[Array, Array]:
-    """Places (looks,) in an element, and the polynomial there from its points (s + 1, looks)."""
-    places = (np.arange(looks) + 0.5) / looks
-    return places, np.ascontiguousarray(rule.interpolation(places).T)
 
 
 def _known_kinds(
