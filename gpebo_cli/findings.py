@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, Generic, TypeVar, overload
 
+from gpebo_cli.kernels.threads import single
+
 T = TypeVar("T")
 
 
@@ -32,7 +34,7 @@ class OnDemand(Generic[T]):
         if callable(values[self._name]):
             import numpy as np  # the command line's help does without
 
-            with np.errstate(all="ignore"):  # as in a run
+            with single(), np.errstate(all="ignore"):  # as in a run
                 values[self._name] = values[self._name]()
         found: T = values[self._name]
         return found
@@ -43,10 +45,11 @@ class OnDemand(Generic[T]):
 
 def evaluated(instance: object) -> dict[str, Any]:
     """What there is to be pickled of an instance: the values, and not how to find them."""
-    return {
-        name: value() if name.startswith("_") and callable(value) else value
-        for name, value in instance.__dict__.items()
-    }
+    with single():
+        return {
+            name: value() if name.startswith("_") and callable(value) else value
+            for name, value in instance.__dict__.items()
+        }
 
 
 @dataclass(frozen=True)

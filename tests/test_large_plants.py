@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tracemalloc
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.findings import OnDemand
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import SHARE, initial_mesh
@@ -426,6 +428,16 @@ def test_blas_has_one_thread_where_matrices_are_small(cells, one):
         assert threadpool_info() == before
     assert asked
     assert all((1 in found) == one for found in asked)
+
+
+def test_what_is_computed_when_it_is_read_has_one_thread_of_blas_too():
+    @dataclass
+    class Read:
+        threads: OnDemand[list[int]] = OnDemand()
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        found = Read(lambda: [p["num_threads"] for p in threadpool_info()])
+        assert set(found.threads) == {1}
 
 
 def test_a_blas_that_is_loaded_between_two_runs_has_one_thread_too():

@@ -18,8 +18,8 @@ from gpebo_cli.evidence.excitation import Excitation, assess, estimable
 from gpebo_cli.evidence.knowledge import LARGE, Knowledge
 from gpebo_cli.evidence.uncertainty import of_least_squares
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
-from gpebo_cli.experiment.threads import one_thread
 from gpebo_cli.findings import Assumption
+from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.observers import Measurements, Observation, Observer, build

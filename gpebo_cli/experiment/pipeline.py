@@ -25,9 +25,9 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.pace import Pace, paced
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
-from gpebo_cli.experiment.threads import one_thread
 from gpebo_cli.experiment.uncertainty import sampled_deviations
 from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
+from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.settings import Settings

@@ -48,7 +48,7 @@ class Source:
     true: Signals | None = None  # of a simulation, without noise
     simulation: SimulationResult | None = None
     recording: RecordingResult | None = None
-    cells: Array | None = None  # of a recording, see Recording.cells
+    cells: Array | None = None  # (K + 1,) of a recording, see Recording.cells
     pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 

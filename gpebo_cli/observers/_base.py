@@ -30,7 +30,7 @@ class SignalNoise:
     inputs: Array  # (m,) standard deviation of every sample
     outputs: Array  # (r,)
     sample_time: float  # seconds, on the average
-    cells: Array | None = None  # of a recording: between which errors are those of one sample
+    cells: Array | None = None  # (K + 1,) of a recording: between them errors are of one sample
 
     @property
     def variances(self) -> Array:

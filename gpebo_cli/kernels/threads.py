@@ -7,22 +7,24 @@ from collections.abc import Callable
 from functools import cache, wraps
 from typing import Any, TypeVar, cast
 
-from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.settings import Settings
-
 _Work = TypeVar("_Work", bound=Callable[..., Any])
 _LARGE = 200  # states, up to which one thread is as fast as several
+
+
+def single() -> Any:
+    """A context with one thread of BLAS."""
+    # SciPy brings a BLAS of its own when it is needed; others are not called here.
+    return _pools("scipy.linalg" in sys.modules).limit(limits=1, user_api="blas")
 
 
 def one_thread(work: _Work) -> _Work:
     """``work(settings, system, …)`` with one thread of BLAS, unless the plant is large."""
 
     @wraps(work)
-    def limited(settings: Settings, system: DescriptorSystem, *args: Any, **kwargs: Any) -> Any:
+    def limited(settings: Any, system: Any, *args: Any, **kwargs: Any) -> Any:
         if system.n > _LARGE:
             return work(settings, system, *args, **kwargs)
-        # SciPy brings a BLAS of its own when it is needed; others are not called here.
-        with _pools("scipy.linalg" in sys.modules).limit(limits=1, user_api="blas"):
+        with single():
             return work(settings, system, *args, **kwargs)
 
     return cast(_Work, limited)
