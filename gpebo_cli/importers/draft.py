@@ -147,7 +147,7 @@ class PlantDraft:
         } | {name: unit for name, unit in self.outputs.items() if unit}
         return {
             key: value for key, value in text.items()
-            if value is not None and (value or not isinstance(value, dict | list))
+            if value is not None and (not isinstance(value, dict | list) or value)
         }
 
     def to_yaml(self, archive: str = "") -> str:
