@@ -47,18 +47,10 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
 def mixed_points(extended: Array) -> tuple[Array, Array]:
     """Δ (K, s + 1) and η̄ = 𝐘/Δ, usable everywhere, (K, s + 1, p c) of [Ω | 𝒴] (.., p, p + c)."""
     points = extended.shape[:-2]
-    delta, quotient, usable = determinant_and_quotient(extended.reshape(-1, *extended.shape[-2:]))
-    return delta.reshape(points), filled(quotient.reshape(*points, -1), usable.reshape(points))
-
-
-def determinant_and_quotient(extended: Array) -> tuple[Array, Array, BoolArray]:
-    """Δ = det Ω, η̄ = 𝐘/Δ, and where η̄ is more than rounding, of [Ω | 𝒴] (N, p, p + c).
-
-    𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
-    """
-    delta, quotient, condition = kernels.laws.mixed(extended)
+    # 𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
+    delta, quotient, condition = kernels.laws.mixed(extended.reshape(-1, *extended.shape[-2:]))
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
-    return delta, quotient, usable
+    return delta.reshape(points), filled(quotient.reshape(*points, -1), usable.reshape(points))
 
 
 def filled(quotient: Array, usable: BoolArray) -> Array:

@@ -192,9 +192,8 @@ def _element_maps(
     By collocation of η̂' = γΔ𝐘 − γΔ²η̂. Where the directions of Ω are so unequal that 𝐘/Δ is
     rounding, the law has its closed form with the next η̄ that is known, which has no more error.
 
-    Returns:
-        (K, g, l, s, 1 + p/l): factor and shifts, l being 1 or p; and the error of η̂ that the
-        rounding of 𝐘/Δ makes, (K,).
+    They are (K, g, l, s, 1 + p/l), factor and shifts, l being 1 or p, and the error of η̂ that the
+    rounding of 𝐘/Δ makes is (K,).
     """
     points, inside = mesh.points[chosen], mesh.inside[chosen]
     rule, h, (g, lanes), p = mesh.rule, mesh.steps[chosen], gains.shape, ends.shape[1]

@@ -240,8 +240,8 @@ def run_filter(
 def _units(A: Array, deviation: Array, horizon: float) -> Array:
     """Units (n,) of ζ: deviations at the start, or what those of constants soon make of them.
 
-    Powers of two, so that nothing is rounded. What is constant has a row of zeros in A (N, n, n);
-    it moves the others for as long as these remember. By ``_GROWTH`` X₁ may be out of balance.
+    Powers of two: nothing is rounded. What is constant, a row of zeros in A, moves the others for
+    as long as these remember. By ``_GROWTH`` X₁ may be out of balance.
     """
     largest = deviation.max(initial=0.0)
     rounding = np.sqrt(np.finfo(float).eps) * largest  # of a variance beside the largest one

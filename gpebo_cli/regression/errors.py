@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.problem import LinearEquation
 
 
 class ErrorSystem(NamedTuple):
@@ -20,6 +21,13 @@ class ErrorSystem(NamedTuple):
     B: Array  # (N, S, I)
     C: Array  # (N, O, S)
     D: Array  # (N, O, I)
+
+
+    def driven(self, errors: Array, rows: int | None = None) -> LinearEquation:
+        """s' and as extras C and D i, for errors i (N, I, c), perhaps of the first outputs only."""
+        return LinearEquation(
+            None, self.A, self.B @ errors, (self.C[:, :rows], self.D[:, :rows] @ errors)
+        )
 
 
 # (times (N,), inside (N,)) -> the system there

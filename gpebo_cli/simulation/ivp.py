@@ -33,11 +33,8 @@ def underlying_ode(
     """x' = A x + f from one differentiation more than the strangeness index.
 
     The derivative array of order μ + 1 determines x_1 = x' uniquely (it is 1-full), so the first
-    n rows of its minimum-norm solution are the ODE. Solutions drift off the constraints slowly;
-    the tolerance of the check is chosen accordingly.
-
-    Returns:
-        A (N, n, n) and f (N, n).
+    n rows of its minimum-norm solution are the ODE, A (N, n, n) and f (N, n). Solutions drift off
+    the constraints slowly; the tolerance of the check is chosen accordingly.
     """
     n, scaling = system.n, structure.scaling
     M, N, g = _array(system, structure, t, inside, structure.mu + 1)
@@ -63,10 +60,7 @@ def _array(
 def consistent_start(
     system: DescriptorSystem, structure: Structure, t: float, inside: float
 ) -> Array:
-    """The start (n,) of this path, by singular vectors of the derivative array and constraints.
-
-    The same question as in :func:`gpebo_cli.reduction.consistency.consistent_state`.
-    """
+    """``consistent_state`` (n,) of this path, by singular vectors of the derivative array."""
     now, scaling, x0 = np.array([t]), structure.scaling, system.initial_state
     M, N, g = _array(system, structure, now, np.array([inside]), structure.mu)
     Z2 = np.linalg.svd(M[0])[0][:, len(M[0]) - structure.a :]

@@ -16,14 +16,7 @@ from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution
 from gpebo_cli.numerics.errors import EPS
-from gpebo_cli.numerics.mesh import (
-    SHARE,
-    Kind,
-    Mesh,
-    Trajectory,
-    initial_mesh,
-    legendre_tail,
-)
+from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, initial_mesh, legendre_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.consistency import Jump

@@ -175,12 +175,10 @@ def _known_resolved(
 ) -> tuple[Mesh, Coefficients, Callable[[Array], Array]]:
     """The mesh that the known functions ask for, all of them there, and :func:`_beside_inputs`.
 
-    Where bounds do not already say that nothing narrow hides between the nodes, it is looked for.
-    Elements are cut until the inputs are resolved, as far as cutting helps: the solution's mesh
-    has to resolve them in any case, and evaluating an input costs next to nothing beside solving
-    for the state on elements that are too long. Where nothing needs the elements that short, they
-    are joined again: what is narrow has been looked for on the short ones. But not where the state
-    may grow or decay much within one of them: an element that does not resolve growth may hide it.
+    Elements are cut until the inputs are resolved, as far as cutting helps: evaluating an input
+    costs next to nothing beside solving for the state on elements that are too long. Where nothing
+    needs them that short they are joined again, but not where the state may grow or decay much
+    within one: an element that does not resolve growth may hide it.
     And not where elements are solved sooner than it is seen that they can be joined.
     """
     def evaluated(mesh: Mesh) -> Coefficients:

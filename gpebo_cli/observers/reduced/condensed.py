@@ -129,9 +129,8 @@ def _response(
     ζ is resolved in terms of the ``size`` of what it is part of.
     """
     def coefficients(t: Array, inside: Array) -> LinearEquation:
-        o = errors(t, inside)
-        e = (signals(t, inside) - few.at(t, inside))[:, :, None]
-        return LinearEquation(None, o.A, o.B @ e, (o.C, o.D @ e))
+        e = signals(t, inside) - few.at(t, inside)
+        return errors(t, inside).driven(e[:, :, None])
 
     problem = LinearProblem(
         coefficients, zeta, name="observer's response to the samples", floor=size

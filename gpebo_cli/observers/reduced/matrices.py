@@ -170,10 +170,7 @@ def observer_matrices(
 def _in_frame(
     model: Equations, rows: Array, scale: Array, frame: Frame, rank_tol: float
 ) -> ObserverMatrices | None:
-    """What :func:`_by_steps` finds if the frame is that of E at all times, in one call.
-
-    It is None where the frame is another one, and where singular values have to decide.
-    """
+    """What :func:`_by_steps` finds in the frame of E; None where singular values have to decide."""
     (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
      from_signals) = kernels.observer.in_frame(
         *model[:5], rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
@@ -269,9 +266,8 @@ def _by_steps(
 def _held(found: ObserverMatrices, units: Array, rank_tol: float) -> ObserverMatrices:
     """The same with a term that pulls w onto the hidden constraints, which w then never leaves.
 
-    w has as many components as E has rank. Constraints that leave fewer hold because they held at
-    the start, and rounding need not stay small: away from them w may grow as no solution does. What
-    they lack comes back at twice the rate at which anything grows, −2‖A_0‖ (R𝒜)⁺R(𝒜w + g_y + Gθ).
+    Of more constraints than E leaves room for, rounding may grow as no solution does. What they
+    lack comes back at twice the rate at which anything grows, −2‖A_0‖ (R𝒜)⁺R(𝒜w + g_y + Gθ).
     """
     own = units_along(found.split.basis, units)
     hidden = found.algebraic.shape[1] - found.outputs
@@ -306,8 +302,7 @@ def _eliminate(
 ) -> tuple[Array, Array, Array]:
     """Q1 and H of K = (𝒜 Q)⁺ = H Q1ᵀ, and a bound of the singular value behind Assumption 1.
 
-    With V2 of the kernel and 𝒜 V2 = Q1 R1, (𝒜 Q)⁺ = V2 R1⁻¹ Q1ᵀ. σ_min(R1) is at least 1/‖R1⁻¹‖_F;
-    it is computed itself only where that bound leaves a doubt. The states have units (n,).
+    σ_min(R1) ≥ 1/‖R1⁻¹‖_F; it is computed itself only where that bound leaves a doubt.
     """
     kernel = kernel / np.linalg.norm(kernel / units[:, None], axis=1, keepdims=True)
     on_kernel = algebraic @ kernel

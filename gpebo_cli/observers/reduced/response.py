@@ -9,7 +9,7 @@ from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.problem import LinearProblem
 from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
@@ -51,14 +51,11 @@ def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) 
         SolverError: the mesh does not resolve the response.
     """
     errors = Trajectory(mesh, np.concatenate([e_u, e_y], axis=2))
-
-    def coefficients(t: Array, inside: Array) -> LinearEquation:
-        o, e = errors_at(t, inside), errors(t, inside)
-        return LinearEquation(None, o.A, o.B @ e, (o.C[:, :rows], o.D[:, :rows] @ e))
-
     size = errors_at(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]
-    start = np.zeros((size, e_y.shape[-1]))
-    problem = LinearProblem(coefficients, start, name="response to noise")
+    problem = LinearProblem(
+        lambda t, inside: errors_at(t, inside).driven(errors(t, inside), rows),
+        np.zeros((size, e_y.shape[-1])), name="response to noise",
+    )
     solution = solve(problem, mesh, tol=np.inf, max_elements=mesh.size)
     if solution.error_estimate > _RESPONSE:
         raise SolverError(

@@ -253,9 +253,8 @@ def sampled_observer(
 def _kernel_is_fixed(
     form: EquationForm, first: ObserverMatrices, t: Array, sample: Array, rank_tol: float
 ) -> bool:
-    """Whether kernel and range of E are at the times t (N,) what they are at the first sample.
+    """Whether kernel and range of E stay at times (N,): the extension needs n_a coordinates, not n.
 
-    The sample is [u; y] (m + r,). If they are, the extension needs n_a coordinates, else all n.
     A kernel that starts to turn later on is refused then.
     """
     frame = first.split.frame

@@ -60,7 +60,10 @@ class CurrentCoordinates:
         identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
         p = q + k
 
-        def assembled(t: Array, inside: Array) -> tuple[Assembled, Array, Array, tuple[Array, ...]]:
+        def evaluate(
+            mesh: Mesh
+        ) -> tuple[tuple[Assembled, Array, Array, tuple[Array, Array]], list[tuple[Array, float]]]:
+            t, inside = mesh.points.ravel(), mesh.inside.ravel()
             o = reduced.matrices(t, inside)
             signals = reduced.measured(t, inside)
             A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
@@ -71,14 +74,9 @@ class CurrentCoordinates:
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
                 a = _with_kernel(a, np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n)), q)
-            return a, A, b, (o.injectivity, o.elimination)
-
-        def evaluate(
-            mesh: Mesh
-        ) -> tuple[tuple[Assembled, Array, Array, tuple[Array, ...]], list[tuple[Array, float]]]:
-            found = a, A, b, _ = assembled(mesh.points.ravel(), mesh.inside.ravel())
             kinds = (*a.kinds(), (A, 0.0), (b, 0.0))
-            return found, [(v.reshape(*mesh.points.shape, -1), floor) for v, floor in kinds]
+            signals_of = [(v.reshape(*mesh.points.shape, -1), floor) for v, floor in kinds]
+            return (a, A, b, (o.injectivity, o.elimination)), signals_of
 
         mesh, (final, A, b, injective), error = resolve(
             evaluate, reduced.mesh, tol=solver.tol, max_elements=solver.max_elements,

@@ -90,10 +90,7 @@ def _unsettled(count: int, why: str) -> SolverError:
 
 
 def _change(found: Observation, before: Array, after: Array, tol: float) -> float:
-    """Root mean square of ψ(η̂₊ − η̂) in terms of that of the residual (Bates & Watts 1981).
-
-    Below what signals are resolved to, ``tol``, there is no change.
-    """
+    """Root mean square of ψ(η̂₊ − η̂) in terms of that of the residual (Bates & Watts 1981)."""
     Y, psi = found.regression.Y.values, found.regression.psi.values
     residual = Y - psi @ after
     floor = tol * float(np.abs(Y).max(initial=0.0) + np.abs(psi @ after).max(initial=0.0))
