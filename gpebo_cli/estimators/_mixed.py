@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -11,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
+from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._recursive import (
     KreisselmeierFilter,
@@ -23,7 +23,7 @@ from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
@@ -42,7 +42,7 @@ def filter_rates(rates: object, parameters: Sequence[str]) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class FilteredEstimator(ResumableEstimator):
-    """Filters as the extension, then mixing and the scalar law.
+    """Filters as the extension (by default Kreisselmeier's), then mixing and the scalar law.
 
     Attributes:
         gamma: γ, also by parameter.
@@ -87,23 +87,23 @@ class FilteredEstimator(ResumableEstimator):
 
     def at_samples(self, rates: Array) -> KreisselmeierFilter:
         """The filters in discrete time, with rates of shape (p,)."""
-        return KreisselmeierFilter(rates, self.seen)
+        return KreisselmeierFilter(rates)
 
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
         return RecursiveMixed(self, parameters, SampledMixing(self, parameters), mu=mu)
 
-    @abstractmethod
     def seen(self, psi: Array) -> Array:
-        """What the filters of 𝒴 take of Y, (N, p, rows), for ψ (N, rows, p)."""
+        """What the filters of 𝒴 take of Y: ψᵀ (N, p, rows) of ψ (N, rows, p)."""
+        return transpose(psi)
 
-    @abstractmethod
     def extend(self, regression: LinearRegression, rates: Array, start: Array | None) -> Trajectory:
-        """[Ω | 𝒴] (p, p + c) with filters of the ``rates`` (p,), from ``start`` or 0."""
+        """Filtered [ψᵀψ | ψᵀY] (p, p + c), with the ``rates`` (p,), from ``start`` or 0."""
+        return kreisselmeier(regression, rates, start)
 
-    @abstractmethod
     def size(self, regression: LinearRegression) -> float:
         """What no filter exceeds."""
+        return largest(regression.outer.values)
 
 
 def scalar_errors(

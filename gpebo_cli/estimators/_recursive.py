@@ -225,13 +225,10 @@ def _shares(x: Array, decay: Array, hold: str) -> tuple[Array, Array]:
 
 
 class KreisselmeierFilter:
-    """Ω' = −Λ(Ω − ζψ) over each sample, exact for ζψ as the hold rule has it between samples.
+    """Ω' = −Λ(Ω − ζψ) over each sample, exact for ζψ as the hold rule has it between samples."""
 
-    ζ (p, rows) is ψᵀ, or what else an extension makes of ψ.
-    """
-
-    def __init__(self, rates: Array, zeta: Callable[[Array], Array] = transpose) -> None:
-        self._zeta, self._rates = zeta, rates[:, None]  # one per row
+    def __init__(self, rates: Array) -> None:
+        self._rates = rates[:, None]  # one per row
         self._value = np.zeros((len(rates), len(rates) + 1))
 
     def update(self, regression: SampledRegression) -> Array:
@@ -247,8 +244,8 @@ class KreisselmeierFilter:
         return values
 
     def seen(self, regression: SampledRegression) -> tuple[Array | float, Array, Array]:
-        """0 where a step starts anew, else 1, and ζ at its ends, (K, p, rows) each."""
-        zeta = self._zeta(regression.rows[..., : regression.p])
+        """0 where a step starts anew, else 1, and ζ = ψᵀ at its ends, (K, p, rows) each."""
+        zeta = transpose(regression.rows[..., : regression.p])
         return 1.0, zeta[:-1], zeta[1:]
 
     def errors(self) -> Filter:

@@ -105,12 +105,8 @@ class FittedMap(StateMap):
 
     def at(self, t: Array) -> Reconstruction:
         """θ̂ (g, M, q) of η̂ (g, M, k) at the times t (M,)."""
-        weight = self.regression.gram(t)[..., : self.regression.p]
-
-        def fitted(eta: Array) -> Array:
-            return np.array([self.parametrisation.fitted(of_case, weight) for of_case in eta])
-
-        return fitted
+        weight, S = self.regression.gram(t)[..., : self.regression.p], self.parametrisation
+        return lambda eta: np.array([S.fitted(of_case, weight) for of_case in eta])
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,14 +138,9 @@ class GivenAtSamples:
             whole = (np.broadcast_to(part, (count, *part.shape[1:])) for part in (o.C, o.D))
             errors = ErrorSteps(np.zeros((count, 0, 2 * o.D.shape[2])), *whole)
 
-        def fit(eta: Array, weight: Array) -> tuple[Array, Array]:
-            assert S is not None  # noqa: S101  else it is not called
-            theta = np.array([S.fitted(of_case, weight) for of_case in eta])
-            return theta, np.array([S.gain(of_case, weight) for of_case in theta])
-
         return state, SampledBlock(
             regression, none[:, :, 0], none, none[:, :0], scale, errors,
-            fit=None if S is None else fit,
+            fit=None if S is None else S.fit,
         )
 
     def assumptions(self, reached: TextState) -> tuple[Assumption, ...]:  # noqa: ARG002  protocol

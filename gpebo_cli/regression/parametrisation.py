@@ -156,6 +156,11 @@ class Parametrisation:
             z, rest, damping = z[moves], rest[moves], damping[moves]
         return found
 
+    def fit(self, eta: Array, weight: Array) -> tuple[Array, Array]:
+        """θ̂ (g, N, q) and ∂θ̂/∂η̂ of the η̂ (g, N, k) of every case, with weights (N, k, k)."""
+        theta = np.array([self.fitted(of_case, weight) for of_case in eta])
+        return theta, np.array([self.gain(of_case, weight) for of_case in theta])
+
     def gain(self, theta: Array, weight: Array) -> Array:
         """∂θ̂/∂η̂ (N, q, k) at θ̂ (N, q): what errors of η̂ make of θ̂."""
         L = _root(weight)
