@@ -75,7 +75,7 @@ def main(words: list[str]) -> int:
         from gpebo_cli.experiment.assumptions import examine
         from gpebo_cli.experiment.sensors import candidates
 
-        examined = examine(job.settings, job.system, both=True)
+        examined = examine(job.settings, job.system)
         tried = candidates(job.settings, job.system) if sensors else []
     found = examined.assumptions
     title = f"plant {job.system.name}, observer {job.settings.observer['name']}"

@@ -57,17 +57,15 @@ def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...
 
     They are about ψ, which noise does not reach: signals are taken without it.
     """
-    return examine(settings, system, both=True).assumptions
+    return examine(settings, system).assumptions
 
 
 @one_thread
 @np.errstate(all="ignore")  # as in a run
-def examine(
-    settings: Settings, system: DescriptorSystem, *, both: bool = False
-) -> Examination:
+def examine(settings: Settings, system: DescriptorSystem) -> Examination:
     """:func:`check`, with what can be known; of a recording the observer's part only.
 
-    ``both``: where the observer may choose, evidence of the form that it does not take, too.
+    Where the observer may choose, there is evidence of the form that it does not take, too.
     """
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if settings.data.name == "csv":
@@ -75,7 +73,7 @@ def examine(
         noise = signal_noise(settings.noise, levels, recording.cells)
         seen = Measurements(recording.inputs, recording.outputs, noise, recording.derivatives)
         return Examination(()) if observer is None else _of_observer(
-            observer, settings, system, seen, [], both
+            observer, settings, system, seen, []
         )
     found: list[Assumption] = []
     try:
@@ -94,12 +92,12 @@ def examine(
     noise = signal_noise(settings.noise, levels)
     derivatives = InputDerivatives.of_plant(system, ~levels.noisy_inputs)
     seen = Measurements(signals.inputs, signals.outputs, noise, derivatives)
-    return _of_observer(observer, settings, system, seen, found, both)
+    return _of_observer(observer, settings, system, seen, found)
 
 
 def _of_observer(
     observer: Observer, settings: Settings, system: DescriptorSystem, seen: Measurements,
-    found: list[Assumption], both: bool,
+    found: list[Assumption],
 ) -> Examination:
     """What the observer needs of the plant, and of the signals it gets to see."""
     try:
@@ -115,7 +113,7 @@ def _of_observer(
     )
     growth = observation.growth, observation.growth_rate
     found += of_observation(observation.assumptions, growth, excitation, system)
-    if both and isinstance(observer, Gpebo) and observer.form == "auto":
+    if isinstance(observer, Gpebo) and observer.form == "auto":
         found = [_with_other_form(a, observer, system, seen, settings) for a in found]
     return Examination(
         tuple(found), times, excitation,
@@ -200,14 +198,9 @@ def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assu
     moved = float(np.abs(simulation.initial_state - system.initial_state).max(initial=0.0))
     found = [
         Assumption(
-            "Solvability",
-            _SOLVABILITY,
-            True,
+            "Solvability", _SOLVABILITY, True,
             {
-                "strangeness_index": s.mu,
-                "index": s.index,
-                "d": s.d,
-                "a": s.a,
+                "strangeness_index": s.mu, "index": s.index, "d": s.d, "a": s.a,
                 "smallest_singular_value": s.smallest_singular_value,
                 # Functions from Python are looked at between the nodes, but nothing bounds them.
                 "bounded_between_nodes": simulation.bounded,
@@ -215,9 +208,7 @@ def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assu
             },
         ),
         Assumption(
-            "Consistent start",
-            "a consistent initial state exists near the one given",
-            True,
+            "Consistent start", "a consistent initial state exists near the one given", True,
             {"largest_change": moved},
         ),
     ]

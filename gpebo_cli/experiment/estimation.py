@@ -251,15 +251,10 @@ def at_samples(
     std, gains = made.at(kept, ~np.isnan(told) & ~still[:, None, None])
     why = none_at_samples(len(by.cases)) if settings.uncertainty and p and std is None else ""
     estimation = EstimationResult(
-        cases=by.cases,
-        t=t[kept],
-        names=online.parameters,
-        parameters=parameters[:, kept],
-        true_parameters=truth[kept],
-        states=states[:, kept],
+        cases=by.cases, t=t[kept], names=online.parameters, parameters=parameters[:, kept],
+        true_parameters=truth[kept], states=states[:, kept],
         delta=None if made.delta is None else made.delta[:, kept],
-        checks={},
-        requirement=by.requirement,
+        checks={}, requirement=by.requirement,
         parameters_std=None if std is None else std[..., :p],
         states_std=None if std is None else std[..., p:],
         still=still,
@@ -386,15 +381,9 @@ def _estimate(
     parameters[..., np.isnan(told[0])] = np.nan
     estimated[..., np.isnan(told[1])] = np.nan
     result = EstimationResult(
-        cases=estimator.cases,
-        t=kept,
-        names=observation.parameters,
-        parameters=parameters,
-        true_parameters=truth[chosen],
-        states=estimated,
-        delta=lambda: estimates.delta(kept),
-        checks=checks,
-        requirement=requirement,
+        cases=estimator.cases, t=kept, names=observation.parameters, parameters=parameters,
+        true_parameters=truth[chosen], states=estimated, delta=lambda: estimates.delta(kept),
+        checks=checks, requirement=requirement,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
         explaining=explaining,
         warnings=(lambda: accuracy.astray(

@@ -185,16 +185,9 @@ def _judged(system: DescriptorSystem) -> slice:
 def _sample_recording(system: DescriptorSystem, recording: Recording, t: Array) -> RecordingResult:
     table, sampled = recording.table, recording.sampled(t)
     return RecordingResult(
-        t=t,
-        inputs=sampled.inputs,
-        outputs=sampled.outputs,
-        states=sampled.states,
-        file=table.header.source,
-        sha256=table.sha256,
-        rows=len(table.samples.t),
-        hold=recording.hold,
-        first=float(table.samples.t[0]),
-        last=float(table.samples.t[-1]),
+        **vars(sampled), file=table.header.source, sha256=table.sha256,
+        rows=len(table.samples.t), hold=recording.hold,
+        first=float(table.samples.t[0]), last=float(table.samples.t[-1]),
         known_states=tuple(system.states[i] for i in table.header.known),
         elements=recording.inputs.mesh.size,
     )
@@ -221,23 +214,15 @@ def _sample_simulation(
         if jump.impulses[:, i].any()
     ]
     return SimulationResult(
-        t=t,
-        inputs=sampler(signals.inputs.values),
-        outputs=sampler(signals.outputs.values),
-        states=sampler(signals.states.values),
-        index=structure.index,
-        strangeness_index=structure.mu,
-        differential=structure.d,
-        algebraic=structure.a,
+        t=t, inputs=sampler(signals.inputs.values), outputs=sampler(signals.outputs.values),
+        states=sampler(signals.states.values), index=structure.index,
+        strangeness_index=structure.mu, differential=structure.d, algebraic=structure.a,
         initial_state=simulation.initial_state,
         moved=tuple(_changes(system, system.initial_state, simulation.initial_state, start, size)),
-        jumps=tuple(jumps),
-        impulses=tuple(impulses),
-        error_estimate=simulation.error_estimate,
-        state_errors=simulation.state_errors,
+        jumps=tuple(jumps), impulses=tuple(impulses),
+        error_estimate=simulation.error_estimate, state_errors=simulation.state_errors,
         linear_solves=None if simulation.effort is None else simulation.effort.linear_solves,
-        elements=signals.mesh.size,
-        bounded=simulation.bounded,
+        elements=signals.mesh.size, bounded=simulation.bounded,
     )
 
 

@@ -29,7 +29,10 @@ def write_run(
     wanted = result.settings.output.figures
     figures = draw(result, None if wanted is True else wanted or [])
     make_folder(folder)
-    _remove_earlier(folder)
+    # What an earlier run left, by name: a folder may hold files that are not ours.
+    made = [folder / name for name in ("summary.json", *_FILES)]
+    remove_files(path.with_suffix(suffix) for path in made for suffix in (path.suffix, ".parquet"))
+    remove_files(folder / "figures" / f"{name}.{s}" for name in FIGURES for s in FORMATS)
 
     write_text(folder / "config.yaml", config_text)
     for name, make in TABLES.items():
@@ -44,10 +47,3 @@ def write_run(
         for suffix in result.settings.output.formats:
             save(figure, folder / "figures" / f"{name}.{suffix}")
     write_text(folder / "summary.json", summary_text(result, made_by or provenance()))
-
-
-def _remove_earlier(folder: Path) -> None:
-    """Remove what an earlier run left, by name: a folder may hold files that are not ours."""
-    made = [folder / name for name in ("summary.json", *_FILES)]
-    remove_files(path.with_suffix(suffix) for path in made for suffix in (path.suffix, ".parquet"))
-    remove_files(folder / "figures" / f"{name}.{s}" for name in FIGURES for s in FORMATS)
