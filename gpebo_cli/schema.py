@@ -259,16 +259,9 @@ def per_name(
 ) -> NDArray[np.float64]:
     """A number for every name, shape (names,), from one for all, a list, or a mapping by name.
 
-    Args:
-        value: what is given.
-        names: of signals, states or parameters.
-        noun: what they are, for messages.
-        where: the setting, for messages.
-        accept: which numbers.
-        absent: for a name that a mapping leaves out; None: it has to name all.
-
-    Raises:
-        ConfigError: the wrong number of values, an unknown or missing name, or a wrong number.
+    Messages call the names ``noun`` and the setting ``where``. A name that a mapping leaves out has
+    the value ``absent``; if that is None, the mapping has to name all (ConfigError: the wrong
+    number of values, an unknown or missing name, or a wrong number).
     """
     import numpy as np
 

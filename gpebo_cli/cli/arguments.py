@@ -145,11 +145,7 @@ def _check_questions(given: Options) -> None:
 
 
 def _stored(word: str) -> str:
-    """``figures.dpi=300`` where it is stored: ``figures`` itself is a list of names.
-
-    Raises:
-        ConfigError: figures have no such key.
-    """
+    """``figures.dpi=300`` where it is stored: ``figures`` itself is a list of names."""
     match = re.match(r"\+*figures\.([^=]*)=", word)
     if match is None:
         return word

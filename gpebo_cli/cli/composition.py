@@ -107,10 +107,9 @@ class Loader(ConfigLoaderImpl):
 
 
 def refuse_code(config: Mapping[str, Any]) -> None:
-    """The second line: whatever the files were, only Hydra's and our own plugins are called.
+    """The second line: only Hydra's and our own plugins are called, whatever the files were.
 
-    Raises:
-        ConfigError: a callback, or a name of something to call.
+    A ConfigError names a callback, or a name of something to call.
     """
     hydra = config["hydra"]
     for key in ("callbacks", "searchpath"):

@@ -35,14 +35,10 @@ _OPEN = ("start", "horizon")  # of time: null where the data, or a default, deci
 
 
 def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
-    """The settings of one run.
+    """The settings of one run, from plain data of the keys in :data:`KEYS`.
 
-    Args:
-        config: plain data, of the keys in :data:`KEYS`.
-        draw: whether ``figures: null`` means all figures or none.
-
-    Raises:
-        ConfigError: an unknown key, a wrong type, or a value out of range.
+    ``draw``: whether ``figures: null`` means all figures or none (ConfigError: an unknown key, a
+    wrong type, or a value out of range).
     """
     for key in config:
         if key not in KEYS:

@@ -53,9 +53,6 @@ def outline(path: str, section: str = "") -> dict[str, str]:
 
     Reads lines, not YAML: a parser takes longer to import than everything that needs this takes,
     and a file that is hostile, or half-written, costs nothing. What is no file has no keys.
-
-    Raises:
-        OSError: it cannot be read.
     """
     if not os.path.isfile(path):  # a pipe would block
         return {}

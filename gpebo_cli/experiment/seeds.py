@@ -39,11 +39,7 @@ _MOST_SAMPLES = 2e6  # of all seeds: some twenty seconds
 
 
 def check_seeds(settings: NoiseSettings, levels: NoiseLevels, horizon: float) -> None:
-    """Refuse many seeds of nothing, and more samples in all of them than can be computed soon.
-
-    Raises:
-        ConfigError: says what is needed.
-    """
+    """Refuse many seeds of nothing, and more samples than can be computed soon (ConfigError)."""
     if settings.seeds > 1 and levels.silent:
         raise ConfigError(f"noise.seeds = {settings.seeds}, but there is no noise; set its levels")
     samples = settings.seeds * horizon / settings.sample_time

@@ -46,10 +46,8 @@ class Sensor:
 def candidates(settings: Settings, system: DescriptorSystem) -> list[Sensor]:
     """Every state as a further output: the best, the best beside that one, and so on.
 
-    The best is that with which most is determined, then that with the largest log det G.
-
-    Raises:
-        ConfigError: there is no simulation or no observer, or no strangeness-free form.
+    The best is that with which most is determined, then that with the largest log det G
+    (ConfigError: there is no simulation or no observer).
     """
     if build(settings.observer) is None or settings.data.name == "csv" or system.regression:
         raise ConfigError("sensors=all needs a simulation of a plant (data=none) and an observer")

@@ -121,11 +121,7 @@ def _rows_of_cases(estimation: EstimationResult, cases: slice) -> Array:
 
 
 def check_parquet() -> None:
-    """Refuse Parquet files where nothing can write them; worth doing before a long run.
-
-    Raises:
-        ConfigError: names what is missing.
-    """
+    """Refuse Parquet files where nothing can write them, before a long run (ConfigError)."""
     if find_spec("pyarrow") is None:
         raise ConfigError("output.parquet needs pyarrow: pip install 'gpebo[parquet]'")
 
