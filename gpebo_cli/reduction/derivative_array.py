@@ -172,8 +172,10 @@ class _Terms(NamedTuple):
 
     def transposed(self, values: Array) -> Array:
         """The product of the transpose with values (e,), (a + b + 1,)."""
-        both = np.concatenate([self.rows, self.columns])
-        found = np.bincount(both, np.tile(values, 2), self.total).astype(np.float64)
+        of_rows, of_columns = (
+            np.bincount(which, values, self.total) for which in (self.rows, self.columns)
+        )
+        found = (of_rows + of_columns).astype(np.float64)  # without entries bincount has integers
         found[-1] = self.of_time @ values
         return found
 
