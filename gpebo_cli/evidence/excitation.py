@@ -115,7 +115,7 @@ def assess(
     # What is looked at later must not keep what is known of this regression by now.
     later = replace(evidence, regression=replace(regression))
     return Excitation(
-        t, window, settings.rho, regression.parameters, evidence.known(t[-1:]),
+        t, window, settings.rho, regression.parameters, replace(evidence, t=t[-1:]).known(),
         partial(_t_c, later, settings.rho), later.lambda_min, later.least_share, later.known,
         later.eigenvalues, later.levels,
     )
@@ -143,26 +143,13 @@ def _t_c(evidence: _Evidence, rho: float | None) -> float | None:
             level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
-    def hopeless() -> BoolArray:
-        """Points (K, s + 1) where ψ is surely not exciting yet.
-
-        G grows: inside, λ_min(N) is at most that at the end times the largest growth of a G_jj.
-        """
-        if rho is not None or not enough or regression.dynamics is not None:
-            return np.zeros(gram.mesh.points.shape, dtype=bool)
-        before = np.einsum("ksjj->ksj", gram.values[..., :p])
-        last = np.broadcast_to(before[:, -1:], before.shape)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            growth = np.divide(last, before, out=np.ones_like(before), where=last > 0.0)
-            return np.asarray(of_ends.smallest[:, None] * growth.max(axis=2, initial=1.0) < enough)
-
     doubt = p * _EPS / (enough or 1.0)  # that rounding of G leaves in the level
-    return _first_time(gram, ends, reached, hopeless, doubt)
+    return _first_time(gram, ends, reached, doubt)
 
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """What a regression says at any times (M,), by default those of the evidence."""
+    """What a regression says at the times t (N,)."""
 
     regression: LinearRegression
     t: Array
@@ -176,10 +163,9 @@ class _Evidence:
         element = mesh.edges[1:-1].searchsorted(at, side="left")
         return sizes[element], at - mesh.edges[0], self.tol
 
-    def known(self, at: Array | None = None) -> Knowledge:
+    def known(self) -> Knowledge:
         """What is known of the parameters."""
-        at = self.t if at is None else at
-        return knowledge(self.regression.gram(at), *self.beside(at))
+        return knowledge(self.regression.gram(self.t), *self.beside(self.t))
 
     def least_share(self) -> Array:
         """Of the parameters, (N,); 0 some time before it is ``WELL`` for good."""
@@ -193,14 +179,14 @@ class _Evidence:
                 break
         return found
 
-    def eigenvalues(self, at: Array | None = None) -> Array:
-        """Those of G, (M, p)."""
-        gram = self.regression.gram(self.t if at is None else at)
-        return np.maximum(symmetric_eigenvalues(gram), 0.0)
+    def eigenvalues(self) -> Array:
+        """Those of G, (N, p)."""
+        return np.maximum(symmetric_eigenvalues(self.regression.gram(self.t)), 0.0)
 
     def lambda_min(self) -> float:
         """The smallest of G at the last of the times."""
-        return float(self.eigenvalues(self.t[-1:])[0, 0]) if self.regression.p else 0.0
+        last = replace(self, t=self.t[-1:])
+        return float(last.eigenvalues()[0, 0]) if self.regression.p else 0.0
 
     def levels(self) -> Array:
         """The smallest eigenvalue over each trailing window, (N,)."""
@@ -227,27 +213,25 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 
 
 def _first_time(
-    gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array],
-    hopeless: Callable[[], BoolArray], doubt: float,
+    gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array], doubt: float
 ) -> float | None:
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
     Each round looks where the polynomial through the four nearest points, t of the level, points,
     else the secant, and at distances around it that fall by powers of four. ``edges`` are the right
-    ends of elements, ``hopeless`` the points (K, s + 1) at which it is surely negative, and
-    ``doubt`` is a difference that is rounding.
+    ends of elements, and ``doubt`` is a difference that is rounding.
     """
     mesh = gram.mesh
     ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
     if len(ends) == 0:
         return None
 
-    # Up to the first element at whose end it is reached.
-    levels, looked_at = np.full(mesh.points.shape, np.log(_TINY)), ~hopeless()
-    looked_at[ends[0]], looked_at[ends[0] + 1 :] = True, False
-    levels[looked_at] = reached(mesh.points[looked_at], gram.values[looked_at])
+    points = mesh.points[: ends[0] + 1]  # up to the first element at whose end it is reached
+    matrices = gram.values[: ends[0] + 1].reshape(points.size, *gram.values.shape[2:])
+    levels = reached(points.ravel(), matrices).reshape(points.shape)
+    levels[-1, -1] = max(levels[-1, -1], 0.0)  # rounding; it was reached there
     k = int(np.argmax((levels >= 0.0).any(axis=1)))
-    points, level = mesh.points[k], levels[k]
+    points, level = points[k], levels[k]
     piece = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
     start, horizon = float(mesh.edges[0]), float(mesh.edges[-1] - mesh.edges[0])
     at_once = np.minimum(start + _AT_ONCE * horizon, mesh.edges[k + 1 : k + 2])

@@ -105,7 +105,9 @@ class Tape:
             here = slice(first, first + part)
             times = t[here]
             decided = times if inside is None else inside[here]
-            jets_of_signals = _jets(None if signals is None else signals[:, here])
+            jets_of_signals: list[Jet] | None = None
+            if signals is not None:
+                jets_of_signals = [list(each) for each in np.moveaxis(signals[:, here], 2, 0)]
             places = self._checked(times, order, decided, jets_of_signals)
             for column, place in enumerate(self.outputs):
                 for k, coefficient in enumerate(places[place][: order + 1]):
@@ -315,11 +317,6 @@ class Assembly:
             once.flags.writeable = False
             matrices.append(once)
         return *program, self.targets, *matrices
-
-
-def _jets(signals: Array | None) -> list[Jet] | None:
-    """Signals (J + 1, N, number) as one jet each."""
-    return None if signals is None else [list(signals[:, :, j]) for j in range(signals.shape[2])]
 
 
 def _first_not_finite(coefficient: Coefficient) -> float:
