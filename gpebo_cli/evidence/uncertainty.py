@@ -47,17 +47,13 @@ def deviations(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, instants: Array,
     variances: Array, t: Array, starts: Array | None = None,
 ) -> tuple[Array, Array]:
-    """One standard deviation of η̂ (M, p) and of x̂ (M, n) at the times t (M,).
+    """One standard deviation of η̂ (M, p) and of x̂ (M, n) at the times t (M,), ascending.
 
-    Args:
-        observer: errors of [u; y] to those of Y and of the state's offset.
-        estimator: errors of Y to those of η̂.
-        gain: of x = offset + gain η at the times, (M, n, p).
-        edges: of the regression's mesh, (K + 1,) seconds; ψ is smooth between them.
-        instants: times of the samples; errors are held from one to the next.
-        variances: of each sample of [u; y], (m + r,).
-        t: ascending.
-        starts: edges at which ζ begins anew, of several experiments; None: at the first one only.
+    ``observer`` takes errors of [u; y] to those of Y and of the state's offset, ``estimator`` those
+    of Y to those of η̂; the gain is that of x = offset + gain η (M, n, p). ψ is smooth between
+    ``edges`` (K + 1,), in seconds. Errors are held from one of the ``instants`` of samples to the
+    next, and ``variances`` are those of each sample of [u; y] (m + r,). ζ begins anew at the edges
+    ``starts``, of several experiments; None: at the first one only.
     """
     most, per, before = len(instants) // _GROUPS, _PER_ELAPSED, list[Array]()
     anew = edges[:1] if starts is None else starts

@@ -16,18 +16,10 @@ def in_frame(
 ) -> tuple[Array, ...]:
     """The matrices of the observer at N times, those of the plant being (N or 1, ...).
 
-    Args:
-        E: (n, n).
-        A: (n, n).
-        B: (n, m).
-        F: (n, q).
-        C: (r, n).
-        rows: by which the equations are divided (n,).
-        scale: by which the outputs are multiplied (r,).
-        domain: orthonormal basis of range E⁺E (n, d).
-        range_: of range E (n, d).
-        kernel: of the kernel of E (n, b).
-        equations: those without derivatives, as rows (e, n).
+    E and A are (n, n), B (n, m), F (n, q) and C (r, n); equations are divided by ``rows`` (n,),
+    outputs multiplied by ``scale`` (r,). Orthonormal bases are those of range E⁺E (n, d), of range
+    E (n, d) and of the kernel of E (n, b); ``equations`` are those without derivatives, as rows (e,
+    n).
 
     Returns:
         the largest entry of E outside the frame, the largest norm of UᵀE B and of its inverse (3,);

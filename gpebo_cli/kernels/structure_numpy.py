@@ -107,14 +107,11 @@ def reference(
     E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, place: int,
     rank_tol: float,
 ) -> tuple[int, Array, IntArray, IntArray, Array]:
-    """Where elimination at other times starts from: :func:`levels` and pivots of one time.
+    """Where elimination at other times starts from: :func:`levels` and pivots at one ``place``.
 
-    Arguments are those of :func:`levels`, and the time's ``place``.
-
-    Returns:
-        the number of constraints a; the singular values (3,); all rows and all columns of M, those
-        that carry its rank first; and Z1 (n, d), an orthonormal basis of range(E T2). With more
-        constraints than states only the first one means something.
+    They are the number of constraints a; the singular values (3,); all rows and all columns of M,
+    those that carry its rank first; and Z1 (n, d), an orthonormal basis of range(E T2). With more
+    constraints than states only the first one means something.
     """
     E, A = (x if x.shape[1] == 1 else x[:, place : place + 1] for x in (E, A))
     e, a = scaled(E, A, rows, columns, time, orders)

@@ -93,13 +93,11 @@ def resolve(
     """Resolve signals that are known: nothing is integrated.
 
     ``evaluate`` gives what is wanted on a mesh, and the signals (K, s + 1, c) to resolve, each kind
-    with its floor (see :func:`unresolved_kinds`); the rest is as of :func:`refine`.
-
-    Returns:
-        The mesh, what is wanted on it, and the largest tail.
+    with its floor (see :func:`unresolved_kinds`); the rest is as of :func:`refine`. The result is
+    the mesh, what is wanted on it, and the largest tail.
 
     Raises:
-        SolverError: if ``max_elements`` do not reach ``tol``; names the time.
+        SolverError: ``max_elements`` do not reach ``tol``; names the time.
     """
 
     def on(mesh: Mesh, before: Found | None, kept: IntArray) -> tuple[Found, Array]:  # noqa: ARG001
