@@ -100,25 +100,20 @@ def _checked(real: str, path: str, inside: str) -> dict[str, Any]:
     text = read_text(real, _MAX_BYTES)
     content = _mapping(path, parse(text, path))
     where = package(inside)
-    _refuse_headers(path, text, allowed=where == GLOBAL)
+    for line in text.splitlines():  # a comment that Hydra would obey, and which does nothing here
+        if match := _HEADER.match(line):
+            if where != GLOBAL:
+                raise ConfigError(f"{path}: `# @package` is not allowed in a file of a group")
+            if match[1] != GLOBAL:
+                raise ConfigError(
+                    f"{path}: only `# @package {GLOBAL}` is allowed, got {shown(match[1])}"
+                )
     if where != GLOBAL:
         if "defaults" in content:
             raise ConfigError(f"{path}: a file of {where}/ has no defaults list")
         return content
     recipe = _recipe(path, content)
     return recipe if "/" in inside else _primary(recipe)
-
-
-def _refuse_headers(path: str, text: str, *, allowed: bool) -> None:
-    """A comment that Hydra would obey in other programs; here it would silently do nothing."""
-    for line in text.splitlines():
-        if match := _HEADER.match(line):
-            if not allowed:
-                raise ConfigError(f"{path}: `# @package` is not allowed in a file of a group")
-            if match[1] != GLOBAL:
-                raise ConfigError(
-                    f"{path}: only `# @package {GLOBAL}` is allowed, got {shown(match[1])}"
-                )
 
 
 def _recipe(path: str, content: Mapping[str, Any]) -> dict[str, Any]:

@@ -251,15 +251,10 @@ def scalar_path(
 
     ``determinant`` gives Δ at any times, where that is cheaper than ``signals``.
     """
-    energy = integral_of_square(mesh, delta)
+    energy = np.maximum.accumulate(Trajectory(mesh, delta**2).integral().values.ravel())
+    energy = energy.reshape(delta.shape)  # ∫Δ² never falls
     at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
     if determinant is None:
         def determinant(t: Array) -> Array:
             return signals(t, t)[0]
     return ScalarPath(mesh, signals, determinant, quotient, energy, t, at_t, floor)
-
-
-def integral_of_square(mesh: Mesh, delta: Array) -> Array:
-    """I = ∫Δ² of Δ (K, s + 1) at the points of its mesh, (K, s + 1); it never falls."""
-    integral = Trajectory(mesh, delta**2).integral().values.ravel()
-    return np.asarray(np.maximum.accumulate(integral).reshape(delta.shape))

@@ -57,7 +57,14 @@ def plant_from_mapping(
     file = f" ({source})" if source else ""
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{kind}{file} must be a mapping with the keys {', '.join(KEYS)}")
-    name = _plant_name(mapping.get("name"), file, kind)
+    name = mapping.get("name")
+    if name is None:
+        raise ConfigError(f"{kind}{file}: name is missing")
+    if not isinstance(name, str) or not _PLANT_NAME.fullmatch(name):
+        raise ConfigError(
+            f"{kind}{file}: name is {brief(name)}; write text of letters, digits, "
+            "'_', '-', '.' and blanks that starts with a letter or digit (it names folders)"
+        )
     plant = f"{kind} {name}{file}"
     check_keys(mapping, KEYS, plant)
     mapping = with_archive(mapping, source, plant)
@@ -95,9 +102,16 @@ def plant_from_mapping(
     everything = {**signals, **parameters}
 
     def read(value: object, where: str, allowed: Mapping[str, str] | None) -> Expression:
+        """ConfigError: signals that may not stand there, also inside of parameters."""
         known = parameters if allowed is None else everything
         expression = parse(value, known, f"{plant}: {where}", elsewhere)
-        _check_signals(expression, elsewhere, allowed or {}, where.partition("[")[0])
+        for name in sorted(expression.node.signals):
+            why = (allowed or {}).get(elsewhere[name])
+            if why != "":
+                raise ConfigError(
+                    f"{expression.where} = {shorten(expression.text)}: {name} is {elsewhere[name]} "
+                    f"and may not stand in {where.partition('[')[0]}{why or ''}"
+                )
         return expression
 
     where = "inputs" if kind == "plant" else "signals"
@@ -175,34 +189,10 @@ def _entries(
     return entries
 
 
-def _check_signals(
-    expression: Expression, kinds: Mapping[str, str], allowed: Mapping[str, str], key: str
-) -> None:
-    """Refuse signals that may not stand in what ``key`` names, also inside of parameters."""
-    for name in sorted(expression.node.signals):
-        why = allowed.get(kinds[name], "")
-        if kinds[name] not in allowed or why:
-            raise ConfigError(
-                f"{expression.where} = {shorten(expression.text)}: {name} is {kinds[name]} and "
-                f"may not stand in {key}{why}"
-            )
-
-
 def _required(mapping: Mapping[str, object], key: str, plant: str) -> object:
     value = mapping.get(key)
     if value is None:
         raise ConfigError(f"{plant}: {key} is missing")
-    return value
-
-
-def _plant_name(value: object, file: str, kind: str) -> str:
-    if value is None:
-        raise ConfigError(f"{kind}{file}: name is missing")
-    if not isinstance(value, str) or not _PLANT_NAME.fullmatch(value):
-        raise ConfigError(
-            f"{kind}{file}: name is {brief(value)}; write text of letters, digits, "
-            "'_', '-', '.' and blanks that starts with a letter or digit (it names folders)"
-        )
     return value
 
 

@@ -113,7 +113,9 @@ class Linearised:
             moved = []
             for by in (shift[:, j], -shift[:, j]):
                 along[0, :, self.system.m + j] = y[0, :, j] + by
-                moved.append(_right_side(source.taylor(t, order, inside, along), known, x))
+                m = source.taylor(t, order, inside, along)
+                of_known = _product(m.B, known.u) + _product(m.F, known.theta)
+                moved.append(m.phi + _product(m.A, x) + of_known)
             along[0, :, self.system.m + j] = y[0, :, j]
             G[..., j] = (moved[0] - moved[1]) / (2.0 * shift[:, j, None])
         GC, GH = _product(G, c.C), _product(G, c.H)
@@ -162,11 +164,6 @@ def looked_along(
         return found
 
     return source.along(signals, mesh.edges)
-
-
-def _right_side(c: Coefficients, known: Coefficients, x: Array) -> Array:
-    """A x + B u + F θ + φ, (K + 1, N, n)."""
-    return c.phi + _product(c.A, x) + _product(c.B, known.u) + _product(c.F, known.theta)
 
 
 def _product(a: Array, b: Array) -> Array:

@@ -68,7 +68,14 @@ def follow(
     Linearised(system, _at_rest(x, t, length, solver)).taylor(at_start, 0)  # refuses by name
     begin = process_time()
     while t < stop - 1e-12 * time.horizon:
-        _check_pace(system.name, process_time() - begin, t - time.start, time.horizon, solver)
+        taken, done = process_time() - begin, (t - time.start) / time.horizon
+        if taken > max(_PART, done) * solver.max_seconds:  # a good part, and too much for that
+            raise SolverError(
+                f"plant {system.name}: the simulation of {time.horizon:g} s would take more "
+                f"computing time than solver.max_seconds = {solver.max_seconds:g} s (the first "
+                f"{t - time.start:.3g} s took {taken:.2g} s); shorten time.horizon, or raise "
+                "solver.max_seconds"
+            )
         length = min(length, stop - t)
         if stop - t < 1.25 * length:
             length = stop - t
@@ -96,19 +103,6 @@ def follow(
         solve(linear, time, solver)
         iterates, work = iterates + 1, work + 1.0
     return Effort(len(pieces), iterates, work, change)
-
-
-def _check_pace(
-    name: str, spent: float, done: float, horizon: float, solver: SolverSettings
-) -> None:
-    """Refuse what will take too long, once a good part of the time is spent."""
-    if spent < _PART * solver.max_seconds or spent * horizon < solver.max_seconds * done:
-        return
-    raise SolverError(
-        f"plant {name}: the simulation of {horizon:g} s would take more computing time than "
-        f"solver.max_seconds = {solver.max_seconds:g} s (the first {done:.3g} s took {spent:.2g} "
-        "s); shorten time.horizon, or raise solver.max_seconds"
-    )
 
 
 def _window(

@@ -18,7 +18,7 @@ from gpebo_cli import kernels
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.model.expressions import jets
-from gpebo_cli.model.expressions.jets import Coefficient, Jet
+from gpebo_cli.model.expressions.jets import Jet
 from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.program import Program, Recorder, finished
 from gpebo_cli.model.expressions.syntax import Expression, shorten
@@ -252,7 +252,8 @@ class Tape:
             # First index of a time at which a place, or something it is made of, is not finite.
             bad: list[float] = []
             for (operation, arguments, _), jet in zip(self.instructions, places, strict=True):
-                own = [_first_not_finite(coefficient) for coefficient in jet]
+                wrong = [np.atleast_1d(~np.isfinite(coefficient)) for coefficient in jet]
+                own = [float(np.argmax(flags)) if flags.any() else math.inf for flags in wrong]
                 told = operation == "signal" and signals is not None
                 bad.append(min([*own, *(bad[argument] for argument in arguments if not told)]))
             for label in self.labels[: len(self.outputs)]:
@@ -317,11 +318,6 @@ class Assembly:
             once.flags.writeable = False
             matrices.append(once)
         return *program, self.targets, *matrices
-
-
-def _first_not_finite(coefficient: Coefficient) -> float:
-    flags = np.atleast_1d(~np.isfinite(coefficient))
-    return float(np.argmax(flags)) if flags.any() else math.inf
 
 
 def record(expressions: Sequence[Expression], inputs: Sequence[Expression] = ()) -> Tape:
