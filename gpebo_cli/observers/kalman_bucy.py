@@ -126,6 +126,14 @@ def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> Fil
     )
 
 
+def _inside(q: int, split: Split, P: Array) -> Array:
+    """diag(I, P) in coordinates of ζ, (N, n, n)."""
+    moving = split.dual @ P @ split.basis
+    inside = np.zeros((len(P), q + moving.shape[1], q + moving.shape[1]))
+    inside[:, :q, :q], inside[:, q:, q:] = np.eye(q), moving
+    return inside
+
+
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
     """Intensities: of the signals' noise, of what drives ζ, and of what regularises V."""
@@ -148,9 +156,7 @@ class NoiseModel:
         Q = weighted @ transpose(s.from_noise)
         if self.process.any():
             # w stays in the range of P(t), and so does what drives it.
-            inside = np.zeros_like(Q)
-            inside[:, :q, :q] = np.eye(q)
-            inside[:, q:, q:] = split.dual @ s.projector @ split.basis
+            inside = _inside(q, split, s.projector)
             Q = Q + (inside * self.process) @ transpose(inside)
         return StateSpace(
             A=s.A,
@@ -326,10 +332,8 @@ def _uniform_observability(
 ) -> Requirement:
     """λ_min of M over all windows, in units of P(0)⁻¹, in the directions that ζ has."""
     P = projector(windows.starts)
-    n, q, split = len(P0), known.system.q, known.first.split
-    inside = np.zeros((len(P), n, n))
-    inside[:, :q, :q] = np.eye(q)
-    inside[:, q:, q:] = split.dual @ P @ split.basis
+    n, q = len(P0), known.system.q
+    inside = _inside(q, known.first.split, P)
     scale = np.sqrt(np.diag(P0))
     scale = np.where(scale > 0, scale, scale.max(initial=0.0) or 1.0)
     M = scale[:, None] * (inside @ windows.gramians @ inside) * scale
@@ -361,10 +365,8 @@ def _measurement_noise(
         for name, value in zip((*system.inputs, *system.outputs), model.signals, strict=True)
     }
     if model.rows.any():
-        used["regularised_with"] = (
-            f"noise of {regularisation:g} of each equation's size at {noise.sample_time:g} s"
-        )
-        used["largest_intensity_added"] = float(model.rows.max())
+        what = f"noise of {regularisation:g} of each equation's size at {noise.sample_time:g} s"
+        used |= {"regularised_with": what, "largest_intensity_added": float(model.rows.max())}
     return Assumption(
         "Measurement noise",
         "its covariance V(t) is positive definite, regularised where the noise leaves it singular",

@@ -127,12 +127,8 @@ class TextRegression:
                 assert Y is not None  # noqa: S101  a source gives it
                 right = Y(mesh.points.ravel(), mesh.inside.ravel())
             right = right.reshape(*mesh.points.shape, self.rows)
-            flat = columns[0].reshape(*mesh.points.shape, -1)
-            products = outer_products(psi, right)
-            kinds = [flat[..., k : k + 1] for k in range(flat.shape[2])]
-            kinds += [psi.reshape(*mesh.points.shape, -1), right,
-                      products.reshape(*mesh.points.shape, -1)]
-            return (psi, right), [(kind, 0.0) for kind in kinds]
+            kinds = [*columns[0].T, psi, right, outer_products(psi, right)]
+            return (psi, right), [(kind.reshape(*mesh.points.shape, -1), 0.0) for kind in kinds]
 
         mesh, (psi, right), error = resolve(
             evaluated, self._mesh(signals), tol=tol, max_elements=max_elements,

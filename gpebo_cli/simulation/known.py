@@ -32,13 +32,12 @@ SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 
 
 
 def first_mesh(
-    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings,
-    elements: int = FIRST_ELEMENTS,
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> tuple[Mesh, Array, bool]:
     """A mesh without anything narrow between its nodes, jumps (B,), and whether that is sure."""
     start, stop = time.start, time.start + time.horizon
     cuts = system.coefficients.breakpoints(start, stop)
-    mesh = initial_mesh(start, stop, cuts, elements, radau_rule(solver.stages))
+    mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
     edges, bounded = system.coefficients.resolved(mesh.edges)
     return Mesh(edges, mesh.rule), cuts, bounded
 

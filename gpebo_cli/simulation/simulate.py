@@ -99,13 +99,11 @@ def _simulate_linear(
         system, start, start + time.horizon, max_mu=solver.max_strangeness_index,
         rank_tol=solver.rank_tol,
     )
-    mesh, c, terms = _known_resolved(
-        system, structure, mesh, cuts, solver, bounded=bounded
-    )
+    mesh, c, terms = _known_resolved(system, structure, mesh, cuts, solver, bounded=bounded)
     first = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
-    if solver.name == "ivp":
-        inside = float(mesh.inside[0, 0])
-        x0 = ivp.consistent_start(system, structure, start, inside)
+    independent = solver.name == "ivp"  # the underlying ODE of the derivative array, by scipy
+    if independent:
+        x0 = ivp.consistent_start(system, structure, start, float(mesh.inside[0, 0]))
     else:
         x0 = consistent_state(first, system.initial_state, structure.scaling.weights)
     if not np.isfinite(x0).all():
@@ -115,9 +113,9 @@ def _simulate_linear(
         )
 
     happened: dict[float, tuple[Array, Jump]] = {}
-    restarts: dict[float, Callable[[Array], Array]] = {}
-    for cut in map(float, cuts):
-        restarts[cut] = _restart(system, structure, cut, mesh.edges, happened)
+    restarts = {
+        cut: _restart(system, structure, cut, mesh.edges, happened) for cut in map(float, cuts)
+    }
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         return _equations(strangeness_free_form(system, structure, t, inside))
@@ -146,7 +144,6 @@ def _simulate_linear(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
         _amplification(first, structure.scaling.columns, float(mesh.steps.max())), apart=True,
     )
-    independent = solver.name == "ivp"  # the underlying ODE of the derivative array, by scipy
     if independent:
         problem = replace(problem, coefficients=explicit)
     own = ivp.solve if independent else partial(solve, known=_equations(first))
@@ -159,13 +156,10 @@ def _simulate_linear(
     y = _outputs(C, x, *direct)
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
-        structure=structure,
-        initial_state=x0,
+        structure=structure, initial_state=x0,
         jumps=tuple((t, *happened[t]) for t in sorted(happened)),
-        error_estimate=solution.error_estimate,
-        bounded=bounded,
-        state_errors=solution.errors[:, 0],
-        lost=solution.lost,
+        error_estimate=solution.error_estimate, bounded=bounded,
+        state_errors=solution.errors[:, 0], lost=solution.lost,
     )
 
 

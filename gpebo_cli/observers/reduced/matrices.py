@@ -199,12 +199,11 @@ def _by_steps(
     if (rows != 1.0).any():
         E, A, B, F = (matrix / rows for matrix in (E, A, B, F))
     C, D, H = (scale[:, None] * matrix for matrix in (C, D, H))
+    split = None
     if frame is not None:
         split = split_in_frame(E, frame, units.states, rank_tol)
-    else:
-        split = None
-        if like is None:
-            split = constant_split(E, system.states, units.states, rank_tol)
+    elif like is None:
+        split = constant_split(E, system.states, units.states, rank_tol)
     if split is None:
         known = None if like is None else like.split
         split = split_by_svd(system, E, slope() / rows, t, units.states, rank_tol, known)
@@ -223,12 +222,11 @@ def _by_steps(
     of_y = np.zeros((1, algebraic.shape[1], r))
     of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
     g_signals = joined(of_inputs, of_y, axis=2)
+    arguments = system, algebraic, split.kernel, units.states, t, rank_tol
     if frame is not None and frame.remaining is not None:
-        Q1, K, injectivity = _eliminate_in_part(
-            system, algebraic, split.kernel, units.states, t, rank_tol, frame.remaining.rank
-        )
+        Q1, K, injectivity = _eliminate_in_part(*arguments, frame.remaining.rank)
     else:
-        Q1, K, injectivity = _eliminate(system, algebraic, split.kernel, units.states, t, rank_tol)
+        Q1, K, injectivity = _eliminate(*arguments)
     if hidden is not None:
         Q1[:, Q1.shape[1] - r :] = 0.0  # y is not in it, and neither is its rounding
     Lambda = exact_product(pinv, A)  # Λ = E⁺A + Ṗ

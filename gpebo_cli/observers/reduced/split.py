@@ -153,18 +153,14 @@ def fits(
 
 def within_frame(frame: Frame, pinv: Array) -> Split:
     """The split in a frame, with dual E⁺ (N, n_a, n)."""
-    left = frame.remaining
-    if left is not None:
-        return Split(
-            rank=left.kept.shape[1], basis=left.kept, dual=left.dual,
-            pinv=left.dual @ frame.domain @ pinv, turn=None, equations=frame.equations[None],
-            kernel=np.hstack([frame.kernel, left.given_up])[None],
-            projector=(left.kept @ left.dual)[None], frame=frame,
-        )
+    basis, dual, kernel, projector = frame.domain, frame.dual, frame.kernel, frame.projector
+    if (left := frame.remaining) is not None:
+        basis, dual, pinv = left.kept, left.dual, left.dual @ frame.domain @ pinv
+        kernel, projector = np.hstack([kernel, left.given_up]), basis @ dual
     return Split(
-        rank=frame.domain.shape[1], basis=frame.domain, dual=frame.dual, pinv=pinv, turn=None,
-        equations=frame.equations[None], kernel=frame.kernel[None],
-        projector=frame.projector[None], frame=frame,
+        rank=basis.shape[1], basis=basis, dual=dual, pinv=pinv, turn=None,
+        equations=frame.equations[None], kernel=kernel[None], projector=projector[None],
+        frame=frame,
     )
 
 
