@@ -232,11 +232,7 @@ class RecursiveMonotone:
         raise SolverError("the monotone law cannot be followed at samples; lower its gain")
 
     def _newton(self, theta: Array, x: Array, goal: Array) -> Array:
-        """θ̂ (g, q) after one implicit step.
-
-        Raises:
-            LinAlgError: Newton's method does not find it.
-        """
+        """θ̂ (g, q) after one implicit step; LinAlgError where Newton's method does not find it."""
         (g, q), R = theta.shape, radau_rule(_NODES).integration
         rule, moved = R * x[:, None, None], np.zeros((g, _NODES, q))
         for _ in range(_ROUNDS):

@@ -167,10 +167,7 @@ def initial_extension(
 ) -> Array:
     """ξ_a(start) in the coordinates of V1, shape (n_a,): ``observer.xi_a0``, the plant's, or 0.
 
-    Args:
-        given: the setting.
-        system: the plant.
-        names: of e₀'s components.
+    The setting is ``given``, ``names`` are those of e₀'s components.
 
     Raises:
         ConfigError: unknown state, or the wrong number of values.

@@ -193,10 +193,7 @@ class Gpebo:
 def _same_on_both_forms(
     found: Observation, system: DescriptorSystem, signals: Measurements
 ) -> bool:
-    """Whether the equations as given hide nothing: no hidden constraints, and Φ does not grow.
-
-    Nor is there another form of differential equations alone.
-    """
+    """Whether the equations as given hide no constraints and Φ does not grow, or all have x'."""
     t, inside = signals.mesh.points[0, :1], signals.mesh.inside[0, :1]
     follows = system.coefficients.signals
     along = signals.at(t, inside)[None] if follows else None

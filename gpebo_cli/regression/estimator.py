@@ -70,12 +70,7 @@ class ResumableEstimates(Estimates, Protocol):
         ...
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
-        """η̂ of some cases at the times, shape (g, M, p).
-
-        Args:
-            cases: which.
-            start: η̂ of each of them (g, p) at the start of the regression; None: the settings'.
-        """
+        """η̂ of some cases (g, M, p) at the times, from ``start`` (g, p); None: the settings'."""
         ...
 
 
@@ -95,12 +90,9 @@ class Resumable(Protocol):
     def resume(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> ResumableEstimates:
-        """As ``Estimator.estimate`` at the times t (M,), from extensions that are known.
+        """As ``Estimator.estimate`` at the times t (M,), for Y = ψη without resets.
 
-        Args:
-            regression: Y = ψη without resets.
-            t: times.
-            known: the extensions at its start; none: they start at zero.
+        From extensions that are known at its start; none: they start at zero.
         """
         ...
 

@@ -102,9 +102,8 @@ def _overlooked(
 ) -> BoolArray:
     """Elements (K,) with something narrow between their nodes, a pulse of an input for instance.
 
-    What the nodes do not see leaves no trace in Legendre coefficients. So every known function is
-    looked at in between, and an element is suspected where it is far from what the coefficients
-    make one expect.
+    That leaves no trace in Legendre coefficients. So known functions are looked at in between, and
+    an element is suspected where they are far from what the coefficients let one expect.
     """
     looks = min(_LOOKS, _MOST_LOOKS // mesh.size)
     names = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]

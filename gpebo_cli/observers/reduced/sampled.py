@@ -111,13 +111,9 @@ class SampledObserver:
     def advance(
         self, state: SampledState | None, t: Array, u: Array, y: Array
     ) -> tuple[SampledState, SampledBlock]:
-        """Carry the recursion over the samples at the times t (K,).
+        """Carry the recursion over the samples u (K, m), y (K, r) at t (K,), after ``state.t``.
 
-        Args:
-            state: None before the first sample.
-            t: ascending, after ``state.t``.
-            u: (K, m).
-            y: (K, r).
+        The state is None before the first sample.
 
         Raises:
             ModelError: the rank of E changes, or Assumption 1 fails.
