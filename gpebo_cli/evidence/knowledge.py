@@ -38,9 +38,7 @@ class Knowledge:
 
     def at(self, chosen: slice | IntArray) -> Knowledge:
         """The spectra at some of the times, a slice or indices (M,)."""
-        return Knowledge(
-            self.sizes[chosen], self.eigenvalues[chosen], self.vectors[chosen], self.level[chosen]
-        )
+        return Knowledge(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
     @staticmethod
     def joined(parts: Sequence[Knowledge]) -> Knowledge:

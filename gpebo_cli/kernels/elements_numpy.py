@@ -220,8 +220,7 @@ def sweeps(
         most: sweeps over one element.
 
     Returns:
-        (K, s + 1, d, c), before what is added; and the last relative change of each element (K,),
-        or ``tol``.
+        (K, s + 1, d, c), before what is added; and the last relative changes (K,), or ``tol``.
     """
     s, d, columns = len(R), *start.shape
     values, changes = np.empty((len(h), s + 1, d, columns)), np.full(len(h), np.inf)

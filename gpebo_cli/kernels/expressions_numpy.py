@@ -14,20 +14,16 @@ from gpebo_cli.kernels.arrays import Array
 RUNS_PROGRAMS = False
 
 
-def jets(t: Array, inside: Array | None, signals: Array, *program: Any) -> tuple[Array, ...] | None:
+def jets(_t: Array, _at: Array | None, _signals: Array, *_: Any) -> tuple[Array, ...] | None:
     """Matrices (orders, N, ...) of which some entries are the results of a program.
 
     Of times (N,), where jumps are decided (N,), further rows (rows, N), the program, the matrix
     and the entry of each output (outputs, 2) and the matrices (orders, 1, ...) as they are
     elsewhere. None: the interpreter has to do it, or an operation may have to be refused.
     """
-    del t, inside, signals, program
     return None
 
 
-def intervals(
-    low: Array, high: Array, inside: Array, *program: Any
-) -> tuple[Array, Array] | None:
+def intervals(_low: Array, _high: Array, _at: Array, *_: Any) -> tuple[Array, Array] | None:
     """Bounds (orders, N, outputs) of the results of a program over cells of time (N,), or None."""
-    del low, high, inside, program
     return None

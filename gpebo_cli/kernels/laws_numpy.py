@@ -62,18 +62,10 @@ def squared_errors(
     """Weighted squares of η̂ − η and of x̂ − x, x̂ = offset + gain η̂, both (g, M).
 
     And when each error is above its level for the last time, as an index, −1 for never (g, p + n),
-    and each sum of squares above a share of its beginning (g, 2).
-
-    Args:
-        eta: η̂ (g, M, p).
-        truth: η (M or 1, p).
-        in_eta: weights of its components (p,); with the weight 0 a component may be NaN.
-        offset: of x̂, (M or 1, n).
-        gain: of x̂, (M or 1, n, p).
-        x: the true states (M or 1, n).
-        in_x: their weights (n,).
-        levels: of the errors (g, p + n); None: nobody asks when they are above them.
-        share: of the first sum of squares.
+    and each sum of squares above a ``share`` of its beginning (g, 2). Of η̂ (g, M, p), η (M or 1,
+    p) and the weights of its components (p,), with the weight 0 of which one may be NaN; of the
+    offset (M or 1, n) and gain (M or 1, n, p), x (M or 1, n) and its weights (n,). ``levels`` are
+    those of the errors (g, p + n); None: nobody asks when they are above them.
     """
     some, seen = in_eta != 0.0, in_x != 0.0
     in_all = [eta - truth, np.matmul(gain, eta[..., None])[..., 0] + (offset - x)]

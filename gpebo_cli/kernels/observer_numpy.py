@@ -109,21 +109,12 @@ def regression_signals(
     z: Array, q: int, basis: Array, algebraic: Array, g_y: Array, G: Array, range_: Array,
     elimination: Array,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """All rows of Y and ψ, and the state's offset and gain, at N times.
+    """Y (N, rows), ψ (N, rows, p), and the state's offset (N, n) and gain (N, n, p), at N times.
 
-    Args:
-        z: [ξ_a | ξ_b | Φ] in the coordinates of the basis (N, k, 1 + p).
-        q: number of unknown parameters.
-        basis: B (n, k).
-        algebraic: 𝒜 B (N or 1, rows, k).
-        g_y: of the signals (N, rows).
-        G: of θ (N or 1, rows, q).
-        range_: Q1 of K = H Q1ᵀ and R = I − Q1 Q1ᵀ (N or 1, rows, b).
-        elimination: H (N or 1, n, b).
-
-    Returns:
-        Y (N, rows), ψ (N, rows, p), offset (N, n), gain (N, n, p), and the size of the terms of Y
-        and of each column of ψ before they cancel (1 + p,).
+    And the size of the terms of Y and of each column of ψ before they cancel (1 + p,). They come
+    from ``z``, [ξ_a | ξ_b | Φ] in the coordinates of the basis B (n, k), (N, k, 1 + p), with q
+    unknown parameters, 𝒜 B (N or 1, rows, k), g_y of the signals (N, rows), G of θ (N or 1, rows,
+    q), and Q1 (N or 1, rows, b) and H (N or 1, n, b) of K = H Q1ᵀ and R = I − Q1 Q1ᵀ.
     """
     signs = np.ones(z.shape[2])
     signs[1 : 1 + q] = -1.0  # w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ

@@ -137,15 +137,11 @@ class Mesh:
     ) -> Mesh:
         """Neighbours of equal length joined where a polynomial over all of them does as well.
 
-        Compared at all points of the short elements, so that nothing they have seen is lost. Where
-        nothing is joined, it is this mesh itself.
-
-        Args:
-            values: point values (K, s + 1, c) of signals.
-            counts: how many of them are of one kind (kinds,), one kind after the other.
-            tol: by how much a value may change, relative to the signal's own size so far.
-            keep: edges (B,) that stay.
-            longest: no element is joined to one that is longer.
+        Compared at all points of the short elements, so that nothing they have seen is lost. Of
+        point values (K, s + 1, c), of which so many as ``counts`` (kinds,) are of one kind, one
+        kind after the other, none may change by more than ``tol``, relative to the signal's own
+        size so far. The edges ``keep`` (B,) stay, and no element is joined to one that is longer
+        than ``longest``. Where nothing is joined, it is this mesh itself.
         """
         inner = set(np.searchsorted(self.edges, keep).tolist()) if len(keep) else set()
         bounds = [0, *sorted(inner - {0, self.size}), self.size]
@@ -212,9 +208,8 @@ class Sampler:
         """Sample point values (K, s + 1, ...) at the times: (N, ...)."""
         flat = _flat(values)
         columns = flat.shape[2]
-        grouped = None
-        if columns > _WIDE and columns * len(self.element) >= _MANY:
-            grouped = self._grouped
+        wide = columns > _WIDE and columns * len(self.element) >= _MANY
+        grouped = self._grouped if wide else None
         if grouped is None:
             sampled = signals.sample(self.element, self.weights, flat)
         else:
@@ -349,8 +344,6 @@ def equal_lengths(h: Array) -> tuple[IntArray, Array]:
 
 def _flat(values: Array) -> Array:
     """Values (K, s + 1, …) as (K, s + 1, c)."""
-    if values.ndim == 3:
-        return values
     return values.reshape(values.shape[0], values.shape[1], prod(values.shape[2:]))
 
 

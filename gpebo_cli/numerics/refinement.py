@@ -31,15 +31,10 @@ def refine(
 ) -> tuple[Mesh, Found, Array, int]:
     """Cut the elements of ``mesh`` until the tail of each one is at most ``tol``.
 
-    Args:
-        evaluate: finds what is wanted on a mesh, and what each element leaves out of it, relative
-            to its size; it may keep what was found on the elements that have not been cut.
-        mesh: where to start; its edges stay edges.
-        tol: of the tails.
-        max_elements: refuse to go beyond.
-        name: of what is found, for messages.
-        patience: after so many cuts without effect what is left counts as rounding. What swings
-            within a long element may not become smaller by the first.
+    ``evaluate`` finds what is wanted on a mesh, and what each element leaves out of it, relative to
+    its size; it may keep what was found on the elements that have not been cut. Edges of the mesh
+    stay edges. After as many cuts without effect as the ``patience`` what is left counts as
+    rounding: what swings within a long element may not become smaller by the first.
 
     Returns:
         The mesh, what was found on it, the tails (K,) and the number of rounds.
