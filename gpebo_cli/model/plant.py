@@ -206,9 +206,7 @@ def _line(plant: str, key: str, value: object) -> str:
 
 
 def _mapping(plant: str, key: str, mapping: Mapping[str, object]) -> Mapping[str, object]:
-    value = mapping.get(key)
-    if value is None:
-        return {}
+    value = {} if mapping.get(key) is None else mapping[key]
     if not isinstance(value, Mapping):
         raise ConfigError(f"{plant}: {key} must be a mapping, not {brief(value)}")
     return value
