@@ -183,6 +183,22 @@ def test_rows_that_any_estimates_explain_do_not_tell_their_noise(rows):
     assert "no standard deviations: the samples are so few" in found.verdict
 
 
+@pytest.mark.parametrize(("change", "told"), [
+    (lambda y: np.where(np.arange(len(y)) % 50 == 7, 9999.0, y), "24 of y (first at t = 0.14"),
+    (lambda y: np.round(y / 0.05) * 0.05, "rounding (y to steps of 0.05)"),
+    (lambda y: y, "explain the data up to white noise"),
+    (lambda y: np.round(y, 2), "explain the data up to white noise"),  # below the noise
+])
+def test_gaps_written_as_numbers_and_rounding_are_told(change, told):
+    """9999 leaves a white residual, too: it is as large as Y, and explains nothing."""
+    t = np.linspace(0.0, 24.0, 1201)
+    plant = TANK | {"A": [[-1]], "F": [["1", "sin(t)"]], "inputs": {}}
+    clean = 1.0 - np.exp(-t) + 0.5 * (np.sin(t) - np.cos(t) + np.exp(-t))
+    noise = 0.02 if told.startswith("explain") else 0.0
+    y = change(clean + noise * np.random.default_rng(3).standard_normal(len(t)))
+    assert told in run(plant, data={"t": t, "y": y}).verdict
+
+
 def test_at_samples_matrices_may_follow_an_input_without_noise():
     """A pump's gain: F follows u, whose samples are exact; y alone is noisy."""
     system = plant_from_mapping(TANK, "tank")

@@ -32,6 +32,9 @@ _SILENT = 1e-9  # of an output: a residual below that is rounding
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
 _ASTRAY = 0.02  # of a quantity's size: estimates that differ by more are different
 _WORSE = 3.0  # times the residual of least squares: more than that is not the noise of the data
+_FAR = 7.0  # deviations of most samples: what is farther away is no noise of theirs
+_ROUNDING = 0.35  # steps: rounding alone leaves 0.29
+_ROUNDED = 0.95  # share of an output's changes that are whole steps, if it is rounded to these
 _TINY = float(np.finfo(float).tiny)
 _STILL = 1e-9  # of the same: an estimate that moved by less than that was not moved by data
 
@@ -278,6 +281,15 @@ def fit_of(
     )
 
 
+def _step(y: Array) -> float:
+    """What an output (N,) is rounded to; 0.0 where most changes are no multiples of one step."""
+    change = np.abs(np.diff(y))
+    change = change[change > _SILENT * np.abs(y).max()]
+    step = float(np.median(change)) if len(change) else 0.0
+    whole = np.abs(change - step * np.rint(change / step)) < _SILENT**0.5 * step if step else change
+    return step if len(change) and whole.mean() >= _ROUNDED else 0.0
+
+
 def _explained(
     fit: Fit, eta: Array, observation: Observation, system: DescriptorSystem, source: Source, *,
     every: bool,
@@ -304,7 +316,8 @@ def _explained(
     u, y = recording.inputs, recording.outputs
     fitted = outputs(t, t if source.own_t is None else source.own_t, u, y)
     fit = replace(fit, outputs=fitted)
-    samples = source.inputs.mesh.edges
+    samples = t if source.samples is None else source.samples
+    samples = samples[(samples >= t[0]) & (samples <= t[-1])]
     if every and len(samples) > len(t):
         u, y = source.inputs(samples), source.outputs(samples)
         t, fitted = samples, outputs(samples, samples, u, y)
@@ -324,8 +337,19 @@ def _explained(
         ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
     ])
     names = frozenset[str]().union(*system.coefficients.signals.values())
+    typical = np.median(np.abs(residual), axis=0) / 0.6745  # σ of normal noise, whatever few do
+    far = (np.abs(residual) > _FAR * typical) & seen & (typical > 0.0)
     return replace(
-        fit, correlation=correlation, lag=stride * step,
+        fit, far=[
+            (name, int(own.sum()), float(t[::stride][np.argmax(own)]))
+            for name, own in zip(system.outputs, far.T, strict=True) if own.any()
+        ],
+        rounded=[
+            (name, step) for name, step, own in zip(
+                system.outputs, map(_step, y.T), np.sqrt(power / count), strict=True
+            ) if own < _ROUNDING * step
+        ],
+        correlation=correlation, lag=stride * step,
         in_matrices=tuple(name for name in system.outputs if name in names),
         band=1.96 / np.sqrt(count * seen.sum()),
     )

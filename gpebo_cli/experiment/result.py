@@ -6,7 +6,7 @@ figures and ``summary.json``; nothing in here knows about files, pandas or matpl
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
@@ -165,6 +165,8 @@ class Fit:
     correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
     lag: float = np.nan  # seconds
     band: float = np.nan  # 95 % of the correlations of white noise are within
+    far: Sequence[tuple[str, int, float]] = ()  # outputs, samples far from most, time of the first
+    rounded: Sequence[tuple[str, float]] = ()  # outputs, and steps above what is left of them
     in_matrices: tuple[str, ...] = ()  # outputs, whose noise there is no error of Y
     ratio: float | None = None  # of the residual to what the sensors' noise makes of it, √χ²/dof
 

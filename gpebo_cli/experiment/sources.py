@@ -49,6 +49,7 @@ class Source:
     simulation: SimulationResult | None = None
     recording: RecordingResult | None = None
     cells: Array | None = None  # (K + 1,) of a recording, see Recording.cells
+    samples: Array | None = None  # (N,) of one recording: the times of its rows
     pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
@@ -97,6 +98,7 @@ def recorded(
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
         assumptions=tuple, verdict="", derivatives=recording.derivatives,
         recording=_sample_recording(system, recording, t), cells=recording.cells,
+        samples=recording.table.samples.t,
     )
 
 

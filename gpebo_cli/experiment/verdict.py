@@ -83,6 +83,12 @@ def _explains(fit: Fit, case: int) -> str:
         return noise + (f", which suggests {why}" if fit.ratio > _FEW else "")
     if fit.residual[case] <= _EXACT * fit.size:
         return ": the estimates explain the data"
+    if fit.far:
+        told = (f"{count} of {name} (first at t = {t:.6g})" for name, count, t in fit.far)
+        return (
+            f": some samples are far from what explains the others, {', '.join(told)}, which "
+            f"suggests gaps that are written as numbers (data.gaps), or a sensor that fails{noise}"
+        )
     if fit.ratio is not None and fit.ratio < _LESS:
         return f": the residual is far below the noise{noise}"
     if fit.white and (fit.ratio is None or fit.ratio < _MORE):
@@ -90,6 +96,9 @@ def _explains(fit: Fit, case: int) -> str:
     if fit.white:
         return f": the residual is white{noise}, which suggests a noisier sensor than was said"
     names = ", ".join(fit.in_matrices)
+    if fit.rounded:
+        steps = ", ".join(f"{name} to steps of {step:.2g}" for name, step in fit.rounded)
+        why = f"that it is rounding ({steps}), for which deviations are too small, or {why}"
     return (
         f": the residual{noise and noise + ','} is not white (its correlation is "
         f"{np.abs(fit.correlation).max():.2f}), which "

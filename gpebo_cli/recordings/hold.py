@@ -22,7 +22,7 @@ Held = Callable[[Array, Array], Array]
 _STAGES = (3, 4, 6, 9, 12, 16)  # candidates for the mesh of a recording
 _FIRST_ELEMENTS = 24  # at least this many, as for a simulation
 _PROBED = 64  # elements on which the plant's matrices are looked at
-_GAP = 2.0  # times the median step: a longer one is a gap
+_GAP = 5.0  # times the median step: a longer one is a pause
 _SAME = 1e-13  # slopes that differ by less than this share of the signal's size are the same
 _SMALLEST = 1e-9  # an edge nearer than this share of a step to a sample is that sample
 
