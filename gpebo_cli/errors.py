@@ -30,10 +30,6 @@ class SolverError(GpeboError):
     """The solver cannot reach the tolerance it was asked for."""
 
 
-class ElementsError(SolverError):
-    """It cannot with so many elements; with more of them it might."""
-
-
 def check_memory(what: str, numbers: float) -> None:
     """Refuse what would hold more than a run may: a machine that swaps stands still.
 

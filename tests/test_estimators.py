@@ -751,3 +751,18 @@ def test_estimates_that_are_not_what_the_data_say_are_told(observer):
     assert "theta1, theta2, e0_x1, e0_x2, x1, x2, x3 are up to" in warning
     assert warned(name="ls_drem", **slow | {"gamma": 10.0}) == ((), True)
     assert warned(name="least_squares", f0=0.01, initial=1e5) == ((), False)
+
+
+def test_so_they_are_of_several_recordings(tmp_path):
+    files = [tmp_path / name for name in ("a.csv", "b.csv")]
+    signals = gpebo_cli.run("descriptor", observer="none").details.simulation
+    for file, count in zip(files, (401, 301), strict=True):
+        rows = np.column_stack([signals.t, signals.inputs, signals.outputs])[:count]
+        np.savetxt(file, rows, "%.17g", ",", header="t,u,y", comments="")
+    several = {"name": "csv", "file": [str(file) for file in files], "hold": "cubic"}
+    slow = {"name": "ls_drem", "gamma": 1.5, "f0": 0.01, "initial": 1e5}
+    details = gpebo_cli.run("descriptor", estimator=slow, data=several).details
+    assert details.estimation.requirement.holds
+    assert "least squares over the same data" in "".join(details.warnings)
+    fine = {"name": "least_squares", "f0": 1e-9}
+    assert not gpebo_cli.run("descriptor", estimator=fine, data=several).details.warnings

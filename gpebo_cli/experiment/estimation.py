@@ -383,27 +383,20 @@ def _estimate(
     result = EstimationResult(
         cases=estimator.cases, t=kept, names=observation.parameters, parameters=parameters,
         true_parameters=truth[chosen], states=estimated, delta=lambda: estimates.delta(kept),
-        checks=checks, requirement=requirement,
+        checks=checks, requirement=requirement, explaining=explaining,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
-        explaining=explaining,
         warnings=(lambda: accuracy.astray(
             regression.root, explaining,
             lambda eta: state_map.at(kept)(eta[:, None].repeat(len(kept), axis=1)),
             [*regression.parameters, *system.states], np.concatenate(sizes),
             np.append(determined, seen), columns,
-        )) if requirement.holds and about_own and _settles(observation) else (),
+        )) if requirement.holds and about_own and not (  # one η for all of the data, and one Y
+            regression.resets or regression.dynamics or regression.parametrisation
+            or regression.realisations or observation.bounds
+        ) else (),
         still=accuracy.still(parameters, requirement, natural),
     )
     return estimator, result, accuracy.metrics_of(numbers, observation.parameters, system)
-
-
-def _settles(observation: Observation) -> bool:
-    """Whether there is one η (p,) without bounds for all of the data, and one Y."""
-    regression = observation.regression
-    return not (
-        regression.resets or regression.dynamics or regression.parametrisation
-        or regression.realisations or observation.bounds
-    )
 
 
 def _estimates(

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from gpebo_cli.errors import ElementsError, SolverError
+from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.mesh import Mesh, unresolved_kinds
@@ -120,7 +120,7 @@ def _check_budget(
     worst = int(np.argmax(tail))
     t = mesh.edges[worst]
     if parts.sum() > max_elements:
-        raise ElementsError(
+        raise SolverError(
             f"the {name} is not resolved with {max_elements} elements; worst near "
             f"t = {t:.6g} (tail {tail[worst]:.1e}); raise solver.max_elements or solver.tol"
         )

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError, ElementsError, GpeboError, SolverError
+from gpebo_cli.errors import ConfigError, GpeboError, SolverError
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.observers._base import Measurements, Sampling
@@ -131,11 +131,7 @@ class Gpebo:
                     return other
             except GpeboError:  # the form does not exist, or not for these signals
                 pass
-        if isinstance(found, ElementsError):
-            return self._on("auto", *arguments)
-        if isinstance(found, SolverError):
-            raise found
-        return found
+        return self._on("auto", *arguments) if isinstance(found, SolverError) else found
 
     def _on(
         self, form: str, system: DescriptorSystem, signals: Measurements, solver: SolverSettings,
