@@ -33,9 +33,8 @@ class SolverError(GpeboError):
 def check_memory(what: str, numbers: float) -> None:
     """Refuse what would hold more than a run may: a machine that swaps stands still.
 
-    Args:
-        what: asks for it; the setting and its value.
-        numbers: of 8 bytes each that it would hold, estimated.
+    ``what`` asks for it, the setting and its value; it would hold so many ``numbers`` of 8 bytes
+    each, estimated.
 
     Raises:
         ConfigError: names the setting, what it would need, and the limit.

@@ -74,11 +74,9 @@ def shown(value: object) -> str:
 def read(cls: type[T], mapping: object, where: str) -> T:
     """An instance of the dataclass ``cls`` from plain data.
 
-    Args:
-        cls: a dataclass whose fields are numbers, text, literals, lists, mappings, unions of
-            them, or dataclasses; a field annotated ``object`` takes anything.
-        mapping: the data, keys being the fields' names; what is absent has its default.
-        where: the name of the whole, for messages (``solver``).
+    Its fields are numbers, text, literals, lists, mappings, unions of them, or dataclasses; one
+    annotated ``object`` takes anything. Keys of the mapping are the names of fields; what is absent
+    has its default. Messages begin with ``where``, the name of the whole (``solver``).
 
     Raises:
         ConfigError: not a mapping, an unknown or missing key, or a value of the wrong type.

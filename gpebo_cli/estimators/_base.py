@@ -50,14 +50,10 @@ def gain(
 ) -> Any:
     """A field of an estimator that is a gain: a number, a list, or ``logspace(a, b, n)``.
 
-    Args:
-        default: its value where none is given.
-        accept: which numbers it may be.
-        by_parameter: whether it may also be a mapping by parameter, which makes one case.
-        auto: whether it may be ``auto``, which :meth:`GainEstimator.tuned` replaces: the larger the
-            gain the faster, and the requirement says which one is the least.
-        raised: whether nothing said (None) is the default, and more where that turns out to be too
-            little, see :meth:`GainEstimator.raised`.
+    It may be ``by_parameter``, a mapping which makes one case; ``auto``, which
+    :meth:`GainEstimator.tuned` replaces: the larger the gain the faster, and the requirement says
+    which one is the least; ``raised``: where nothing was said (None) it is the default, and more
+    where that turns out to be too little, see :meth:`GainEstimator.raised`.
     """
     declared = _Gain(accept, by_parameter, auto, default)
     return field(default=None if raised else default, metadata={"gain": declared})
@@ -123,9 +119,6 @@ class GainEstimator(ABC):
         """The estimator itself, or one with ten times the least gain that would do.
 
         It is the latter where no gain was given and the default is less than that.
-
-        Args:
-            requirement: what the estimates with the default turned out to need.
         """
         enough = _AMPLE * requirement.gain
         unsaid = [

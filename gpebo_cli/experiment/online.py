@@ -112,16 +112,9 @@ class Online:
     ) -> None:
         """Prepare for samples of which the first, [u; y] (m + r,), is at ``start``.
 
-        Args:
-            settings: observer, estimator, solver and level of excitation.
-            system: the plant.
-            hold: what is assumed between samples, zoh or linear.
-            start: seconds.
-            sample: the first one.
-            estimator: used instead of the one that the settings name.
-            deviations: of what is estimated; None: nobody asks for them.
-            derivatives: of the inputs, as far as they are known.
-            columns: parameters to estimate (k,), the others being zero; None: all.
+        The estimator is used instead of the one that the settings name; ``deviations`` None: nobody
+        asks for them; ``derivatives`` are of the inputs, as far as they are known; of the
+        parameters ``columns`` (k,) are estimated, the others being zero; None: all.
         """
         self._observer = observers.able(
             observers.build(settings.observer), observers.AtSamples,

@@ -35,11 +35,9 @@ def from_netlist(
 ) -> PlantDraft:
     """A plant from a SPICE netlist by modified nodal analysis.
 
-    Args:
-        netlist: its text (more than one line) or its path.
-        name: of the plant.
-        measure: outputs, ``"v(out), y=i(L1)+i(V)"``; default: the voltages of ``.save``.
-        unknown: constant sources whose values are to be estimated, ``"I5,V3"``.
+    The netlist is its text (more than one line) or its path. Outputs to ``measure`` are such as
+    ``"v(out), y=i(L1)+i(V)"``, by default the voltages of ``.save``; ``unknown`` names constant
+    sources whose values are to be estimated, ``"I5,V3"``.
 
     Returns:
         The plant; its comments say what the topology says of the index.

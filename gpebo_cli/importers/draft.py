@@ -74,9 +74,7 @@ class PlantDraft:
     def measure(self, names: Iterable[str], where: str) -> None:
         """Make states the outputs, in place of those there are.
 
-        Args:
-            names: of the states.
-            where: begins a message.
+        A message begins with ``where``.
 
         Raises:
             ConfigError: no such state.
@@ -95,9 +93,6 @@ class PlantDraft:
 
     def make_unknown(self, names: Iterable[str]) -> None:
         """Turn constant inputs into unknown parameters: their columns of B and D move to F and H.
-
-        Args:
-            names: of the inputs.
 
         Raises:
             ConfigError: no such input, or one that is not constant.
@@ -153,8 +148,7 @@ class PlantDraft:
     def to_yaml(self, archive: str = "") -> str:
         """The text of the plant's file, with a comment for every equation.
 
-        Args:
-            archive: the file that has the matrices of :meth:`archived`; empty: the text has all.
+        The file ``archive`` has the matrices of :meth:`archived`; empty: the text has all.
         """
         plant, comments = self.mapping(), self.comments
         if archive:

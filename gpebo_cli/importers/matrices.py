@@ -36,16 +36,10 @@ def from_matrices(
 ) -> PlantDraft:
     """E x' = A x + B u, y = C x + D u with constant matrices.
 
-    Args:
-        matrices: A (n, n), and E (n, n; default: identity), B (n, m), C (r, n), D (r, m), dense or
-            sparse.
-        name: of the plant.
-        states: n names; default x1, x2, …
-        inputs: m names with their signals, or names alone (their signals are 0); default u1, …
-        outputs: r names; default y1, …
-        initial_state: (n,); default zeros.
-        title: one line.
-        reference: where the matrices are from.
+    The matrices are A (n, n), and E (n, n; default: identity), B (n, m), C (r, n), D (r, m), dense
+    or sparse. There are n states (default x1, x2, …) from ``initial_state`` (n,) or zeros, m inputs
+    with their signals, or names alone (their signals are 0; default u1, …), and r outputs (default
+    y1, …).
 
     Raises:
         ConfigError: A is missing, sizes that do not fit (says both), or entries that are not real.

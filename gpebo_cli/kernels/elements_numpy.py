@@ -22,18 +22,11 @@ def element_maps(
     p)_i/h with X_i = T_i z_i + p_i. Elements of one group, all of one length and with constant E, A
     and T, share the system of the first of them.
 
-    Args:
-        D: the differentiation matrix of the rule (s, s).
-        h: lengths (K,).
-        E: at the K (s + 1) points of all elements, or at one, as for all that follow: (P or 1, d,
-            n), None for the identity.
-        A: (P or 1, d, n).
-        f: (P or 1, d, c).
-        basis: T (P or 1, n, d), None for the identity.
-        offset: p (P or 1, n, c), None without T.
-        group: of each element (K,), 0 … groups − 1.
-        groups: how many there are, K where each element has a system of its own.
-        solve: what takes the place of :func:`solve_blocks`.
+    D is the differentiation matrix of the rule (s, s), h the lengths (K,). At the K (s + 1) points
+    of all elements, or at one: E (P or 1, d, n), None for the identity, A likewise, f (P or 1, d,
+    c), T as ``basis`` (P or 1, n, d), None for the identity, and p as ``offset`` (P or 1, n, c),
+    None without T. Each element is of a ``group`` (K,), 0 … groups − 1; ``solve`` stands in for
+    :func:`solve_blocks`.
 
     Raises:
         LinAlgError: a system is singular.
@@ -137,21 +130,16 @@ def carried_errors(
     made of. End points are superconvergent, of order 2s − 1 against s + 1 inside: with ρ the decay
     per coefficient their error is about ρ^(s−1) times the tail. Half that exponent is used.
 
-    Args:
-        values: at the points (K, s + 1, n, c).
-        to_legendre: from them to Legendre coefficients (s + 1, s + 1).
-        powers: that make of each of the last coefficients the next one (j,).
-        last: maps from left ends to right ends (K or 1, n, n).
-        particular: right ends from zero (K or 1, n, c).
-        noise: of the terms in an element, see :func:`numerics.errors.estimated_errors`.
-        signs: of each kind of error, at the start and the ends (K + 1, n, 2 S).
-        h: lengths (K,).
-        level: coefficients that fall by less over two degrees are noise.
-        end: units in the last place of what an end value is made of, lost in solving an element.
-        chance: square of how much a sum of independent errors may exceed its root mean square.
-        same: relative difference of rates that are constant: then errors may be wrong in the same
-            direction each time.
-        renew: what becomes of errors (e, n, c) of the limit (n, c) at an edge.
+    Values are at the points (K, s + 1, n, c); ``to_legendre`` (s + 1, s + 1) makes coefficients of
+    them, ``powers`` (j,) of each of the last ones the next. ``last`` (K or 1, n, n) are maps from
+    left to right ends, ``particular`` (K or 1, n, c) right ends from zero, ``noise`` that of the
+    terms in an element, see :func:`numerics.errors.estimated_errors`, ``signs`` those of each kind
+    of error at the start and the ends (K + 1, n, 2 S), and h lengths (K,). Coefficients that fall
+    by less than ``level`` over two degrees are noise; ``end`` units in the last place are lost in
+    solving an element; a sum of independent errors may exceed its root mean square by √``chance``;
+    rates that differ by less than ``same`` are constant: errors may then be wrong in the same
+    direction each time. ``renew`` says what becomes of errors (e, n, c) of the limit (n, c) at an
+    edge.
 
     Returns:
         bounds of the errors at right ends (K, n, c); and the largest over time (5, n, c) of these,
@@ -204,20 +192,12 @@ def sweeps(
     ``X ← x_0 + h R (A X + f)`` until nothing changes by more than ``tol``, relative to the largest
     a row has been so far, or to a ``share`` of the largest of all rows, times their weights.
 
-    Args:
-        R: the integration matrix of the rule (s, s).
-        h: lengths (K,).
-        rows: A by rows (d + 1,), where each begins in
-        indices: the columns of its entries (e,), and
-        entries: them at the K (s + 1) points of all elements, or at one (P or 1, e).
-        f: of the first columns of X (P or 1, d, f).
-        kicks: what is added to X at the end of each element (K, d, c), or None.
-        onward: from the points before to where the nodes are, which X begins with (K, s, s + 1).
-        start: at the first left end (d, c).
-        weights: 1 over the unit of each row (d,).
-        tol: see above.
-        share: see above.
-        most: sweeps over one element.
+    R is the integration matrix of the rule (s, s), h the lengths (K,). A stands by rows: where each
+    begins (d + 1,) in the columns of its entries, ``indices`` (e,), and these (P or 1, e) at the K
+    (s + 1) points of all elements, or at one; f (P or 1, d, f) is of the first columns of X.
+    ``kicks`` (K, d, c) or None are added to X at the end of each element; it begins with what
+    ``onward`` (K, s, s + 1) makes of the points before, and at the first left end with ``start``
+    (d, c). Weights are 1 over the unit of each row (d,); ``most`` sweeps are made over one element.
 
     Returns:
         (K, s + 1, d, c), before what is added; and the last relative changes (K,), or ``tol``.

@@ -45,10 +45,8 @@ def plant_from_mapping(
 ) -> DescriptorSystem:
     """Build a plant from the plain data of its file.
 
-    Args:
-        mapping: the KEYS of a plant file; one that is absent, None or empty is the same.
-        source: the file, for messages.
-        kind: what it is called in messages; only a plant needs states.
+    Of the KEYS in the mapping one that is absent, None or empty is the same. Messages name the
+    ``source``, its file, and what ``kind`` it is; only a plant needs states.
 
     Raises:
         ConfigError: anything that is missing, unknown, of the wrong kind or size, or not an

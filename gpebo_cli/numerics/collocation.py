@@ -87,15 +87,10 @@ def solve(
 ) -> LinearSolution:
     """Solve on ``mesh``, refined until every signal is resolved to ``tol``.
 
-    Args:
-        problem: the equation.
-        mesh: where to start; its edges stay edges.
-        tol: target for the tail of each element's Legendre coefficients, relative to each
-            signal's own size.
-        max_elements: refuse to go beyond.
-        restarts: at these edges, the map from the limit from the left (n, columns) to the new
-            start.
-        known: the coefficients at all points of ``mesh``, where they are at hand.
+    Edges of the mesh stay edges. ``tol`` is for the tail of each element's Legendre coefficients,
+    relative to each signal's own size. At ``restarts`` a map makes a new start of the limit from
+    the left (n, columns); ``known`` are the coefficients at all points of ``mesh``, where they are
+    at hand.
 
     Raises:
         SolverError: if ``max_elements`` do not reach ``tol``; names the time.

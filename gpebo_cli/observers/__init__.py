@@ -85,11 +85,8 @@ def observe(
 ) -> Observation:
     """Run an observer on measured signals.
 
-    Args:
-        system: the plant; its true θ and initial state are not looked at.
-        signals: u and y.
-        solver: tolerances.
-        settings: ``name`` of the observer (default: gpebo) and its own settings.
+    The true θ and initial state of ``system`` are not looked at; ``settings`` are ``name`` of the
+    observer (default: gpebo) and its own settings.
 
     Raises:
         ModelError: an assumption of the observer fails; names the time and the evidence.

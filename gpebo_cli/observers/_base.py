@@ -71,10 +71,7 @@ class Observer(Protocol):
     ) -> Observation:
         """From measured signals to a regression, and a map from its parameters to the state.
 
-        Args:
-            system: the plant; its true θ and initial state are not looked at.
-            signals: u and y.
-            solver: tolerances.
+        The true θ and initial state of ``system`` are not looked at.
 
         Raises:
             ModelError: an assumption of the observer fails; names the time and the evidence.

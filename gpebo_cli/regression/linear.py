@@ -49,12 +49,8 @@ class LinearRegression:
     ) -> LinearRegression:
         """A regression whose ψ and Y are given as smooth functions of time, without a plant.
 
-        Args:
-            psi: times (K, s + 1) in seconds to ψ (K, s + 1, rows, p).
-            Y: the same times to Y (K, s + 1, rows).
-            parameters: p names.
-            horizon: it ends there; it starts at 0.
-            elements: of the mesh, on each of which ψ and Y are polynomials of degree 9.
+        They make ψ (K, s + 1, rows, p) and Y (K, s + 1, rows) of times (K, s + 1) from 0 to the
+        horizon, in seconds. On each of the elements ψ and Y are polynomials of degree 9.
         """
         mesh = initial_mesh(0.0, horizon, [], elements, radau_rule(9))
         rows = Trajectory(mesh, psi(mesh.points))
