@@ -167,7 +167,7 @@ def carried_errors(
         added = (apart[1:] * kinds).reshape(K, n, 2 * S * columns)
         start = apart[0] * (_EPS * np.abs(values[0, 0]))[:, None, None]
         start[:, 0] = 0.0
-        error, ends = start.reshape(n, -1), np.empty_like(added)
+        error, ends = start.reshape(n, 2 * S * columns), np.empty_like(added)
         for k in range(K):
             if k and renew is not None:
                 error = np.moveaxis(error.reshape(n, 2 * S, columns), 1, 0)
