@@ -764,5 +764,3 @@ def test_so_they_are_of_several_recordings(tmp_path):
     details = gpebo_cli.run("descriptor", estimator=slow, data=several).details
     assert details.estimation.requirement.holds
     assert "least squares over the same data" in "".join(details.warnings)
-    fine = {"name": "least_squares", "f0": 1e-9}
-    assert not gpebo_cli.run("descriptor", estimator=fine, data=several).details.warnings
