@@ -363,3 +363,63 @@ def test_recipes_run_from_the_command_line(name, tmp_path):
     assert summary["plant"] == RECIPES[name]
     assert (tmp_path / "figures" / "states.png").exists()
     assert (tmp_path / "signals.csv").exists()
+
+
+# Jumps and kinks that outputs pass -------------------------------------------------------------
+
+
+def with_friction(t, mu=0.3):
+    """v' = 2 sin t − μ sign v, v(0) = 1: in closed form between the zeros of v."""
+    start, value, sign, v = 0.0, 1.0, 1.0, np.empty(len(t))
+    while start < t[-1]:
+        def at(s, start=start, value=value, sign=sign):
+            return value + 2.0 * (np.cos(start) - np.cos(s)) - sign * mu * (s - start)
+
+        grid = np.linspace(start + 1e-6, t[-1] + 1.0, 4001)
+        k = np.argmax(sign * at(grid) < 0.0)
+        stop = brentq(at, grid[k - 1], grid[k], xtol=1e-15) if k else np.inf
+        here = (t >= start) & (t <= stop)
+        v[here], start, value, sign = at(t[here]), stop, 0.0, -sign
+    return v
+
+
+@pytest.mark.parametrize("tol", [1e-9, 1e-11])
+@pytest.mark.parametrize("algebraic", [False, True])
+def test_elements_end_where_an_output_passes_a_jump(tol, algebraic):
+    """Friction: with a jump within an element the error was 5e-4, and nobody was told."""
+    plant = {
+        "name": "friction", "states": ["v"], "inputs": {"u": "2*sin(t)"}, "outputs": ["y"],
+        "E": [[1]], "A": [[0]], "B": [[1]], "phi": ["-0.3*sign(y)"], "C": [[1]],
+        "initial_state": [1.0],
+    } if not algebraic else {
+        "name": "friction", "states": ["v", "f"], "inputs": {"u": "2*sin(t)"}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[0, 1], [0, -1]], "B": [[1], [0]],
+        "phi": [0, "-0.3*sign(y)"], "C": [[1, 0]], "initial_state": [1.0, 0.0],
+    }
+    found = run(plant, solver={"tol": tol}, time={"horizon": 20.0, "samples": 201})
+    error = np.abs(found["v"] - with_friction(found.t)).max()
+    assert error < 1e-11
+    assert error < 10.0 * found.details.simulation.error_estimate
+    assert found.cases[0]["final_error_states"] < 1e-8
+
+
+def test_an_unknown_friction_is_estimated_from_a_speed_that_changes_its_sign():
+    plant = {
+        "name": "friction", "states": ["p", "v"], "inputs": {"u": "2*sin(t)"},
+        "outputs": ["p_m", "v_m"],
+        "E": [[1, 0], [0, 1]], "A": [[0, 1], [-1, 0]], "B": [[0], [1]],
+        "F": [[0, 0], ["-sign(v_m)", "-max(v_m - 0.5, 0)"]], "unknowns": {"mu": 0.3, "k": 0.1},
+        "C": [[1, 0], [0, 1]], "initial_state": [0.0, 1.0],
+    }
+    found = run(plant, time={"horizon": 20.0, "samples": 201})
+    assert found.cases[0]["final_error_parameters"] < 1e-8
+
+
+def test_a_solution_that_slides_along_a_jump_is_refused_in_time():
+    plant = {
+        "name": "friction", "states": ["v"], "inputs": {"u": "0.2*sin(t)"}, "outputs": ["y"],
+        "E": [[1]], "A": [[0]], "B": [[1]], "phi": ["-0.5*sign(y)"], "C": [[1]],
+        "initial_state": [1.0],
+    }
+    with pytest.raises(SolverError, match=r"cannot be followed beyond t = 2\.7731\d*"):
+        run(plant, time={"horizon": 10.0, "samples": 11})

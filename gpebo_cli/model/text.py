@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients
+from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, CoefficientSource
 from gpebo_cli.model.entries import Entries
 from gpebo_cli.model.expressions import (
     Assembly,
@@ -33,6 +33,8 @@ MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
 _TOUCHED = 1e-12
 _POLYNOMIAL = ("add", "subtract", "multiply", "negative", "signal")  # no narrower than a signal
 _MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds
+_ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
+_MOST_SWITCHED, _BISECTIONS = 4096, 52
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +208,35 @@ class TextCoefficients:
             return edges, True
         return resolved(Bounds(tape, signals), edges, _MOST_ALONG)
 
+    @cached_property
+    def switches(self) -> Tape:
+        """Arguments of sign, abs, min and max that follow signals."""
+        places = [s.argument for s in self.tape.switches]
+        return self.tape.of([place for place in places if place not in self.tape.of_time])
+
+    def switched(self, t: Array, signals: Callable[[Array], Array]) -> Array:
+        """Times (number,) between those of t (N,), ascending, where a switch changes sign.
+
+        ``signals`` gives [u; y] (1, M, m + r) at any times (M,). Changes of sign that are rounding
+        of an argument are left out.
+        """
+        def at(t: Array) -> Array:
+            return np.asarray(self.switches.taylor(t, 0, None, signals(t))[0])
+
+        found = at(t)
+        k, j = np.nonzero((found[1:] >= 0.0) != (found[:-1] >= 0.0))
+        size = np.maximum(np.abs(found[k, j]), np.abs(found[k + 1, j]))
+        told = size > _ROUNDING * np.abs(found).max(axis=0, initial=0.0)[j]
+        k, j = k[told], j[told]
+        if not 0 < len(k) <= _MOST_SWITCHED:
+            return np.zeros(0)
+        low, high, before = t[k], t[k + 1], found[k, j] >= 0.0
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            same = (at(middle)[np.arange(len(j)), j] >= 0.0) == before
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+        return np.unique(high)
+
     def with_cells(self, cells: Array) -> TextCoefficients:
         """The same with ``cells`` (number,) among the edges of what is resolved in time."""
         return replace(self, restricted=replace(self.of_time, cells=cells))
@@ -213,6 +244,11 @@ class TextCoefficients:
     @cached_property
     def _bounds(self) -> Bounds:
         return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
+
+
+def switching(source: CoefficientSource) -> bool:
+    """Whether something jumps or has a kink where signals say so, as far as that is known."""
+    return isinstance(source, TextCoefficients) and len(source.switches.outputs) > 0
 
 
 def coefficients_of(

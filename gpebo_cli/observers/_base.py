@@ -14,7 +14,8 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.model.text import switching
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, aside
 from gpebo_cli.observers._observation import Observation, SampledBlock, Truth
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.schema import per_name
@@ -58,9 +59,17 @@ class Measurements:
         """First and last time, seconds."""
         return float(self.mesh.edges[0]), float(self.mesh.edges[-1])
 
-    def at(self, t: Array, inside: Array | None = None) -> Array:
-        """[u; y] at the times t (N,), shape (N, m + r)."""
-        return np.concatenate([self.inputs(t, inside), self.outputs(t, inside)], axis=1)
+    def at(
+        self, t: Array, inside: Array | None = None, system: DescriptorSystem | None = None
+    ) -> Array:
+        """[u; y] at the times t (N,), shape (N, m + r).
+
+        Where matrices of the ``system`` switch at t, signals are on their side of that.
+        """
+        there = t
+        if inside is not None and system is not None and switching(system.coefficients):
+            there = aside(t, inside)
+        return np.concatenate([self.inputs(there, inside), self.outputs(there, inside)], axis=1)
 
 
 class Observer(Protocol):

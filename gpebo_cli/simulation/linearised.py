@@ -22,15 +22,16 @@ from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.expressions.intervals import Interval
-from gpebo_cli.model.text import TextCoefficients
+from gpebo_cli.model.text import TextCoefficients, switching
 from gpebo_cli.numerics.linalg import taylor_product
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Trajectory, aside
 from gpebo_cli.numerics.radau import RadauRule
 
 # Share of an output by which it is moved to see what depends on it: G is wrong by the square of it
 # and by rounding over it, which costs Newton's method nothing that could be seen.
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
+_SAME = 1e-12  # of the span: instants closer than this to another are that one
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +76,29 @@ class Linearised:
         return self.system.coefficients.truth(t)
 
     def breakpoints(self, start: float, stop: float) -> Array:
-        """Those of functions of time."""
-        return self.system.coefficients.breakpoints(start, stop)
+        """Those of functions of time, and where outputs of the guess pass a jump or a kink."""
+        found = self.system.coefficients.breakpoints(start, stop)
+        inner = self.switched[(self.switched > start) & (self.switched < stop)]
+        if not len(inner):
+            return found
+        known = np.concatenate([[start], found, [stop]])
+        apart = np.abs(inner[:, None] - known).min(axis=1)
+        return np.union1d(found, inner[apart > _SAME * (stop - start)])
+
+    @cached_property
+    def switched(self) -> Array:
+        """Times (number,) at which outputs of the guess pass a jump or a kink."""
+        source, mesh = self.system.coefficients, self.guess.mesh
+        if not isinstance(source, TextCoefficients) or not self._switches or mesh.size == 1:
+            return np.zeros(0)
+        found = source.switched(mesh.points.ravel(), lambda t: self._along(t, 0, t)[2])
+        # A guess that switches more often than its elements can show slides along a jump.
+        return found if len(found) <= mesh.size else np.zeros(0)
+
+    @cached_property
+    def _switches(self) -> bool:
+        """Whether something jumps or has a kink where outputs say so."""
+        return switching(self.system.coefficients)
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
         """Cells for what depends on time alone, from edges (K + 1,); the guess has its own."""
@@ -98,29 +120,57 @@ class Linearised:
             ConfigError: an entry without a finite value along the guess.
         """
         source = self.system.coefficients
+        known, x, along = self._along(t, order, inside, signals)
+        c = source.taylor(t, order, inside, along)
+        y = along[0, :, self.system.m :].copy()
+        size = np.abs(y)
+        shift = _SHIFT * np.maximum(size, np.maximum(_NOT_ZERO * size.max(axis=0), 1e-300))
+
+        def right_side() -> tuple[Array, Array]:
+            """A x̄ + B u + F θ̄ + φ (order + 1, N, n), and which side of a jump y is on (N, ·)."""
+            m = source.taylor(t, order, inside, along)
+            of_known = _product(m.B, known.u) + _product(m.F, known.theta)
+            return m.phi + _product(m.A, x) + of_known, self._sides(t, along)
+
+        here, side = right_side() if self._switches else (np.zeros(()), np.zeros((len(t), 0)))
+        G = np.empty((*x.shape, self.system.r))
+        for j in range(self.system.r):
+            ends, width = [], np.zeros(len(t))
+            for by in (shift[:, j], -shift[:, j]):
+                along[0, :, self.system.m + j] = y[:, j] + by
+                moved, its_side = right_side()
+                same = (its_side == side).all(axis=1)  # a difference does not pass a jump
+                ends.append(moved if same.all() else np.where(same[:, None], moved, here))
+                width += same * np.abs(by)
+            along[0, :, self.system.m + j] = y[:, j]
+            G[..., j] = (ends[0] - ends[1]) / np.maximum(width, 1e-300)[:, None]
+        GC, GH = _product(G, c.C), _product(G, c.H)
+        phi = c.phi - _product(GC, x) - _product(GH, known.theta)
+        return c._replace(A=c.A + GC, F=c.F + GH, phi=phi, u=known.u)
+
+    def _sides(self, t: Array, along: Array) -> Array:
+        """On which side of each jump or kink [u; y] (order + 1, N, m + r) is, (N, number)."""
+        source = self.system.coefficients
+        if not isinstance(source, TextCoefficients) or not self._switches:
+            return np.zeros((len(t), 0))
+        return np.asarray(source.switches.taylor(t, 0, None, along[:1])[0] >= 0.0)
+
+    def _along(
+        self, t: Array, order: int, inside: Array | None, signals: Array | None = None
+    ) -> tuple[Coefficients, Array, Array]:
+        """What time says, the guess (order + 1, N, n) and [u; y] along it (order + 1, N, m + r).
+
+        Where something switches, the guess is on its side of that.
+        """
+        source = self.system.coefficients
         known = source.of_time.taylor(t, order, inside, signals)
         if self.theta is not None:
             known = known._replace(theta=np.zeros((order + 1, len(t), self.system.q)))
             known.theta[0] = self.theta
-        x = self._states(t, order, inside)
+        there = aside(t, inside) if inside is not None and self._switches else t
+        x = self._states(there, order, inside)
         y = _product(known.C, x) + _product(known.D, known.u) + _product(known.H, known.theta)
-        along = np.concatenate([known.u, y], axis=2)
-        c = source.taylor(t, order, inside, along)
-        size = np.abs(y[0])
-        shift = _SHIFT * np.maximum(size, np.maximum(_NOT_ZERO * size.max(axis=0), 1e-300))
-        G = np.empty((*x.shape, self.system.r))
-        for j in range(self.system.r):
-            moved = []
-            for by in (shift[:, j], -shift[:, j]):
-                along[0, :, self.system.m + j] = y[0, :, j] + by
-                m = source.taylor(t, order, inside, along)
-                of_known = _product(m.B, known.u) + _product(m.F, known.theta)
-                moved.append(m.phi + _product(m.A, x) + of_known)
-            along[0, :, self.system.m + j] = y[0, :, j]
-            G[..., j] = (moved[0] - moved[1]) / (2.0 * shift[:, j, None])
-        GC, GH = _product(G, c.C), _product(G, c.H)
-        phi = c.phi - _product(GC, x) - _product(GH, known.theta)
-        return c._replace(A=c.A + GC, F=c.F + GH, phi=phi, u=known.u)
+        return known, x, np.concatenate([known.u, y], axis=2)
 
     def _states(self, t: Array, order: int, inside: Array | None) -> Array:
         """Taylor coefficients of the guess, (order + 1, N, n)."""

@@ -190,7 +190,7 @@ class ReducedSystem:
 
     def matrices(self, t: Array, inside: Array) -> ObserverMatrices:
         """The matrices at the times t (N,), with output injection."""
-        signals = self.signals.at(t, inside) if self.form.follows_signals else None
+        signals = self.signals.at(t, inside, self.system) if self.form.follows_signals else None
         o = observer_matrices(
             self.form, t, inside, self.solver.rank_tol, self.first, signals=signals
         )
@@ -232,7 +232,7 @@ def reduced_system(
     """
     mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
-    at = signals.at(t, inside) if system.coefficients.signals else None
+    at = signals.at(t, inside, system) if system.coefficients.signals else None
     lost = None
     try:
         used, first, note = choose_form(
