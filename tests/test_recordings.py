@@ -493,6 +493,7 @@ def test_what_is_wrong_with_a_data_frame(change, part):
     ("settings", "part"),
     [
         ({"columns": {"W": "x"}}, "data.columns: 'W' is no signal"),
+        ({"scale": {"V": 0.0}}, "data.scale.V must be a finite number other than 0"),
         ({"columns": {"V": "U"}}, "no column U"),
         ({"scale": {"v": 2.0}}, "did you mean V?"),
         ({"separator": "ab"}, "data.separator"),

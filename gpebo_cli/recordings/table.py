@@ -166,6 +166,9 @@ def read_header(
                     f"data.{key}: {shown(name)} is no signal of plant {system.name}; those are "
                     f"{', '.join((*signals, *system.states))}" + nearest(name, signals)
                 )
+    for name, factor in scale.items():
+        if not 0.0 < abs(factor) < np.inf:
+            raise ConfigError(f"data.scale.{name} must be a finite number other than 0")
     if len(names) == 1 and data.separator == ",":
         for character, word in _SEPARATORS.items():
             if character in names[0]:
