@@ -141,7 +141,8 @@ def test_matrices_of_a_plant(count, order):
     for name in MATRIX_NAMES:
         a, b = getattr(one, name), getattr(other, name)
         assert a.shape == b.shape
-        assert a.strides == b.strides or not a.size
+        many = [axis for axis in range(a.ndim) if a.shape[axis] > 1]
+        assert [a.strides[k] for k in many] == [b.strides[k] for k in many] or not a.size
         assert a.flags.writeable == b.flags.writeable
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
 
@@ -227,7 +228,8 @@ def test_what_is_overlooked(known, tol):
 def test_a_pulse_between_the_nodes_is_far_from_the_polynomial():
     rule, looks = radau_rule(5), 7
     mesh = initial_mesh(0.0, 1.0, [], 3, rule)
-    places, between = at_known._looks(rule, looks)
+    places = (np.arange(looks) + 0.5) / looks
+    between = rule.interpolation(places).T
     nodal = np.sin(mesh.points).reshape(1, -1, 1) * [1.0, 1.0, 2.0]
     t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
     seen = np.sin(t).reshape(1, -1, 1) * [1.0, 1.0, 2.0]

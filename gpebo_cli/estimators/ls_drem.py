@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._information import Information, Spectrum
+from gpebo_cli.estimators._information import Information, Spectrum, check_held
 from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
 from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import Mixed, integrating, quotient_of
@@ -94,8 +94,9 @@ class LsDrem(ResumableEstimator):
     def resume(
         self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
     ) -> MixedEstimates:
-        """Mix every combination of α, f₀, β at the times t (M,)."""
+        """Mix every combination of α, f₀, β at the times t (M,), each with a path of its own."""
         part = self.least_squares
+        check_held(regression, len(part.cases))
         infos = part.informations(regression, known)
         return MixedEstimates(
             groups=tuple(
