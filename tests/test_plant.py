@@ -361,6 +361,9 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "B without inputs": (lambda: without("inputs"), "B has 2 columns but there are 0 inputs"),
     "F without unknowns": (lambda: without("unknowns"), "F has 1 column but there are 0 unknowns"),
     "C without outputs": (lambda: without("outputs"), "C has 1 row but there are 0 outputs"),
+    "unknown is empty": (
+        lambda: mine(unknowns={"a": None}, F=[[0], [0]]), "unknowns.a is empty; write its true"
+    ),
     "entry is empty": (lambda: mine(E=[[1, None], [0, 0]]), "E[0][1] is empty"),
     "entry is a list": (lambda: mine(E=[[1, [0]], [0, 0]]), "E[0][1] is a list"),
     "entry is hostile": (lambda: mine(E=[[1, "__import__('os')"], [0, 0]]), "E[0][1] = "),

@@ -116,6 +116,12 @@ def plant_from_mapping(
     u = [read(value, f"{where}.{label}", None) for label, value in inputs.items()]
     entries = _entries(plant, mapping, read, states, tuple(inputs), tuple(unknowns), outputs)
     entries["u"] = (len(inputs),), dict(enumerate(u))
+    for label, value in unknowns.items():
+        if value is None:
+            raise ConfigError(
+                f"{plant}: unknowns.{label} is empty; write its true value, which simulations "
+                "use, or any number where nobody knows it"
+            )
     theta = [read(value, f"unknowns.{label}", None) for label, value in unknowns.items()]
     entries["theta"] = (len(unknowns),), dict(enumerate(theta))
     given = _initial_values(plant, _required(mapping, "initial_state", plant), states)
