@@ -20,6 +20,7 @@ from gpebo_cli.model.expressions import (
     Tape,
     breakpoints,
     divisors_of,
+    halved,
     record,
     resolved,
     shorten,
@@ -34,7 +35,7 @@ _TOUCHED = 1e-12
 _POLYNOMIAL = ("add", "subtract", "multiply", "negative", "signal")  # no narrower than a signal
 _MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds
 _ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
-_MOST_SWITCHED, _BISECTIONS = 4096, 52
+_MOST_SWITCHED = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,12 +231,9 @@ class TextCoefficients:
         k, j = k[told], j[told]
         if not 0 < len(k) <= _MOST_SWITCHED:
             return np.zeros(0)
-        low, high, before = t[k], t[k + 1], found[k, j] >= 0.0
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            same = (at(middle)[np.arange(len(j)), j] >= 0.0) == before
-            low, high = np.where(same, middle, low), np.where(same, high, middle)
-        return np.unique(high)
+        index = np.arange(len(j))
+        before = found[k, j] >= 0.0
+        return np.unique(halved(lambda t: at(t)[index, j] >= 0.0, before, t[k], t[k + 1]))
 
     def with_cells(self, cells: Array) -> TextCoefficients:
         """The same with ``cells`` (number,) among the edges of what is resolved in time."""
@@ -246,9 +244,10 @@ class TextCoefficients:
         return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
 
 
-def switching(source: CoefficientSource) -> bool:
-    """Whether something jumps or has a kink where signals say so, as far as that is known."""
-    return isinstance(source, TextCoefficients) and len(source.switches.outputs) > 0
+def switching(source: CoefficientSource) -> TextCoefficients | None:
+    """The source, if something in it is known to jump or to have a kink where signals say so."""
+    text = source if isinstance(source, TextCoefficients) else None
+    return text if text is not None and text.switches.outputs else None
 
 
 def coefficients_of(

@@ -21,7 +21,7 @@ from gpebo_cli.numerics.radau import RadauRule
 # ends of an element see the limit from within. Nodes in between decide for themselves: a jump
 # that nobody announced then shows up as an unresolved element, not as a wrong number.
 _INSIDE = 1e-3
-_ASIDE = 1e-7  # of that way: a smooth signal is there what it is at the end, to any tolerance
+_ASIDE = 1e-7  # of that way: a signal moves there by 1e-10 of what it does in the element
 FIRST_ELEMENTS = 24  # of a first mesh: enough nodes to notice a pulse, few enough to be free
 SHARE = 1e-3  # of the largest component: what is smaller is measured against that
 _FOOT = 1e-8  # of its final size: what a component was before may be that wrong

@@ -88,16 +88,15 @@ class Linearised:
     @cached_property
     def switched(self) -> Array:
         """Times (number,) at which outputs of the guess pass a jump or a kink."""
-        source, mesh = self.system.coefficients, self.guess.mesh
-        if not isinstance(source, TextCoefficients) or not self._switches or mesh.size == 1:
+        mesh = self.guess.mesh
+        if self._switching is None or mesh.size == 1:
             return np.zeros(0)
-        found = source.switched(mesh.points.ravel(), lambda t: self._along(t, 0, t)[2])
+        found = self._switching.switched(mesh.points.ravel(), lambda t: self._along(t, 0, t)[2])
         # A guess that switches more often than its elements can show slides along a jump.
         return found if len(found) <= mesh.size else np.zeros(0)
 
     @cached_property
-    def _switches(self) -> bool:
-        """Whether something jumps or has a kink where outputs say so."""
+    def _switching(self) -> TextCoefficients | None:
         return switching(self.system.coefficients)
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
@@ -132,7 +131,7 @@ class Linearised:
             of_known = _product(m.B, known.u) + _product(m.F, known.theta)
             return m.phi + _product(m.A, x) + of_known, self._sides(t, along)
 
-        here, side = right_side() if self._switches else (np.zeros(()), np.zeros((len(t), 0)))
+        here, side = right_side() if self._switching else (np.zeros(()), np.zeros((len(t), 0)))
         G = np.empty((*x.shape, self.system.r))
         for j in range(self.system.r):
             ends, width = [], np.zeros(len(t))
@@ -150,10 +149,9 @@ class Linearised:
 
     def _sides(self, t: Array, along: Array) -> Array:
         """On which side of each jump or kink [u; y] (order + 1, N, m + r) is, (N, number)."""
-        source = self.system.coefficients
-        if not isinstance(source, TextCoefficients) or not self._switches:
+        if self._switching is None:
             return np.zeros((len(t), 0))
-        return np.asarray(source.switches.taylor(t, 0, None, along[:1])[0] >= 0.0)
+        return np.asarray(self._switching.switches.taylor(t, 0, None, along[:1])[0] >= 0.0)
 
     def _along(
         self, t: Array, order: int, inside: Array | None, signals: Array | None = None
@@ -167,7 +165,7 @@ class Linearised:
         if self.theta is not None:
             known = known._replace(theta=np.zeros((order + 1, len(t), self.system.q)))
             known.theta[0] = self.theta
-        there = aside(t, inside) if inside is not None and self._switches else t
+        there = aside(t, inside) if inside is not None and self._switching else t
         x = self._states(there, order, inside)
         y = _product(known.C, x) + _product(known.D, known.u) + _product(known.H, known.theta)
         return known, x, np.concatenate([known.u, y], axis=2)

@@ -116,18 +116,21 @@ def _window(
     tolerance, and the change that one more is expected to make.
     """
     guess = _at_rest(system.initial_state, time.start, time.horizon, solver)
-    before, work = np.inf, 0.0
+    before, work, was_full = np.inf, 0.0, False
     for count in range(1, _MOST_ITERATES + 1):
         full = before <= _NEAR or solver.tol >= _LOOSE
         along = Linearised(system, guess)
         linear = replace(system, coefficients=along)
-        if count > 2:  # what makes so many more of them does not converge
+        own = solver if full else replace(solver, tol=_LOOSE)
+        alike = count > 2 and full == was_full
+        if alike:  # what makes so many more of them at one tolerance does not converge
             most = max(_FEW_ELEMENTS, _MORE_ELEMENTS * guess.mesh.size)
-            solver = replace(solver, max_elements=min(solver.max_elements, most))
+            own = replace(own, max_elements=min(own.max_elements, most))
+        was_full = full
         try:
-            found, rate = solve(linear, time, solver if full else replace(solver, tol=_LOOSE))
+            found, rate = solve(linear, time, own)
         except SolverError:
-            if count > 2:
+            if alike:
                 break
             raise
         if rate * time.horizon > _MOST_GROWTH:

@@ -276,12 +276,17 @@ def _bisected(arguments: Tape, cells: _Cells) -> Array:
     at_low = (before == 0) & (sign(low - width, low - 0.5 * width) * after < 0)
     at_high = (after == 0) & (sign(high + width, high + 0.5 * width) * before < 0)
     between = before * after < 0
-    found = np.where(at_low, low, high)
+    inner = halved(lambda t: sign(t, t), before, low, high)
+    found = np.where(between, inner, np.where(at_low, low, high))
+    return np.asarray(found[between | at_low | at_high])
+
+
+def halved(sign: Callable[[Array], Array], before: Array, low: Array, high: Array) -> Array:
+    """Where signs at times (N,), ``before`` at low (N,), change up to high (N,), to rounding."""
     for _ in range(_BISECTIONS):
         half = 0.5 * (low + high)
         if np.all((half <= low) | (half >= high)):
             break
-        left = sign(half, half) == before
+        left = sign(half) == before
         low, high = np.where(left, half, low), np.where(left, high, half)
-    found = np.where(between, high, found)
-    return np.asarray(found[between | at_low | at_high])
+    return high
