@@ -73,11 +73,7 @@ class GainEstimator(ABC):
     initial: object = 0.0
 
     def axes(self) -> dict[str, Sequence[float]]:
-        """The gains as axes, in the order in which they are declared.
-
-        Raises:
-            ConfigError: a gain is no gain.
-        """
+        """The gains as axes, in the order in which they are declared."""
         axes: dict[str, Sequence[float]] = {}
         for own in fields(self):
             declared = own.metadata.get("gain")
@@ -131,8 +127,7 @@ class GainEstimator(ABC):
     def gains(self, name: str, parameters: Sequence[str]) -> Array:
         """The values of one gain, shape (g, 1), or (1, p) where it is a mapping by parameter.
 
-        Raises:
-            ConfigError: a mapping that does not name every parameter.
+        ConfigError: a mapping that does not name every parameter.
         """
         value, where = getattr(self, name), f"estimator.{name}"
         if value is None:
@@ -147,11 +142,7 @@ class GainEstimator(ABC):
         return np.array(axis(value, where))[:, None]
 
     def start(self, parameters: Sequence[str]) -> Array:
-        """η̂ at the start, shape (p,).
-
-        Raises:
-            ConfigError: the wrong number of values, an unknown name, or not a number.
-        """
+        """η̂ at the start, shape (p,)."""
         return per_name(self.initial, parameters, "parameter", "estimator.initial", "finite")
 
     @abstractmethod

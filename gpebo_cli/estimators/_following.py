@@ -64,11 +64,7 @@ class SolvedEstimates(Unmixed):
         )
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:  # noqa: ARG002
-        """η̂ of some cases, shape (g, M, p).
-
-        Raises:
-            SolverError: Ω is singular at one of the times.
-        """
+        """η̂ of some cases, shape (g, M, p) (SolverError: Ω is singular at one of the times)."""
         try:
             return np.array([
                 np.linalg.solve(e[..., :-1], e[..., -1:])[..., 0] for e in self.extended[cases]

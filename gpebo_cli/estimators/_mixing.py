@@ -19,10 +19,8 @@ SINGULAR = 1e-14
 def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     """Mix [Ω | 𝒴] (p, p + c): the path that the scalar law takes, reported at the times t (M,).
 
-    The law takes c realisations as p·c parameters, in the order of (p, c).
-
-    Raises:
-        SolverError: Ω is beyond what a number can be; names the time.
+    The law takes c realisations as p·c parameters, in the order of (p, c) (SolverError: Ω is beyond
+    what a number can be; names the time).
     """
     p = extended.values.shape[-2]
     finite = np.isfinite(extended.values).all(axis=(1, 2, 3))

@@ -33,10 +33,8 @@ class PowerLaw:
     def solve(self, start: Array, gains: Array) -> Array:
         """η̂ (g, M, P) at the path's times, from ``start`` (P,) or (g, P), for gains (g, P or 1).
 
-        Every gain and parameter has steps of its own, because errors reach zero at different times.
-
-        Raises:
-            SolverError: steps become too short.
+        Every gain and parameter has steps of its own, because errors reach zero at different times
+        (SolverError: steps become too short).
         """
         path = self.path
         P = path.quotient.shape[-1]

@@ -54,9 +54,6 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     """Estimates (g, M, p) at the times of the path.
 
     From η̂ = ``start``, (p,), or (g, p) for each gain its own, with the gains γ (g, p or 1).
-
-    Raises:
-        SolverError: the law cannot be resolved.
     """
     variation, size = _variation(path, float(gains.max(initial=0.0)), start)
     if variation <= _CONSTANT * size:

@@ -53,9 +53,6 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
 
     At a reset η̂ becomes T η̂ + τ and the extension ``ExtensionState.after``. A time at which
     there is a reset belongs to what follows it.
-
-    Raises:
-        ConfigError: the estimator cannot follow parameters that move, or go on after a reset.
     """
     if not regression.p:
         return Nothing(len(estimator.cases), len(t))

@@ -80,9 +80,6 @@ def spread(
     """The estimator of some settings, of which plain numbers may be lists or ``logspace(a, b, n)``.
 
     These are fields of the dataclass annotated ``float`` or ``int``; ``build`` makes one estimator.
-
-    Raises:
-        ConfigError: a value is not a number.
     """
     several = {key: value for key, value in settings.items() if _is_axis(value)}
     hints: dict[str, Any] = get_type_hints(cls) if several else {}

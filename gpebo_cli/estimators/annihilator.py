@@ -40,8 +40,7 @@ class Annihilator(Instrumental):
     def left(self, means: Array, names: Sequence[str]) -> Array:
         """(NΩ)ᵀN (N, p, 2p) of [Ω | 𝒴] (N, 2p, p + c).
 
-        Raises:
-            ConfigError: a perturbed parameter that there is not.
+        ConfigError: a perturbed parameter that there is not.
         """
         for name in self.perturbed:
             if name not in names:

@@ -71,11 +71,7 @@ class Exciting(GainEstimator):
         return Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
 
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
-        """Extend, mix, rotate, and keep what the closed form needs at the times t (M,).
-
-        Raises:
-            ConfigError: κ is not positive.
-        """
+        """Extend, mix, rotate, and keep what the closed form needs at the times t (M,)."""
         inner = self.linear.resume(regression, t, ())
         (path,) = inner.groups
         columns, turning = 1 + path.quotient.shape[-1], self._turning(path)
@@ -108,11 +104,7 @@ class Exciting(GainEstimator):
         return replace(inner, groups=(law,), condition="IE")
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
-        """The estimator at samples.
-
-        Raises:
-            ConfigError: κ is not positive.
-        """
+        """The estimator at samples."""
         return RecursiveMixed(self, parameters, Rotation(self, parameters), "IE")
 
     def _turning(self, path: ScalarPath) -> Callable[[Array, Array], Array]:

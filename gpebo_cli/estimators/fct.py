@@ -55,11 +55,7 @@ class FiniteTime(ResumableEstimator):
         )
 
     def axes(self) -> dict[str, Sequence[float]]:
-        """The cases of the inner estimator.
-
-        Raises:
-            ConfigError: ``mu`` is not between 0 and 1.
-        """
+        """The cases of the inner estimator (ConfigError: ``mu`` is not between 0 and 1)."""
         mu = number(self.mu, "estimator.mu")
         if not mu < 1:
             raise ConfigError(f"estimator.mu must lie between 0 and 1, got {mu:g}")
@@ -86,11 +82,7 @@ class FiniteTime(ResumableEstimator):
         )
 
     def recursive(self, parameters: Sequence[str]) -> Recursion:
-        """The estimator at samples: w_c is exact there, too.
-
-        Raises:
-            ConfigError: forgetting with a bound, which there is in continuous time only.
-        """
+        """The estimator at samples: w_c is exact there, too."""
         return self.inner.recursive(parameters, float(self.mu))
 
     def resume(

@@ -49,11 +49,7 @@ class Instrumental(GainEstimator):
 
     @property
     def seconds(self) -> tuple[float, float]:
-        """The delay d and T₀.
-
-        Raises:
-            ConfigError: one of them is not positive.
-        """
+        """The delay d and T₀."""
         return number(self.delay, "estimator.delay"), number(self.settle, "estimator.settle")
 
     def means(self, regression: LinearRegression) -> Trajectory:
@@ -61,11 +57,7 @@ class Instrumental(GainEstimator):
         return averaged(regression, *self.seconds)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
-        """The estimator at samples.
-
-        Raises:
-            ConfigError: the delay or T₀ is not positive.
-        """
+        """The estimator at samples."""
         return RecursiveMixed(self, parameters, SampledMeans(self, parameters))
 
     def left(self, means: Array, names: Sequence[str]) -> Array:  # noqa: ARG002

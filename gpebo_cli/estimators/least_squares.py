@@ -56,8 +56,7 @@ class LeastSquares(ResumableEstimator):
     def axes(self) -> dict[str, Sequence[float]]:
         """The gains as axes, f₀ checked against the bound.
 
-        Raises:
-            ConfigError: a gain is no gain, or M is below 1/f₀.
+        ConfigError: a gain is no gain, or M is below 1/f₀.
         """
         axes = super().axes()
         bound = self.covariance_bound
@@ -93,11 +92,7 @@ class LeastSquares(ResumableEstimator):
     def informations(
         self, regression: LinearRegression, known: Sequence[ExtensionState]
     ) -> list[Information]:
-        """G_z, h_z and z of every case, from what was known before; those that are equal are one.
-
-        Raises:
-            ConfigError: they would hold too much memory.
-        """
+        """G_z, h_z and z of every case, from what was known before; equal ones are one."""
         bound, cases = self.covariance_bound, self.cases
         bounded = bound is not None and max(case["beta"] for case in cases) > 0.0
         needed = ["alpha", "f0", "beta"] if bounded else ["beta"]
@@ -114,8 +109,7 @@ class LeastSquares(ResumableEstimator):
     def recursive(self, parameters: Sequence[str]) -> RecursiveLeastSquares:
         """The estimator at samples.
 
-        Raises:
-            ConfigError: forgetting with a bound, which there is in continuous time only.
+        ConfigError: forgetting with a bound, which there is in continuous time only.
         """
         if self.bound is not None:
             raise ConfigError(
@@ -128,10 +122,7 @@ class LeastSquares(ResumableEstimator):
     ) -> SolvedEstimates:
         """η̂ = F 𝒴 with F⁻¹ and 𝒴 from (f₀ I, f₀ η̂₀), at the times t (M,).
 
-        They forget at the rate β + ρ.
-
-        Raises:
-            ConfigError: forgetting with a bound.
+        They forget at the rate β + ρ (ConfigError: forgetting with a bound).
         """
         if self.covariance_bound is not None:
             raise ConfigError(

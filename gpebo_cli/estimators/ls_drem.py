@@ -83,11 +83,7 @@ class LsDrem(ResumableEstimator):
         return tuple(partial(at, case, info, gain) for case, info in pairs for gain in gains)
 
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
-        """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law.
-
-        Raises:
-            ConfigError: forgetting with a bound, which there is in continuous time only.
-        """
+        """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
         part, cases = self.least_squares.recursive(parameters), self.least_squares.cases
         return RecursiveMixed(self, parameters, SampledShares(part, cases), "IE", len(cases), mu)
 

@@ -65,11 +65,7 @@ class Monotone(GainEstimator):
     initial: object = None
 
     def estimate(self, regression: LinearRegression, t: Array) -> MonotoneEstimates:
-        """Verify T, extend and mix, for the times t (M,).
-
-        Raises:
-            ConfigError: as :meth:`law`.
-        """
+        """Verify T, extend and mix, for the times t (M,)."""
         extended = kreisselmeier(regression, filter_rates(self.rates, regression.parameters))
         return MonotoneEstimates(
             *self.law(regression.parametrisation), mix(extended, np.asarray(t), regression.floor),
@@ -83,8 +79,7 @@ class Monotone(GainEstimator):
     def law(self, S: Parametrisation | None) -> tuple[Parametrisation, Array, float, Array]:
         """S, T (q, k), μ, and θ̂ at the start (q,).
 
-        Raises:
-            ConfigError: the regression has no S, or T does not fit it or does not make it monotone.
+        ConfigError: the regression has no S, or T does not fit it or does not make it monotone.
         """
         if S is None:
             raise ConfigError("estimator=monotone is for a regression with S and box; it has none")
@@ -137,8 +132,7 @@ class MonotoneEstimates:
     def solution(self, gamma: float) -> Theta:
         """θ̂ (N, c, q) at times (N,), for c realisations of Y.
 
-        Raises:
-            SolverError: the law cannot be integrated.
+        SolverError: the law cannot be integrated.
         """
         path, (q, k), count = self.path, self.T.shape, int(np.prod(self.realisations))
 
@@ -195,12 +189,7 @@ class RecursiveMonotone:
         self._energy, self._mu = 0.0, 1.0
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
-        """Take K samples and give the estimates at each; nobody knows how errors go through.
-
-        Raises:
-            ConfigError: as :meth:`Monotone.law`.
-            SolverError: an implicit step has no solution that is found.
-        """
+        """Take K samples and give the estimates at each; nobody knows how errors go through."""
         if self._theta is None:
             S, T, self._mu, start = self._settings.law(regression.parametrisation)
             self._S, self._T = S, T

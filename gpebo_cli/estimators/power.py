@@ -49,11 +49,7 @@ class Power(ResumableEstimator):
     rates: object = field(default=None, metadata={"key": "lambda"})
 
     def axes(self) -> dict[str, Sequence[float]]:
-        """The gain γ.
-
-        Raises:
-            ConfigError: a power or γ₂ is out of its range.
-        """
+        """The gain γ (ConfigError: a power or γ₂ is out of its range)."""
         if not (0.0 < self.alpha < 1.0 < self.beta < np.inf and 0.0 <= self.gamma2 < np.inf):
             raise ConfigError(
                 "estimator: it takes 0 < alpha < 1 < beta and gamma2 of 0 or more, got "
@@ -69,8 +65,7 @@ class Power(ResumableEstimator):
     def recursive(self, parameters: Sequence[str]) -> RecursivePower:
         """The finite-time law at samples.
 
-        Raises:
-            ConfigError: γ₂ is not zero; the fixed-time law has no closed form.
+        ConfigError: γ₂ is not zero; the fixed-time law has no closed form.
         """
         if self.gamma2:
             raise ConfigError(

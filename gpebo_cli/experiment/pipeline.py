@@ -142,8 +142,7 @@ def run_experiment(
 def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Array], Online]:
     """The estimation of rows that come one after the other, from the time of the first one on.
 
-    Raises:
-        ConfigError: a setting that needs to know how a recording goes on.
+    ConfigError: a setting that needs to know how a recording goes on.
     """
     sources.check_stream(settings, system)
     estimator = estimators.build(settings.estimator)

@@ -69,8 +69,7 @@ def joined_observation(
 ) -> Observation:
     """One regression about θ (q,) and every initial error, of observations of each recording.
 
-    Raises:
-        ConfigError: an observer or a remedy whose parameters are others.
+    ConfigError: an observer or a remedy whose parameters are others.
     """
     maps = [each.state_map for each in observations]
     plain = all(

@@ -105,8 +105,7 @@ def recorded(
 def check(settings: Settings, levels: NoiseLevels) -> None:
     """Refuse what no source can give: noise on a recording, a span or a grid that is none, ….
 
-    Raises:
-        ConfigError: names the key and what it may be.
+    ConfigError: names the key and what it may be.
     """
     time, recorded = settings.time, settings.data.name == "csv"
     if recorded and settings.observer["name"] == "none":
@@ -132,8 +131,7 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
 def check_stream(settings: Settings, system: DescriptorSystem) -> None:
     """Refuse what would need later rows of a recording, whose rows come one after the other.
 
-    Raises:
-        ConfigError: names the key and what it may be.
+    ConfigError: names the key and what it may be.
     """
     if settings.noise.seeds > 1 or noise_levels(settings.noise, system).steps.any():
         raise ConfigError(

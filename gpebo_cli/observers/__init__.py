@@ -57,19 +57,12 @@ def build(settings: Mapping[str, object]) -> Observer | None:
     """The observer that ``settings["name"]`` asks for, with the remaining keys as its settings.
 
     It is None for the name none: there is a simulation, and nobody observes it.
-
-    Raises:
-        ConfigError: unknown name or key, with the nearest known one.
     """
     return None if settings.get("name") == _NONE else _OBSERVERS.build(settings)
 
 
 def settings_of(settings: Mapping[str, object]) -> list[str]:
-    """The settings that the observer called ``settings["name"]`` has.
-
-    Raises:
-        ConfigError: unknown name, with the nearest known one.
-    """
+    """The settings that the observer called ``settings["name"]`` has."""
     return [] if settings.get("name") == _NONE else _OBSERVERS.settings_of(settings)
 
 

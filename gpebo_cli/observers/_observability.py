@@ -51,9 +51,6 @@ def window_gramians(
 
     ``model`` gives A and W (N, n, n) at times (N,); ``tol`` is relative to the size of Ψ and of
     what is integrated.
-
-    Raises:
-        SolverError: the tolerance cannot be reached.
     """
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:

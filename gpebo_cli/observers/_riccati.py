@@ -160,10 +160,8 @@ def run_filter(
     From ζ̂ = ``start`` (n, g) with the covariance ``P0`` (n, n). The model at times (N,) comes with
     whatever ``monitor`` needs, which gives further signals to resolve from that and ζ̂. ``tol`` is
     relative to each signal's own size, to that of each element for P, which so is as accurate where
-    it has become small. Below sizes ``floor`` (n,) ζ̂ is not resolved for its own sake.
-
-    Raises:
-        SolverError: the tolerance cannot be reached, or P is not positive semidefinite.
+    it has become small. Below sizes ``floor`` (n,) ζ̂ is not resolved for its own sake
+    (SolverError: the tolerance cannot be reached, or P is not positive semidefinite).
     """
     m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
     horizon = float(mesh.edges[-1] - mesh.edges[0])

@@ -66,8 +66,7 @@ class Blocks:
 def canonical_blocks(system: DescriptorSystem, t: Array, inside: Array) -> Blocks:
     """Read the blocks off E = diag(I, N), A = diag(A_a, I), F = (F_a, 0).
 
-    Raises:
-        ModelError: the plant is not in canonical form; names the entry and the time.
+    ModelError: the plant is not in canonical form; names the entry and the time.
     """
     c = system.coefficients.taylor(t, 1, inside)
     E, A, F = c.E[0], c.A[0], c.F[0]
@@ -117,13 +116,7 @@ class Canonical:
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
     ) -> Observation:
-        """The regression of Proposition 3, and z_b by Proposition 4 where it applies.
-
-        Raises:
-            ModelError: not in canonical form, or no output satisfies Assumption 3.
-            ConfigError: settings that do not fit the plant.
-            SolverError: the tolerance cannot be reached.
-        """
+        """The regression of Proposition 3, and z_b by Proposition 4 where it applies."""
         _refuse_beyond(system)
         inputs, outputs, mesh = signals.inputs, signals.outputs, signals.mesh
         blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())

@@ -86,13 +86,7 @@ class Gpebo:
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
     ) -> Observation:
-        """The regression and the state map, with the remedy.
-
-        Raises:
-            ModelError: rank of E not constant, Assumption 1 violated.
-            ConfigError: no outputs, or a setting that does not fit the plant.
-            SolverError: the tolerance cannot be reached.
-        """
+        """The regression and the state map, with the remedy."""
         keeps = isinstance(self.remedy, Plain | OutputInjection) and not self.bounds
         few = thinned(system, signals, solver) if keeps else None
         if few is None:
@@ -155,12 +149,7 @@ class Gpebo:
         self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
         sample: Array, derivatives: InputDerivatives | None,
     ) -> SampledObserver:
-        """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``.
-
-        Raises:
-            ModelError: Assumption 1 fails at the start.
-            ConfigError: a remedy, no outputs, or a setting that does not fit the plant.
-        """
+        """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``."""
         self._refuse_what_needs_the_past()
         return sampled_observer(
             system, solver, hold, start, sample, derivatives,

@@ -213,10 +213,7 @@ class KalmanBucy:
     ) -> Observation:
         """Run the filter; the regression is that of the GPEBO observer, as evidence of excitation.
 
-        Raises:
-            ModelError: the rank of E is not constant, or Assumption 1 is violated.
-            ConfigError: settings that do not fit the plant.
-            SolverError: the tolerance cannot be reached.
+        ConfigError: settings that do not fit the plant.
         """
         known = reduced_system(
             system, signals, solver, xi_a0=self.xi_a0, form=self.form

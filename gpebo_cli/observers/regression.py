@@ -44,12 +44,7 @@ class Given:
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
     ) -> Observation:
-        """The regression of the system's text; there is no state.
-
-        Raises:
-            ConfigError: the system is a plant, or an expression has no finite value at some time.
-            SolverError: the tolerance cannot be reached.
-        """
+        """The regression of the system's text; there is no state."""
         given = _text_of(system)
         regression, error = given.on(
             signals.inputs, signals.outputs if given.Y is None else None, solver.tol,
@@ -83,11 +78,7 @@ class Given:
         self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,  # noqa: ARG002  protocol
         sample: Array, derivatives: InputDerivatives | None,  # noqa: ARG002
     ) -> GivenAtSamples:
-        """The regression's recursion, whose first sample [u; y] (m + r,) is at ``start``.
-
-        Raises:
-            ConfigError: the system is a plant.
-        """
+        """The regression's recursion, whose first sample [u; y] (m + r,) is at ``start``."""
         return GivenAtSamples(_text_of(system), hold)
 
 
@@ -124,11 +115,7 @@ class GivenAtSamples:
     def advance(
         self, state: TextState | None, t: Array, u: Array, y: Array
     ) -> tuple[TextState, SampledBlock]:
-        """Regression at the samples t (K,) of u (K, m), and y (K, rows) where the text has no Y.
-
-        Raises:
-            ConfigError: an expression without a finite value; names it and the time.
-        """
+        """Regression at the samples t (K,) of u (K, m), and y (K, rows) where the text has no Y."""
         state, regression, scale = advance(self.text, self.hold, state, t, u, y)
         count, S = len(t), self.text.parametrisation
         none = np.zeros((count, self.text.system.n, len(self.parameters)))

@@ -35,9 +35,6 @@ def filtered(
     Nothing in it grows as solutions of η' = 𝔸η do; in directions that decay, Ω would grow as the
     square of their inverse, which the forgetting ρ makes up for. ``outer`` is [ψᵀψ | ψᵀy]
     (p, p + 1), and Λ and Γ have the diagonals ``rates`` and ``gains`` (p,).
-
-    Raises:
-        SolverError: not resolved.
     """
     p = outer.values.shape[2]
     start = np.zeros((p, p + 1)) if start is None else start

@@ -41,11 +41,7 @@ class Parametrisation:
     high: Array  # (q,)
 
     def values(self, theta: Array) -> Array:
-        """S(θ) (N, k) of θ (N, q).
-
-        Raises:
-            ConfigError: an entry of S without a finite value there.
-        """
+        """S(θ) (N, k) of θ (N, q)."""
         return self._taylor(0, theta[None])
 
     def jacobian(self, theta: Array) -> Array:
@@ -86,10 +82,8 @@ class Parametrisation:
     def monotone(self, T: Array) -> float:
         """A number that λ_min(T∇S + (T∇S)ᵀ) is nowhere below in the box, for T (q, k).
 
-        The box is halved until intervals say so everywhere.
-
-        Raises:
-            ConfigError: at some θ, which is named, it is not positive; or no end is in sight.
+        The box is halved until intervals say so everywhere (ConfigError: at some θ, which is named,
+        it is not positive; or no end is in sight).
         """
         low, high, least, axis = self.low[None], self.high[None], np.inf, 0
         while True:
@@ -178,8 +172,7 @@ def _root(weight: Array) -> Array:
 def read_box(given: object, names: tuple[str, ...], where: str) -> tuple[Array, Array]:
     """Ends (q,) and (q,) of the box: ``{name: [low, high]}`` for every unknown.
 
-    Raises:
-        ConfigError: a name without two ends, or that is not an unknown.
+    ConfigError: a name without two ends, or that is not an unknown.
     """
     if not isinstance(given, Mapping):
         raise ConfigError(

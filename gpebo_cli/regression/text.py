@@ -112,10 +112,6 @@ class TextRegression:
 
         Y (rows,) is needed where the text has none. ``tol`` is relative to each signal's own size;
         beside the regression comes the error estimate of its signals.
-
-        Raises:
-            ConfigError: an expression without a finite value; names it and the time.
-            SolverError: the tolerance cannot be reached.
         """
 
         def evaluated(mesh: Mesh) -> tuple[tuple[Array, Array], list[tuple[Array, float]]]:
@@ -326,11 +322,7 @@ def _parametrisation(
 
 
 def system_from_mapping(mapping: Mapping[str, object], source: str = "") -> DescriptorSystem:
-    """The plant, or with ``psi`` the regression in place of one, that a file describes.
-
-    Raises:
-        ConfigError: whatever is wrong in it.
-    """
+    """The plant, or with ``psi`` the regression in place of one, that a file describes."""
     kind, key = ("regression", "signals") if "psi" in mapping else ("plant", "inputs")
     inputs, found = tables(mapping.get(key), f"{kind} {mapping.get('name')}: {key}", source)
     mapping = {**mapping, key: inputs} if found else mapping
@@ -353,10 +345,7 @@ def simulation_of(
 ) -> Simulation:
     """The plant's solution; of a regression its signals, with Y = ψθ where the text has none.
 
-    Raises:
-        ConfigError: a signal without a finite value, or one that has to be recorded.
-        ModelError: the plant cannot be simulated.
-        SolverError: the tolerance cannot be reached.
+    ConfigError: a signal without a finite value, or one that has to be recorded.
     """
     given = system.regression
     if not isinstance(given, TextRegression):

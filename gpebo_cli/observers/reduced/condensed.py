@@ -64,9 +64,6 @@ def condensed(
     """What is ``found`` along ``few`` signals, those of :func:`thinned`, along all of them.
 
     Its regression has no resets and is affine in the signals, and so is the state.
-
-    Raises:
-        SolverError: the tolerance cannot be reached.
     """
     regression, state_map, errors = found.regression, found.state_map, found.errors
     extension = found.truth.extension if isinstance(found.truth, InitialError) else None

@@ -103,11 +103,7 @@ def begin_at(
     xi_a0: Mapping[str, float] | list[float] | None, system: DescriptorSystem,
     units: Array, o: ObserverMatrices, begin: Start,
 ) -> Array:
-    """``observer.xi_a0``, of the differential states, in the coordinates of the start, (d,).
-
-    Raises:
-        ConfigError: an unknown state, or the wrong number of values.
-    """
+    """``observer.xi_a0``, of the differential states, in the coordinates of the start, (d,)."""
     P, frame = o.split.projector[0], o.split.frame
     if frame is not None:  # with what may have been given up
         P = frame.projector
@@ -123,10 +119,8 @@ def with_unknown(
     """The start with errors of the ``unknown`` states only, and ξ_a0 of these, from those of all.
 
     The others start where the plant's ``initial_state`` says, or ``observer.xi_a0`` as ``given``
-    (ξ_a0 (d,) of all), and e₀ has no component for them: Φ has fewer columns.
-
-    Raises:
-        ConfigError: no differential state, or errors that are not those of single states.
+    (ξ_a0 (d,) of all), and e₀ has no component for them: Φ has fewer columns (ConfigError: no
+    differential state, or errors that are not those of single states).
     """
     names = [name.removeprefix("e0_") for name in begin.names]
     for name in unknown:
@@ -226,9 +220,6 @@ def reduced_system(
 
     ``unknown`` is ``observer.unknown_initial``. ``in_part`` asks for what is left without that
     which a failure of Assumption 1 touches.
-
-    Raises:
-        ModelError, ConfigError: as :func:`choose_form`, and a setting that does not fit.
     """
     mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
@@ -270,11 +261,8 @@ def choose_form(
     The first time is that of the start. A plant whose matrices follow signals needs [u; y]
     (N, m + r) there, and hidden constraints the derivatives of inputs, as far as they are known.
     ``units`` are those in which everything counts; None: of the plant at the start. ``piecewise``
-    the matrices are looked at piece by piece, and those of the first times do, unless E moves.
-
-    Raises:
-        ModelError: rank of E not constant, Assumption 1 violated, not uniquely solvable.
-        ConfigError: no outputs, wrong weights, a derivative of an input that is not known.
+    the matrices are looked at piece by piece, and those of the first times do, unless E moves
+    (ConfigError: no outputs, wrong weights, a derivative of an input that is not known).
     """
     if system.r == 0:
         raise ConfigError(
@@ -357,12 +345,7 @@ class Extension:
 
 
 def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
-    """Integrate [ξ_a | ξ_b | Φ] from ``start`` (k, 1 + q + n_a) over ``mesh``, refined.
-
-    Raises:
-        ModelError: rank of E not constant, Assumption 1 violated.
-        SolverError: the tolerance cannot be reached, or the extension grows beyond all bounds.
-    """
+    """Integrate [ξ_a | ξ_b | Φ] from ``start`` (k, 1 + q + n_a) over ``mesh``, refined."""
     system, solver, basis = reduced.system, reduced.solver, reduced.basis
     q, columns = system.q, start.shape[1]
     large = len(start) > _SMALL and solver.name != "ivp"

@@ -37,8 +37,7 @@ def invariant_observer(
 ) -> Invariant:
     """The observer's matrices, with ``observer.form`` and ``.weights``, at ``start`` seconds.
 
-    Raises:
-        ConfigError: a plant that varies with time, or an observer that needs derivatives of inputs.
+    ConfigError: a plant that varies with time, or an observer that needs derivatives of inputs.
     """
     moving = [key for key in "EABFCDH" if key not in system.coefficients.constant]
     if moving or "phi" not in system.coefficients.zero:

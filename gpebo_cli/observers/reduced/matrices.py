@@ -142,10 +142,6 @@ def observer_matrices(
     Equations and outputs count in the form's units, outputs with √w = ``output_scale`` (r,), else
     as in ``like``, the matrices of other times, whose basis is kept. A ``frame`` stands in place of
     theirs. A plant whose matrices follow signals needs [u; y] (N, m + r).
-
-    Raises:
-        ModelError: the rank of E is not constant, or Assumption 1 fails; names the time and the
-            singular value.
     """
     system, model = form.system, form.equations(t, inside, signals)
     units = form.units

@@ -45,10 +45,8 @@ def _stacked(upper: Array, lower: Array) -> Array:
 def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) -> Array:
     """What errors e_u (K, s + 1, m, c) and e_y (K, s + 1, r, c) add to Y, (K, s + 1, rows, c).
 
-    All columns in one solve on the mesh of the regression, in whose elements errors are smooth.
-
-    Raises:
-        SolverError: the mesh does not resolve the response.
+    All columns in one solve on the mesh of the regression, in whose elements errors are smooth
+    (SolverError: the mesh does not resolve the response).
     """
     errors = Trajectory(mesh, np.concatenate([e_u, e_y], axis=2))
     size = errors_at(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]

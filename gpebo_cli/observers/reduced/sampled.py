@@ -114,10 +114,6 @@ class SampledObserver:
         """Carry the recursion over the samples u (K, m), y (K, r) at t (K,), after ``state.t``.
 
         The state is None before the first sample.
-
-        Raises:
-            ModelError: the rank of E changes, or Assumption 1 fails.
-            SolverError: a step cannot be resolved.
         """
         own = np.hstack([u, y])
         times, signals, start, error = t, own, self.start, 0.0
@@ -225,10 +221,6 @@ def sampled_observer(
     """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start`` seconds.
 
     Settings are those of the observer; auto is as given where Assumption 1 holds at the start.
-
-    Raises:
-        ConfigError: no outputs, or a setting that does not fit.
-        ModelError: Assumption 1 fails at the start.
     """
     t = np.array([start])
     used, first, note = choose_form(system, t, t, sample[None], derivatives, solver, form, weights)

@@ -171,10 +171,8 @@ def split_by_svd(
     """The general case: singular vectors at every time, and Ṗ = S + Sᵀ with S = E⁺ Ė Q.
 
     E and Ė (N, n, n) are those at the times t (N,), the states have units (n,), and a split that is
-    given keeps its basis.
-
-    Raises:
-        ModelError: the rank changes, or the kernel turns where that of the basis did not.
+    given keeps its basis (ModelError: the rank changes, or the kernel turns where that of the basis
+    did not).
     """
     U, sigma, Vt = np.linalg.svd(E * units)
     size = np.maximum(sigma.max(initial=0.0), TINY)

@@ -47,11 +47,7 @@ class CurrentCoordinates:
     """No Φ: what is estimated moves along with the state."""
 
     def observe(self, reduced: ReducedSystem) -> Observation:
-        """The regression about ζ and its dynamics.
-
-        Raises:
-            ModelError, SolverError: as without a remedy.
-        """
+        """The regression about ζ and its dynamics."""
         system, solver = reduced.system, reduced.solver
         q, n, basis = system.q, system.n, reduced.basis
         rotates = basis.shape[1] > reduced.rank

@@ -38,12 +38,7 @@ class NoiseFree:
     """The observer on the plant linearised along a copy of its signals without noise."""
 
     def observe(self, reduced: ReducedSystem) -> Observation:
-        """The regression along the copy that least squares fits; ``Plain``'s if no matrix has y.
-
-        Raises:
-            ModelError: rank of E not constant, Assumption 1 violated.
-            SolverError: the tolerance cannot be reached, or the copy does not settle.
-        """
+        """The regression along the copy that least squares fits; ``Plain``'s if no matrix has y."""
         found, system = Plain().observe(reduced), reduced.system
         if not system.depends_on_outputs:
             return found

@@ -53,12 +53,7 @@ class OutputInjection:
     injection: list[list[float | str]] | None = None
 
     def observe(self, reduced: ReducedSystem) -> Observation:
-        """The observer without a remedy, with A_0 − K_o c in place of A_0.
-
-        Raises:
-            ModelError, SolverError: as there.
-            ConfigError: ``injection`` does not fit the plant.
-        """
+        """The observer without a remedy, with A_0 − K_o c in place of A_0."""
         if not reduced.basis.shape[1]:  # nothing moves by itself
             return Plain().observe(reduced)
         if self.injection is None:
@@ -71,11 +66,8 @@ class OutputInjection:
 def given_injection(system: DescriptorSystem, entries: list[list[float | str]]) -> Injection:
     """K_o as the user has it, a number or an expression of t for each entry.
 
-    It takes the outputs' rows of the residual, as L does in L (y − C x̂). What points out of
-    range P is left out.
-
-    Raises:
-        ConfigError: the wrong size, or text that is no expression.
+    It takes the outputs' rows of the residual, as L does in L (y − C x̂). What points out of range
+    P is left out (ConfigError: the wrong size, or text that is no expression).
     """
     n, r = system.n, system.r
     sizes = {len(row) for row in entries}

@@ -18,12 +18,7 @@ class Plain:
     """The observer as Proposition 1 has it."""
 
     def observe(self, reduced: ReducedSystem) -> Observation:
-        """The regression, and the state from its parameters; perhaps with output injection.
-
-        Raises:
-            ModelError: rank of E not constant, Assumption 1 violated.
-            SolverError: the tolerance cannot be reached.
-        """
+        """The regression, and the state from its parameters; perhaps with output injection."""
         extension = extend(reduced, reduced.mesh, reduced.start())
         if reduced.lost is not None:
             for signal in (extension.assembled.offset, extension.assembled.gain):

@@ -58,12 +58,7 @@ class Resets:
     keep: float = field(default=1.0, metadata={"key": "reset_keep", "range": (0.0, 1.0)})
 
     def observe(self, reduced: ReducedSystem) -> Observation:
-        """One regression over all segments, with the maps from each to the next.
-
-        Raises:
-            ModelError, SolverError: as without resets.
-            ConfigError: times that are not inside the horizon.
-        """
+        """One regression over all segments, with the maps from each to the next."""
         mesh, times = _with_edges(reduced.mesh, reset_times(reduced, self))
         cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
         p = reduced.system.q + len(reduced.begin.names)
@@ -119,8 +114,7 @@ def _restart(
 def reset_times(reduced: ReducedSystem, settings: Resets) -> Array:
     """When to reset, ascending, strictly inside the horizon.
 
-    Raises:
-        ConfigError: a time outside, or too many.
+    ConfigError: a time outside, or too many.
     """
     start, stop = reduced.signals.span
     outside = [t for t in settings.times if not start < t < stop]
