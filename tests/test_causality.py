@@ -66,6 +66,13 @@ def test_of_shipped_plants(plant, way):
     assert_same_past(one, other, 1e-6 if way == "reset" else 1e-8)
 
 
+@pytest.mark.parametrize("plant", ["circuit", "descriptor", "window"])
+def test_of_the_kalman_bucy_filter(plant):
+    """Without noise, where measurements are exact, and what regularises them is its own."""
+    one, other = (run_to(plant, count, observer="kalman_bucy") for count in (20, 64))
+    assert_same_past(one, other)
+
+
 def test_with_bounds():
     observer = {"name": "gpebo", "bounds": {"states": {"x1": [-0.5, 0.9]}}}
     one, other = (run_to("descriptor", count, observer=observer) for count in (20, 50))

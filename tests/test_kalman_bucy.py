@@ -118,7 +118,7 @@ def normalised_errors(name: str, outputs: float, inputs: float, seeds: int) -> t
         system, t, inside, signals.inputs(t, inside), signals.outputs(t, inside)
     )
     n, q = s.A.shape[1], system.q
-    intensities = noise_model(s, noise, np.zeros(n), 1e-3)
+    intensities = noise_model(noise, np.zeros(n), np.full(n, 10.0), 1e-3)
 
     def model(t: Array, inside: Array):
         s, basis, _ = in_basis(
@@ -191,7 +191,8 @@ def test_states_deviations_hold_the_errors_and_the_direct_noise():
 def test_what_regularises_an_exact_measurement_is_reported():
     quiet = run(shipped("circuit"), noise=NoiseSettings(outputs=0.02, sample_time=0.1))
     found = assumption(quiet, "Measurement noise")
-    assert found.evidence["regularised_with"] == "noise of 0.001 of each equation's size at 0.1 s"
+    assert found.evidence["regularised_with"] == (
+        "noise of 0.001 of each equation's own under P0 at 0.1 s")
     assert found.evidence["intensity_y"] == pytest.approx(0.02**2 * 0.1)
     assert "measurement noise regularised: 0.001 of each" in quiet.verdict
     noisy = run(shipped("circuit"), noise=NoiseSettings(outputs=0.02, inputs=0.02, sample_time=0.1))

@@ -14,8 +14,9 @@ depends on which. An observer sees u + ν_u and y + ν_y, and both enter twice:
 with g_y = g_inputs u − E_y y. Noise with standard deviation σ per sample of T_s seconds is, for a
 filter that is slow beside T_s, white with intensity σ²T_s; process and measurement noise are
 correlated. Where V = DSDᵀ is singular (a constraint that holds exactly, as e1 = −V in the circuit)
-the filter has no finite gain, and V is regularised: every equation of the residual gets independent
-noise, a share of its own size. The covariance that the filter states is then an upper bound.
+the filter has no finite gain, and V is regularised there: every equation of the residual gets
+independent noise, a share of what its terms vary by under P0. Nothing of that is chosen from data,
+which would come later. The covariance that the filter states is then an upper bound.
 
 The state follows as x = X_w w + X_θ θ + x_y. What the signals' noise does to x_y directly is part
 of the standard deviations of x̂; its correlation with ζ̂ (of order T_s) is not.
@@ -32,7 +33,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.uncertainty import noise_level
 from gpebo_cli.findings import Assumption, Requirement
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers._base import Measurements, SignalNoise
@@ -53,6 +54,8 @@ from gpebo_cli.settings import NoiseSettings, SolverSettings
 _LEVEL = 1e-8  # of M's largest eigenvalue over all windows, in units of P(0)⁻¹: below, no evidence
 _ROUNDING = 8.0 * float(np.finfo(float).eps)  # of the terms of a sum
 _INITIAL_VARIANCE = 10.0  # of what observer.P0 leaves out
+_NOTHING = 1e-28  # of the square of the largest row: rounding
+_EXACT = 1e-4  # of the variance that would regularise it: what noise leaves below is exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +63,13 @@ class FilterModel:
     """The linear system above at N times, before its noise is known; ζ in coordinates of a basis.
 
     c, g_y and the noise's way into them are in all e + r rows of the residual; ``rows`` is Z.
+    Squares ``terms`` are of what c is made of, which does not cancel.
     """
 
     A: Array  # (N, n, n) of ζ
     b: Array  # (N, n)
     c: Array  # (N, e + r, n)
+    terms: Array  # (N, e + r, n)
     rows: Array  # (N, e + r, r) Z
     g_y: Array  # (N, e + r)
     from_noise: Array  # (N, n, m + r) Γ
@@ -93,6 +98,8 @@ def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> Fil
     algebraic = o.algebraic @ basis  # 𝒜 B
     c = np.empty((count, g.shape[1], q + k))
     c[:, :, :q], c[:, :, q:] = o.G, algebraic
+    terms = np.abs(c)
+    terms[:, :, q:] = np.abs(o.algebraic) @ np.abs(basis)
     K_g, K_c = (np.asarray(o.elimination @ (transpose(o.range) @ x)) for x in (g, c))
     gain = -K_c  # [X_θ, X_w B] = [−K G, B − K 𝒜 B]
     gain[:, :, q:] += basis
@@ -115,6 +122,7 @@ def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> Fil
         A=A,
         b=(inward @ signals)[:, :, 0],
         c=c,
+        terms=terms**2,
         rows=np.broadcast_to(Z, (count, *Z.shape[1:])),
         g_y=(g @ signals)[:, :, 0],
         from_noise=-o.of_noise(inward, m),
@@ -136,57 +144,61 @@ def _inside(q: int, split: Split, P: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Intensities: of the signals' noise, of what drives ζ, and of what regularises V."""
+    """Intensities: of the signals' noise, of what drives ζ, and of what stands for exact ζ."""
 
     signals: Array  # (m + r,)
     process: Array  # (n,)
-    rows: Array  # (e + r,) zero: V needs none
+    exact: Array  # (n,)
 
-    def state_space(
-        self, s: FilterModel, q: int, split: Split, steps: Array | float = 1.0
-    ) -> StateSpace:
-        """The model with its covariances, one column of signals, w in the basis of a split.
+    def measured(
+        self, s: FilterModel, steps: Array | float = 1.0
+    ) -> tuple[Array, Array, BoolArray]:
+        """S Dᵀ (N, m + r, r), V (N, r, r), and in which directions (N, r) V was regularised.
 
         ``steps`` (N,) are those between samples, relative to the sample time.
         """
         Zt = transpose(s.rows)
         D = Zt @ s.in_measurement
+        SDt = self.signals[:, None] * np.reshape(steps, (-1, 1, 1)) * transpose(D)
+        size = s.terms @ self.exact
+        # A row without terms is as exact as the largest one.
+        largest = size.max(axis=1, keepdims=True)
+        size = np.where(size > _NOTHING * largest, size, np.where(largest > 0.0, largest, 1.0))
+        L = np.linalg.cholesky((Zt * size[:, None]) @ s.rows)
+        whole = np.linalg.solve(L, D @ SDt)
+        values, U = np.linalg.eigh(np.linalg.solve(L, transpose(whole)))
+        exact = values < _EXACT
+        L = L @ U
+        return SDt, (L * (values + exact)[:, None]) @ transpose(L), exact
+
+    def state_space(
+        self, s: FilterModel, q: int, split: Split, steps: Array | float = 1.0
+    ) -> StateSpace:
+        """The model with its covariances, one column of signals, w in the basis of a split."""
+        Zt = transpose(s.rows)
+        SDt, V, _ = self.measured(s, steps)
         signals = self.signals * np.reshape(steps, (-1, 1, 1))
-        weighted = s.from_noise * signals  # Γ S
-        Q = weighted @ transpose(s.from_noise)
+        Q = (s.from_noise * signals) @ transpose(s.from_noise)
         if self.process.any():
             # w stays in the range of P(t), and so does what drives it.
             inside = _inside(q, split, s.projector)
             Q = Q + (inside * self.process) @ transpose(inside)
         return StateSpace(
-            A=s.A,
-            b=s.b[:, :, None],
-            c=Zt @ s.c,
-            z=-(Zt @ s.g_y[:, :, None]),
-            Q=Q,
-            N=weighted @ transpose(D),
-            V=(D * signals) @ transpose(D) + (Zt * self.rows) @ s.rows,
+            A=s.A, b=s.b[:, :, None], c=Zt @ s.c, z=-(Zt @ s.g_y[:, :, None]), Q=Q,
+            N=s.from_noise @ SDt, V=V,
         )
 
 
 def noise_model(
-    s: FilterModel, noise: SignalNoise, process: Array, regularisation: float
+    noise: SignalNoise, process: Array, variances: Array, regularisation: float
 ) -> NoiseModel:
-    """Intensities; V is regularised if at some time it is below what regularises it.
+    """Intensities, with ``process`` and the ``variances`` of P0, (n,) each.
 
-    That is a standard deviation relative to the size of each row. ``process`` is (n,).
+    What is known at the start counts as what is least known.
     """
-    size = np.abs(s.g_y).max(axis=0)
-    # A row without data, 0 = c ζ, is as exact as the largest one.
-    size = np.where(size > 0, size, size.max(initial=0.0) or 1.0)
-    rows = (regularisation * size) ** 2 * noise.sample_time
-    signals = noise.variances * noise.sample_time
-    Zt = transpose(s.rows)
-    D = Zt @ s.in_measurement
-    floor = (Zt * rows) @ s.rows
-    ratio = np.linalg.eigvals(np.linalg.solve(floor, (D * signals) @ transpose(D))).real
-    needed = bool(ratio.min(initial=np.inf) < 1.0)
-    return NoiseModel(signals, process, rows if needed else np.zeros_like(rows))
+    varies = np.where(variances > 0.0, variances, variances.max(initial=0.0) or 1.0)
+    exact = regularisation**2 * noise.sample_time * varies
+    return NoiseModel(noise.variances * noise.sample_time, process, exact)
 
 
 @dataclass(frozen=True)
@@ -199,7 +211,7 @@ class KalmanBucy:
         P0: its variance: one number, a list, or by name (theta1, w_e1; absent: 10).
         process: intensity of white noise that drives what is estimated, given as P0 is (absent: 0).
         regularisation: where the noise leaves measurements exact: standard deviation of the noise
-            assumed instead, relative to each one's own size, at the noise's sample time.
+            assumed instead, relative to each one's own under P0, at the noise's sample time.
     """
 
     form: Literal["auto", "given", "strangeness_free"] = "auto"
@@ -252,8 +264,10 @@ class KalmanBucy:
         variances = per_name(self.P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
         P0 = _initial_covariance(variances, known)
         process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
-        known_of = reduced(mesh.points.ravel(), mesh.inside.ravel())
-        model_noise = noise_model(known_of, noise, process, self.regularisation)
+        points, inside = mesh.points.ravel(), mesh.inside.ravel()
+        known_of = reduced(points, inside)
+        model_noise = noise_model(noise, process, variances, self.regularisation)
+        regularised = bool(model_noise.measured(known_of, steps(inside))[2].any())
         # What w is beside the part of x that is known may be rounding of that, added up.
         turns = 1.0 + float(np.abs(known_of.A).max() * (mesh.edges[-1] - mesh.edges[0]))
         beside = turns * np.abs(split.dual) @ np.abs(known_of.offset).max(axis=0)
@@ -295,7 +309,7 @@ class KalmanBucy:
             error_estimate=max(evidence.error_estimate, filtered.error_estimate),
             assumptions=(
                 *evidence.assumptions,
-                _measurement_noise(system, model_noise, noise, self.regularisation),
+                _measurement_noise(system, model_noise, noise, self.regularisation * regularised),
                 Assumption(
                     observability.name,
                     "the observability Gramian over windows of a tenth of the horizon stays away "
@@ -306,9 +320,9 @@ class KalmanBucy:
             estimator=Filter(filtered, observability),
             names=names,
             note=note + (
-                f"; measurement noise regularised: {self.regularisation:g} of each equation's size "
-                "(observer.regularisation)"
-            ) * bool(model_noise.rows.any()),
+                f"; measurement noise regularised: {self.regularisation:g} of each equation's own "
+                "under P0 (observer.regularisation)"
+            ) * regularised,
         )
 
 
@@ -361,9 +375,9 @@ def _measurement_noise(
         f"intensity_{name}": float(value)
         for name, value in zip((*system.inputs, *system.outputs), model.signals, strict=True)
     }
-    if model.rows.any():
-        what = f"noise of {regularisation:g} of each equation's size at {noise.sample_time:g} s"
-        used |= {"regularised_with": what, "largest_intensity_added": float(model.rows.max())}
+    if regularisation > 0.0:
+        what = f"noise of {regularisation:g} of each equation's own under P0 "
+        used["regularised_with"] = f"{what}at {noise.sample_time:g} s"
     return Assumption(
         "Measurement noise",
         "its covariance V(t) is positive definite, regularised where the noise leaves it singular",
