@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,28 +38,6 @@ _MOST_SWITCHED = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class _Layout:
-    """How one matrix is put together from constants and columns of the tape's values."""
-
-    shape: tuple[int, ...]
-    fixed: Array  # (size,), constants; zero where an entry depends on time
-    positions: NDArray[np.intp]  # of the entries that depend on time
-    columns: NDArray[np.intp]  # where their values stand among the tape's outputs
-
-    def assemble(self, values: Array) -> Array:
-        """Coefficients (K + 1, N, *shape) from the tape's values (K + 1, N, M)."""
-        orders, times = values.shape[:2]
-        if not len(self.positions):
-            once = np.zeros((orders, 1, *self.shape))
-            once[0] = self.fixed.reshape(self.shape)
-            return np.broadcast_to(once, (orders, times, *self.shape))
-        flat = np.zeros((orders, times, len(self.fixed)))
-        flat[0] = self.fixed
-        flat[:, :, self.positions] = values[:, :, self.columns]
-        return flat.reshape(orders, times, *self.shape)
-
-
-@dataclass(frozen=True, eq=False)
 class TextCoefficients:
     """The matrices of a plant given as text; a ``CoefficientSource``.
 
@@ -68,8 +45,7 @@ class TextCoefficients:
     depend on time come as read-only broadcast arrays.
     """
 
-    tape: Tape
-    layouts: Mapping[str, _Layout]  # by the names in MATRIX_NAMES
+    assembly: Assembly  # of the matrices in the order of MATRIX_NAMES
     unknowns: Tape  # theta on its own
     signals: Mapping[str, frozenset[str]]  # what a matrix depends on, by the same names
     outputs: frozenset[str]
@@ -84,15 +60,22 @@ class TextCoefficients:
     # (number,)
     _resolved: dict[bytes, tuple[Array, bool]] = field(default_factory=dict, init=False)
 
+    @property
+    def tape(self) -> Tape:
+        """What the entries that depend on time are computed by."""
+        return self.assembly.tape
+
     @cached_property
     def constant(self) -> frozenset[str]:
         """Those of ``MATRIX_NAMES`` that do not depend on time."""
-        return frozenset(k for k, layout in self.layouts.items() if not len(layout.positions))
+        moving = {MATRIX_NAMES[k] for k in self.assembly.targets[:, 0].tolist()}
+        return frozenset(MATRIX_NAMES) - moving
 
     @cached_property
     def zero(self) -> frozenset[str]:
         """Those of ``constant`` that vanish."""
-        return frozenset(k for k in self.constant if not self.layouts[k].fixed.any())
+        fixed = zip(MATRIX_NAMES, self.assembly.fixed, strict=True)
+        return self.constant.intersection(name for name, matrix in fixed if not matrix.any())
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
@@ -111,11 +94,7 @@ class TextCoefficients:
                         f"{min(names & self.outputs)}, which is not known here"
                     )
         t = np.asarray(t, dtype=np.float64)
-        filled = self._assembly.taylor(t, order, inside, signals)
-        if filled is None:
-            values = self.tape.taylor(t, order, inside, signals)
-            filled = tuple(self.layouts[k].assemble(values) for k in MATRIX_NAMES)
-        found = Coefficients._make(filled)
+        found = Coefficients._make(self.assembly.taylor(t, order, inside, signals))
         if signals is None:
             return found
         if self.divisors:
@@ -149,18 +128,18 @@ class TextCoefficients:
 
     def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
-        moving = self.tape.taylor(np.asarray(t, dtype=np.float64), order, inside)
+        moving, targets = self.tape.taylor(t, order, inside), self.assembly.targets
         values: dict[str, Array] = {}
         places: dict[str, tuple[NDArray[np.intp], ...]] = {}
-        for name, layout in self.layouts.items():
-            fixed = np.flatnonzero(layout.fixed)
-            there = np.concatenate([fixed, layout.positions])
-            found = np.zeros((order + 1, len(t) if len(layout.positions) else 1, len(there)))
-            found[0, :, : len(fixed)] = layout.fixed[fixed]
-            if len(layout.positions):
-                found[:, :, len(fixed) :] = moving[:, :, layout.columns]
+        for k, (name, matrix) in enumerate(zip(MATRIX_NAMES, self.assembly.fixed, strict=True)):
+            fixed, columns = np.flatnonzero(matrix), np.flatnonzero(targets[:, 0] == k)
+            there = np.concatenate([fixed, targets[columns, 1]])
+            found = np.zeros((order + 1, len(t) if len(columns) else 1, len(there)))
+            found[0, :, : len(fixed)] = matrix.flat[fixed]
+            if len(columns):
+                found[:, :, len(fixed) :] = moving[:, :, columns]
             values[name] = found
-            places[name] = np.unravel_index(there, layout.shape)
+            places[name] = np.unravel_index(there, matrix.shape)
         return Entries(Coefficients(**values), places)
 
     @property
@@ -172,16 +151,6 @@ class TextCoefficients:
         """True values of the unknowns at the times ``t`` (N,), shape (N, q)."""
         values: Array = self.unknowns.taylor(t, 0)[0]
         return values
-
-    @cached_property
-    def _assembly(self) -> Assembly:
-        layouts = [self.layouts[name] for name in MATRIX_NAMES]
-        targets = np.empty((len(self.tape.outputs), 2), dtype=np.intp)
-        for matrix, layout in enumerate(layouts):
-            targets[layout.columns, 0] = matrix
-            targets[layout.columns, 1] = layout.positions
-        fixed = tuple(layout.fixed.reshape(layout.shape) for layout in layouts)
-        return Assembly(self.tape, targets, fixed)
 
     def breakpoints(self, start: float, stop: float) -> Array:
         """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks."""
@@ -272,19 +241,18 @@ def coefficients_of(
         }
         restricted = coefficients_of(kept, inputs, outputs, name)
     varying: list[Expression] = []
-    layouts: dict[str, _Layout] = {}
-    for key, (shape, given) in entries.items():
-        fixed = np.zeros(prod(shape))
+    targets: list[tuple[int, int]] = []
+    fixed = {key: np.zeros(shape) for key, (shape, _) in entries.items()}
+    for key, (_, given) in entries.items():
         constant = {k: e.value for k, e in given.items() if e.is_constant}
-        fixed[list(constant)] = list(constant.values())
+        fixed[key].flat[list(constant)] = list(constant.values())
         moving = {k: e for k, e in given.items() if k not in constant}
-        layouts[key] = _Layout(
-            shape,
-            fixed,
-            np.array(list(moving), dtype=np.intp),
-            np.arange(len(varying), len(varying) + len(moving), dtype=np.intp),
-        )
+        targets += [(MATRIX_NAMES.index(key), k) for k in moving]
         varying += moving.values()
+    assembly = Assembly(
+        record(varying, inputs), np.array(targets, dtype=np.intp).reshape(-1, 2),
+        tuple(fixed[name] for name in MATRIX_NAMES),
+    )
     signals = {
         key: frozenset[str]().union(*(e.node.signals for e in given.values()))
         for key, (_, given) in entries.items()
@@ -296,5 +264,5 @@ def coefficients_of(
         if not node.signals.isdisjoint(outputs)
     )
     return TextCoefficients(
-        record(varying, inputs), layouts, truth, depending, outputs, name, restricted, divisors
+        assembly, truth, depending, outputs, name, restricted, divisors
     )

@@ -94,10 +94,12 @@ class Tape:
         Raises:
             ConfigError: a value that is not finite; names the entry, its text and the time.
         """
-        t = np.asarray(t, dtype=np.float64)
-        filled = self._in_a_row.taylor(t, order, inside, signals)
-        if filled is not None:
-            return filled[0]
+        return self._in_a_row.taylor(np.asarray(t, dtype=np.float64), order, inside, signals)[0]
+
+    def interpreted(
+        self, t: Array, order: int, inside: Array | None, signals: Array | None
+    ) -> Array:
+        """:meth:`taylor` of float64 times (N,) without the compiled kernel."""
         result = np.zeros((order + 1, len(self.outputs), len(t)))
         held = max(1, len(self.instructions)) * (order + 1 + max(self.extra, default=0))
         part = max(64, MAX_NUMBERS // held)
@@ -276,48 +278,60 @@ class Assembly:
 
     tape: Tape
     targets: IntArray  # (outputs, 2) the matrix and the entry in it, counted by rows
-    fixed: tuple[Array, ...]  # the matrices; what stands at the targets does not matter
+    fixed: tuple[Array, ...]  # the matrices, zero at the targets
     # What the kernel is given besides times and signals.
     _plans: dict[_Key, tuple[Any, ...] | None] = field(default_factory=dict, init=False)
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
-    ) -> tuple[Array, ...] | None:
-        """As :meth:`Tape.taylor` at the times t (N,), of the matrices, by the compiled kernel.
+    ) -> tuple[Array, ...]:
+        """As :meth:`Tape.taylor` at the times t (N,), of the matrices, (order + 1, N, ...) each.
 
-        They are (order + 1, N, ...) each, read-only where constant in time; None where there is no
-        kernel for it, or where it met an operation that may have to be refused: :meth:`Tape.taylor`
-        has to decide.
+        Those that are constant in time are read-only. The interpreter computes what no program is
+        worth or runs on, and what the kernel met an operation in that may have to be refused.
         """
-        if not kernels.expressions.RUNS_PROGRAMS:
-            return None
-        apart = inside is not None and inside is not t and self.tape.jumps
-        given = None if signals is None else (len(signals), signals.shape[2])
-        key = order, apart, given
-        if key not in self._plans:
-            self._plans[key] = self._plan(order, apart, given)
-        plan = self._plans[key]
-        if plan is None:
-            return None
-        if signals is None:
-            rows = np.empty((0, len(t)))
-        else:
-            rows = np.swapaxes(signals, 1, 2).reshape(-1, len(t)) if len(t) else signals[:, :, 0]
-        return kernels.expressions.jets(t, inside if apart else t, rows, *plan)
+        found = None
+        if kernels.expressions.RUNS_PROGRAMS:
+            apart = inside is not None and inside is not t and self.tape.jumps
+            key = order, apart, None if signals is None else (len(signals), signals.shape[2])
+            if key not in self._plans:
+                self._plans[key] = self._plan(*key)
+            plan = self._plans[key]
+            if plan is not None:
+                if signals is None:
+                    rows = np.empty((0, len(t)))
+                else:
+                    count = signals.shape[0] * signals.shape[2]
+                    rows = np.swapaxes(signals, 1, 2).reshape(count, len(t))
+                found = kernels.expressions.jets(t, inside if apart else t, rows, *plan)
+        return found or self._placed(self.tape.interpreted(t, order, inside, signals))
 
     def _plan(
         self, order: int, apart: bool, signals: tuple[int, int] | None = None
     ) -> tuple[Any, ...] | None:
         program = self.tape.program(order, apart, signals)
-        if program is None:
-            return None
-        matrices = []
-        for fixed in self.fixed:
-            once = np.zeros((order + 1, 1, *fixed.shape))
+        return None if program is None else (*program, self.targets, *self._constants(order + 1))
+
+    def _constants(self, orders: int) -> list[Array]:
+        """The matrices with nothing at the targets, (orders, 1, ...)."""
+        matrices = [np.zeros((orders, 1, *fixed.shape)) for fixed in self.fixed]
+        for once, fixed in zip(matrices, self.fixed, strict=True):
             once[0, 0] = fixed
             once.flags.writeable = False
-            matrices.append(once)
-        return *program, self.targets, *matrices
+        return matrices
+
+    def _placed(self, values: Array) -> tuple[Array, ...]:
+        """The matrices with what the tape gives (orders, N, outputs)."""
+        found = []
+        for matrix, once in enumerate(self._constants(len(values))):
+            whole = np.broadcast_to(once, (*values.shape[:2], *once.shape[2:]))
+            which = self.targets[:, 0] == matrix
+            if which.any():
+                whole = whole.copy()
+                flat = whole.reshape(*values.shape[:2], self.fixed[matrix].size)
+                flat[:, :, self.targets[which, 1]] = values[:, :, which]
+            found.append(whole)
+        return tuple(found)
 
 
 def record(expressions: Sequence[Expression], inputs: Sequence[Expression] = ()) -> Tape:
