@@ -135,33 +135,29 @@ _PRIMITIVES: dict[str, tuple[Callable[[Coefficient], Coefficient], Callable[[Jet
 }
 
 
+def _integral(value: Coefficient, slope: Jet) -> Jet:
+    """The jet with this value and this derivative."""
+    return [value, *(c / k for k, c in enumerate(slope, 1))]
+
+
 def primitive(name: str, a: Jet, order: int) -> Jet:
     """y = f(a) for one of ``_PRIMITIVES``, from g y' = a'."""
     function, of_argument = _PRIMITIVES[name]
-    y: Jet = [function(a[0])]
     if len(a) == 1 or order == 0:
-        return y
-    w, g = weighted(a, order), of_argument(a, order)
-    v: Jet = [0.0]  # k y[k]
-    for k in range(1, order + 1):
-        rest = (w[k] if k < len(w) else 0.0) - convolve(v, g, k, first=1)
-        v.append(np.divide(rest, g[0]))
-        y.append(v[k] / k)
-    return y
+        return [function(a[0])]
+    slope = divide(derivative(a, order - 1), of_argument(a, order - 1), order - 1)
+    return _integral(function(a[0]), slope)
 
 
 def erf(a: Jet, order: int) -> Jet:
     """y = erf(a), from y' = 2/√π exp(-a²) a'."""
     from scipy.special import erf as of_values
 
-    y: Jet = [of_values(a[0])]
     if len(a) == 1 or order == 0:
-        return y
-    w = weighted(a, order)
-    bell = exp(negative(multiply(a, a, order), order), order)
-    for k in range(1, order + 1):
-        y.append(convolve(w, bell, k, first=1) * (2.0 / math.sqrt(math.pi) / k))
-    return y
+        return [of_values(a[0])]
+    bell = exp(negative(multiply(a, a, order - 1), order - 1), order - 1)
+    slope = multiply([2.0 / math.sqrt(math.pi)], derivative(a, order - 1), order - 1)
+    return _integral(of_values(a[0]), multiply(slope, bell, order - 1))
 
 
 def switched(name: str, decided: Coefficient, arguments: list[Jet], order: int) -> Jet:
