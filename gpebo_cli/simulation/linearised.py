@@ -21,6 +21,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.expressions import with_others
 from gpebo_cli.model.expressions.intervals import Interval
 from gpebo_cli.model.text import TextCoefficients, switching
 from gpebo_cli.numerics.linalg import taylor_product
@@ -79,11 +80,7 @@ class Linearised:
         """Those of functions of time, and where outputs of the guess pass a jump or a kink."""
         found = self.system.coefficients.breakpoints(start, stop)
         inner = self.switched[(self.switched > start) & (self.switched < stop)]
-        if not len(inner):
-            return found
-        known = np.concatenate([[start], found, [stop]])
-        apart = np.abs(inner[:, None] - known).min(axis=1)
-        return np.union1d(found, inner[apart > _SAME * (stop - start)])
+        return with_others(np.array([start, *found, stop]), inner, _SAME * (stop - start))[1:-1]
 
     @cached_property
     def switched(self) -> Array:
@@ -104,11 +101,8 @@ class Linearised:
         found, bounded = self.system.coefficients.of_time.resolved(edges)
         if not bounded or len(self.guess.mesh.edges) == 2:
             return found, bounded
-        inner = self.guess.mesh.edges[1:-1]
-        apart = np.abs(found[np.clip(np.searchsorted(found, inner), 0, len(found) - 1)] - inner)
-        before = np.abs(found[np.clip(np.searchsorted(found, inner) - 1, 0, None)] - inner)
-        close = 1e-9 * np.diff(self.guess.mesh.edges).min()
-        return np.union1d(found, inner[np.minimum(apart, before) > close]), bounded
+        own = self.guess.mesh.edges
+        return with_others(found, own[1:-1], 1e-9 * np.diff(own).min()), bounded
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None

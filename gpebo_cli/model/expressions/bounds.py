@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -135,21 +136,6 @@ def _rest(bounds: Bounds, low: Array, high: Array) -> tuple[Array, Array]:
     return rest, size
 
 
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Cells in which one of the functions may have a root."""
-
-    which: IntArray  # (N,) the function
-    low: Array
-    high: Array
-
-    def __len__(self) -> int:
-        return len(self.which)
-
-    def __getitem__(self, some: BoolArray) -> _Cells:
-        return _Cells(self.which[some], self.low[some], self.high[some])
-
-
 def breakpoints(tape: Tape, start: float, stop: float) -> Array:
     """Times strictly between ``start`` and ``stop`` where some expression jumps or has a kink.
 
@@ -169,15 +155,17 @@ def breakpoints(tape: Tape, start: float, stop: float) -> Array:
     if len(affine) == len(tape.switches) or not start < stop:
         return exact
 
-    found = np.sort(roots(tape, exact, start, stop))
-    near = _SAME * (stop - start)
-    known = np.concatenate([[start], exact, [stop]])
-    place = np.searchsorted(known, found)  # between start and stop, where all of them are
-    new = (found - known[np.maximum(place - 1, 0)] > near) & (
-        known[np.minimum(place, len(known) - 1)] - found > near
-    )
-    new[1:] &= np.diff(found) > near
-    return np.sort(np.concatenate([exact, found[new]]))
+    found, near = np.sort(roots(tape, exact, start, stop)), _SAME * (stop - start)
+    found = found[np.diff(found, prepend=-np.inf) > near]
+    return with_others(np.array([start, *exact, stop]), found, near)[1:-1]
+
+
+def with_others(known: Array, others: Array, near: float) -> Array:
+    """Times ``known`` (A,), sorted, and those ``others`` (B,) that are not so ``near`` to one."""
+    place = np.searchsorted(known, others)
+    before, after = known[np.maximum(place - 1, 0)], known[np.minimum(place, len(known) - 1)]
+    new = np.minimum(np.abs(others - before), np.abs(after - others)) > near
+    return np.union1d(known, others[new])
 
 
 def roots(tape: Tape, knots: Array, start: float, stop: float) -> Array:
@@ -198,76 +186,66 @@ def roots(tape: Tape, knots: Array, start: float, stop: float) -> Array:
     nested = Bounds(arguments.of([s.argument for s in arguments.switches]))
     bounds, searched = Bounds(arguments), range(len(arguments.outputs))
     grid = np.union1d(np.linspace(start, stop, _CELLS + 1), knots)
-    which = np.repeat(np.array(searched, dtype=np.intp), len(grid) - 1)
-    active = _Cells(which, np.tile(grid[:-1], len(searched)), np.tile(grid[1:], len(searched)))
-    bracketed: list[_Cells] = []
-    narrowest = _NARROWEST * (stop - start)
-    while len(active):
+    # Which argument may vanish, and from when to when: the columns of ``active`` and the others.
+    active = np.array([(j, a, b) for j in searched for a, b in pairwise(grid)]).T
+    bracketed: list[Array] = []
+    while active.size:
         possible, monotone, vanishing = _judged(bounds, nested, active)
-        bracketed.append(active[monotone])
+        bracketed.append(active[:, monotone])
         rest = possible & ~monotone
         if rest.sum() > _MOST_CELLS:  # where it is zero, or there is no end of them
             if not vanishing[rest].all():
                 raise ConfigError(
                     "an argument of sign, abs, min or max has more changes of sign than can be "
-                    f"followed, near t = {active[rest & ~vanishing].low[0]:.6g}; choose a shorter "
+                    f"followed, near t = {active[1, rest & ~vanishing][0]:.6g}; choose a shorter "
                     "horizon"
                 )
             break
-        active = active[rest]
-        tiny = active.high - active.low <= narrowest
-        bracketed.append(_joined(active[tiny]))
-        active = active[~tiny]
-        middle = 0.5 * (active.low + active.high)
-        active = _Cells(
-            np.tile(active.which, 2), np.concatenate([active.low, middle]),
-            np.concatenate([middle, active.high]),
-        )  # fmt: skip
-    cells = _Cells(*(
-        np.concatenate([getattr(c, name) for c in bracketed]) for name in ("which", "low", "high")
-    ))  # fmt: skip
-    return _bisected(arguments, cells)
+        active = active[:, rest]
+        tiny = active[2] - active[1] <= _NARROWEST * (stop - start)
+        bracketed.append(_joined(active[:, tiny]))
+        which, low, high = active[:, ~tiny]
+        middle = 0.5 * (low + high)
+        active = np.concatenate([[which, low, middle], [which, middle, high]], axis=1)
+    return _bisected(arguments, np.concatenate(bracketed, axis=1))
 
 
 def _judged(
-    bounds: Bounds, nested: Bounds, cells: _Cells
+    bounds: Bounds, nested: Bounds, cells: Array
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Whether arguments may vanish in their cells, may and are monotone, may in the middle."""
-    low, back = np.unique(np.stack([cells.low, cells.high]), axis=1, return_inverse=True)
-    least, most = bounds.of(low[0], low[1], 1)
-    middle = 0.5 * (low[0] + low[1])
-    at_middle = bounds.of(middle, middle, 0)
-    pick = back.ravel(), cells.which
-    least0, most0, least1, most1 = least[0][pick], most[0][pick], least[1][pick], most[1][pick]
-    inner = nested.of(low[0], low[1], 0)
+    (low, high), back = np.unique(cells[1:], axis=1, return_inverse=True)
+    pick = back.ravel(), cells[0].astype(np.intp)
+    (least0, least1), (most0, most1) = (
+        [each[pick] for each in bound] for bound in bounds.of(low, high, 1)
+    )
+    middle = 0.5 * (low + high)
+    least, most = (bound[0][pick] for bound in bounds.of(middle, middle, 0))
+    inner = nested.of(low, high, 0)
     decided = (inner[0][0] > 0) | (inner[1][0] < 0)  # no sign inside of the argument may change
     smooth = decided.all(axis=1)[back.ravel()]
-    half = 0.5 * (cells.high - cells.low)
     with np.errstate(invalid="ignore"):
-        reach = half * np.maximum(-least1, most1)
-        away = smooth & ((at_middle[0][0][pick] > reach) | (at_middle[1][0][pick] < -reach))
+        reach = 0.5 * (cells[2] - cells[1]) * np.maximum(-least1, most1)
+        away = smooth & ((least > reach) | (most < -reach))
     possible = (least0 <= 0) & (most0 >= 0) & ~away
-    vanishing = (at_middle[0][0][pick] <= 0) & (at_middle[1][0][pick] >= 0)
-    return possible, possible & smooth & ((least1 > 0) | (most1 < 0)), vanishing
+    return possible, possible & smooth & ((least1 > 0) | (most1 < 0)), (least <= 0) & (most >= 0)
 
 
-def _joined(cells: _Cells) -> _Cells:
+def _joined(cells: Array) -> Array:
     """Neighbouring cells of one function as one."""
-    order = np.lexsort((cells.low, cells.which))
-    which, low, high = cells.which[order], cells.low[order], cells.high[order]
+    which, low, high = cells[:, np.lexsort(cells[1::-1])]
     first = np.ones(len(which), dtype=bool)
     first[1:] = (which[1:] != which[:-1]) | (low[1:] != high[:-1])
     last = np.append(first[1:], True)[: len(which)]
-    return _Cells(which[first], low[first], high[last])
+    return np.array([which[first], low[first], high[last]])
 
 
-def _bisected(arguments: Tape, cells: _Cells) -> Array:
+def _bisected(arguments: Tape, cells: Array) -> Array:
     """The change of sign in each cell that has one between its ends."""
-    low, high = cells.low, cells.high
-    index = np.arange(len(low))
+    (which, low, high), index = cells, np.arange(cells.shape[1])
 
     def sign(t: Array, inside: Array) -> Array:
-        values: Array = arguments.taylor(t, 0, inside)[0][index, cells.which]
+        values: Array = arguments.taylor(t, 0, inside)[0][index, which.astype(np.intp)]
         return np.sign(values)
 
     middle, width = 0.5 * (low + high), high - low
