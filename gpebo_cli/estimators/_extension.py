@@ -40,13 +40,7 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
             poor &= unresolved(flat, mesh.rule) > _TOLERANCE
         if not poor.any():
             break
-        finer, parent = mesh.split(np.where(poor, 4, 1))
-        values = np.empty((*finer.points.shape, *signal.values.shape[2:]))
-        kept, new = parent >= 0, parent < 0
-        values[kept] = signal.values[parent[kept]]
-        sampled = signal(finer.points[new].ravel(), finer.inside[new].ravel())
-        values[new] = sampled.reshape(-1, *values.shape[1:])
-        signal = Trajectory(finer, values)
+        signal = mesh.split(np.where(poor, 4, 1))[0].along(signal)
     return filtered
 
 

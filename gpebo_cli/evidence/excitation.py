@@ -12,11 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from gpebo_cli.evidence.knowledge import (
-    Knowledge,
-    knowledge,
-    least_share,
-)
+from gpebo_cli.evidence.knowledge import Knowledge, knowledge, least_share
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, BoolArray
@@ -28,11 +24,9 @@ from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
 WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hundredfold
-_TINY, _EPS = float(np.finfo(float).tiny), float(np.finfo(float).eps)
-_ROUNDS, _SAME_TIME = 30, 1e-12
+_TINY = float(np.finfo(float).tiny)
+_PLACES, _SAME_TIME = 17, 1e-14  # in a bracket; of the horizon
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
-_STEPS = 0.25 ** np.array([0.0, 1.0, 2.0, 4.0, 6.0, 9.0])
-_AROUND = np.concatenate([-_STEPS, [0.0], _STEPS[::-1]])
 _BLOCK = 16  # times that are looked at together, from the end on, of more parameters than that
 WINDOWS = 10  # default PE window: this many per horizon
 
@@ -123,8 +117,7 @@ def assess(
 
 def _t_c(evidence: _Evidence, rho: float | None) -> float | None:
     """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``."""
-    regression, p = evidence.regression, evidence.regression.p
-    gram = regression.gram  # of parameters that move, on a mesh of its own
+    gram = evidence.regression.gram  # of parameters that move, on a mesh of its own
     ends = gram.mesh.edges[1:]
     of_ends = knowledge(gram.values[:, -1], *evidence.beside(ends))
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
@@ -143,8 +136,7 @@ def _t_c(evidence: _Evidence, rho: float | None) -> float | None:
             level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
-    doubt = p * _EPS / (enough or 1.0)  # that rounding of G leaves in the level
-    return _first_time(gram, ends, reached, doubt)
+    return _first_time(gram, ends, reached)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,13 +205,12 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 
 
 def _first_time(
-    gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array], doubt: float
+    gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array]
 ) -> float | None:
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
-    Each round looks where the polynomial through the four nearest points, t of the level, points,
-    else the secant, and at distances around it that fall by powers of four. ``edges`` are the right
-    ends of elements, and ``doubt`` is a difference that is rounding.
+    Each round looks at equally many times within the bracket. ``edges`` are the right ends of
+    elements.
     """
     mesh = gram.mesh
     ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
@@ -237,32 +228,14 @@ def _first_time(
     at_once = np.minimum(start + _AT_ONCE * horizon, mesh.edges[k + 1 : k + 2])
     if k == 0 and reached(at_once, piece(at_once)) >= 0.0:
         return start
-    for _ in range(_ROUNDS):
-        j = int(np.argmax(level >= 0.0)) if (level >= 0.0).any() else len(level) - 1
+    while True:
+        j = int(np.argmax(level >= 0.0))
         low, high = float(points[max(j - 1, 0)]), float(points[j])
-        if high - low <= _SAME_TIME * max(abs(high), horizon) or 0.0 <= level[j] <= doubt:
-            break
-        share = level[j - 1] / (level[j - 1] - level[j])
-        guess = low + (high - low) * (share if 0.0 <= share <= 1.0 else 0.5)
-        near = slice(max(j - 2, 0), j + 2)
-        cubic = _where_zero(level[near].tolist(), points[near].tolist())
-        guess = cubic if low < cubic < high else guess
-        points = np.minimum(np.maximum(guess + (high - low) * _AROUND, low), high)
-        points = points[np.append(True, points[1:] > points[:-1])]
+        if high - low <= _SAME_TIME * max(abs(high), horizon):
+            return high if high > at_once[0] else start
+        points = np.linspace(low, high, _PLACES)
         level = reached(points, piece(points))
-        level[-1] = max(level[-1], 0.0)  # rounding; it was reached there
-    return high if high > at_once[0] else start
-
-
-def _where_zero(levels: list[float], t: list[float]) -> float:
-    """Where the polynomial through the times t of different levels is at level 0, else NaN."""
-    found = 0.0
-    for i, (own, time) in enumerate(zip(levels, t, strict=True)):
-        for k, other in enumerate(levels):
-            if k != i:
-                time *= other / (other - own) if other != own else np.nan  # noqa: PLW2901
-        found += time
-    return found
+        level[-1] = max(level[-1], 0.0)
 
 
 def segment_level(regression: LinearRegression, t: Array, window: float) -> Array:

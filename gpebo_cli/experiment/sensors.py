@@ -1,21 +1,21 @@
 """Which sensor next: every state as one more output, and what the data would then determine.
 
 On the strangeness-free form no output is fed back: Φ, ξ_a and ξ_b are the same whatever is
-measured, and every output adds a row to ψ. So one observer with all states measured has them all,
-G = G_0 + Σ G_k over the outputs chosen, and as their noise is white there, cov η̂ ~ G⁻¹.
+measured, and every output adds a row to ψ. With x = offset + gain η a state that is measured adds
+its row of the gain: G = G_0 + Σ G_k over those chosen, and as noise is white there, cov η̂ ~ G⁻¹.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge
-from gpebo_cli.model.descriptor import Array, Coefficients, CoefficientSource, DescriptorSystem
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.observers import Measurements, build
 from gpebo_cli.observers.reduced.extension import extend, reduced_system
 from gpebo_cli.reduction.form import InputDerivatives
@@ -90,32 +90,28 @@ class _Rows:
 
     def __init__(self, settings: Settings, system: DescriptorSystem) -> None:
         signals = simulation_of(system, settings.time, settings.solver).signals
-        x, y = signals.states.values, signals.outputs.values
-        sizes = np.abs(x).max(axis=(0, 1), initial=0.0)
-        size = np.abs(y).max(initial=0.0) or 1.0
-        rows = np.diag(size / np.where(sizes > 0.0, sizes, size))
-        larger = replace(
-            system, outputs=(*system.outputs, *(f"{state} measured" for state in system.states)),
-            coefficients=_WithOutputs(system.coefficients, rows),
-        )
         self._solver, self._system = settings.solver, system
-        reduced = reduced_system(larger, Measurements(
-            signals.inputs, Trajectory(signals.mesh, np.concatenate([y, x @ rows.T], axis=-1)),
-            derivatives=InputDerivatives.of_plant(larger, np.ones(larger.m, dtype=bool)),
+        reduced = reduced_system(system, Measurements(
+            signals.inputs, signals.outputs,
+            derivatives=InputDerivatives.of_plant(system, np.ones(system.m, dtype=bool)),
         ), settings.solver, form="strangeness_free")
         extension = extend(reduced, reduced.mesh, reduced.start())
-        mesh, final, n = extension.mesh, extension.assembled, system.n
-        psi = final.psi[:, :, None, :]
-        square = mesh.trajectory(np.swapaxes(psi, 2, 3) @ psi)  # of every row
+        mesh, final = extension.mesh, extension.assembled
+        # ψ of an output that is a state is its gain, here of a state as large as the outputs are.
+        sizes = largest_over_time(signals.states.values, 2)
+        size = np.abs(signals.outputs.values).max(initial=0.0) or 1.0
+        gain = final.gain * (size / np.where(sizes > 0.0, sizes, size))[:, None]
+        more = mesh.trajectory(gain[..., None] * gain[..., None, :])
+        psi = final.psi[:, -system.r :] / reduced.first.output_scale[:, None]
+        own = mesh.trajectory(np.swapaxes(psi, 1, 2) @ psi)
+        self._gram, self._more = own.integral().final, more.integral().final
+        self._terms = np.maximum(extension.scale[-1], np.abs(gain).max(axis=(0, 1), initial=0.0))
         start, stop = mesh.edges[[0, -1]]
-        whole = square.integral().final
-        self._gram, self._more = whole[:-n].sum(axis=0), whole[-n:]
-        self._terms = extension.scale[-1:]
         self._elapsed = np.array([stop - start])
         self._parameters = (*system.unknowns, *reduced.begin.names)
         self._gain = mesh.trajectory(final.gain)(np.linspace(start, stop, _TIMES))
         self._units = reduced.form.units.states
-        self._common = self._known(range(n)).sizes[0]
+        self._common = self._known(range(system.n)).sizes[0]
 
     def _known(self, chosen: Sequence[int]) -> Knowledge:
         gram = self._gram + self._more[list(chosen)].sum(axis=0)
@@ -140,51 +136,3 @@ class _Rows:
              if is_known}, log_det,
         )
 
-
-@dataclass(frozen=True, eq=False)
-class _WithOutputs:
-    """A model with further constant rows of C."""
-
-    source: CoefficientSource
-    rows: Array  # (c, n)
-
-    @property
-    def constant(self) -> frozenset[str]:
-        return self.source.constant
-
-    @property
-    def zero(self) -> frozenset[str]:
-        return self.source.zero - {"C"}
-
-    @property
-    def of_time(self) -> CoefficientSource:
-        return _WithOutputs(self.source.of_time, self.rows)
-
-    @property
-    def signals(self) -> Mapping[str, frozenset[str]]:
-        return self.source.signals
-
-    def taylor(
-        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
-    ) -> Coefficients:
-        known = self.source.taylor(
-            t, order, inside, None if signals is None else signals[..., : -len(self.rows)]
-        )
-
-        def extended(matrix: Array, rows: Array | float) -> Array:
-            last = np.zeros((*matrix.shape[:2], len(self.rows), matrix.shape[3]))
-            last[0] = rows
-            return np.concatenate([matrix, last], axis=2)
-
-        return known._replace(
-            C=extended(known.C, self.rows), D=extended(known.D, 0.0), H=extended(known.H, 0.0)
-        )
-
-    def breakpoints(self, start: float, stop: float) -> Array:
-        return self.source.breakpoints(start, stop)
-
-    def truth(self, t: Array) -> Array:
-        return self.source.truth(t)
-
-    def resolved(self, edges: Array) -> tuple[Array, bool]:
-        return self.source.resolved(edges)

@@ -386,7 +386,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         return _assembled(reduced, _in_units(swept, units), monitor.latest, as_found=True)
     known, large, monitor.axes = None if large else known, False, None
     if len(windows) > 1:
-        return joined(_over(windows, reduced, problem, monitor), mesh.size)
+        return joined(_over(windows, reduced, problem, monitor))
     own = ivp.solve if solver.name == "ivp" else partial(solve, known=known)
     solution = own(problem, mesh, **limits)
     return _assembled(reduced, _in_units(solution, units), monitor.latest, as_found=False)
@@ -457,52 +457,31 @@ def _over(
         yield _assembled(reduced, _in_units(solution, units), found, as_found=False)
 
 
-class _Growing:
-    """Arrays one after the other; what is not yet filled takes no memory."""
-
-    def __init__(self) -> None:
-        self._values, self._filled = np.zeros(0), 0
-
-    def add(self, values: Array, share: float) -> None:
-        """One more, which is about that share of all of them."""
-        last = self._filled + len(values)
-        if last > len(self._values):
-            room = np.empty((int(2 * last + 1.5 * len(values) / share), *values.shape[1:]))
-            if self._filled:
-                room[: self._filled] = self.values
-            self._values = room
-        self._values[self._filled : last], self._filled = values, last
-
-    @property
-    def values(self) -> Array:
-        """All of them."""
-        return self._values[: self._filled]
-
-
-def joined(parts: Iterable[Extension], elements: int) -> Extension:
-    """One extension of those on neighbouring meshes with about so many elements in all."""
-    whole, rest = defaultdict[str, _Growing](_Growing), list[tuple[Any, ...]]()
-    end = np.zeros(0)
+def joined(parts: Iterable[Extension]) -> Extension:
+    """One extension of those on neighbouring meshes."""
+    whole, rest = defaultdict[str, list[Array]](list), list[tuple[Any, ...]]()
     for part in parts:
-        found, size = part.assembled, part.mesh.size
-        for name, values in {
-            "edges": part.mesh.edges[:-1], "scale": part.scale, "z": part.trajectory.values,
-            **{name: getattr(found, name) for name in OVER_TIME},
-        }.items():
-            whole[name].add(values, size / max(elements, size))
+        found = part.assembled
+        whole["edges"].append(part.mesh.edges[:-1])
+        whole["scale"].append(part.scale)
+        whole["z"].append(part.trajectory.values)
+        for name in OVER_TIME:
+            whole[name].append(getattr(found, name))
         rest.append((part.error_estimate, part.weakest, found.Y_scale, found.column_scale,
                      found.largest, found.moving))
-        end, rule, units = part.mesh.edges[-1:], part.mesh.rule, part.units
+    whole["edges"].append(part.mesh.edges[-1:])
     errors, weak, of_Y, of_columns, largest, moving = zip(*rest, strict=True)
-    over_time: dict[str, Any] = {name: whole[name].values for name in OVER_TIME}
-    mesh = Mesh(np.append(whole["edges"].values, end), rule)
+    # One after the other, so that no two of them are held twice.
+    over_time: dict[str, Any] = {name: np.concatenate(whole.pop(name)) for name in [*whole]}
+    mesh = Mesh(over_time.pop("edges"), part.mesh.rule)
+    z, scale = over_time.pop("z"), over_time.pop("scale")
     return Extension(
-        Trajectory(mesh, whole["z"].values), max(errors),
+        Trajectory(mesh, z), max(errors),
         replace(
             found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
             largest=np.max(largest, axis=0), moving=np.max(moving, axis=0),
         ),
-        np.maximum.accumulate(whole["scale"].values, axis=0), units, min(weak),
+        np.maximum.accumulate(scale, axis=0), part.units, min(weak),
     )
 
 
