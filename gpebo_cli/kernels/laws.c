@@ -155,11 +155,10 @@ static inline void note(const Course *course, npy_intp j, const double *error, d
 {
     if (course->level == NULL)
         return;
-    double *const last = course->last[j];
-    const double *const level = course->level[j];
-    Lane found;
-    EACH found[l] = fabs(error[l]) > level[l] ? time : last[l];
-    memcpy(last, found, sizeof(Lane));
+    double *restrict last = course->last[j];
+    const double *restrict level = course->level[j];
+#pragma omp simd
+    EACH last[l] = fabs(error[l]) > level[l] ? time : last[l];
 }
 
 /* Weighted squares of η̂ − η and x̂ − x at one time, x̂ = offset + gain η̂, in each lane. */

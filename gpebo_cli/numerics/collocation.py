@@ -63,7 +63,7 @@ class LinearSolution:
     errors: Array  # (n, columns) of each component of X relative to its largest value
     lost: float | None  # from when on a component's error exceeds the component
     extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each, or (1, 1, ...)
-    uncertain: float | Array = 0.0  # (n, columns) estimated errors at the end
+    uncertain: Array | None = None  # (n, columns) estimated errors at the end
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,7 +61,7 @@ def estimated_errors(
         random_signs(len(values), len(problem.start), 2), mesh.steps, LEVEL, END, CHANCE**2, _SAME,
         renew=None if renewal is None else renewal.error,
     )
-    if np.any(problem.uncertain):
+    if problem.uncertain is not None:
         of_start = np.zeros((len(values), 1, *last.shape[1:]))
         of_start = elements.chain(last[:, None], of_start, np.eye(values.shape[2]))[0][:, 1]
         carried = np.sqrt(carried**2 + of_start**2 @ np.square(problem.uncertain))

@@ -66,5 +66,5 @@ class LinearProblem:
     # Whether components have units of their own: then one that is small beside the others counts
     # for itself, unless it is small beside what it is made of.
     apart: bool = False
-    uncertain: float | Array = 0.0  # (n, columns) errors of the start beside rounding
+    uncertain: Array | None = None  # (n, columns) errors of the start beside rounding
     told: bool = False  # whether the monitor has all components among its signals

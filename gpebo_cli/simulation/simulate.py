@@ -285,14 +285,12 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
     if not c.B.shape[3]:
         return lambda _size: np.zeros(0)
     A, B = (largest_over_time(distinct(matrix)[0]) for matrix in (c.A, c.B))
-
-    def terms(size: Array) -> Array:
-        beside = np.full(B.shape, np.inf)
-        np.divide((A @ size)[:, None], B, out=beside, where=B > 0.0)
-        least = beside.min(axis=0, initial=np.inf)
-        return np.where(np.isfinite(least), least, 0.0)
-
-    return terms
+    has, heard = B > 0.0, B.any(axis=0)
+    share = 1.0 / np.where(has, B, 1.0)
+    apart = np.where(has | ~heard, 0.0, np.inf)  # equations without the input ask nothing of it
+    return lambda size: np.where(
+        heard, ((A @ size)[:, None] * share + apart).min(axis=0, initial=np.inf), 0.0
+    )
 
 
 def _outputs(C: Array, x: Array, direct: Array | None = None) -> Array:

@@ -114,7 +114,7 @@ def regression_signals(
         sizes = np.maximum(sizes, (np.abs(algebraic) @ np.abs(z)).max(axis=(0, 1), initial=0.0))
         nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= VANISHING * sizes[1:]
         psi = np.where(nothing, 0.0, psi)
-    largest, used = largest_over_time(z), np.asarray(H.any(axis=(0, 2)))
+    largest, used = largest_over_time(z), np.asarray(largest_over_time(H).any(axis=1))
     moving = np.abs(basis) @ largest[:, 1:]
     return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, largest, moving)
 
