@@ -224,19 +224,19 @@ def test_what_is_overlooked(known, tol):
     np.testing.assert_array_equal(one, other)
 
 
-def test_a_pulse_between_the_nodes_is_far_from_the_polynomial():
-    rule, looks = radau_rule(5), 7
-    mesh = initial_mesh(0.0, 1.0, [], 3, rule)
-    places = (np.arange(looks) + 0.5) / looks
-    between = rule.interpolation(places).T
-    nodal = np.sin(mesh.points).reshape(1, -1, 1) * [1.0, 1.0, 2.0]
-    t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
-    seen = np.sin(t).reshape(1, -1, 1) * [1.0, 1.0, 2.0]
-    seen[0, looks + 2, 2] += 4.0
-    still = np.ones((1, nodal.shape[1], 1)), np.ones((1, seen.shape[1], 1))
-    far = at_known._missed_between(between, nodal, seen, *still)
-    np.testing.assert_array_equal(far[1], 0.0)
-    np.testing.assert_allclose(far[0], [0.0, 4.0 / seen.max(), 0.0], atol=1e-6)
+def test_a_pulse_between_the_nodes_is_seen():
+    system, mesh = plant(), initial_mesh(0.0, 1.0, [], 3, radau_rule(5))
+    c = system.coefficients.taylor(mesh.points.ravel(), 0)
+
+    def overlooked(pulse):
+        def looked_at(t):
+            found = system.coefficients.taylor(t, 0)
+            return found._replace(u=found.u + pulse * (np.arange(len(t)) == len(t) // 2)[:, None])
+
+        return at_known._overlooked(system, c, looked_at, mesh, 1e-9, np.zeros(1)).tolist()
+
+    assert overlooked(0.0) == [False, False, False]
+    assert overlooked(0.1) == [False, True, False]
 
 
 def test_noise_is_not_joined_and_nothing_is_where_no_number_is():

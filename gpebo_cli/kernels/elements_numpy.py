@@ -33,8 +33,12 @@ def element_maps(
     """
     k, s, columns = len(h), len(D), f.shape[2]
     d, n = A.shape[1:]
-    forcing, identity = forcing_at_nodes(D, h, E, A, f, offset), np.eye(n)[None]
+    forcing, identity = at_nodes(f, k, s), np.eye(n)[None]
     E_, A_ = (at_nodes(identity if x is None else x, k, s) for x in (E, A))
+    if offset is not None:  # what drives z: f + A p − E (D p)/h
+        p = at_nodes(offset, k, s)
+        slope = np.matmul(D / h[:, None, None], p.reshape(k, s, -1)).reshape(p.shape)
+        forcing = forcing + A_ @ p - E_ @ slope
     T_ = None if basis is None else at_nodes(basis, k, s)
     start = D.sum(axis=1)[:, None, None]
     homogeneous, particular = np.empty((groups, s, n, n)), np.empty((k, s, n, columns))
@@ -52,7 +56,7 @@ def element_maps(
             solved[:, :, n:].reshape(s, n, len(same), columns), 2, 0
         )
     if offset is not None:
-        particular += at_nodes(offset, k, s)
+        particular += p
     return homogeneous, particular
 
 
@@ -77,21 +81,6 @@ def at_nodes(values: Array, k: int, s: int) -> Array:
     if len(values) == 1:
         return np.broadcast_to(values, (k, s, *values.shape[1:]))
     return values.reshape(k, s + 1, *values.shape[1:])[:, 1:]
-
-
-def forcing_at_nodes(
-    D: Array, h: Array, E: Array | None, A: Array, f: Array, offset: Array | None
-) -> Array:
-    """What drives z at the nodes, f + A p − E (D p)/h, shape (k, s, d, columns)."""
-    k, s = len(h), len(D)
-    forcing = at_nodes(f, k, s)
-    if offset is None:
-        return forcing
-    p = at_nodes(offset, k, s)
-    slope = np.matmul(D / h[:, None, None], p.reshape(k, s, -1)).reshape(p.shape)
-    if E is not None:
-        slope = at_nodes(E, k, s) @ slope
-    return np.asarray(forcing + at_nodes(A, k, s) @ p - slope)
 
 
 def chain(

@@ -12,6 +12,8 @@ and the number μ + 1 of orders that are used.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gpebo_cli.kernels.arrays import Array, BoolArray, IntArray, inverses
@@ -182,16 +184,6 @@ def bounds(
         return found, left, Z1.T @ a[0] @ states[:, :, :d]
 
 
-def forcing(B: Array, F: Array, u: Array, theta: Array, orders: int) -> Array:
-    """Taylor coefficients of B u + F θ, shape (orders, N, n)."""
-    f = np.zeros((orders, max(x.shape[1] for x in (B, F, u, theta)), B.shape[2]))
-    for k in range(orders):
-        for i in range(k + 1):
-            f[k] += np.matmul(F[i], theta[k - i][..., None])[..., 0]
-            f[k] += np.matmul(B[i], u[k - i][..., None])[..., 0]
-    return f
-
-
 def by_elimination(
     E: Array, M: Array, N: Array, g: Array, pivot_rows: IntArray, pivot_columns: IntArray,
     rank: int, Z1: Array, every: int, growth: float, residual: float,
@@ -226,11 +218,7 @@ def by_elimination(
     return A2, constraints[:, :, n:].copy(), size, inverse / scale[:, None, :], poor
 
 
-def eliminated(
-    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, B: Array, F: Array,
-    u: Array, theta: Array, pivot_rows: IntArray, pivot_columns: IntArray, rank: int, Z1: Array,
-    every: int, growth: float, residual: float,
-) -> tuple[Array, ...] | None:
+def eliminated(*_: Any) -> tuple[Array, ...] | None:
     """E1 x' = A1 x + f1 and 0 = Â2 x + f2 in the model's own states, at N times.
 
     With the coefficients of f = B u + F θ, B (orders, N or 1, n, m), F (…, n, q), u (…, m) and θ
@@ -240,28 +228,11 @@ def eliminated(
     Returns:
         E1, A1 (N, d, n), f1 (N, d), Â2 (N, a, n), f2 (N, a), T (N, n, d) and offset (N, n) of the
         consistent states T z + offset with z = E1 x, and by how much relative rounding of each
-        state, and of 1, reaches each state through the constraints (n, n + 1); None where the
-        elimination fails at some time. Matrices come at one time where E and A do.
+        state, and of 1, reaches each state through the constraints (n, n + 1). Matrices come at one
+        time where E and A do. None where the elimination fails at some time, and without C: the
+        caller then takes :func:`by_elimination` and :func:`in_own_states`.
     """
-    e, a = scaled(E, A, rows, columns, time, orders)
-    M, N = derivative_array(e, a, orders - 1)
-    f = forcing(B[:orders], F[:orders], u[:orders], theta[:orders], orders)
-    times = max(len(M), f.shape[1])
-    f = np.broadcast_to(f, (orders, times, len(rows)))
-    weights = (time ** np.arange(orders))[:, None] * rows
-    g = np.moveaxis(f * weights[:, None, :], 0, 1).reshape(times, -1, 1)
-    A2, f2, size, inverse, poor = by_elimination(
-        e[0], M, N, g, pivot_rows, pivot_columns, rank, Z1, every, growth, residual
-    )
-    if poor.any():
-        return None
-    found = in_own_states(E[0], A[0], f[0], Z1[None], A2, f2, size, inverse, rows, columns, time,
-                          every)
-    counts = [len(M), len(M), times, len(M), times, len(M), times]
-    return *(
-        np.broadcast_to(x, (count, *x.shape[1:])) if len(x) == 1 else x
-        for x, count in zip(found[:-1], counts, strict=True)
-    ), found[-1]
+    return None
 
 
 def in_own_states(

@@ -33,10 +33,9 @@ class Side:
         return f"there {verb} {counted(len(self.names), self.noun)}{named}"
 
 
-def listed(names: Sequence[str], limit: int = 8) -> str:
-    """The names with commas, the first ``limit`` of them."""
-    rest = [] if len(names) <= limit else ["..."]
-    return ", ".join([*names[:limit], *rest])
+def listed(names: Sequence[str]) -> str:
+    """The names with commas, the first eight of them."""
+    return ", ".join([*names[:8], *(["..."] if len(names) > 8 else [])])
 
 
 def counted(number: int, noun: str) -> str:

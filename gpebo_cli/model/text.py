@@ -224,14 +224,13 @@ def coefficients_of(
     inputs: Sequence[Expression],
     outputs: frozenset[str],
     name: str,
-    restricted: TextCoefficients | None = None,
 ) -> TextCoefficients:
     """Coefficients from entries by the names in ``MATRIX_NAMES``, and those of theta.
 
-    Inputs stand for their names in ``entries``, outputs have values only along signals;
-    ``restricted`` is the same without what depends on outputs, None: it is made here.
+    Inputs stand for their names in ``entries``, outputs have values only along signals.
     """
-    if restricted is None and any(
+    restricted = None
+    if any(
         not e.node.signals.isdisjoint(outputs)
         for _, given in entries.values() for e in given.values()
     ):
@@ -263,6 +262,4 @@ def coefficients_of(
         Expression(node, e.text, e.where) for e in varying for node in divisors_of(e.node)
         if not node.signals.isdisjoint(outputs)
     )
-    return TextCoefficients(
-        assembly, truth, depending, outputs, name, restricted, divisors
-    )
+    return TextCoefficients(assembly, truth, depending, outputs, name, restricted, divisors)

@@ -66,14 +66,10 @@ class LinearSolution:
     uncertain: Array | None = None  # (n, columns) estimated errors at the end
 
 
-@dataclass(frozen=True, eq=False)
-class _ElementMaps:
-    """X at the nodes of each element = ``homogeneous`` X(left end) + ``particular``."""
-
-    homogeneous: Array  # (K, s, n, n), or (1, s, n, n) if it is the same for all
-    particular: Array  # (K, s, n, columns)
-    noise: Array  # (K, n, n + columns), see estimated_errors
-    extras: tuple[Array, ...]  # (K, s + 1, ...) each, or (1, 1, ...) if constant
+# X at the nodes of each element = ``homogeneous`` X(left end) + ``particular``: the first one
+# (K, s, n, n), or (1, s, n, n) if it is the same for all; the second (K, s, n, columns); ``noise``
+# (K, n, n + columns), see estimated_errors; and extras (K, s + 1, ...), or (1, 1, ...) if constant.
+_Maps = list[Array]
 
 
 def solve(
@@ -97,12 +93,12 @@ def solve(
     """
 
     def evaluate(
-        mesh: Mesh, before: tuple[_ElementMaps, Array, int] | None, kept: IntArray
-    ) -> tuple[tuple[_ElementMaps, Array, int], Array]:
+        mesh: Mesh, before: tuple[_Maps, Array, int] | None, kept: IntArray
+    ) -> tuple[tuple[_Maps, Array, int], Array]:
         if before is None:
             maps = _element_maps(problem, mesh, None, known)
         else:
-            maps = _merge(before[0], _element_maps(problem, mesh, kept < 0), kept)
+            maps = merged(before[0], _element_maps(problem, mesh, kept < 0), kept)
         values, whole = _chain(maps, problem, mesh, restarts or {})
         tail = _tail_of_numbers(problem, mesh, values, maps, whole, tol)
         return (maps, values, whole), tail
@@ -112,11 +108,11 @@ def solve(
     )
     if whole < mesh.size:
         raise _not_finite(problem, mesh, maps, values, float(mesh.edges[whole]))
-    noise = maps.noise
+    homogeneous, particular, noise, *extras = maps
     if restarts:
         noise = _with_instants(noise, Trajectory(mesh, values), np.array(list(restarts)))
     errors, lost, last = estimated_errors(
-        problem, mesh, maps.homogeneous[:, -1], maps.particular[:, -1], noise, values
+        problem, mesh, homogeneous[:, -1], particular[:, -1], noise, values
     )
     if lost == mesh.size and errors.max(initial=0.0) > _AMPLIFIED * tol:
         errors = np.maximum(errors, _rounded_otherwise(problem, mesh, values, restarts or {}))
@@ -126,7 +122,7 @@ def solve(
     estimate = max(left, float(errors.max(initial=0.0)))
     return LinearSolution(
         Trajectory(mesh, values), estimate, rounds, errors,
-        None if lost == mesh.size else float(mesh.edges[lost + 1]), maps.extras, last,
+        None if lost == mesh.size else float(mesh.edges[lost + 1]), tuple(extras), last,
     )
 
 
@@ -152,15 +148,15 @@ def _rounded_otherwise(
 
 
 def _not_finite(
-    problem: LinearProblem, mesh: Mesh, maps: _ElementMaps, values: Array, since: float
+    problem: LinearProblem, mesh: Mesh, maps: _Maps, values: Array, since: float
 ) -> SolverError:
     """Why a solution is not finite: it grows, or what rounding left of something small does."""
     count = _modest(values)
     if count:
-        part = slice(count)
+        homogeneous, particular, noise = (array[:count] for array in maps[:3])
         _, lost, _ = estimated_errors(
-            problem, Mesh(mesh.edges[: count + 1], mesh.rule), maps.homogeneous[part, -1],
-            maps.particular[part, -1], maps.noise[part], values[part],
+            problem, Mesh(mesh.edges[: count + 1], mesh.rule), homogeneous[:, -1],
+            particular[:, -1], noise, values[:count],
         )
         if lost < count:
             return nothing_left(problem.name, float(mesh.edges[lost + 1]))
@@ -178,7 +174,7 @@ def _modest(values: Array) -> int:
 
 
 def _tail_of_numbers(
-    problem: LinearProblem, mesh: Mesh, values: Array, maps: _ElementMaps, whole: int, tol: float
+    problem: LinearProblem, mesh: Mesh, values: Array, maps: _Maps, whole: int, tol: float
 ) -> Array:
     """:func:`unresolved_signals`; where not all is finite, of the elements before, else zero.
 
@@ -190,13 +186,13 @@ def _tail_of_numbers(
     if count:
         part = slice(count)
         if problem.apart:
-            last = np.abs(maps.homogeneous[part, -1])
-            made_of = last @ np.abs(values[part, 0]) + np.abs(maps.particular[part, -1])
+            last, particular = (np.abs(array[part, -1]) for array in maps[:2])
+            made_of = last @ np.abs(values[part, 0]) + particular
         else:  # lengths are said: there may be no components
             made_of = values[part].reshape(count * values.shape[1], *values.shape[2:])
         tail[part] = unresolved_signals(
             problem, mesh.rule, values[part],
-            tuple(e if e.shape[:2] == (1, 1) else e[part] for e in maps.extras),
+            tuple(e if e.shape[:2] == (1, 1) else e[part] for e in maps[3:]),
             largest_over_time(made_of), tol,
         )
     return tail
@@ -219,14 +215,6 @@ def unresolved_signals(
         return tail
     least = least_sizes(problem, made_of, tol).reshape(n * columns)
     return np.maximum(tail, unresolved(values.reshape(size, points, n * columns), rule, least))
-
-
-def _merge(old: _ElementMaps, new: _ElementMaps, kept: IntArray) -> _ElementMaps:
-    before, after = (
-        (maps.homogeneous, maps.particular, maps.noise, *maps.extras) for maps in (old, new)
-    )
-    homogeneous, particular, noise, *extras = merged(before, after, kept)
-    return _ElementMaps(homogeneous, particular, noise, tuple(extras))
 
 
 def merged(before: Sequence[Array], after: Sequence[Array], kept: IntArray) -> list[Array]:
@@ -252,7 +240,7 @@ def merged(before: Sequence[Array], after: Sequence[Array], kept: IntArray) -> l
 def _element_maps(
     problem: LinearProblem, mesh: Mesh, elements: BoolArray | None,
     known: LinearEquation | None = None,
-) -> _ElementMaps:
+) -> _Maps:
     """Solve the block systems of some elements, None: all, in chunks of bounded memory."""
     n, columns = problem.start.shape
     s = mesh.rule.stages
@@ -275,16 +263,15 @@ def _element_maps(
         maps = _solve_elements(problem, mesh.rule, h[part], t[part], c)
         if len(h) <= chunk:
             return maps
-        piece = [maps.homogeneous, maps.particular, maps.noise, *maps.extras]
         if not whole:
             whole = [
                 values if values.shape[:2] == (1, 1) else np.empty((len(h), *values.shape[1:]))
-                for values in piece
+                for values in maps
             ]
-        for everywhere, here in zip(whole, piece, strict=True):
+        for everywhere, here in zip(whole, maps, strict=True):
             if everywhere.shape[:2] != (1, 1):
                 everywhere[part] = here
-    return _ElementMaps(whole[0], whole[1], whole[2], tuple(whole[3:]))
+    return whole
 
 
 def _is_constant(c: LinearEquation) -> bool:
@@ -316,9 +303,8 @@ def at_points(values: Array, k: int, s: int) -> Array:
 
 def _solve_elements(
     problem: LinearProblem, rule: RadauRule, h: Array, t: Array, c: LinearEquation
-) -> _ElementMaps:
+) -> _Maps:
     k, s = len(h), rule.stages
-    extras = tuple([at_points(extra, k, s) for extra in c.extras])
     basis, offset = (None, None) if c.constraints is None else c.constraints
     group, groups = np.arange(k), k
     solve: Callable[..., tuple[Array, Array]] = elements.element_maps
@@ -338,7 +324,8 @@ def _solve_elements(
         ) from error
     if 1 < groups < k:
         homogeneous = homogeneous[group]
-    return _ElementMaps(homogeneous, particular, _noise(h, t, c), extras)
+    extras = [at_points(extra, k, s) for extra in c.extras]
+    return [homogeneous, particular, _noise(h, t, c), *extras]
 
 
 def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
@@ -412,15 +399,16 @@ def decoupled(
 
 
 def _chain(
-    maps: _ElementMaps,
+    maps: _Maps,
     problem: LinearProblem,
     mesh: Mesh,
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, int]:
     """Point values (K, s + 1, n, columns), and how many elements in front are finite."""
     renew = None if problem.renewal is None else problem.renewal.state
+    homogeneous, particular, *_ = maps
     if not restarts:
-        return elements.chain(maps.homogeneous, maps.particular, problem.start, renew)
+        return elements.chain(homogeneous, particular, problem.start, renew)
     edges = mesh.edges.tolist()
     cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
     state, pieces, whole = problem.start, [], 0
@@ -430,9 +418,8 @@ def _chain(
             if renew is not None:
                 state = renew(state)
         part = slice(first, last)
-        same = len(maps.homogeneous) == 1
-        homogeneous = maps.homogeneous if same else maps.homogeneous[part]
-        values, finite = elements.chain(homogeneous, maps.particular[part], state, renew)
+        own = homogeneous if len(homogeneous) == 1 else homogeneous[part]
+        values, finite = elements.chain(own, particular[part], state, renew)
         whole += finite if whole == first else 0
         pieces.append(values)
         state = values[-1, -1]

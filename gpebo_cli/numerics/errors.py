@@ -28,7 +28,7 @@ _TINY = float(np.finfo(float).tiny)
 _SIGNS = 3  # choices of them for each kind of error
 CHANCE = 4.0  # by how much a sum of independent errors may exceed its root mean square
 END = 8.0  # units in the last place of what an end value is made of, lost in solving an element
-_VALUE = 32.0  # likewise of any value, which are not carried on
+VALUE = 32.0  # likewise of any value, which are not carried on
 _ROUNDING = 8.0  # units in the last place that cannot be resolved
 LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _SAME = 1e-9  # relative difference of rates that are constant
@@ -93,7 +93,7 @@ def judged_errors(
     """
     with np.errstate(over="ignore", invalid="ignore"):
         through = _through_constraints(problem, own)
-        total = largest + tail + noise + EPS * (_VALUE * own + through)
+        total = largest + tail + noise + EPS * (VALUE * own + through)
         coupled = np.maximum(np.maximum(made_of, through), problem.floor)
         if problem.apart:
             scale = np.where(own > NOTHING * coupled, own, coupled)

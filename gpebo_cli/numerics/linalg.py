@@ -86,10 +86,6 @@ def determinant_and_adjugate_action(
     The usual det(Ω)·inv(Ω) is rejected: it is undefined at the start, where every extension begins
     at Ω = 0. Beside both stands the reciprocal condition number σ_min/σ_max (...,), zero where Ω =
     0.
-
-    Examples:     >>> import numpy as np     >>> delta, action, _ =
-    determinant_and_adjugate_action(np.zeros((2, 2)), np.ones(2))     >>> float(delta),
-    action.tolist()  # the adjugate of Ω = 0 is defined, its inverse is not     (0.0, [0.0, 0.0])
     """
     p = omega.shape[-1]
     if rhs is None:

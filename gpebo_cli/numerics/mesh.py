@@ -60,10 +60,6 @@ class Looked(NamedTuple):
             0.0, None, units,
         )
 
-    def tail(self, rule: RadauRule, scale: Array) -> Array:
-        """:func:`legendre_tail` of these signals, beside a scale (K, c)."""
-        return _predicted(self.last[:, -len(rule.to_next) :], rule, scale)
-
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -382,14 +378,14 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
     scale ρ^(s+1); the largest prediction counts. Several, because single coefficients vanish by
     accident, two of them where the signal is odd or even.
     """
-    last = np.abs(np.matmul(rule.to_legendre[-len(rule.to_next) :], values))
-    return _predicted(last, rule, scale)
+    return predicted_tail(np.abs(np.matmul(rule.to_legendre[-4:], values)), rule, scale)
 
 
-def _predicted(last: Array, rule: RadauRule, scale: Array) -> Array:
-    """:func:`legendre_tail` (K, c) from the sizes of the last coefficients (K, used, c)."""
+def predicted_tail(last: Array, rule: RadauRule, scale: Array) -> Array:
+    """:func:`legendre_tail` (K, c) from the sizes of the last coefficients (K, up to 4, c)."""
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
-    predicted = np.minimum(last / size, 1.0) ** rule.to_next[:, None]
+    used = last[:, -len(rule.to_next) :]
+    predicted = np.minimum(used / size, 1.0) ** rule.to_next[:, None]
     return np.asarray(size[:, 0] * predicted.max(axis=1))
 
 

@@ -27,7 +27,14 @@ from gpebo_cli.numerics.collocation import (
 )
 from gpebo_cli.numerics.elimination import Eliminated, StiffError
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
-from gpebo_cli.numerics.mesh import SHARE, Looked, Mesh, Trajectory, equal_lengths
+from gpebo_cli.numerics.mesh import (
+    SHARE,
+    Looked,
+    Mesh,
+    Trajectory,
+    equal_lengths,
+    predicted_tail,
+)
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
@@ -359,7 +366,7 @@ def _errors(
     K, points, n, columns = values.shape
     sizes = found.sizes
     size, last = np.maximum(sizes, _TINY), found.looked.last
-    tail = found.looked.tail(rule, size.reshape(K, -1)).reshape(sizes.shape)
+    tail = predicted_tail(last, rule, size.reshape(K, -1)).reshape(sizes.shape)
     # As in numerics.errors; and what sweeps have not finished.
     added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * sizes
     added += EPS * (END * found.made_of + found.moved)

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gpebo_cli.kernels.structure_numpy import forcing as kernel_forcing
 from gpebo_cli.model.descriptor import (
     Array,
     BoolArray,
@@ -74,7 +73,12 @@ class Units(NamedTuple):
 
 def forcing(c: Coefficients) -> Array:
     """Taylor coefficients of f = B u + F θ + φ, shape (K + 1, N, n)."""
-    return np.asarray(c.phi + kernel_forcing(c.B, c.F, c.u, c.theta, len(c.E)))
+    f = c.phi.copy()
+    for k in range(len(f)):
+        for i in range(k + 1):
+            f[k] += np.matmul(c.F[i], c.theta[k - i][..., None])[..., 0]
+            f[k] += np.matmul(c.B[i], c.u[k - i][..., None])[..., 0]
+    return f
 
 
 def balance(c: Coefficients, mass: float = 1.0) -> Scaling:

@@ -317,25 +317,21 @@ def strangeness_free(
         return whole
     if structure.mu and signals is not None:
         _refuse_slopes(whole, found, t, inside, signals)
-    size = np.abs(found.driving).max(axis=(0, 1), initial=0.0)
-    m = system.m
-    used = []
-    for place, (k, j) in enumerate(whole.derivatives):
-        orders = [size[j] * 1.0, *(
-            size[m + other] / structure.scaling.time ** whole.derivatives[other][0]
-            for other in range(len(whole.derivatives)) if whole.derivatives[other][1] == j
-        )]
-        if size[m + place] / structure.scaling.time**k > _ABSENT * max(orders):
-            used.append((k, j))
-            if inputs is None or not inputs.known[j]:
-                # M is a projector: its rows, weighted by the column of the derivative, are that.
-                weight = np.abs(found.driving[:, :, m + place]).max(axis=0)
-                of = [x for x, w in zip(system.states, weight, strict=True)
-                      if w > _ABSENT * weight.max()]
-                raise ConfigError(_unknown(
-                    system, system.inputs[j],
-                    f"a hidden constraint on {listed(of)} contains its derivative of order {k}",
-                ))
+    m, orders = system.m, np.arange(structure.mu + 1)
+    driving = np.abs(found.driving[:, :, : m * len(orders)]).max(axis=0, initial=0.0)
+    of_order = driving.max(axis=0, initial=0.0).reshape(len(orders), m)
+    of_order /= structure.scaling.time ** orders[:, None]
+    used = [(k, j) for k, j in whole.derivatives if of_order[k, j] > _ABSENT * of_order[:, j].max()]
+    for k, j in used:
+        if inputs is None or not inputs.known[j]:
+            # M is a projector: its rows, weighted by the column of the derivative, are that.
+            weight = driving[:, m * k + j]
+            of = [x for x, w in zip(system.states, weight, strict=True)
+                  if w > _ABSENT * weight.max()]
+            raise ConfigError(_unknown(
+                system, system.inputs[j],
+                f"a hidden constraint on {listed(of)} contains its derivative of order {k}",
+            ))
     return replace(whole, derivatives=tuple(used))
 
 

@@ -24,6 +24,7 @@ from gpebo_cli.model.descriptor import (
     IntArray,
     distinct,
 )
+from gpebo_cli.model.expressions import halved
 from gpebo_cli.numerics.linalg import inverse_or_none, transpose
 from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, initial_edges
 from gpebo_cli.reduction.derivative_array import Scaling, balance, who
@@ -283,7 +284,6 @@ def _refuse_overflow(
         )
 
 
-_BISECTIONS = 60
 _NARROW = 16  # probes in a cell in which something is narrow
 _MOST_PROBES = 1 << 13
 _PLACES = np.sort([1e-3, 1.0 - 1e-3, *(np.arange(1, _PROBES + 1) * 0.6180339887498949 % 1.0)])
@@ -421,13 +421,13 @@ def _refuse_crossing(system: DescriptorSystem, t: Array, E: Array) -> None:
     changes = np.flatnonzero(sign[1:] != sign[:-1])
     if not len(changes):
         return
-    low, high = t[changes[0]], t[changes[0] + 1]
-    for _ in range(_BISECTIONS):
-        half = np.array([0.5 * (low + high)])
-        same = np.linalg.slogdet(system.coefficients.taylor(half, 0).E[0])[0] == sign[changes[0]]
-        low, high = (half[0], high) if same else (low, half[0])
+    there = changes[:1]
+    at = halved(
+        lambda t: np.linalg.slogdet(system.coefficients.taylor(t, 0).E[0])[0], sign[there],
+        t[there], t[there + 1],
+    )
     raise ModelError(
-        f"{who(system)}: the rank of the differential part changes at t = {high:.9g} (det E "
+        f"{who(system)}: the rank of the differential part changes at t = {at[0]:.9g} (det E "
         "changes its sign); choose a horizon that avoids this time"
     )
 

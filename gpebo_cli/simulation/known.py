@@ -76,6 +76,17 @@ def inputs_resolved(
     return mesh, c
 
 
+def least_beside(terms: Array, inputs: IntArray, m: int) -> Array:
+    """The sizes that m inputs have to compare with, (m,).
+
+    An input whose share of every equation is rounding of the others' is rounding itself: what
+    stands beside it in one, divided by its factor there, are ``terms`` (e,) of ``inputs`` (e,).
+    """
+    least = np.full(m, np.inf)
+    np.minimum.at(least, inputs, terms)
+    return np.where(np.isfinite(least), least, 0.0)
+
+
 def known_joined(
     system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients], mesh: Mesh,
     c: Coefficients, cuts: Array, tol: float, longest: float = np.inf,
@@ -111,45 +122,26 @@ def _overlooked(
     if looks == 0 or not names:
         return found
     places = (np.arange(looks) + 0.5) / looks
-    between = np.ascontiguousarray(mesh.rule.interpolation(places).T)
     t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
     seen = looked_at(t.ravel())
     least = max(tol, 1e-12)
     # An input that is rounding of what stands beside it in its equations is not looked at.
     u = np.concatenate([c.u[0], seen.u[0]])
     audible = np.abs(u).max(axis=0, initial=0.0) > _NOTHING * beside
-    pairs = [
-        array * audible if name == "u" else array
-        for name in names for array in (getattr(c, name), getattr(seen, name))
-    ]
-    missed = _missed_between(between, *pairs)
-    for name, far in zip(names, missed, strict=True):
-        if far.max(initial=0.0) <= _SURPRISE * least:
-            continue
-        nodal = getattr(c, name)[0].reshape(*mesh.points.shape, -1)
-        nodal = nodal[..., np.ptp(nodal, axis=(0, 1)) > 0.0]
-        found |= far > _SURPRISE * np.maximum(unresolved(nodal, mesh.rule), least)
-    return found
-
-
-def _missed_between(between: Array, *pairs: Array) -> Array:
-    """How far functions are from the polynomials through their nodes, (pairs, K), relative.
-
-    Of each function values at the points (orders, K (s + 1), …) and ``between`` (orders, K looks,
-    …), to which (s + 1, looks) leads; the first order counts, of entries that move the worst.
-    """
-    points, looks = between.shape
-    found = []
-    for nodal, seen in zip(pairs[::2], pairs[1::2], strict=True):
-        nodes = nodal[0].reshape(nodal.shape[1] // points, points, -1)
-        actual = seen[0].reshape(len(nodes), looks, -1)
-        first = nodes[:1, :1]
-        moves = (nodes != first).any(axis=(0, 1)) | (actual != first).any(axis=(0, 1))
-        nodes, actual = nodes[..., moves], actual[..., moves]
+    for name in names:
+        nodes, actual = (
+            (getattr(of, name)[0] * (audible if name == "u" else 1.0)).reshape(mesh.size, count, -1)
+            for of, count in ((c, mesh.rule.stages + 1), (seen, looks))
+        )
         size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodes).max(axis=(0, 1)))
-        far = np.abs(between.T @ nodes - actual).max(axis=1) / size
-        found.append(far.max(axis=1, initial=0.0))
-    return np.array(found)
+        moves = np.ptp(nodes, axis=(0, 1)) > 0.0
+        there = (actual != nodes[:1, :1]).any(axis=(0, 1)) | moves
+        missed = np.abs(mesh.rule.interpolation(places) @ nodes - actual).max(axis=1)
+        far = (missed[:, there] / size[there]).max(axis=1, initial=0.0)
+        if far.max(initial=0.0) > _SURPRISE * least:
+            tail = unresolved(nodes[..., moves], mesh.rule)
+            found |= far > _SURPRISE * np.maximum(tail, least)
+    return found
 
 
 def _known_kinds(

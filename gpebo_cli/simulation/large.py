@@ -15,7 +15,7 @@ from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import sweeps
 from gpebo_cli.numerics.collocation import LinearSolution
-from gpebo_cli.numerics.errors import EPS
+from gpebo_cli.numerics.errors import EPS, NOTHING, VALUE
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, initial_mesh, legendre_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
@@ -32,33 +32,36 @@ from gpebo_cli.reduction.explicit import (
 )
 from gpebo_cli.reduction.structure import Structure, analyse, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
-from gpebo_cli.simulation.known import MARGIN, SHORT, first_mesh, inputs_resolved, known_joined
+from gpebo_cli.simulation.known import (
+    MARGIN,
+    SHORT,
+    first_mesh,
+    inputs_resolved,
+    known_joined,
+    least_beside,
+)
 from gpebo_cli.simulation.signals import Signals, Simulation
 
 SMALL = 8  # states, up to which dense matrices are faster in any case
 _FULL = 50  # states, beyond which full constant plants are simulated here, too
 _ENTRIES = 4  # per row of E; with more of them E counts as full
 _LENGTH = 2.6  # h‖A‖ of an element: products of two solutions, too, are resolved to 1e-9 there
-_NOTHING = 8.0 * EPS  # of what it is made of: a state that is smaller is rounding itself
 _ROUNDING = 32.0  # units in the last place by which a consistent state may miss one asked for
-_VALUE = 32.0  # units in the last place that any value may be wrong by
 _TINY = float(np.finfo(float).tiny)
 
 
 def forcing(found: Entries, n: int) -> Array:
     """Taylor coefficients (orders, N, n) of f = B u + F θ + φ."""
-    f = np.zeros((len(found.values.u), max(x.shape[1] for x in found.values[5:8]), n))
-    f = _placed(found, "phi", n) + f
+    f = _placed(found, "phi", n)
+    times = max(getattr(found.values, name).shape[1] for name in ("B", "F", "u", "theta", "phi"))
+    f = f.repeat(times // f.shape[1], axis=1)
     for matrix, vector in (("B", "u"), ("F", "theta")):
         known = found.of(vector)
         for (i, j), value in found.of(matrix).items():
             signal = known.get((j,))
             if signal is not None:
-                term = product(value, signal)
-                if term.shape[1] > f.shape[1]:
-                    f = np.repeat(f, term.shape[1], axis=1)
-                f[:, :, i] += term
-    return np.asarray(f)
+                f[:, :, i] += product(value, signal)
+    return f
 
 
 def _placed(found: Entries, name: str, size: int) -> Array:
@@ -247,17 +250,12 @@ def _no_coefficients(t: Array, inside: Array) -> LinearEquation:
 
 
 def _beside_inputs(found: Entries, size: Array) -> Array:
-    """Sizes that the inputs (m,) have to compare with, beside states of some size (n,).
-
-    An input whose share of every equation is rounding of the others' is rounding itself.
-    """
+    """:func:`least_beside` the inputs (m,), with states of some size (n,)."""
     (i, j), (row, column) = found.places["A"], found.places["B"]
-    terms = np.bincount(i, np.abs(found.values.A[0]).max(axis=0) * size[j], len(size))
-    B = np.abs(found.values.B[0]).max(axis=0)
+    A, B = (np.abs(values[0]).max(axis=0) for values in (found.values.A, found.values.B))
+    there, terms = B > 0.0, np.bincount(i, A * size[j], len(size))
     m = 1 + max([-1, *found.places["u"][0].tolist(), *column.tolist()])
-    least = np.full(m, np.inf)
-    np.minimum.at(least, column[B > 0.0], (terms[row] / np.maximum(B, _TINY))[B > 0.0])
-    return np.where(np.isfinite(least), least, 0.0)
+    return least_beside(terms[row[there]] / B[there], column[there], m)
 
 
 def _signals(plant: _Plant, z: Array) -> tuple[Array, Array, Array]:
@@ -314,8 +312,8 @@ def _result(
     made_of = np.maximum(form.sizes_from(own_z)[:, 0] + form.known, own)
     tail = legendre_tail(x, mesh.rule, np.maximum(np.abs(x).max(axis=1), _TINY)).max(axis=0)
     wrong = form.sizes_from(solution.errors * own_z)[:, 0] + tail
-    wrong += _VALUE * EPS * form.loss * made_of
-    scale = np.maximum(np.where(own > _NOTHING * made_of, own, made_of), _TINY)
+    wrong += VALUE * EPS * form.loss * made_of
+    scale = np.maximum(np.where(own > NOTHING * made_of, own, made_of), _TINY)
     state_errors = np.where(wrong > 0.0, wrong / scale, 0.0)
     jumps = []
     for cut in map(float, cuts):

@@ -22,7 +22,14 @@ from gpebo_cli.reduction.strangeness_free import StrangenessFree, direct_part, s
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.simulation.known import MARGIN, SHORT, first_mesh, inputs_resolved, known_joined
+from gpebo_cli.simulation.known import (
+    MARGIN,
+    SHORT,
+    first_mesh,
+    inputs_resolved,
+    known_joined,
+    least_beside,
+)
 from gpebo_cli.simulation.large import SMALL, large_simulation
 from gpebo_cli.simulation.linearised import Linearised, looked_along
 from gpebo_cli.simulation.newton import follow
@@ -278,19 +285,11 @@ def _restart(
 
 
 def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
-    """From the sizes of the states (n,) to those that the inputs (m,) have to compare with.
-
-    An input whose share of every equation is rounding of the others' is rounding itself.
-    """
-    if not c.B.shape[3]:
-        return lambda _size: np.zeros(0)
+    """From the sizes of the states (n,) to :func:`least_beside` the inputs (m,)."""
     A, B = (largest_over_time(distinct(matrix)[0]) for matrix in (c.A, c.B))
-    has, heard = B > 0.0, B.any(axis=0)
-    share = 1.0 / np.where(has, B, 1.0)
-    apart = np.where(has | ~heard, 0.0, np.inf)  # equations without the input ask nothing of it
-    return lambda size: np.where(
-        heard, ((A @ size)[:, None] * share + apart).min(axis=0, initial=np.inf), 0.0
-    )
+    i, j = B.nonzero()
+    own = B[i, j]
+    return lambda size: least_beside((A @ size)[i] / own, j, B.shape[1])
 
 
 def _outputs(C: Array, x: Array, direct: Array | None = None) -> Array:
