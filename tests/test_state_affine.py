@@ -222,6 +222,21 @@ def test_the_linearisation_is_the_derivative():
     np.testing.assert_allclose(c.A[1], slope, atol=1e-5)
 
 
+def test_an_output_that_moves_nothing_but_rounding_has_no_derivative():
+    """A transistor that is off; one that conducts has its conductance."""
+    plant = plant_from_mapping({
+        "name": "diodes", "states": ["a", "b"], "outputs": ["u", "v"],
+        "E": [[1, 0], [0, 1]], "A": [[-1, 0], [0, -1]], "C": [[1, 0], [0, 1]],
+        "phi": ["2 - 1e-6*exp(u/0.026)", "2 - 1e-6*exp(v/0.026)"],
+        "initial_state": [0.3, -0.31],
+    })
+    c = Linearised(plant, found := simulate(plant, TimeSettings(horizon=1e-9), SOLVER)
+                   .signals.states).taylor(np.zeros(1), 0)
+    conductance = 1e-6 * np.exp(found(np.zeros(1))[0, 0] / 0.026) / 0.026
+    assert c.A[0, 0, 0, 0] == pytest.approx(-1.0 - conductance, rel=1e-7)
+    assert c.A[0, 0, 1].tolist() == [0.0, -1.0]
+
+
 def test_finite_escape_is_named_with_its_time():
     """x' = x² from 1 ends at t = 1."""
     system = plant_from_mapping({

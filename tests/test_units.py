@@ -10,18 +10,19 @@ from random_systems import HORIZON, random_system
 from units import drawn, in_units
 
 from gpebo_cli import run
+from gpebo_cli.evidence.excitation import WELL
 from gpebo_cli.model.plant import plant_from_mapping
 
-# Of the transistor amplifier, Newton's method does not find the solution in every unit.
 SHIPPED = sorted(
     path.relative_to(CONF / "plant").as_posix().removesuffix(".yaml")
-    for path in (CONF / "plant").rglob("*.yaml") if path.stem not in ("none", "transistor")
+    for path in (CONF / "plant").rglob("*.yaml") if path.stem != "none"
 )
 RANDOM = [seed for seed in range(13) if seed % 5 < 4]  # of index 0 to 3
 SHORT = {"lorenz": 1.0, "motor": 0.5, "duffing": 4.0, "generator": 2.0,
-         "published/ascher_petzold": 1.0}
+         "published/ascher_petzold": 1.0, "published/transistor": 5e-4}
 # Matrices follow outputs that are zero at the start, where the observer's units are found.
 FROM_ZERO = ("motor", "published/akzo", "published/hires", "published/robertson")
+EPS = float(np.finfo(float).eps)
 
 
 def both(name, decades, kept=(), **settings):
@@ -51,9 +52,26 @@ def test_a_simulation_is_the_same_in_any_units(name, decades):
     a, b = one.simulation, other.simulation
     assert (a.index, a.differential, a.algebraic) == (b.index, b.differential, b.algebraic)
     assert [change.state for change in a.moved] == [change.state for change in b.moved]
-    size = np.maximum(np.abs(a.states).max(axis=0), 1e-6)
+    size = np.abs(a.states).max(axis=0)
+    size = np.where(size > 0.0, size, 1e-6 * size.max())
     assert (np.abs(b.states / units.states - a.states) <= 1e-9 * size).all()
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+
+
+def doubt_of_t_c(a):
+    """What rounding leaves open of t_c, in seconds.
+
+    Eigenvalues of a p × p matrix with unit diagonal are rounded by p ε, in either run: this over
+    their slope at the level that t_c asks for, half the last one where that is small. A column of
+    ψ that begins as zero counts from ten of its errors on: there it is known to a tenth.
+    """
+    if a.t_c is None or a.t_c <= a.t[0]:
+        return 0.0
+    if a.normalised_min[1] >= WELL:
+        return 0.1 * a.t_c
+    i = int(np.searchsorted(a.t, a.t_c))
+    slope = (a.normalised_min[i] - a.normalised_min[i - 1]) / (a.t[i] - a.t[i - 1])
+    return 2.0 * len(a.parameters) * EPS / slope
 
 
 @pytest.mark.parametrize("decades", [True, False])
@@ -68,15 +86,14 @@ def test_evidence_is_the_same_in_any_units(name, decades):
     if not decades or name in FROM_ZERO:
         rotates = ["time"] if isinstance(name, int) else []
         kept = ("states", "equations", "outputs", *rotates)
-    one, other, units = both(name, decades, kept)
+    one, other, units = both(name, decades, kept, estimator="least_squares")
     a, b, T = one.excitation, other.excitation, units.time
     assert a.is_ie == b.is_ie
-    assert b.level == pytest.approx(a.level, abs=1e-8)
-    horizon = float(a.t[-1])
-    for x, y in ((a.t_c, b.t_c), *zip(a.determined_at.values(), b.determined_at.values(),
-                                      strict=True)):
+    assert b.level == pytest.approx(a.level, rel=1e-9, abs=100 * EPS)
+    for x, y, doubt in ((a.t_c, b.t_c, doubt_of_t_c(a)), *(
+            (a.determined_at[p], b.determined_at[p], 0.0) for p in a.parameters)):
         assert (x is None) == (y is None)
-        assert x is None or y / T == pytest.approx(x, rel=1e-6, abs=1e-7 * horizon)
+        assert x is None or abs(y / T - x) <= 1e-9 * a.t[-1] + doubt
     known, again = ({name for name, since in run.estimable.items() if since is not None}
                     for run in (one, other))
     assert known == again

@@ -32,6 +32,7 @@ from gpebo_cli.numerics.radau import RadauRule
 # and by rounding over it, which costs Newton's method nothing that could be seen.
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
+_NO_MORE = 1e-14  # of a right side: what an output moves it by is rounding up to that
 _SAME = 1e-12  # of the span: instants closer than this to another are that one
 
 
@@ -136,7 +137,9 @@ class Linearised:
                 ends.append(moved if same.all() else np.where(same[:, None], moved, here))
                 width += same * np.abs(by)
             along[0, :, self.system.m + j] = y[:, j]
-            G[..., j] = (ends[0] - ends[1]) / np.maximum(width, 1e-300)[:, None]
+            apart = ends[0] - ends[1]
+            apart[np.abs(apart) <= _NO_MORE * np.abs(ends[0])] = 0.0
+            G[..., j] = apart / np.maximum(width, 1e-300)[:, None]
         GC, GH = _product(G, c.C), _product(G, c.H)
         phi = c.phi - _product(GC, x) - _product(GH, known.theta)
         return c._replace(A=c.A + GC, F=c.F + GH, phi=phi, u=known.u)
@@ -176,9 +179,7 @@ class Linearised:
         return x
 
 
-def looked_along(
-    system: DescriptorSystem, known: Trajectory
-) -> tuple[Array, bool]:
+def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bool]:
     """Edges of cells in which what follows outputs hides nothing, and whether they are enough.
 
     ``known`` are inputs and outputs (m + r,); the edges are those of its mesh and more.
