@@ -24,7 +24,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.errors import ErrorSystem
 from gpebo_cli.regression.estimator import Estimates, ResumableEstimates
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import Known
 from gpebo_cli.schema import LARGEST, Accepted, number, per_name
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
@@ -159,9 +159,7 @@ class ResumableEstimator(GainEstimator):
         return self.resume(regression, t, ())
 
     @abstractmethod
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> ResumableEstimates:
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> ResumableEstimates:
         """Prepare the estimates at the times t (M,), with extensions known at the start."""
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Protocol
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import ExtensionState, Known
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import per_name
 
@@ -53,9 +52,7 @@ class FilteredEstimator(ResumableEstimator):
     gamma: object = gain(1e10, by_parameter=True, auto=True)
     rates: object = field(default=None, metadata={"key": "lambda"})
 
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> MixedEstimates:
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Extend, mix, and keep what the closed form needs at the times t (M,)."""
         names = regression.parameters
         before = known[0].values if known else None
@@ -69,9 +66,7 @@ class FilteredEstimator(ResumableEstimator):
             realisations=regression.realisations,
         )
 
-    def errors(
-        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
-    ) -> tuple[ErrorsAt, ...]:
+    def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
         """δ𝒴 behind the filters, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂), of every case."""
         names, p = regression.parameters, regression.p
         rates = filter_rates(self.rates, names)
@@ -91,7 +86,7 @@ class FilteredEstimator(ResumableEstimator):
 
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
-        return RecursiveMixed(self, parameters, SampledMixing(self, parameters), mu=mu)
+        return RecursiveMixed(self, parameters, sampled_mixing(self, parameters), mu=mu)
 
     def seen(self, psi: Array) -> Array:
         """What the filters of 𝒴 take of Y: ψᵀ (N, p, rows) of ψ (N, rows, p)."""
@@ -119,7 +114,7 @@ def scalar_errors(
     return filtered_errors(filters, into, law, weighted * adjugate)
 
 
-def reached(size: float, extended: Trajectory, known: Sequence[ExtensionState]) -> ExtensionState:
+def reached(size: float, extended: Trajectory, known: Known) -> ExtensionState:
     """[Ω | 𝒴] (p, p + 1) at the end, of filters whose input is of that ``size``."""
     level = max(size, known[0].level) if known else size
     return ExtensionState(extended.final, level, surplus=1.0)
@@ -152,34 +147,27 @@ def finite_time(mu: float) -> tuple[str, float, str]:
     return "IE with enough ∫Δ²", float(-np.log1p(-mu)), "finite-time convergence"
 
 
-class Extending(Protocol):
-    """An extension at samples, with mixing."""
-
-    def update(self, regression: SampledRegression) -> Mixed:
-        """Δ and η̄ at K samples."""
-        ...
+Mixing = Callable[[SampledRegression], Mixed]  # an extension, and Δ and η̄ at K samples
 
 
-class SampledMixing:
+def sampled_mixing(settings: FilteredEstimator, parameters: Sequence[str]) -> Mixing:
     """The filters of an estimator at samples, and mixing; one group."""
+    filters = settings.at_samples(filter_rates(settings.rates, parameters))
 
-    def __init__(self, settings: FilteredEstimator, parameters: Sequence[str]) -> None:
-        self._filter = settings.at_samples(filter_rates(settings.rates, parameters))
-
-    def update(self, regression: SampledRegression) -> Mixed:
-        """Δ and η̄ at K samples."""
-        extended = self._filter.update(regression)
+    def mixed(regression: SampledRegression) -> Mixed:
+        extended = filters.update(regression)
         return Mixed(
-            *mix_sampled(extended),
-            lambda: ([self._filter.errors()], [inverse_sampled(extended)]),
+            *mix_sampled(extended), lambda: ([filters.errors()], [inverse_sampled(extended)])
         )
+
+    return mixed
 
 
 class RecursiveMixed:
     """An extension of held signals, mixing, a closed-form step of the scalar law."""
 
     def __init__(
-        self, settings: GainEstimator, parameters: Sequence[str], mixing: Extending,
+        self, settings: GainEstimator, parameters: Sequence[str], mixing: Mixing,
         condition: str = "Δ not in L2", groups: int = 1, mu: float = 1.0,
     ) -> None:
         self._mixing, self._condition = mixing, condition
@@ -188,7 +176,7 @@ class RecursiveMixed:
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
-        return self._law.update(regression, *self._mixing.update(regression))
+        return self._law.update(regression, *self._mixing(regression))
 
     @property
     def requirement(self) -> Requirement:

@@ -35,11 +35,8 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
         delta, Y, digits = determinant_and_adjugate_action(values[..., :p], values[..., p:])
         return delta, Y.reshape(len(t), -1), digits
 
-    def determinant(t: Array) -> Array:
-        return np.asarray(np.linalg.det(extended(t)[..., :p]))
-
     delta, quotient = mixed_points(extended.values)
-    return scalar_path(extended.mesh, signals, delta, quotient, t, determinant, floor)
+    return scalar_path(extended.mesh, signals, delta, quotient, t, floor)
 
 
 def mixed_points(extended: Array) -> tuple[Array, Array]:

@@ -42,12 +42,15 @@ class ScalarPath:
 
     mesh: Mesh
     signals: MixedSignals
-    delta: Callable[[Array], Array]  # times (N,) -> Δ (N,)
     quotient: Array  # (K, s + 1, p) η̄, usable everywhere
     energy: Array  # (K, s + 1) I
     t: Array  # (M,)
     energy_at_t: Array  # (M,)
     floor: float  # size below which η̂ is rounding
+
+    def delta(self, t: Array) -> Array:
+        """Δ at the times t (N,)."""
+        return self.signals(t, t)[0]
 
 
 def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
@@ -241,17 +244,10 @@ def _values(maps: Array, start: Array) -> Array:
 
 
 def scalar_path(
-    mesh: Mesh, signals: MixedSignals, delta: Array, quotient: Array, t: Array,
-    determinant: Callable[[Array], Array] | None = None, floor: float = 0.0,
+    mesh: Mesh, signals: MixedSignals, delta: Array, quotient: Array, t: Array, floor: float,
 ) -> ScalarPath:
-    """Prepare the law for Δ (K, s + 1) and η̄ (K, s + 1, p), reported at the times t (M,).
-
-    ``determinant`` gives Δ at any times, where that is cheaper than ``signals``.
-    """
+    """Prepare the law for Δ (K, s + 1) and η̄ (K, s + 1, p), reported at the times t (M,)."""
     energy = np.maximum.accumulate(Trajectory(mesh, delta**2).integral().values.ravel())
     energy = energy.reshape(delta.shape)  # ∫Δ² never falls
     at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
-    if determinant is None:
-        def determinant(t: Array) -> Array:
-            return signals(t, t)[0]
-    return ScalarPath(mesh, signals, determinant, quotient, energy, t, at_t, floor)
+    return ScalarPath(mesh, signals, quotient, energy, t, at_t, floor)

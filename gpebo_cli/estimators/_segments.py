@@ -73,7 +73,7 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
         # The end is added to the times that are asked for: there the next one takes over.
         times = np.append(own, segment.mesh.edges[-1])
         parts.append(resumable.resume(segment, times, known))
-    return Chain(tuple(parts), regression.resets, tuple(int(k) for k in first))
+    return Chain(tuple(parts), regression.resets)
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,6 @@ class Chain:
 
     parts: tuple[ResumableEstimates, ...]
     resets: tuple[Reset, ...]
-    first: tuple[int, ...]  # index of each but the first segment's first time
 
     @property
     def reached(self) -> tuple[ExtensionState, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -80,10 +81,7 @@ class VectorLaw:
                 f[:, :p] = self.dynamics.b(t, inside)[:, :, None]
             return LinearEquation(E, A, f)
 
-        first = packed.values[0, 0]
-        start = np.broadcast_to(start.reshape(p, -1), (p, c))
-        residual = first[:, 2 * p :] - first[:, p : 2 * p] @ start
-        starts = np.concatenate([start, residual])
+        starts = _with_residual(packed.values[0, 0], np.broadcast_to(start.reshape(p, -1), (p, c)))
         problem = LinearProblem(coefficients, starts, name="estimator", floor=sizes)
         return solve(
             problem, packed.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
@@ -96,15 +94,18 @@ def _residual_restarts(packed: Trajectory, p: int) -> dict[float, Callable[[Arra
     before, after = packed.values[:-1, -1], packed.values[1:, 0]
     size = np.abs(packed.values).max(axis=(0, 1))
     jumps = (np.abs(after - before) > _ROUNDING * size).any(axis=(1, 2))
+    def restart(signals: Array, state: Array) -> Array:
+        return _with_residual(signals, state[:p])
 
-    def restart(k: int) -> Callable[[Array], Array]:
-        def after_jump(state: Array) -> Array:
-            residual = after[k][:, 2 * p :] - after[k][:, p : 2 * p] @ state[:p]
-            return np.concatenate([state[:p], residual])
+    return {
+        float(packed.mesh.edges[k + 1]): partial(restart, after[k]) for k in np.flatnonzero(jumps)
+    }
 
-        return after_jump
 
-    return {float(packed.mesh.edges[k + 1]): restart(int(k)) for k in np.flatnonzero(jumps)}
+def _with_residual(signals: Array, eta: Array) -> Array:
+    """(η̂, ν) from η̂ (p, c) and [M | N | b] (k, 2p + c) at one time."""
+    p = len(eta)
+    return np.concatenate([eta, signals[:, 2 * p :] - signals[:, p : 2 * p] @ eta])
 
 
 @dataclass(frozen=True, eq=False)

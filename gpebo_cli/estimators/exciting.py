@@ -28,8 +28,8 @@ from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     RecursiveMixed,
-    SampledMixing,
     filter_rates,
+    sampled_mixing,
     scalar_errors,
 )
 from gpebo_cli.estimators._mixing import filled, mix
@@ -100,12 +100,12 @@ class Exciting(GainEstimator):
         new, right = found.values[:, :, 1, 0], found.values[:, :, 1, 1:]
         usable = np.abs(new) > _KNOWN
         quotient = filled(right / np.where(usable, new, 1.0)[..., None], usable)
-        law = scalar_path(found.mesh, signals, new, quotient, np.asarray(t), None, path.floor)
+        law = scalar_path(found.mesh, signals, new, quotient, np.asarray(t), path.floor)
         return replace(inner, groups=(law,), condition="IE")
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
         """The estimator at samples."""
-        return RecursiveMixed(self, parameters, Rotation(self, parameters), "IE")
+        return RecursiveMixed(self, parameters, Rotation(self, parameters).update, "IE")
 
     def _turning(self, path: ScalarPath) -> Callable[[Array, Array], Array]:
         """φ'/Δ² = κ (π/2) e^{−κ∫Δ²} at times (N,)."""
@@ -149,14 +149,14 @@ class Rotation:
     """
 
     def __init__(self, settings: Exciting, parameters: Sequence[str]) -> None:
-        self._mixing, self._steps = SampledMixing(settings.linear, parameters), Steps()
+        self._mixing, self._steps = sampled_mixing(settings.linear, parameters), Steps()
         self._kappa = number(settings.kappa, "estimator.kappa")
         self._energy, self._turned = 0.0, np.zeros(len(parameters), complex)  # ∫Δ², c e^{−iφ}
         self._inverse: Array | None = None
 
     def update(self, regression: SampledRegression) -> Mixed:
         """Φ_21 and e_2/Φ_21 at K samples."""
-        mixed = self._mixing.update(regression)
+        mixed = self._mixing(regression)
         energy, mean, both = self._steps.means(regression, mixed.delta**2, mixed)
         so_far = np.cumsum(np.concatenate([[self._energy], energy]))
         phi = -0.5 * np.pi * np.expm1(-self._kappa * so_far)

@@ -19,7 +19,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Recursion
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import Known
 from gpebo_cli.schema import number
 
 
@@ -61,9 +61,7 @@ class FiniteTime(ResumableEstimator):
             raise ConfigError(f"estimator.mu must lie between 0 and 1, got {mu:g}")
         return self.inner.axes()
 
-    def errors(
-        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
-    ) -> tuple[ErrorsAt, ...]:
+    def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
         """δη̂_f = δη̂/(1 − w_c), of every case."""
         inner = self.inner.resume(regression, regression.mesh.edges[-1:], known)
         mu, gains = float(self.mu), inner.gains
@@ -85,9 +83,7 @@ class FiniteTime(ResumableEstimator):
         """The estimator at samples: w_c is exact there, too."""
         return self.inner.recursive(parameters, float(self.mu))
 
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> MixedEstimates:
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """The inner estimates at the times t (M,) with the correction on top.
 
         After a reset the law starts anew from the corrected estimate.

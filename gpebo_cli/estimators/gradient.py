@@ -22,7 +22,7 @@ from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import Known
 from gpebo_cli.regression.samples import SampledRegression
 
 _ALL = 10.0  # σ from which on e^{−σ²} is nothing
@@ -38,17 +38,13 @@ class Gradient(ResumableEstimator):
 
     gamma: object = gain(10.0, by_parameter=True)
 
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]  # noqa: ARG002
-    ) -> VectorEstimates:
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> VectorEstimates:  # noqa: ARG002
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         information = Trajectory(regression.mesh, regression.outer.values[..., : regression.p])
         law = VectorLaw(regression.psi, regression.psi, regression.Y, regression.floor)
         return vector_estimates(self, regression, law, information, t)
 
-    def errors(
-        self, regression: LinearRegression, known: Sequence[ExtensionState] = (),  # noqa: ARG002
-    ) -> tuple[ErrorsAt, ...]:
+    def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:  # noqa: ARG002
         """δη̂' = Γψᵀ(δY − ψ δη̂), of every case."""
         p = regression.p
 

@@ -58,7 +58,7 @@ class Instrumental(GainEstimator):
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
         """The estimator at samples."""
-        return RecursiveMixed(self, parameters, SampledMeans(self, parameters))
+        return RecursiveMixed(self, parameters, SampledMeans(self, parameters).update)
 
     def left(self, means: Array, names: Sequence[str]) -> Array:  # noqa: ARG002
         """What makes p equations of the 2p means (N, 2p, p + c), (N or 1, p, 2p)."""

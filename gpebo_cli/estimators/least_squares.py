@@ -27,7 +27,7 @@ from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates, Unmixed
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import ExtensionState, Known
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import number
 
@@ -72,9 +72,7 @@ class LeastSquares(ResumableEstimator):
         """M as a number, or None without a bound."""
         return None if self.bound is None else number(self.bound, "estimator.bound")
 
-    def errors(
-        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
-    ) -> tuple[ErrorsAt, ...]:
+    def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
         """δh_z' = −β δh_z + ψᵀδY, δη̂ = α (z f₀ I + α G_z)⁻¹ δh_z, of every case."""
 
         def at(
@@ -89,9 +87,7 @@ class LeastSquares(ResumableEstimator):
         infos = self.informations(regression, known)
         return tuple(map(partial, repeat(at), self.cases, infos))
 
-    def informations(
-        self, regression: LinearRegression, known: Sequence[ExtensionState]
-    ) -> list[Information]:
+    def informations(self, regression: LinearRegression, known: Known) -> list[Information]:
         """G_z, h_z and z of every case, from what was known before; equal ones are one."""
         bound, cases = self.covariance_bound, self.cases
         bounded = bound is not None and max(case["beta"] for case in cases) > 0.0
@@ -141,9 +137,7 @@ class LeastSquares(ResumableEstimator):
             for case in self.cases
         ))
 
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> LeastSquaresEstimates:
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> LeastSquaresEstimates:
         """Everything but the gains, at the times t (M,).
 
         After a reset the prior z f₀ I is about the new parameters, centred at the estimate there.

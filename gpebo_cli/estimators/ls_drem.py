@@ -18,12 +18,12 @@ from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_e
 from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import Mixed, integrating, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
-from gpebo_cli.estimators.least_squares import LeastSquares, RecursiveLeastSquares
+from gpebo_cli.estimators.least_squares import LeastSquares
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import Known
 from gpebo_cli.regression.samples import SampledRegression
 
 _AT_ONCE = 4096  # elements
@@ -62,9 +62,7 @@ class LsDrem(ResumableEstimator):
         self.least_squares.axes()
         return super().axes()
 
-    def errors(
-        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
-    ) -> tuple[ErrorsAt, ...]:
+    def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
         """δh_z as of least squares, δη̂' = γΔ(adj(H) αF δh_z − Δ δη̂), of every case."""
         part = self.least_squares
 
@@ -85,11 +83,22 @@ class LsDrem(ResumableEstimator):
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
         part, cases = self.least_squares.recursive(parameters), self.least_squares.cases
-        return RecursiveMixed(self, parameters, SampledShares(part, cases), "IE", len(cases), mu)
 
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> MixedEstimates:
+        def mixed(regression: SampledRegression) -> Mixed:
+            spectra = part.spectra(regression)
+            delta = [
+                np.prod(_shares(s, case["alpha"], case["f0"]), axis=1)
+                for s, case in zip(spectra, cases, strict=True)
+            ]
+            quotient, usable, inverse = zip(*map(quotient_of, spectra), strict=True)
+            return Mixed(
+                np.stack(delta, axis=1), np.stack(quotient, axis=1), np.stack(usable, axis=1),
+                lambda: ([integrating(regression, case["beta"]) for case in cases], inverse),
+            )
+
+        return RecursiveMixed(self, parameters, mixed, "IE", len(cases), mu)
+
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,), each with a path of its own."""
         part = self.least_squares
         check_held(regression, len(part.cases))
@@ -104,28 +113,6 @@ class LsDrem(ResumableEstimator):
             gains=self.gains("gamma", regression.parameters),
             condition="IE",
             realisations=regression.realisations,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class SampledShares:
-    """Least squares at samples, and mixing; a group for each of its cases."""
-
-    part: RecursiveLeastSquares
-    cases: Sequence[Mapping[str, float]]
-
-    def update(self, regression: SampledRegression) -> Mixed:
-        """Δ and η̄ at K samples."""
-        spectra = self.part.spectra(regression)
-        delta = [
-            np.prod(_shares(s, case["alpha"], case["f0"]), axis=1)
-            for s, case in zip(spectra, self.cases, strict=True)
-        ]
-        found = [quotient_of(s) for s in spectra]
-        quotient, usable, inverse = zip(*found, strict=True)
-        return Mixed(
-            np.stack(delta, axis=1), np.stack(quotient, axis=1), np.stack(usable, axis=1),
-            lambda: ([integrating(regression, case["beta"]) for case in self.cases], inverse),
         )
 
 
@@ -165,7 +152,7 @@ def mix_least_squares(
             delta[part] = np.prod(_shares(at.spectrum, alpha, f0), axis=1).reshape(points.shape)
         if usable.any():
             break
-    return scalar_path(mesh, signals, delta, filled(quotient, usable), t, floor=floor)
+    return scalar_path(mesh, signals, delta, filled(quotient, usable), t, floor)
 
 
 def _adjugate(s: Spectrum, alpha: float, f0: float) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators._base import GainEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import SampledMixing, energy_requirement, filter_rates
+from gpebo_cli.estimators._mixed import energy_requirement, filter_rates, sampled_mixing
 from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._recursive import Steps
 from gpebo_cli.estimators._scalar import ScalarPath
@@ -182,8 +182,8 @@ class RecursiveMonotone:
 
     def __init__(self, settings: Monotone, parameters: Sequence[str]) -> None:
         self._settings = settings
-        drem = Drem(rates=settings.rates)
-        self._mixing, self._steps = SampledMixing(drem, parameters), Steps()
+        self._mixing = sampled_mixing(Drem(rates=settings.rates), parameters)
+        self._steps = Steps()
         self._gains = settings.gains("gamma", parameters)[:, 0]
         self._theta: Array | None = None  # (g, q)
         self._energy, self._mu = 0.0, 1.0
@@ -194,7 +194,7 @@ class RecursiveMonotone:
             S, T, self._mu, start = self._settings.law(regression.parametrisation)
             self._S, self._T = S, T
             self._theta = np.tile(start, (len(self._gains), 1))
-        mixed = self._mixing.update(regression)
+        mixed = self._mixing(regression)
         energy, goal, _ = self._steps.means(regression, mixed.delta**2, mixed)
         out = np.empty((len(energy), *self._theta.shape))
         for k, x in enumerate(self._gains * energy[:, None]):

@@ -30,7 +30,7 @@ from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import Known
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import number
 
@@ -49,9 +49,7 @@ class MemoryExtension(ResumableEstimator):
     gamma: object = gain(100.0, by_parameter=True)
     rate: object = field(default=0.2, metadata={"key": "lambda"})
 
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> VectorEstimates:
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> VectorEstimates:
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         extended = kreisselmeier(
             regression, self._rates(regression.p), known[0].values if known else None
@@ -59,9 +57,7 @@ class MemoryExtension(ResumableEstimator):
         state = reached(largest(regression.outer.values), extended, known)
         return replace(self._estimates(regression, extended, t), reached=(state,))
 
-    def errors(
-        self, regression: LinearRegression, known: Sequence[ExtensionState] = ()
-    ) -> tuple[ErrorsAt, ...]:
+    def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
         """δ𝒴' = −λ(δ𝒴 − ψᵀδY), δη̂' = Γ(δ𝒴 − Ω δη̂), of every case."""
         p = regression.p
         rates = self._rates(p)

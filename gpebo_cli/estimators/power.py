@@ -16,7 +16,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._mixed import MixedEstimates, SampledMixing, energy_requirement
+from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement, sampled_mixing
 from gpebo_cli.estimators._power import PowerLaw
 from gpebo_cli.estimators._recursive import Steps
 from gpebo_cli.estimators._scalar import ScalarPath
@@ -26,7 +26,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import Known
 from gpebo_cli.regression.samples import SampledRegression
 
 
@@ -73,9 +73,7 @@ class Power(ResumableEstimator):
             )
         return RecursivePower(self, parameters)
 
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> PowerEstimates:
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> PowerEstimates:
         """Extend and mix as ``drem``, for the times t (M,)."""
         inner = self.linear.resume(regression, t, known)
         own = {"alpha": self.alpha, "beta": self.beta, "gamma2": self.gamma2}
@@ -113,7 +111,7 @@ class RecursivePower:
     """
 
     def __init__(self, settings: Power, parameters: Sequence[str]) -> None:
-        self._mixing, self._steps = SampledMixing(settings.linear, parameters), Steps()
+        self._mixing, self._steps = sampled_mixing(settings.linear, parameters), Steps()
         self._alpha, self._gains = settings.alpha, settings.gains("gamma", parameters)
         self._start = settings.start(parameters)
         self._eta = np.broadcast_to(self._start, (len(self._gains), len(self._start)))
@@ -121,7 +119,7 @@ class RecursivePower:
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each; nobody knows how errors go through."""
-        mixed, rest = self._mixing.update(regression), 1.0 - self._alpha
+        mixed, rest = self._mixing(regression), 1.0 - self._alpha
         powers = np.abs(mixed.delta) ** (1.0 + self._alpha)
         energy, goal, _ = self._steps.means(regression, powers, mixed)
         out = np.empty((len(self._eta), len(goal), goal.shape[1]))

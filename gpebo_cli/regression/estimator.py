@@ -16,7 +16,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import ExtensionState, Known
 from gpebo_cli.regression.samples import SampledRegression
 
 
@@ -87,9 +87,7 @@ class Weighing(Protocol):
 class Resumable(Protocol):
     """An estimator that can go on after a reset."""
 
-    def resume(
-        self, regression: LinearRegression, t: Array, known: Sequence[ExtensionState]
-    ) -> ResumableEstimates:
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> ResumableEstimates:
         """As ``Estimator.estimate`` at the times t (M,), for Y = ψη without resets.
 
         From extensions that are known at its start; none: they start at zero.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,6 +83,10 @@ class ExtensionState:
             replace(self, values=np.column_stack([omega, one])).after(plain).values[:, -1]
             for one in np.eye(len(omega))
         ])
+
+
+Known = Sequence[ExtensionState]
+"""Extensions that are known at the start of a segment; none: they start at zero."""
 
 
 def _share(rows: Array, limit: float) -> Array:
