@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -127,6 +126,7 @@ def run_recipes(names: list[str], arguments: Arguments = NO_WORDS) -> Iterator[R
 
 def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConfig]]:
     """Configurations of a recipe: one, or those of its ``hydra.sweeper.params`` by their values."""
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.types import RunMode
 
@@ -136,17 +136,12 @@ def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConf
     if first.hydra.mode != RunMode.MULTIRUN or not swept:
         yield "", first
         return
-    parser = OverridesParser.create()
-    values = []
-    for key, text in swept.items():
-        override = parser.parse_override(f"{key}={text}")
-        values.append(
-            list(override.sweep_string_iterator()) if override.is_sweep_override() else [str(text)]
-        )
-    for chosen in itertools.product(*values):
-        pairs = zip(swept, chosen, strict=True)
-        words = [*overrides, *(f"{k}={v}" for k, v in pairs)]
-        yield ", ".join(chosen), loader.load_configuration(PRIMARY, words, RunMode.RUN)
+    stored = OverridesParser.create().parse_overrides([f"{k}={v}" for k, v in swept.items()])
+    (jobs,) = BasicSweeper.split_arguments(stored, None)
+    for words in jobs:
+        label = ", ".join(word.partition("=")[2] for word in words)
+        config = loader.load_configuration(PRIMARY, [*overrides, *words], RunMode.RUN)
+        yield label, config
 
 
 def run_recipe_job(cfg: DictConfig, arguments: Arguments, where: str) -> RunResult:

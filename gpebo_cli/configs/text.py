@@ -8,7 +8,7 @@ merge keys, a key that stands twice or is no text, and anchors that expand to mo
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NoReturn
 
 import yaml
@@ -39,75 +39,69 @@ class _Builder:
     def __init__(self, path: str, *, ours: bool) -> None:
         self._path = path
         self._ours = ours
-        self._documents: list[Any] = []
-        # Collections that are open: what is in them, anchor, entries before, key of the next value.
-        self._open: list[list[Any]] = []
+        self._events: Iterator[Any] = iter(())
         self._anchors: dict[str, tuple[Any, int]] = {}  # values, and how many entries they are
         self._count = 0
 
     def build(self, text: str) -> Any:
-        for event in yaml.parse(text, Loader=_Parser):
-            if tag := getattr(event, "tag", None):
-                self._refuse(event, f"the tag {tag} is not allowed; a file is plain data")
+        documents: list[Any] = []
+        self._events = yaml.parse(text, Loader=_Parser)
+        for event in self._events:
             if isinstance(event, yaml.DocumentStartEvent):
-                self._begin_document(event)
-            elif isinstance(event, yaml.ScalarEvent):
-                value = self._scalar(event)
-                self._count += 1
-                self._keep(event.anchor, value, 1)
-                self._add(event, value)
-            elif isinstance(event, yaml.AliasEvent):
-                if event.anchor not in self._anchors:
-                    self._refuse(event, f"*{event.anchor} contains itself, or stands for nothing")
-                value, size = self._anchors[event.anchor]
-                self._count += size
-                self._add(event, value)
-            elif isinstance(event, yaml.CollectionStartEvent):
-                self._begin(event)
-            elif isinstance(event, yaml.CollectionEndEvent):
-                value, anchor, before, _ = self._open.pop()
-                self._keep(anchor, value, self._count - before)
-            if self._count > _MAX_ENTRIES:
-                self._refuse(event, f"more than {_MAX_ENTRIES} entries, aliases expanded")
-        return self._documents[0] if self._documents else None
+                if event.version or event.tags:
+                    self._refuse(event, "a directive (%…) is not allowed")
+                if documents:
+                    self._refuse(event, "a second document (---) is not allowed")
+                documents.append(self._value(next(self._events), 0))
+        return documents[0] if documents else None
 
-    def _begin_document(self, event: yaml.DocumentStartEvent) -> None:
-        if event.version or event.tags:
-            self._refuse(event, "a directive (%…) is not allowed")
-        if self._documents:
-            self._refuse(event, "a second document (---) is not allowed")
-
-    def _begin(self, event: yaml.CollectionStartEvent) -> None:
-        if len(self._open) >= _MAX_DEPTH:
-            self._refuse(event, f"nested more than {_MAX_DEPTH} levels deep")
-        value: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
-        self._add(event, value)
-        self._open.append([value, event.anchor, self._count, None])
-        self._anchors.pop(str(event.anchor), None)  # until it ends, the name means nothing
-        self._count += 1
-
-    def _keep(self, anchor: str | None, value: Any, size: int) -> None:
-        if anchor is not None:
-            self._anchors[anchor] = value, size
-
-    def _add(self, event: yaml.NodeEvent, value: Any) -> None:
-        if not self._open:
-            self._documents.append(value)
-            return
-        inside, _, _, key = self._open[-1]
-        if isinstance(inside, list):
-            inside.append(value)
-        elif key is not None:
-            inside[key] = value
-            self._open[-1][3] = None
-        elif not isinstance(value, str):
-            self._refuse(event, "a key must be text; write it in quotes")
-        elif value == "<<":
-            self._refuse(event, "a merge key (<<) is not allowed; write the keys out")
-        elif value in inside:
-            self._refuse(event, f"the key {value[:60]} stands twice")
+    def _value(self, event: Any, depth: int) -> Any:
+        """What begins with an event, ``depth`` collections deep."""
+        if tag := getattr(event, "tag", None):
+            self._refuse(event, f"the tag {tag} is not allowed; a file is plain data")
+        before = self._count
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in self._anchors:
+                self._refuse(event, f"*{event.anchor} contains itself, or stands for nothing")
+            value, size = self._anchors[event.anchor]
+            self._count += size
         else:
-            self._open[-1][3] = value
+            self._count += 1
+            self._anchors.pop(event.anchor, None)  # until its value ends, the name means nothing
+            if isinstance(event, yaml.ScalarEvent):
+                value = self._scalar(event)
+            elif isinstance(event, yaml.MappingStartEvent):
+                value = self._mapping(event, depth)
+            else:
+                value = self._sequence(event, depth)
+            if event.anchor is not None:
+                self._anchors[event.anchor] = value, self._count - before
+        if self._count > _MAX_ENTRIES:
+            self._refuse(event, f"more than {_MAX_ENTRIES} entries, aliases expanded")
+        return value
+
+    def _inside(self, event: yaml.NodeEvent, depth: int) -> Iterator[Any]:
+        """The events with which begins what a collection holds."""
+        if depth >= _MAX_DEPTH:
+            self._refuse(event, f"nested more than {_MAX_DEPTH} levels deep")
+        while not isinstance(inner := next(self._events), yaml.CollectionEndEvent):
+            yield inner
+
+    def _sequence(self, event: yaml.NodeEvent, depth: int) -> list[Any]:
+        return [self._value(inner, depth + 1) for inner in self._inside(event, depth)]
+
+    def _mapping(self, event: yaml.NodeEvent, depth: int) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for inner in self._inside(event, depth):
+            key = self._value(inner, depth + 1)
+            if not isinstance(key, str):
+                self._refuse(inner, "a key must be text; write it in quotes")
+            if key == "<<":
+                self._refuse(inner, "a merge key (<<) is not allowed; write the keys out")
+            if key in found:
+                self._refuse(inner, f"the key {key[:60]} stands twice")
+            found[key] = self._value(next(self._events), depth + 1)
+        return found
 
     def _scalar(self, event: yaml.ScalarEvent) -> Any:
         text = event.value

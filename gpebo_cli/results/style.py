@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
@@ -79,22 +79,12 @@ _ALWAYS: dict[str, Any] = {
 }
 
 
-@contextmanager
-def our_rc(style: str | None = None) -> Iterator[None]:
-    """Set :data:`RC`, or a style of matplotlib's, for a while.
+def our_rc(style: str | None = None) -> AbstractContextManager[None]:
+    """Set :data:`RC`, or a style of matplotlib's, for a while."""
+    from matplotlib import rc_context
 
-    ``matplotlib.rc_context`` would copy and check all 300 settings for every figure.
-    """
-    import matplotlib as mpl
-
-    settings: Any = mpl.rcParams  # its keys are typed as literals
-    ours = {**(RC if style is None else _style(style)), **_ALWAYS}
-    theirs = {key: settings[key] for key in ours}
-    try:
-        settings.update(ours)
-        yield
-    finally:
-        settings.update(theirs)
+    ours: Any = {**(RC if style is None else _style(style)), **_ALWAYS}  # keys typed as literals
+    return rc_context(ours)
 
 
 def check_look(style: str | None, labels: Mapping[str, str]) -> None:
@@ -395,15 +385,17 @@ def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
     axes.set_xlabel(with_unit(axis.text or escaped(axis.label), unit))
 
 
+def _ends(panel: Panel, low: float, high: float) -> tuple[float, float]:
+    """The smallest and the largest value that is drawn; ``low`` and ``high`` if nothing is."""
+    bands = [] if panel.log else [c.down_to for c in panel.curves if c.down_to is not None]
+    values = np.concatenate([*(drawn(panel, c) for c in panel.curves), *bands, [np.nan]])
+    values = values[np.isfinite(values)]
+    return (float(values.min()), float(values.max())) if values.size else (low, high)
+
+
 def _limits(panel: Panel) -> tuple[float, float]:
     """Ends of a linear axis: finite and apart, whatever the values."""
-    if panel.limits is not None:
-        low, high = panel.limits
-    else:
-        bands = [curve.down_to for curve in panel.curves if curve.down_to is not None]
-        values = np.concatenate([*(c.y for c in panel.curves), *bands, np.zeros(0)])
-        values = values[np.isfinite(values)]
-        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    low, high = panel.limits or _ends(panel, 0.0, 0.0)
     low, high = max(low, -_HUGE), min(high, _HUGE)
     size = max(abs(low), abs(high))
     if size < 1.0 / _HUGE:
@@ -416,9 +408,7 @@ def _limits(panel: Panel) -> tuple[float, float]:
 
 def _log_limits(panel: Panel) -> tuple[float, float]:
     """Ends of a logarithmic axis: whole decades, and a little more so that no curve is cut."""
-    values = np.concatenate([*(c.y for c in panel.curves), np.zeros(0)])
-    values = values[np.isfinite(values) & (values > 0)]
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.1, 1.0)
+    low, high = _ends(panel, 0.1, 1.0)
     high = min(max(high, 1.0 / _HUGE), _HUGE)
     low = min(max(low, ROUNDING * panel.size, 1.0 / _HUGE), high)
     first = math.floor(math.log10(low) + 1e-9)
