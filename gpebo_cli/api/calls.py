@@ -100,14 +100,12 @@ def run(
         >>> bool(abs(result.errors["il"][1, -1]) < 1e-6)
         True
     """
-    plant, observer = _observed(plant, observer, regression, config_dir)
     own = None if estimator is None or isinstance(estimator, str | Mapping) else _own(estimator)
-    sections: dict[str, object] = {
-        "observer": observer, "estimator": None if own else estimator, "solver": solver,
-        "noise": noise, "data": _recording(data), "time": time, "excitation": excitation,
-        "uncertainty": uncertainty,
-    }
-    config, system, settings = _configure(plant, sections, {} if own else gains, config_dir)
+    config, system, settings = _configure(
+        plant, regression, config_dir, {} if own else gains, observer=observer,
+        estimator=None if own else estimator, solver=solver, noise=noise, data=_recording(data),
+        time=time, excitation=excitation, uncertainty=uncertainty,
+    )
     if own is not None:
         if gains:
             raise ConfigError(
@@ -153,34 +151,24 @@ def check(
         >>> [a.name for a in check("circuit", observer={"regression": "paper"}) if not a.holds]
         ['Assumption 2']
     """
-    plant, observer = _observed(plant, observer, regression, config_dir)
-    sections: dict[str, object] = {
-        "observer": observer, "estimator": None, "solver": solver, "noise": noise,
-        "data": _recording(data), "time": time, "excitation": excitation,
-    }
-    _, system, settings = _configure(plant, sections, {}, config_dir)
+    _, system, settings = _configure(
+        plant, regression, config_dir, {}, observer=observer, solver=solver, noise=noise,
+        data=_recording(data), time=time, excitation=excitation,
+    )
     return assumptions.check(settings, system)
 
 
-def _observed(
-    plant: Plant | None, observer: Choice | None, regression: Plant | None,
-    config_dir: Folder | None,
-) -> tuple[Plant | None, Choice | None]:
-    """The plant and the observer, or the regression that stands in place of both.
-
-    Raises:
-        ConfigError: both are given, or the regression is none.
-    """
-    if regression is None:
-        return plant, observer
+def _in_place(
+    regression: Plant, plant: object, observer: object, config_dir: Folder | None
+) -> tuple[Plant, Choice]:
+    """What stands in place of a plant and an observer (ConfigError: they are given, too)."""
     named = isinstance(observer, str) or (isinstance(observer, Mapping) and "name" in observer)
     if plant is not None or named:
         raise ConfigError("a regression stands in place of a plant and an observer")
     if isinstance(regression, DescriptorSystem):
         raise ConfigError("regression takes a name, a path or a mapping")
     settings = observer if isinstance(observer, Mapping) else {}
-    content = choose("regression", regression, config_dir)[0]
-    return content, {"name": "regression", **settings}
+    return choose("regression", regression, config_dir)[0], {"name": "regression", **settings}
 
 
 def load_plant(plant: Plant, config_dir: Folder | None = None) -> DescriptorSystem:
@@ -234,12 +222,12 @@ def available(
 
 
 def _configure(
-    plant: Plant | None,
-    sections: Mapping[str, object],
-    gains: Mapping[str, object],
-    config_dir: Folder | None,
+    plant: Plant | None, regression: Plant | None, config_dir: Folder | None,
+    gains: Mapping[str, object], **sections: object,
 ) -> tuple[dict[str, Any], DescriptorSystem, Settings]:
     """The configuration as ``config.yaml`` has it, the plant, and the settings."""
+    if regression is not None:
+        plant, sections["observer"] = _in_place(regression, plant, sections["observer"], config_dir)
     config = {k: v for k, v in primary().items() if k not in ("defaults", "hydra")}
     for name in _SECTIONS:
         given = sections[name]
@@ -254,11 +242,11 @@ def _configure(
     else:
         content, source = choose("plant", plant, config_dir)
         config["plant"] = plain(located(content, source))
-        ours = config_dir is None and isinstance(plant, str)
-        ours = ours and is_file(conf_folder(), f"plant/{plant}")
+        named = config_dir is None and isinstance(plant, str)
+        ours = named and is_file(conf_folder(), f"plant/{plant}")
         system = _shipped(str(plant)) if ours else system_from_mapping(content, source)
     for name in _CHOSEN:
-        config[name], _ = choose(name, sections[name], config_dir)
+        config[name], _ = choose(name, sections.get(name), config_dir)
     _check_gains(gains, config["estimator"])
     config["estimator"] |= plain(gains)
     settings = configuration.settings(config, draw=True)
@@ -269,16 +257,11 @@ def _configure(
 @cache
 def _shipped(name: str) -> DescriptorSystem:
     """A plant that comes with gpebo: it is parsed once, and what is recorded of it is kept."""
-    content, source = choose("plant", name, None)
-    return system_from_mapping(content, source)
+    return load_plant(name)
 
 
 def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
-    """``data`` as the group has it: a path, a frame, arrays by name, or a mapping with one.
-
-    Raises:
-        ConfigError: arrays that are no columns of one table.
-    """
+    """``data`` as the group has it: a path, a frame, arrays by name, or a mapping with one."""
     if isinstance(data, Mapping):
         if "t" in data:
             from pandas import DataFrame  # a third of a second to import
@@ -300,11 +283,7 @@ def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
 
 
 def _own(estimator: object) -> Estimator:
-    """An estimator that is an object of the caller's.
-
-    Raises:
-        ConfigError: it is none.
-    """
+    """An estimator that is an object of the caller's (ConfigError: it is none)."""
     if isinstance(estimator, type) or not all(hasattr(estimator, k) for k in ("cases", "estimate")):
         raise ConfigError(
             "estimator: expected a name, a mapping or an object with cases and estimate, got "
@@ -320,9 +299,7 @@ def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -
     """Refuse a keyword that the estimator does not have, with where it may belong."""
     known = settings_of(estimator)
     words = (*_CHOSEN, *_SECTIONS, "config_dir", "progress")
-    for key in gains:
-        if key in known:
-            continue
+    for key in [key for key in gains if key not in known]:
         sections = {
             "time": tuple(primary()["time"]),
             "excitation": tuple(primary()["excitation"]),

@@ -17,18 +17,10 @@ TYPE_CHECKING = False  # typing's, which nobody has loaded yet
 if TYPE_CHECKING:
     from typing import NoReturn
 
-COMMANDS = {
-    "run": "run",
-    "check": "check",
-    "compare": "compare",
-    "report": "report",
-    "figures": "figures",
-    "reproduce": "reproduce",
-    "list": "listing",
-    "new": "new",
-    "completion": "completion",
-}
-"""Commands, and the modules of ``gpebo_cli.cli`` whose ``main`` they are."""
+COMMANDS = (
+    "run", "check", "compare", "report", "figures", "reproduce", "list", "new", "completion",
+)
+"""Commands, which are ``main`` of the modules of ``gpebo_cli.cli`` with these names."""
 
 
 def entry() -> None:
@@ -129,11 +121,12 @@ def _dispatch(words: list[str]) -> int:
     if command in COMMANDS:
         from importlib import import_module
 
-        return int(import_module(f"gpebo_cli.cli.{COMMANDS[command]}").main(rest))
+        module = "listing" if command == "list" else command  # list is a type of Python's
+        return int(import_module(f"gpebo_cli.cli.{module}").main(rest))
     if command == "__complete":  # asked by the scripts that `gpebo completion` prints
         from gpebo_cli.cli import completion
 
-        return completion.answer(rest, list(COMMANDS))
+        return completion.answer(rest, COMMANDS)
     raise ConfigError(_unknown(command))
 
 

@@ -11,12 +11,13 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from gpebo_cli.cli import options
 from gpebo_cli.cli.options import PLAIN, Options
 from gpebo_cli.configs.locations import GROUPS, LOOK, PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.schema import shown, unknown
+from gpebo_cli.schema import convert, shown, unknown
 
 VALUES = {
     "--cfg": ("job", "hydra", "all"),
@@ -42,11 +43,13 @@ _NOT_TEXT = re.compile(
     r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false|null", re.IGNORECASE
 )
 
-_SWEEPER = "gpebo"
 _SWEEP_WORDS = ("resume", "fail_fast")  # of a sweep, not of the configuration
 _KEYS = (
     *GROUPS, "launcher", "time", "excitation", "figures", "output", "uncertainty", *_SWEEP_WORDS,
 )
+
+
+_Truth = Literal["true", "false"]
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class Arguments:
     def for_hydra(self) -> list[str]:
         """The overrides that Hydra composes."""
         # Chosen here rather than in conf/gpebo.yaml: other primary configurations sweep, too.
-        words = [*self.overrides, f"hydra/sweeper={_SWEEPER}"]
+        words = [*self.overrides, "hydra/sweeper=gpebo"]
         if self.resume is not None:
             folder = quoted(self.resume)
             words += [f"hydra.sweeper.resume={folder}", f"hydra.sweep.dir={folder}"]
@@ -116,7 +119,7 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
     sweep = {key: text for key, _, text in (word.partition("=") for word in given.words)
              if key in _SWEEP_WORDS}
     overrides = [_stored(w) for w in given.words if w.partition("=")[0] not in _SWEEP_WORDS]
-    config_dir = given.config_dir
+    config_dir, fail_fast = given.config_dir, sweep.get("fail_fast")
     config_name = _config_name(given.values.get("--config-name"), config_dir)
     overrides = _with_data(overrides, config_name)
     multirun = "--multirun" in given.switches
@@ -126,7 +129,7 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
         config_dir,
         config_name,
         _resume(sweep.get("resume")),
-        _fail_fast(sweep.get("fail_fast")),
+        "" if fail_fast is None else convert(fail_fast.lower(), _Truth, "fail_fast"),
     )
 
 
@@ -217,14 +220,6 @@ def _resume(given: str | None) -> str | None:
         what = given or "(nothing)"
         raise ConfigError(f"resume={what}: there is no such folder; give that of a sweep")
     return folder
-
-
-def _fail_fast(given: str | None) -> str:
-    if given is None:
-        return ""
-    if given.lower() not in ("true", "false"):
-        raise ConfigError(f"fail_fast: expected true or false, got {shown(given)}")
-    return given.lower()
 
 
 def _config_name(given: str | None, config_dir: str | None) -> str:

@@ -88,18 +88,14 @@ def main(words: list[str]) -> int:
 
 def _knowledge(examined: Examination) -> list[str]:
     """What can be known, from when on, and how well."""
-    rows = [
-        [name, (
-            f"estimable from t = {since:.4g} s on" if since is not None
-            else "left out by this observer" if name in examined.left_out else "cannot be known"
-        )]
-        for name, since in examined.estimable.items()
-    ]
-    for row in rows:
-        if row[0] in examined.deviations:
-            deviation = examined.deviations[row[0]]
-            row[1] += f", deviation {deviation:.3g} per unit of noise of the outputs"
-    return [f"  {name:<{max(len(row[0]) for row in rows)}}  {text}" for name, text in rows]
+    width, lines = max(map(len, examined.estimable), default=0), []
+    for name, since in examined.estimable.items():
+        why = "left out by this observer" if name in examined.left_out else "cannot be known"
+        text = why if since is None else f"estimable from t = {since:.4g} s on"
+        if (deviation := examined.deviations.get(name)) is not None:
+            text += f", deviation {deviation:.3g} per unit of noise of the outputs"
+        lines.append(f"  {name:<{width}}  {text}")
+    return lines
 
 
 def _sensors(tried: Sequence[Sensor]) -> list[str]:
@@ -135,19 +131,17 @@ def _table(title: str, found: Sequence[Assumption], more: Sequence[str]) -> str:
     lines = [title]
     for a in found:
         lines.append(f"  {'holds' if a.holds else 'FAILS'}  {a.name:<{width}}  {a.statement}")
-        evidence = ", ".join(f"{key} {_value(value)}" for key, value in a.evidence.items())
+        told = ("none" if v is None else v for v in a.evidence.values())
+        evidence = ", ".join(
+            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"
+            for key, value in zip(a.evidence, told, strict=True)
+        )
         lines += _wrapped(evidence, " " * (width + 11))
         if not a.holds and a.name in _ADVICE:
             lines += _wrapped(f"to do: {_ADVICE[a.name]}", " " * (width + 11))
     failed = [a.name for a in found if not a.holds]
     verdict = f"{', '.join(failed)} failed" if failed else "everything that is needed holds"
     return "\n".join([*lines, *more, verdict]) + "\n"
-
-
-def _value(value: float | str | None) -> str:
-    if value is None:
-        return "none"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

@@ -15,7 +15,7 @@ from contextlib import suppress
 
 from gpebo_cli.cli.arguments import OPTIONS, VALUES
 from gpebo_cli.cli.listing import KINDS, described
-from gpebo_cli.cli.options import VOLUME
+from gpebo_cli.cli.options import SHORT, VOLUME
 from gpebo_cli.cli.usage import HELP_OF
 from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder, default, outline
 from gpebo_cli.errors import ConfigError
@@ -117,8 +117,14 @@ def _split(line: str) -> list[str]:
 def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
     """What the last of the words after ``gpebo`` can become, with a description behind a tab."""
     *before, word = words
+    found = dict.fromkeys(_in_place(before, word, commands))
+    return [candidate for candidate in found if candidate.startswith(word)]
+
+
+def _in_place(before: Sequence[str], word: str, commands: Sequence[str]) -> Iterable[str]:
+    """All that can stand in the place of ``word``, some of it with another beginning."""
     if not before:
-        return _starting(word, [*commands, "--help", "--version"])
+        return [*commands, "--help", "--version"]
     command, *before = before
     last, (key, equals, _) = "".join(before[-1:]), word.partition("=")
     if last in _FOLDER_OPTIONS or (equals and key in (*_FOLDER_OPTIONS, *_SWEEP_FOLDERS)):
@@ -137,7 +143,7 @@ def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
         "completion": SCRIPTS,
         "compare": METRICS if last == "--sort" else (),
     }
-    return _starting(word, [*found.get(command, ()), *_options(command)])
+    return [*found.get(command, ()), *_options(command)]
 
 
 def _options(command: str) -> list[str]:
@@ -149,30 +155,28 @@ def _options(command: str) -> list[str]:
     return [*(word for word in words if word.startswith("--")), "--help"]
 
 
-def _of_run(command: str, before: Sequence[str], word: str) -> list[str]:
+def _of_run(command: str, before: Sequence[str], word: str) -> Iterable[str]:
     """Options, groups and keys, and the values of those that have a few."""
     folders = [conf_folder(), *_config_dir(before)]
     last = "".join(before[-1:])
-    if last in ("--config-name", "-cn"):
-        return _starting(word, [name for folder in folders for name in choices(folder, "")])
-    if long := {"-c": "--cfg", "-i": "--info"}.get(last, last if last in VALUES else ""):
-        return _starting(word, VALUES[long])
+    last = SHORT.get(last, last)
+    if last == "--config-name":
+        return [name for folder in folders for name in choices(folder, "")]
+    if last in VALUES:
+        return VALUES[last]
     if word.startswith("-"):
-        return _starting(word, ["--json" if command == "check" else "-m", "--help", *OPTIONS])
+        return ["--json" if command == "check" else "-m", "--help", *OPTIONS]
     key, equals, _ = word.partition("=")
     if equals:
         return _values(key, word, folders)
-    groups = [f"{group}=" for group in (*GROUPS, _LAUNCHER)]
-    return _starting(word, [*groups, *_keys(word, before, folders)])
+    return [*(f"{group}=" for group in (*GROUPS, _LAUNCHER)), *_keys(word, before, folders)]
 
 
 def _values(key: str, word: str, folders: Sequence[str]) -> list[str]:
     if key == "figures" and "[" in word:
         return _listed(word, FIGURE_NAMES)
-    if key in _FIXED:
-        return _starting(word, [f"{key}={value}" for value in _FIXED[key]])
     if key not in (*GROUPS, _LAUNCHER):
-        return []
+        return [f"{key}={value}" for value in _FIXED.get(key, ())]
     # Of a sweep, plant=a,b: what stands before the last comma stays.
     head, comma, _ = word.rpartition(",")
     stem = head + comma if comma else f"{key}="
@@ -183,7 +187,7 @@ def _values(key: str, word: str, folders: Sequence[str]) -> list[str]:
             if name not in taken:
                 path = os.path.join(folder, key, f"{name}.yaml")
                 titles.setdefault(f"{stem}{name}", described(path)[0])
-    return [f"{text}\t{titles[text]}".rstrip() for text in _starting(word, titles)]
+    return [f"{text}\t{title}".rstrip() for text, title in titles.items()]
 
 
 def _keys(word: str, before: Sequence[str], folders: Sequence[str]) -> list[str]:
@@ -233,7 +237,7 @@ def _folders(word: str) -> list[str]:
         return []
     hidden = os.path.basename(path).startswith(".")
     found = [one.name for one in inside if one.is_dir() and (hidden or one.name[0] != ".")]
-    return _starting(word, [f"{stem}{name}/" for name in sorted(found)])
+    return [f"{stem}{name}/" for name in sorted(found)]
 
 
 def _listed(word: str, names: Iterable[str]) -> list[str]:
@@ -241,8 +245,4 @@ def _listed(word: str, names: Iterable[str]) -> list[str]:
     head, separator, _ = word.rpartition("," if "," in word else "[")
     given = head.partition("[")[2].split(",")
     begun = head + separator if separator else f"{word.partition('=')[0]}=["
-    return _starting(word, [f"{begun}{name}" for name in names if name not in given])
-
-
-def _starting(word: str, names: Iterable[str]) -> list[str]:
-    return [name for name in dict.fromkeys(names) if name.startswith(word)]
+    return [f"{begun}{name}" for name in names if name not in given]

@@ -16,10 +16,11 @@ VOLUME = ("--quiet", "--verbose")
 CONFIG_DIR = {"--config-dir": "a folder"}
 """Where files of one's own are, for those commands that look for some."""
 
-_SHORT = {
+SHORT = {
     "-m": "--multirun", "-q": "--quiet", "-v": "--verbose", "-c": "--cfg",
     "-cd": "--config-dir", "-cn": "--config-name", "-i": "--info",
 }
+"""The long names of short options."""
 
 
 class Options:
@@ -77,7 +78,7 @@ def parse(
     rest = iter(words)
     for word in rest:
         key, equals, value = word.partition("=")
-        key = _SHORT.get(key, key)
+        key = SHORT.get(key, key)
         if key in values:
             value = value if equals else next(rest, "")
             if not value or value.startswith("--"):

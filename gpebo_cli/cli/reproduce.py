@@ -159,9 +159,9 @@ def quantity(result: RunResult, name: str, where: str) -> list[float]:
             f"{where}: there is no quantity {shown(name)}; there are "
             f"{', '.join(f'{k}.NAME' for k in _KINDS)}, and of {kind} the names {', '.join(known)}"
         )
+    values = np.atleast_1d(known[of])
     if kind in columns:
-        return [float(value) for value in np.atleast_1d(known[of])]
-    values = known[of]
+        return [float(value) for value in values]
     pick = {"last": values[-1], "first": values[0], "max": values.max(), "min": values.min()}
     return [float(pick[kind])]
 

@@ -206,34 +206,27 @@ def _tokens(text: str, place: Place) -> list[str]:
 
 def _options(text: str, place: Place) -> tuple[list[str], dict[str, str]]:
     """Plain words, and ``key=value`` pairs by lower-case key."""
-    words, options = _tokens(text, place), {}
-    plain: list[str] = []
-    k = 0
-    while k < len(words):
-        if k + 2 < len(words) and words[k + 1] == "=":
-            key = words[k].lower()
-            value = words[k + 2]
-            k += 3
-            # on=1,3,5: more numbers belong to the key until the next key
-            while k < len(words) and number(words[k]) is not None and (
-                k + 1 == len(words) or words[k + 1] != "="
-            ):
-                value += f" {words[k]}"
-                k += 1
-            options[key] = value
-        elif words[k] == "=":
-            raise place.error("= needs a name before it and a value behind it")
+    groups: list[list[str]] = [[]]  # of words between two =
+    for word in _tokens(text, place):
+        if word == "=":
+            groups.append([])
         else:
-            plain.append(words[k])
-            k += 1
-    return plain, options
-
-
-def _element_of(line: str, place: Place) -> tuple[list[str], dict[str, str]]:
-    """The words of an element, its name first, and its options."""
-    plain, options = _options(line, place)
-    if not plain:
-        raise place.error(f"{shown(line)} is no element: a name comes first, then its nodes")
+            groups[-1].append(word)
+    plain: list[str] = []
+    options: dict[str, str] = {}
+    key = ""
+    for k, group in enumerate(groups):
+        last = k + 1 == len(groups)
+        if len(group) < (k > 0) + (not last):
+            raise place.error("= needs a name before it and a value behind it")
+        following = "" if last else group.pop().lower()
+        count = 0
+        if k > 0:  # on=1,3,5: more numbers belong to the key
+            more = itertools.takewhile(lambda word: number(word) is not None, group[1:])
+            values = [group[0], *more]
+            options[key], count = " ".join(values), len(values)
+        plain += group[count:]
+        key = following
     return plain, options
 
 
@@ -254,7 +247,7 @@ class _Reader:
         lines = [(place, line, line.split()[0].lower()) for place, line in block.lines]
         for place, line, head in lines:
             if head in (".param", ".params"):
-                _, given = _options(line.split(None, 1)[1] if " " in line else "", place)
+                _, given = _options(line[len(head) :], place)
                 if not given:
                     raise place.error(".param needs name=value")
                 for name, value in given.items():
@@ -264,10 +257,14 @@ class _Reader:
                 continue
             if head.startswith("."):
                 self._command(head, line, place, scope)
-            elif head.startswith("x"):
-                self._instance(line, place, scope)
-            else:
-                self._element(line, place, scope)
+                continue
+            plain, options = _options(line, place)
+            if not plain:
+                raise place.error(
+                    f"{shown(line)} is no element: a name comes first, then its nodes"
+                )
+            add = self._instance if head.startswith("x") else self._element
+            add(plain, options, place, scope)
 
     def _parameter(self, name: str, value: str, scope: Mapping[str, str], place: Place) -> str:
         taken = {key.lower() for key in self.parameters}.union(RESERVED, keyword.kwlist)
@@ -306,7 +303,7 @@ class _Reader:
         return "".join(out).strip()
 
     def _command(self, head: str, line: str, place: Place, scope: _Scope) -> None:
-        rest = line.split(None, 1)[1] if len(line.split(None, 1)) > 1 else ""
+        rest = line[len(head) :]
         if head == ".ic":
             _, given = _options(rest, place)
             for quantity, value in given.items():
@@ -329,8 +326,9 @@ class _Reader:
             )
         # Other commands ask for analyses, which gpebo's own settings describe.
 
-    def _instance(self, line: str, place: Place, scope: _Scope) -> None:
-        plain, given = _element_of(line, place)
+    def _instance(
+        self, plain: list[str], given: dict[str, str], place: Place, scope: _Scope
+    ) -> None:
         plain = [word for word in plain if word.lower() != "params:"]
         if len(plain) < 2 or plain[-1].lower() not in self.blocks:
             what = shown(plain[-1]) if len(plain) > 1 else "nothing"
@@ -360,8 +358,9 @@ class _Reader:
             inner[key] = self._parameter(inside + key, given.get(key, default), scope.known, place)
         self.expand(block, _Scope(ports, inner, inside, scope.depth + 1))
 
-    def _element(self, line: str, place: Place, scope: _Scope) -> None:
-        plain, options = _element_of(line, place)
+    def _element(
+        self, plain: list[str], options: dict[str, str], place: Place, scope: _Scope
+    ) -> None:
         name, kind = plain[0], plain[0][0].upper()
         if kind == "K":
             element = self._coupling(plain, scope, place)
@@ -429,11 +428,9 @@ class _Reader:
             value = self.value(rest[0], scope.known, place, name)
         if kind in "RLCST" and isinstance(value, float) and value == 0.0:
             raise place.error(f"{name} has the value 0")
-        initial = None
-        if "ic" in options:
-            initial = number(options["ic"])
-            if initial is None:
-                raise place.error(f"{name}: ic={options['ic']} is not a number")
+        initial = number(options["ic"]) if "ic" in options else None
+        if "ic" in options and initial is None:
+            raise place.error(f"{name}: ic={options['ic']} is not a number")
         return Element(kind, name, where, value, place, controls, initial)
 
     def _switch(
@@ -442,17 +439,16 @@ class _Reader:
         """The conductance of a switch that closes and opens at given instants."""
         if "on" not in options and "off" not in options:
             raise place.error(f"{name} needs its instants, as in S1 a b on=1,3 off=2 ron=1m")
-        instants: dict[str, list[float]] = {}
-        for key in ("on", "off"):
-            found = [number(word) for word in options.get(key, "").split()]
-            instants[key] = [time for time in found if time is not None]
-            if len(instants[key]) != len(found):
-                raise place.error(f"{name}: {key}={options[key]} has to be times in seconds")
-        events = sorted([(t, 1) for t in instants["on"]] + [(t, -1) for t in instants["off"]])
-        signs = [sign for _, sign in events]
-        if any(a == b for a, b in itertools.pairwise(signs)):
+        events: list[tuple[float, int]] = []
+        for key, sign in (("on", 1), ("off", -1)):
+            for word in options.get(key, "").split():
+                if (time := number(word)) is None:
+                    raise place.error(f"{name}: {key}={options[key]} has to be times in seconds")
+                events.append((time, sign))
+        events.sort()
+        if any(a == b for (_, a), (_, b) in itertools.pairwise(events)):
             raise place.error(f"{name}: on and off have to take turns")
-        closed = "1" if signs[0] < 0 else "0"
+        closed = "1" if events[0][1] < 0 else "0"
         for time, sign in events:
             closed += f" {'+' if sign > 0 else '-'} step(t - {time!r})"
         ron = self.value(options.get("ron", "1m"), scope, place, name)
@@ -469,9 +465,9 @@ class _Reader:
         shape = re.fullmatch(r"(?is)(?:\S+\s+)?(sin|pulse|pwl|exp)\s*\((.*)\)", text)
         if shape is not None:
             given = [number(word) for word in shape[2].replace(",", " ").split()]
-            if None in given:
-                raise place.error(f"{name}: {shape[1]}(…) takes numbers")
             numbers = [value for value in given if value is not None]
+            if len(numbers) < len(given):
+                raise place.error(f"{name}: {shape[1]}(…) takes numbers")
             try:
                 return _SHAPES[shape[1].lower()](numbers)
             except ValueError as error:
