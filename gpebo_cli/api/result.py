@@ -125,25 +125,23 @@ class Result:
 
         Without an observer there are none.
         """
-        return self._estimated("estimates", 0.0, 0.0)
+        return self._estimated("estimates")
 
     @cached_property
     def errors(self) -> NamedArrays:
         """Estimate minus truth by name, (G, M) each."""
-        estimation = self.details.estimation
-        if estimation is None:
-            return self._estimated("errors", 0.0, 0.0)
-        x = truth_at(self.details, estimation.t)
-        return self._estimated("errors", estimation.true_parameters, x)
+        return self._estimated("errors")
 
-    def _estimated(self, what: str, eta: Array | float, x: Array | float) -> NamedArrays:
-        """Estimates less η and x, by name; none without an observer."""
+    def _estimated(self, what: str) -> NamedArrays:
+        """Estimates or their errors, by name; none without an observer."""
         estimation = self.details.estimation
         if estimation is None:
             return NamedArrays(what, (), np.zeros((0, 0, 0)))
-        names = (*estimation.names, *self.details.system.states)
-        values = np.concatenate([estimation.parameters - eta, estimation.states - x], axis=-1)
-        return NamedArrays(what, names, values)
+        values = np.concatenate([estimation.parameters, estimation.states], axis=-1)
+        if what == "errors":
+            x = truth_at(self.details, estimation.t)
+            values -= np.concatenate([estimation.true_parameters, x], axis=-1)
+        return NamedArrays(what, (*estimation.names, *self.details.system.states), values)
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -28,21 +28,11 @@ from gpebo_cli.cli.sweep_progress import Watch, told
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import is_metric
+from gpebo_cli.results import sweep_folder
 from gpebo_cli.results.files import make_folder, write_text
 from gpebo_cli.results.names import shown_metrics
 from gpebo_cli.results.report import case_rows, columns
-from gpebo_cli.results.sweep_folder import (
-    STOP,
-    TABLE,
-    JobRecord,
-    Plan,
-    clear,
-    read_plan,
-    read_records,
-    table,
-    write_record,
-    write_table,
-)
+from gpebo_cli.results.sweep_folder import STOP, TABLE, JobRecord, Plan
 from gpebo_cli.schema import shown
 
 if TYPE_CHECKING:
@@ -89,7 +79,7 @@ def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
         error=" ".join(error.split()),
         cases=cases,
     )
-    write_record(folder, record)
+    sweep_folder.write_record(folder, record)
     if error and hydra.sweeper.fail_fast:
         write_text(stop, f"{record.job}\n")
 
@@ -106,10 +96,16 @@ def run_sweep(
     orders = config.hydra.sweeper
     folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()
     plan = Plan(tuple(map(_overrides, jobs)), _digest(config))
-    _refuse_subdir(config)
+    # Unresolved: Hydra numbers the folders of jobs, job by job.
+    sweep = cast("dict[str, Any]", OmegaConf.to_container(config.hydra.sweep, resolve=False))
+    if (given := sweep.get("subdir")) != _SUBDIR:
+        raise ConfigError(
+            f"hydra.sweep.subdir={given}: the folders of jobs are numbered, so that a sweep can be "
+            "resumed; leave it away"
+        )
     _check_composition(jobs, config, loader)
     _check_folder(folder, plan, resume=orders.resume is not None)
-    before = read_records(folder, plan)
+    before = sweep_folder.read_records(folder, plan)
     waiting = [record.job for record in before if record.status != "done"]
     if orders.dry_run:
         _print_plan(before, resumed=orders.resume is not None)
@@ -117,7 +113,7 @@ def run_sweep(
 
     make_folder(folder)
     plan.write(folder)
-    clear(folder, waiting)
+    sweep_folder.clear(folder, waiting)
     errors: dict[int, str] = {}
     trouble = ""
     finished = False
@@ -128,9 +124,9 @@ def run_sweep(
     finally:  # also when it is interrupted: what is done is in the table
         records = [
             replace(r, error=errors.get(r.job, "no result")) if r.status == "missing" else r
-            for r in read_records(folder, plan)
+            for r in sweep_folder.read_records(folder, plan)
         ]
-        write_table(folder, records)
+        sweep_folder.write_table(folder, records)
         if not orders.quiet:
             _print_table(records, folder, rows=finished)
     _raise_failures(records, folder, trouble, stopped=(folder / STOP).exists())
@@ -222,16 +218,6 @@ def _digest(config: DictConfig) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _refuse_subdir(config: DictConfig) -> None:
-    content = OmegaConf.to_container(config.hydra.sweep, resolve=False)
-    given = content.get("subdir") if isinstance(content, dict) else None
-    if given != _SUBDIR:
-        raise ConfigError(
-            f"hydra.sweep.subdir={given}: the folders of jobs are numbered, so that a sweep can be "
-            "resumed; leave it away"
-        )
-
-
 def _check_composition(
     jobs: Sequence[Sequence[str]], config: DictConfig, loader: ConfigLoader
 ) -> None:
@@ -253,7 +239,7 @@ def _check_composition(
 
 def _check_folder(folder: Path, plan: Plan, *, resume: bool) -> None:
     """Refuse to mix two sweeps in one folder."""
-    there = read_plan(folder)
+    there = sweep_folder.read_plan(folder)
     name = os.path.relpath(folder)
     if there is None:
         # Killed before it had a plan, a sweep leaves a folder with nothing in it.
@@ -302,7 +288,8 @@ def _print_table(records: Sequence[JobRecord], folder: Path, *, rows: bool) -> N
     """The table's beginning (without it when interrupted), where it is, and counts."""
     lines = []
     if rows:
-        cells = [[told(cell) for cell in row[:-1]] for row in table(records)]  # errors: below
+        # Errors stand below.
+        cells = [[told(cell) for cell in row[:-1]] for row in sweep_folder.table(records)]
         metrics = shown_metrics(case for record in records for case in record.cases or ())
         seen = [k for k, name in enumerate(cells[0]) if name in metrics or not is_metric(name)]
         lines += columns([[row[k] for k in seen] for row in cells[: _SHOWN_ROWS + 1]])

@@ -79,10 +79,16 @@ def examine(netlist: Netlist, file: str) -> Topology:
     nodes = {node for e in branches for node in e.nodes}
     if GROUND not in nodes:
         raise ConfigError(f"{file}: no element is connected to ground, which is the node 0")
-    connected = DisjointSet(nodes)
-    for e in branches:
-        for pair in _branches_of(e):
-            connected.merge(*pair)
+
+    def joined(without: str) -> Any:
+        """Nodes that are connected by elements of other kinds than ``without``."""
+        sets = DisjointSet(nodes)
+        for e in branches:
+            for pair in () if e.kind in without else _branches_of(e):
+                sets.merge(*pair)
+        return sets
+
+    connected = joined("")
     floating = sorted(node for node in nodes if not connected.connected(node, GROUND))
     if floating:
         raise ConfigError(
@@ -98,11 +104,7 @@ def examine(netlist: Netlist, file: str) -> Topology:
                     f"{e.name} closes a loop of voltage sources, or is shorted; its current would "
                     "be anything"
                 )
-    carried = DisjointSet(nodes)
-    for e in branches:
-        if e.kind not in "IGF":
-            for pair in _branches_of(e):
-                carried.merge(*pair)
+    carried = joined("IGF")
     for e in branches:
         if e.kind in "IGF" and not carried.connected(*e.nodes[:2]):
             raise e.place.error(
@@ -110,7 +112,7 @@ def examine(netlist: Netlist, file: str) -> Topology:
                 "voltage would be anything"
             )
     return Topology(
-        tuple(_loops(branches)), tuple(_cutsets(branches, DisjointSet(nodes))),
+        tuple(_loops(branches)), tuple(_cutsets(branches, joined("LIGF").subsets())),
         all(e.kind in "RLCVIS" for e in netlist.elements),
     )
 
@@ -160,17 +162,12 @@ def _path(branches: Sequence[Element], start: str, stop: str) -> list[str] | Non
     return reached.get(stop)
 
 
-def _cutsets(branches: Sequence[Element], rest: Any) -> Iterable[tuple[str, ...]]:
-    """Inductors and current sources around each part that nothing else connects to ground.
-
-    Nodes are joined in ``rest``, a ``DisjointSet`` of them.
-    """
-    for e in branches:
-        if e.kind not in "LIGF":
-            for pair in _branches_of(e):
-                rest.merge(*pair)
+def _cutsets(
+    branches: Sequence[Element], parts: Iterable[set[str]]
+) -> Iterable[tuple[str, ...]]:
+    """Inductors and current sources around each part that nothing else connects to ground."""
     crossing = [e for e in branches if e.kind in "LIGF"]
-    for part in sorted(rest.subsets(), key=min):
+    for part in sorted(parts, key=min):
         if GROUND in part:
             continue
         sides = [[node in part for node in e.nodes[:2]] for e in crossing]

@@ -243,46 +243,41 @@ class RowReader:
         return values
 
     def _value(self, where: str, cell: str, *, first: bool) -> float:
-        policy, of_gap = self._data.missing, self._stands_for_gap(cell, first=first)
-        if of_gap or cell.strip(" \t").lower() in MISSING:
+        policy, text = self._data.missing, cell.strip(" \t")
+        plain = self._number.fullmatch(cell) is not None
+        value = float(cell.replace(self._data.decimal, ".")) if plain else math.nan
+        of_gap = not first and value in (self._data.gaps or ())
+        gap = text.lower() in MISSING
+        if of_gap or gap:
             if policy == "drop" or (policy != "refuse" and not first):
                 return math.nan
-            if not cell.strip(" \t"):
+            if not text:
                 raise ConfigError(
                     f"{where}: the sample is missing; every row needs a number there"
                     + ("" if first else ", or data.missing says what to do")
                 )
         if of_gap:
             raise ConfigError(
-                f"{where}: {cell.strip()} is a gap (data.gaps); data.missing says what to do"
+                f"{where}: {text} is a gap (data.gaps); data.missing says what to do"
             )
         if first and self._data.time_unit == "datetime":
             [value], self._origin = seconds([cell], self._origin)
             if math.isnan(value):
                 raise ConfigError(f"{where}: {shown(cell)} is not {_DATE}")
             return float(value)
-        if self._number.fullmatch(cell) is None:
-            text = cell.strip(" \t").lower()
-            finite = text.lstrip("+-") in ("nan", "inf", "infinity")
-            what = "a finite number" if finite else "a number"
-            gap = text in MISSING and not first
+        if not plain:
+            finite = text.lower().lstrip("+-") in ("nan", "inf", "infinity")
             raise ConfigError(
-                f"{where}: {shown(cell)} is not {what}"
-                + ("; data.missing says what to do with a gap" if gap else "")
+                f"{where}: {shown(cell)} is not {'a finite number' if finite else 'a number'}"
+                + ("; data.missing says what to do with a gap" if gap and not first else "")
             )
-        value = float(cell.replace(self._data.decimal, "."))
         if not math.isfinite(value):
-            raise ConfigError(f"{where}: {shown(cell.strip())} is not a finite number")
+            raise ConfigError(f"{where}: {shown(text)} is not a finite number")
         if abs(value) > LARGEST:
             raise ConfigError(
-                f"{where}: {shown(cell.strip())} is too large; numbers go up to {LARGEST:g} here"
+                f"{where}: {shown(text)} is too large; numbers go up to {LARGEST:g} here"
             )
         return value
-
-    def _stands_for_gap(self, cell: str, *, first: bool) -> bool:
-        if first or not self._data.gaps or self._number.fullmatch(cell) is None:
-            return False
-        return float(cell.replace(self._data.decimal, ".")) in self._data.gaps
 
 
 def seconds(cells: Sequence[str], origin: Any) -> tuple[Array, Any]:

@@ -7,7 +7,6 @@ compares the two.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module, util
 from typing import TYPE_CHECKING, Any
@@ -78,18 +77,19 @@ def circuit() -> Figure:
             "L": elements.Inductor,
         }
         for branch in BRANCHES:
-            shape = shapes[branch.element[0]]
             start, end = _ends(branch)
             if branch.element == "V":  # schemdraw's + stands at the end, this one's at ground
                 start, end = end, start
-            drawing.add(shape().endpoints(start, end))
+            shape = shapes[branch.element[0]]().endpoints(start, end)
+            side = "top" if start[1] > end[1] else "bottom"  # left of an upright element
+            drawing.add(shape.label(typeset(branch.element, {}), loc=side))
             if branch.current:
-                tail, head, _ = _arrow(branch)
-                drawing.add(elements.Arrow(headwidth=0.18, headlength=0.25).at(tail).to(head))
+                arrow = elements.CurrentLabel(
+                    ofst=0.2, length=0.84, top=side == "top", reverse=branch.element == "V"
+                )
+                drawing.add(arrow.at(shape).label(rf"$i_{{{branch.element}}}$", ofst=0.1))
         _add_wires(drawing, elements)
         drawing.draw(show=False)
-        for text, (x, y), side in _texts():
-            axes.text(x, y, text, ha=side, va="center_baseline", fontsize=TEXT)
         axes.set_aspect("equal")
         axes.set_xlim(_LEFT, _LEFT + _ACROSS)
         axes.set_ylim(_LOW, _HIGH)
@@ -105,41 +105,12 @@ def _ends(branch: Branch) -> tuple[_Point, _Point]:
     return places[branch.start], places[branch.end]
 
 
-def _arrow(branch: Branch) -> tuple[_Point, _Point, _Point]:
-    """Tail and head of the arrow beside a branch, and where its name goes."""
-    (x0, y0), (x1, y1) = _ends(branch)
-    x, y = (x0 + x1) / 2, (y0 + y1) / 2
-    if x0 == x1:
-        half = 0.42 if y1 > y0 else -0.42
-        x += 0.85 if branch.element == "V" else 0.6
-        return (x, y - half), (x, y + half), (x + 0.18, y)
-    half = 0.42 if x1 > x0 else -0.42
-    return (x - half, y + 0.5), (x + half, y + 0.5), (x, y + 0.85)
-
-
-def _texts() -> Iterator[tuple[str, _Point, str]]:
-    """Names of elements, currents and nodes, where they stand and how they are aligned."""
-    for branch in BRANCHES:
-        (x0, y0), (x1, y1) = _ends(branch)
-        name = typeset(branch.element, {})
-        if x0 == x1:
-            gap = 0.66 if branch.element == "V" else 0.55
-            yield name, (x0 - gap, (y0 + y1) / 2), "right"
-        else:
-            yield name, ((x0 + x1) / 2, y0 - 0.62), "center"
-        if branch.current:
-            current = rf"$i_{{{branch.element}}}$"
-            yield current, _arrow(branch)[2], "left" if x0 == x1 else "center"
-    yield "$e_1$", (_AT["C1"], _TOP + 0.45), "center"
-    yield "$e_2$", (_AT["C2"], _TOP + 0.45), "center"
-
-
 def _add_wires(drawing: Any, elements: Any) -> None:
     """The rails, dots where more than two wires meet, and ground."""
     drawing.add(elements.Line().at((_AT["V"], _TOP)).to((_AT["C1"], _TOP)))
     drawing.add(elements.Line().at((_AT["C2"], _TOP)).to((_AT["L"], _TOP)))
     drawing.add(elements.Line().at((_AT["V"], 0.0)).to((_AT["L"], 0.0)))
-    for x in (_AT["R2"], _AT["C1"], _AT["C2"]):
-        drawing.add(elements.Dot(radius=0.09).at((x, _TOP)))
-        drawing.add(elements.Dot(radius=0.09).at((x, 0.0)))
+    for element, node in (("R2", ""), ("C1", "$e_1$"), ("C2", "$e_2$")):
+        drawing.add(elements.Dot(radius=0.09).at((_AT[element], _TOP)).label(node, loc="top"))
+        drawing.add(elements.Dot(radius=0.09).at((_AT[element], 0.0)))
     drawing.add(elements.Ground().at(((_AT["C1"] + _AT["C2"]) / 2, 0.0)))

@@ -75,7 +75,10 @@ def _run(name: str, folder: Path) -> str:
         for path in sorted((folder / "figures").glob("*.png"))
         if (content := _picture(path))
     )
-    versions = "; ".join(filter(None, made_with))
+    versions, configuration = "; ".join(filter(None, made_with)), ""
+    if (path := folder / "config.yaml").is_file():
+        written = path.read_text(encoding="utf-8", errors="replace")
+        configuration = html.folded("Configuration", written)
     return (
         f"<section>\n<h2>{escape(name)}</h2>\n{words}"
         f"{_titled('Estimates at the end', html.table(estimates))}"
@@ -83,7 +86,7 @@ def _run(name: str, folder: Path) -> str:
         f"{_titled('What the result rests on', assumptions)}"
         f"{_titled('Facts', html.table(facts, text=True))}"
         f'<div class="figures">{pictures}</div>\n'
-        f"{_configuration(folder)}{html.paragraph(f'Made with {versions}.' if versions else '')}"
+        f"{configuration}{html.paragraph(f'Made with {versions}.' if versions else '')}"
         "</section>\n"
     )
 
@@ -177,10 +180,3 @@ def _picture(path: Path) -> bytes:
         return b""
     content = path.read_bytes()
     return content if content.startswith(_PNG) else b""
-
-
-def _configuration(folder: Path) -> str:
-    path = folder / "config.yaml"
-    if not path.is_file():
-        return ""
-    return html.folded("Configuration", path.read_text(encoding="utf-8", errors="replace"))

@@ -33,11 +33,6 @@ class Provenance:
 
 def provenance() -> Provenance:
     """Collect both; takes some 10 ms, most of it git, and never fails."""
-    return Provenance(package_versions(), git_state(Path(__file__).parents[2]))
-
-
-def package_versions() -> dict[str, str | None]:
-    """Version of this package, its kernels' kind, of Python and of each of :data:`PACKAGES`."""
     versions: dict[str, str | None] = {
         "gpebo": __version__,
         "kernels": kernels.kind(),
@@ -48,7 +43,7 @@ def package_versions() -> dict[str, str | None]:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             versions[name] = None
-    return versions
+    return Provenance(versions, git_state(Path(__file__).parents[2]))
 
 
 def git_state(root: Path) -> GitState | None:
