@@ -35,17 +35,15 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
         delta, Y, digits = determinant_and_adjugate_action(values[..., :p], values[..., p:])
         return delta, Y.reshape(len(t), -1), digits
 
-    delta, quotient = mixed_points(extended.values)
-    return scalar_path(extended.mesh, signals, delta, quotient, t, floor)
-
-
-def mixed_points(extended: Array) -> tuple[Array, Array]:
-    """Δ (K, s + 1) and η̄ = 𝐘/Δ, usable everywhere, (K, s + 1, p c) of [Ω | 𝒴] (.., p, p + c)."""
-    points = extended.shape[:-2]
+    whole, points = extended.values, extended.values.shape[:2]
     # 𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
-    delta, quotient, condition = kernels.laws.mixed(extended.reshape(-1, *extended.shape[-2:]))
+    delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]))
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
-    return delta.reshape(points), filled(quotient.reshape(*points, -1), usable.reshape(points))
+    digits = np.divide(1.0, condition, out=np.zeros(len(condition)), where=usable)
+    return scalar_path(
+        extended.mesh, signals, delta.reshape(points), digits.reshape(points),
+        filled(quotient.reshape(*points, -1), usable), t, floor,
+    )
 
 
 def filled(quotient: Array, usable: BoolArray) -> Array:

@@ -42,6 +42,7 @@ class ScalarPath:
 
     mesh: Mesh
     signals: MixedSignals
+    digits: Array  # (K, s + 1) σ_min/σ_max of Ω, or less by a factor of up to p
     quotient: Array  # (K, s + 1, p) η̄, usable everywhere
     energy: Array  # (K, s + 1) I
     t: Array  # (M,)
@@ -79,16 +80,14 @@ def _variation(path: ScalarPath, gain: float, start: Array) -> tuple[float, floa
     The weight is the share min(1, γδI) of a step of I that η̂ goes to meet η̄. Where the variation
     is more than nothing, what is rounding of 𝐘/Δ does not count.
     """
-    mesh, quotient = path.mesh, path.quotient
+    quotient = path.quotient
     size = max(np.abs(quotient[-1]).max(initial=0.0), np.abs(start).max(), path.floor)
     length = np.maximum(path.energy[:, 1:] - path.energy[:, :-1], 0.0)
     weight = np.minimum(1.0, gain * length)[..., None]
     change = np.abs(quotient[:, 1:] - quotient[:, :-1])
     much = (weight * change > _CONSTANT * size).any(axis=(1, 2))
     if much.any():
-        points, inside = mesh.points[much], mesh.inside[much]
-        digits = path.signals(points.ravel(), inside.ravel())[2].reshape(points.shape)
-        rounding = _SLACK * _ROUNDING / np.maximum(digits, _ROUNDING)
+        rounding = _SLACK * _ROUNDING / np.maximum(path.digits[much], _ROUNDING)
         change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
     return float((weight * change).max(initial=0.0)), float(size)
 
@@ -244,10 +243,11 @@ def _values(maps: Array, start: Array) -> Array:
 
 
 def scalar_path(
-    mesh: Mesh, signals: MixedSignals, delta: Array, quotient: Array, t: Array, floor: float,
+    mesh: Mesh, signals: MixedSignals, delta: Array, digits: Array, quotient: Array, t: Array,
+    floor: float,
 ) -> ScalarPath:
-    """Prepare the law for Δ (K, s + 1) and η̄ (K, s + 1, p), reported at the times t (M,)."""
+    """Prepare the law for Δ, digits (K, s + 1) and η̄ (K, s + 1, p), reported at times t (M,)."""
     energy = np.maximum.accumulate(Trajectory(mesh, delta**2).integral().values.ravel())
     energy = energy.reshape(delta.shape)  # ∫Δ² never falls
     at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
-    return ScalarPath(mesh, signals, quotient, energy, t, at_t, floor)
+    return ScalarPath(mesh, signals, digits, quotient, energy, t, at_t, floor)

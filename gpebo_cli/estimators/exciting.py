@@ -93,14 +93,19 @@ class Exciting(GainEstimator):
             tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
         ).trajectory
 
+        def digits(delta: Array) -> Array:
+            return np.minimum(np.abs(delta), 1.0)
+
         def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
             values = found(t, inside)[:, 1]
-            return values[:, 0], values[:, 1:], np.minimum(np.abs(values[:, 0]), 1.0)
+            return values[:, 0], values[:, 1:], digits(values[:, 0])
 
         new, right = found.values[:, :, 1, 0], found.values[:, :, 1, 1:]
         usable = np.abs(new) > _KNOWN
         quotient = filled(right / np.where(usable, new, 1.0)[..., None], usable)
-        law = scalar_path(found.mesh, signals, new, quotient, np.asarray(t), path.floor)
+        law = scalar_path(
+            found.mesh, signals, new, digits(new), quotient, np.asarray(t), path.floor
+        )
         return replace(inner, groups=(law,), condition="IE")
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:

@@ -137,7 +137,7 @@ def mix_least_squares(
         return delta, Y.reshape(len(t), -1), digits
 
     shape = mesh.points.shape
-    usable, delta = np.empty(shape, dtype=bool), np.empty(shape)
+    digits, delta = np.empty(shape), np.empty(shape)
     rows, columns = info.gram.values.shape[-2:]
     quotient = np.empty((*shape, rows * (columns - rows)))
     # If no digit is left in the units that are given, each parameter's own size is the unit.
@@ -146,13 +146,14 @@ def mix_least_squares(
             part = slice(first, first + _AT_ONCE)
             points = mesh.points[part]
             at = info.at(points.ravel(), mesh.inside[part].ravel())
-            found, digits = at.quotient() if in_own_units else at.spectrum.quotient()
-            usable[part] = (digits > SINGULAR).reshape(points.shape)
+            found, known = at.quotient() if in_own_units else at.spectrum.quotient()
+            digits[part] = known.reshape(points.shape)
             quotient[part] = found.reshape(*points.shape, -1)
             delta[part] = np.prod(_shares(at.spectrum, alpha, f0), axis=1).reshape(points.shape)
+        usable = digits > SINGULAR
         if usable.any():
             break
-    return scalar_path(mesh, signals, delta, filled(quotient, usable), t, floor)
+    return scalar_path(mesh, signals, delta, digits, filled(quotient, usable), t, floor)
 
 
 def _adjugate(s: Spectrum, alpha: float, f0: float) -> tuple[Array, Array]:

@@ -105,7 +105,7 @@ def judged_errors(
         lost = len(carried)
         if not (largest < known).all():
             lost = int(np.argmin((carried < known).all(axis=(1, 2))))
-        relative = np.where(total > 0.0, total / scale, 0.0)
+        relative = total / scale
     return Errors(np.where(np.isfinite(relative), relative, np.inf), lost, carried[-1])
 
 

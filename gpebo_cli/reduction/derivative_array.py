@@ -161,13 +161,18 @@ class _Terms(NamedTuple):
     columns: IntArray  # (e,) after all rows
     of_time: Array  # (e,)
     total: int  # a + b + 1 factors
+    # Where counts, twice, sums of factors, and sums beside the time, twice, stand in products.
+    places: IntArray
 
     @classmethod
     def of(cls, there: BoolArray, order: NDArray[np.int8]) -> _Terms:
         """For the entries that are ``there``, derivatives of this ``order`` (2, a, b)."""
         (kind, i, j), (_, a, b) = there.nonzero(), there.shape
         of_time = np.asarray(kind + order[kind, i, j] - 1, dtype=np.float64)
-        return cls(i, a + j, of_time, a + b + 1)
+        j, n = a + j, a + b + 1
+        every, last = np.arange(n), np.full(n, n - 1)
+        down = np.concatenate([i, j, every, every, last])
+        return cls(i, j, of_time, n, down * n + np.concatenate([j, i, every, last, every]))
 
     def __matmul__(self, factors: Array) -> Array:
         """What the factors (a + b + 1,) add to each logarithm, (e,)."""
@@ -188,21 +193,20 @@ class _Terms(NamedTuple):
 
         Singular values of a thousand states would take longer than a run.
         """
-        n, last = self.total, np.full(self.total, self.total - 1)
+        n = self.total
         with_time = self.transposed(self.of_time * counts)
         own = self.transposed(counts)
         own[-1], with_time[-1] = with_time[-1] + _OPEN, 0.0
         own[:-1] += _OPEN
-        every = np.arange(n)
-        i = np.concatenate([self.rows, self.columns, every, every, last])
-        j = np.concatenate([self.columns, self.rows, every, last, every])
         values = np.concatenate([counts, counts, own, with_time, with_time])
         if n <= _FULL:
-            return partial(np.linalg.solve, np.bincount(i * n + j, values, n * n).reshape(n, n))
+            return partial(np.linalg.solve, np.bincount(self.places, values, n * n).reshape(n, n))
         from scipy.sparse import csc_array
         from scipy.sparse.linalg import splu
 
-        solve: Callable[[Array], Array] = splu(csc_array((values, (i, j)), shape=(n, n))).solve
+        solve: Callable[[Array], Array] = splu(
+            csc_array((values, np.divmod(self.places, n)), shape=(n, n))
+        ).solve
         return solve
 
 

@@ -274,9 +274,12 @@ def _refuse_overflow(
     """LAPACK's singular values of what is not finite may take for ever."""
     with np.errstate(all="ignore"):
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
-        whole = [(distinct(matrix) * weight).ravel() for matrix in (c.E, c.A)]
+        heaviest = float(weight.max(initial=0.0)) ** 2
         # A sum is finite only where all its terms are; a finite one says it at once.
-        finite = all(isfinite(x.dot(x)) or np.isfinite(x).all() for x in whole)
+        finite = all(
+            isfinite(heaviest * x.ravel().dot(x.ravel())) or np.isfinite(x * weight).all()
+            for x in (distinct(c.E), distinct(c.A))
+        )
     if not finite:
         raise ModelError(
             f"{who(system)}: E and A change by more powers of ten than numbers hold; shorten "

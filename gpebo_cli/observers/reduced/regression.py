@@ -46,7 +46,7 @@ class Assembled:
         rows, Y, psi = self._rows, self.Y, self.psi
         if len(rows) < Y.shape[1]:
             Y, psi = Y[:, rows], psi[:, rows]
-        psi = psi / np.tile(columns, (psi.shape[1], 1))
+        psi = psi / columns[None].repeat(psi.shape[1], axis=0)
         others: BoolArray = np.ones(len(self.moving), dtype=bool)
         if basis is not None:
             others[:] = self.eliminated | ~basis.any(axis=1)
