@@ -7,6 +7,8 @@ returns :attr:`GpeboError.exit_code`; anything else that escapes is a bug.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 _MOST = 2.0  # GB
 
 
@@ -30,17 +32,20 @@ class SolverError(GpeboError):
     """The solver cannot reach the tolerance it was asked for."""
 
 
-def check_memory(what: str, numbers: float) -> None:
+def check_memory(
+    what: str, numbers: float, accepted: Callable[[float], str] | None = None
+) -> None:
     """Refuse what would hold more than a run may: a machine that swaps stands still.
 
     ``what`` asks for it, the setting and its value; it would hold so many ``numbers`` of 8 bytes
-    each, estimated.
+    each, estimated. What would be ``accepted`` is told of the share of them that a run may hold.
 
     Raises:
         ConfigError: names the setting, what it would need, and the limit.
     """
     size = 8e-9 * numbers
     if size > _MOST:
+        told = f"; {accepted(_MOST / size)}" if accepted else ""
         raise ConfigError(
-            f"{what} would take some {size:.3g} GB of memory; a run may take {_MOST:g} GB"
+            f"{what} would take some {size:.3g} GB of memory; a run may take {_MOST:g} GB{told}"
         )

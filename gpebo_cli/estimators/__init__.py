@@ -24,6 +24,7 @@ from gpebo_cli.regression.estimator import (
     Affine,
     Estimates,
     Estimator,
+    Fitting,
     Moving,
     Recursion,
     Recursive,
@@ -38,11 +39,11 @@ from gpebo_cli.schema import number, per_name
 
 __all__ = [
     "GROUP", "Affine", "Array", "ErrorSystem", "ErrorsAt", "Estimates", "Estimator",
-    "ExtensionState", "FilteredEstimator", "GainEstimator", "Information", "InformationRoot",
-    "KreisselmeierFilter", "LinearRegression", "MixedEstimates", "Moving", "Recursion", "Recursive",
-    "Requirement", "Reset", "Resumable", "ResumableEstimates", "ResumableEstimator",
-    "SampledEstimates", "SampledRegression", "ScalarLaw", "Trajectory", "VectorEstimates",
-    "VectorLaw", "able", "axis", "build", "combinations", "estimate", "gain", "information",
-    "kreisselmeier", "lion", "low_pass", "mix", "names", "number", "per_name", "persistent",
-    "raised", "reached", "settings_of", "tuned", "tuned_for",
+    "ExtensionState", "FilteredEstimator", "Fitting", "GainEstimator", "Information",
+    "InformationRoot", "KreisselmeierFilter", "LinearRegression", "MixedEstimates", "Moving",
+    "Recursion", "Recursive", "Requirement", "Reset", "Resumable", "ResumableEstimates",
+    "ResumableEstimator", "SampledEstimates", "SampledRegression", "ScalarLaw", "Trajectory",
+    "VectorEstimates", "VectorLaw", "able", "axis", "build", "combinations", "estimate", "gain",
+    "information", "kreisselmeier", "lion", "low_pass", "mix", "names", "number", "per_name",
+    "persistent", "raised", "reached", "settings_of", "tuned", "tuned_for",
 ]

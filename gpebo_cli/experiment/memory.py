@@ -9,7 +9,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, check_memory
 from gpebo_cli.experiment.noise import NoiseLevels
 from gpebo_cli.experiment.sources import kept_samples
-from gpebo_cli.model.descriptor import DescriptorSystem
+from gpebo_cli.model.descriptor import DescriptorSystem, differential_order
 from gpebo_cli.settings import Settings
 
 _HELD = 4  # arrays of every kind that are alive at once; measured
@@ -24,9 +24,7 @@ def check(settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cas
             # The rank of E, which takes a while to find, makes it less.
             start = settings.time.start
             start = start if np.isfinite(start) else 0.0  # of a recording: its own
-            source, at = system.coefficients.of_time, np.array([start])
-            E = source.taylor(at, 0).E[0, 0] if system.n else np.zeros(0)
-            rank = int(np.linalg.matrix_rank(E)) if E.size and np.isfinite(E).all() else system.n
+            rank = differential_order(system, start)
             check_memory(what, _needs(settings, system, levels, cases, rank)[what])
 
 

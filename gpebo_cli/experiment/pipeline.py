@@ -94,6 +94,8 @@ def run_experiment(
         estimator = estimators.build(settings.estimator)
     check_seeds(settings.noise, levels, settings.time.horizon)
     memory.check(settings, system, levels, 0 if estimator is None else len(estimator.cases))
+    if isinstance(estimator, estimators.Fitting):
+        estimator.law(getattr(system.regression, "parametrisation", None))
     stage = _Clock(progress, settings.solver.max_seconds)
     recorded, samples = settings.data.name == "csv", sampling(observer)
     with stage("read" if recorded else "simulate"):

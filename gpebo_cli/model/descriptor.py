@@ -170,6 +170,12 @@ class DescriptorSystem:
         return len(self.outputs)
 
 
+def differential_order(system: DescriptorSystem, start: float) -> int:
+    """The rank of E at the ``start``, or n where E is no number there."""
+    E = system.coefficients.of_time.taylor(np.array([start]), 0).E[0, 0] if system.n else np.eye(0)
+    return int(np.linalg.matrix_rank(E)) if E.size and np.isfinite(E).all() else system.n
+
+
 def check_sizes(system: DescriptorSystem, t: Array) -> None:
     """Refuse numbers whose squares and products overflow: all that came of them would be wrong.
 

@@ -11,15 +11,17 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, check_memory
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, differential_order
 from gpebo_cli.model.text import switching
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, aside
 from gpebo_cli.observers._observation import Observation, SampledBlock, Truth
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import SolverSettings
+
+_HELD = 4  # arrays of every kind that are alive at once; measured
 
 ByName = float | Sequence[float] | Mapping[str, float]
 
@@ -70,6 +72,24 @@ class Measurements:
         if inside is not None and system is not None and switching(system.coefficients):
             there = aside(t, inside)
         return np.concatenate([self.inputs(there, inside), self.outputs(there, inside)], axis=1)
+
+    def check_memory(self, system: DescriptorSystem) -> None:
+        """Refuse a recording of more samples than there is memory for what is made of each.
+
+        Raises:
+            ConfigError: says how much they would take, and what would be accepted.
+        """
+        if self.wanted is None:
+            return
+        start, stop = self.span
+        p = system.q + differential_order(system, start)
+        each = _HELD * (p + 1) * (system.n + p + system.m + system.r)
+        check_memory(
+            f"what is made of each of the recording's {self.mesh.size} samples",
+            each * self.mesh.points.size,
+            lambda share: f"time.horizon={share * (stop - start):.3g} fits, and observer=gpebo "
+            "takes any number of rows as a stream (data.file=- < FILE)",
+        )
 
 
 class Observer(Protocol):

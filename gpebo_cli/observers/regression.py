@@ -46,6 +46,7 @@ class Given:
     ) -> Observation:
         """The regression of the system's text; there is no state."""
         given = _text_of(system)
+        signals.check_memory(system)
         regression, error = given.on(
             signals.inputs, signals.outputs if given.Y is None else None, solver.tol,
             solver.max_elements,

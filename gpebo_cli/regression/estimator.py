@@ -16,6 +16,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.parametrisation import Parametrisation
 from gpebo_cli.regression.resets import ExtensionState, Known
 from gpebo_cli.regression.samples import SampledRegression
 
@@ -103,6 +104,15 @@ class Moving(Protocol):
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
     ) -> Estimates:
         """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending."""
+        ...
+
+
+@runtime_checkable
+class Fitting(Protocol):
+    """An estimator of θ in η = S(θ)."""
+
+    def law(self, S: Parametrisation | None) -> object:
+        """What it makes of S (ConfigError: there is none, or one that it cannot take)."""
         ...
 
 

@@ -223,6 +223,7 @@ def reduced_system(
     """
     mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
+    signals.check_memory(system)
     at = signals.at(t, inside, system) if system.coefficients.signals else None
     lost = None
     try:
