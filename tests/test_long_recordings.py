@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gpebo_cli import run
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
@@ -166,6 +167,22 @@ def test_a_rate_that_is_wrong_by_a_twentieth_is_noticed_and_the_right_one_is_not
     ]
     assert "up to white noise" in said[0]
     assert "is not white" in said[1]
+
+
+def test_what_is_made_of_a_recording_is_forecast(monkeypatch):
+    """A plant that follows what is measured keeps every sample, and a machine must not swap."""
+    t = np.linspace(0.0, 40.0, 2001)
+    data = {"t": t, "current": 2.0 + np.sin(t), "v": 3.7 - 0.03 * np.sin(t)}
+    monkeypatch.setattr("gpebo_cli.errors._MOST", 0.005)
+    with pytest.raises(ConfigError, match=r"2000 samples would take some 0.01\d* GB .*; "
+                       r"time.horizon=15.6 fits, and .* \(data.file=- < FILE\)$"):
+        run("battery", data=data)
+    run("battery", data=data, time={"horizon": 15.5})
+
+
+def test_an_estimator_without_its_map_is_refused_before_a_file_is_read():
+    with pytest.raises(ConfigError, match="monotone is for a regression with S and box"):
+        run("battery", data={"file": "nowhere.csv"}, estimator="monotone")
 
 
 def test_noise_in_the_matrices_is_named():

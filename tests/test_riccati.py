@@ -247,11 +247,12 @@ def test_a_covariance_that_becomes_indefinite_is_refused():
         case.filtered(np.zeros(2), np.eye(2), 3.0)
 
 
-def test_window_gramians_of_a_constant_system():
+@pytest.mark.parametrize("stages", [12, 3])
+def test_window_gramians_of_a_constant_system(stages):
     """M = ∫₀ᵀ e^{Aᵀs} cᵀc e^{As} ds, by the block exponential, for windows that start anywhere."""
     A, c = np.array([[0.3, 1.0], [-2.0, 0.1]]), np.array([[1.0, 0.5]])
     W = c.T @ c
-    mesh = initial_mesh(1.0, 21.0, [], 40, radau_rule(12))
+    mesh = initial_mesh(1.0, 21.0, [], 40, radau_rule(stages))
 
     def model(t: Array, inside: Array) -> tuple[Array, Array]:
         return np.broadcast_to(A, (len(t), 2, 2)), np.broadcast_to(W, (len(t), 2, 2))

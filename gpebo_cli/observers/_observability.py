@@ -20,8 +20,10 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.radau import radau_rule
 
 _WINDOWS = 10  # to a horizon
+_STAGES = 6  # at least: products that begin anew in every element look rough to fewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,7 @@ def window_gramians(
     problem = LinearProblem(
         coefficients, np.eye(n), monitor, "observability Gramian", renewal=_Identity()
     )
+    mesh = Mesh(mesh.edges, radau_rule(max(mesh.rule.stages, _STAGES)))
     solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
     mesh, values = solution.trajectory.mesh, solution.trajectory.values
     local = Trajectory(mesh, products(values, solution.extras)).integral(local=True).values[:, -1]
