@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline
+from scipy.special import erf
 
 from gpebo_cli import run
 from gpebo_cli.errors import ConfigError
@@ -114,3 +115,50 @@ def test_an_experiment_stays_within_the_table(tmp_path):
     plant = {**PLANT, "inputs": {"u": {"file": table(tmp_path)}}}
     with pytest.raises(ConfigError, match=r"is of t = 0 to 3, and the experiment needs t = "):
         run(plant, observer="none", time={"horizon": 4})
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_kinks_that_a_table_passes_are_edges_of_elements(tmp_path, hold):
+    """x' = |u| + sign(u) on straight lines through zero: a mesh without the zeros is 1e-8 off."""
+    plant = {**PLANT, "A": [[0]], "phi": ["abs(u) + sign(u)"], "B": [[0]],
+             "inputs": {"u": {"file": table(tmp_path), "hold": hold}}}
+    result = signals(plant)
+    u = FUNCTIONS[hold]
+    zeros = [a - u_a * (b - a) / (u_b - u_a)
+             for (a, u_a), (b, u_b) in pairwise(zip(T, U, strict=True)) if u_a * u_b < 0]
+    cuts = np.union1d(T, zeros if hold == "linear" else [])
+    middles, steps = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)  # lines between cuts
+    area = np.sum(steps * (np.abs(u(middles)) + np.sign(u(middles))))
+    assert result["x"][-1] == pytest.approx(0.5 + area, abs=1e-12)
+
+
+@pytest.mark.parametrize("width", [1e-2, 1e-4])
+@pytest.mark.parametrize("extra", [{}, {"v": "sin(t)"}])
+def test_what_is_narrow_in_a_table_is_found(tmp_path, width, extra):
+    """x' = exp(−((u − a)/w)²)/w, whose integral over a line is known."""
+    plant = {**PLANT, "A": [[0]], "phi": [f"exp(-((u - 0.7123)/{width})**2)/{width}"], "B": None,
+             "inputs": {**extra, "u": {"file": table(tmp_path)}}}
+    slopes = np.diff(U) / np.diff(T)
+    ends = erf((U - 0.7123) / width)
+    moved = slopes != 0.0  # on the others u is far away
+    area = np.sqrt(np.pi) / 2 * np.sum(np.diff(ends)[moved] / slopes[moved])
+    assert signals(plant)["x"][-1] == pytest.approx(0.5 + area, abs=1e-8)
+
+
+def test_a_table_drives_a_plant_whose_outputs_pass_kinks(tmp_path):
+    """x' = −max(x, 0) − |u| + 1 + u beside the same with the kinks' times put in by hand."""
+    plant = {**PLANT, "A": [[0]], "phi": ["1 - max(y, 0) - abs(u)"], "initial_state": {"x": -0.5},
+             "inputs": {"u": {"file": table(tmp_path)}}}
+    x, t, u = -0.5, 0.0, FUNCTIONS["linear"]
+    zeros = [0.4 * 0.3 / 1.3, 0.4 + 0.7 / 3.0]
+    for end in np.union1d(T[1:], zeros):
+        while t < end:
+            positive = x > 0 or (x == 0 and 1 + u(t) - abs(u(t)) > 0)
+            crossing = lambda _t, x: x[0]  # noqa: E731
+            crossing.terminal, crossing.direction = True, -1 if positive else 1
+            found = solve_ivp(
+                lambda t, x, on=positive: 1 - on * x - abs(u(t)) + u(t), (t, end), [x], "DOP853",
+                rtol=1e-13, atol=1e-14, events=crossing,
+            )
+            t, x = found.t[-1], 0.0 if found.status else found.y[0, -1]
+    assert signals(plant)["x"][-1] == pytest.approx(x, abs=1e-10)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +16,15 @@ from gpebo_cli.model.entries import Entries
 from gpebo_cli.model.expressions import (
     Assembly,
     Bounds,
+    Cells,
     Expression,
     Tape,
     breakpoints,
     divisors_of,
-    halved,
     record,
     resolved,
     shorten,
 )
-from gpebo_cli.model.expressions.intervals import Interval
 
 # Shape of a matrix, and its entries by position, row after row; what is not there is 0.
 MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
@@ -33,8 +33,6 @@ MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
 _TOUCHED = 1e-12
 _POLYNOMIAL = ("add", "subtract", "multiply", "negative", "signal")  # no narrower than a signal
 _MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds
-_ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
-_MOST_SWITCHED = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,41 +166,29 @@ class TextCoefficients:
             self._resolved[key] = resolved(self._bounds, edges)
         return self._resolved[key]
 
-    def along(
-        self, signals: Callable[[Array, Array], list[list[Interval]]], edges: Array
-    ) -> tuple[Array, bool]:
-        """:meth:`resolved` for what follows outputs, from edges (K + 1,) and bounds of signals."""
-        tape = self.tape.of([k for k in self.tape.outputs if k not in self.tape.of_time])
-        if all(i.operation in _POLYNOMIAL for k, i in enumerate(tape.instructions)
-               if k not in tape.of_time):
+    def along(self, signals: Cells, numbers: Container[int], edges: Array) -> tuple[Array, bool]:
+        """:meth:`resolved` for what follows the signals of these numbers, whose cells are given.
+
+        Other inputs are their functions of time; what follows other outputs has no cells. What is
+        made of sums and products is no narrower than the signals. From edges (K + 1,).
+        """
+        unknown = [k for k in range(self.m, self.m + len(self.outputs)) if k not in numbers]
+        followers = self.tape.following(numbers) - self.tape.following(unknown)
+        if all(self.tape.instructions[place].operation in _POLYNOMIAL for place in followers):
             return edges, True
-        return resolved(Bounds(tape, signals), edges, _MOST_ALONG)
+        followed = self.tape.of([place for place in self.tape.outputs if place in followers])
+        return resolved(Bounds(followed, signals), edges, _MOST_ALONG)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return int(self.assembly.fixed[MATRIX_NAMES.index("u")].size)
 
     @cached_property
     def switches(self) -> Tape:
-        """Arguments of sign, abs, min and max that follow signals."""
+        """Arguments of sign, abs, min and max that follow outputs."""
         places = [s.argument for s in self.tape.switches]
         return self.tape.of([place for place in places if place not in self.tape.of_time])
-
-    def switched(self, t: Array, signals: Callable[[Array], Array]) -> Array:
-        """Times (number,) between those of t (N,), ascending, where a switch changes sign.
-
-        ``signals`` gives [u; y] (1, M, m + r) at any times (M,). Changes of sign that are rounding
-        of an argument are left out.
-        """
-        def at(t: Array) -> Array:
-            return np.asarray(self.switches.taylor(t, 0, None, signals(t))[0])
-
-        found = at(t)
-        k, j = np.nonzero((found[1:] >= 0.0) != (found[:-1] >= 0.0))
-        size = np.maximum(np.abs(found[k, j]), np.abs(found[k + 1, j]))
-        told = size > _ROUNDING * np.abs(found).max(axis=0, initial=0.0)[j]
-        k, j = k[told], j[told]
-        if not 0 < len(k) <= _MOST_SWITCHED:
-            return np.zeros(0)
-        index = np.arange(len(j))
-        before = found[k, j] >= 0.0
-        return np.unique(halved(lambda t: at(t)[index, j] >= 0.0, before, t[k], t[k + 1]))
 
     def with_cells(self, cells: Array) -> TextCoefficients:
         """The same with ``cells`` (number,) among the edges of what is resolved in time."""
@@ -213,10 +199,25 @@ class TextCoefficients:
         return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
 
 
-def switching(source: CoefficientSource) -> TextCoefficients | None:
-    """The source, if something in it is known to jump or to have a kink where signals say so."""
-    text = source if isinstance(source, TextCoefficients) else None
-    return text if text is not None and text.switches.outputs else None
+@runtime_checkable
+class FollowsSignals(CoefficientSource, Protocol):
+    """A source that knows what its matrices do where signals say so; see TextCoefficients."""
+
+    @property
+    def switches(self) -> Tape:
+        """Arguments of sign, abs, min and max that follow outputs."""
+
+    def along(self, signals: Cells, numbers: Container[int], edges: Array) -> tuple[Array, bool]:
+        """``resolved`` for what follows signals of these numbers, from edges (K + 1,)."""
+
+    def with_cells(self, cells: Array) -> CoefficientSource:
+        """The same with ``cells`` (number,) among the edges of what is resolved in time."""
+
+
+def switching(source: CoefficientSource) -> Tape | None:
+    """Arguments of what jumps or has a kink where outputs say so, if there are any known."""
+    found = source.switches if isinstance(source, FollowsSignals) else None
+    return found if found is not None and found.outputs else None
 
 
 def coefficients_of(

@@ -8,17 +8,21 @@ needs. Elements end at the samples where it jumps or bends.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import ARCHIVE
-from gpebo_cli.model.descriptor import Array, Coefficients, CoefficientSource, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.expressions import Cells, Tape, switched, with_others
+from gpebo_cli.model.expressions.intervals import Interval, polynomials
+from gpebo_cli.model.text import TextCoefficients
+from gpebo_cli.numerics.mesh import aside
 from gpebo_cli.reading import beside
 from gpebo_cli.recordings.hold import bends
 from gpebo_cli.recordings.table import TIME, read_table
@@ -26,6 +30,8 @@ from gpebo_cli.schema import read
 from gpebo_cli.settings import DataSettings
 
 _ROUNDING = 1e-12  # of the largest time: by how much an experiment may exceed the samples
+_LOOKS = np.linspace(0.0, 1.0, 9)  # of a piece, where one looks at the sign of what switches
+_SAME = 1e-12  # of the span: instants closer than this to another are that one
 
 
 @dataclass(frozen=True)
@@ -76,7 +82,7 @@ class Piecewise:
 class Driven:
     """Matrices of a text, some of its inputs being tables; a ``CoefficientSource``."""
 
-    given: CoefficientSource  # with zero in place of those inputs
+    given: TextCoefficients  # with zero in place of those inputs
     tables: Mapping[int, Piecewise]  # by the number of the input
     outputs: int  # r
 
@@ -101,33 +107,77 @@ class Driven:
         """All matrices at the times t (N,), see the protocol."""
         if signals is not None:
             return self.given.taylor(t, order, inside, signals)
-        found = self.given.taylor(t, order, inside)
-        u = np.array(found.u)
-        for k, table in self.tables.items():
-            u[:, :, k] = table.taylor(t, order, t if inside is None else inside)
+        found, known = self._known(t, order, inside)
         if not self.signals:
-            return found._replace(u=u)
-        y = np.zeros((order + 1, len(t), self.outputs))  # nothing depends on it
-        return self.given.taylor(t, order, inside, np.concatenate([u, y], axis=2))
+            return found._replace(u=known[:, :, : found.u.shape[2]])
+        return self.given.taylor(t, order, inside, known)
+
+    def _known(self, t: Array, order: int, inside: Array | None) -> tuple[Coefficients, Array]:
+        """What the text says without tables, and [u; 0] (order + 1, N, m + r) with them."""
+        found = self.given.of_time.taylor(t, order, inside)
+        # Nothing depends on y.
+        known = np.concatenate([found.u, np.zeros((order + 1, len(t), self.outputs))], axis=2)
+        inside = t if inside is None else inside
+        there = aside(t, inside) if self._switches.outputs else t  # on its side of what switches
+        for k, table in self.tables.items():
+            known[:, :, k] = table.taylor(there, order, inside)
+        return found, known
 
     @cached_property
     def of_time(self) -> Driven:
         """The same with zero for what depends on outputs."""
-        return Driven(self.given.of_time, self.tables, self.outputs)
+        return replace(self, given=self.given.of_time)
+
+    def with_cells(self, cells: Array) -> Driven:
+        """As of the text, for cells (number,)."""
+        return replace(self, given=self.given.with_cells(cells))
+
+    @property
+    def switches(self) -> Tape:
+        """Those of the text."""
+        return self.given.switches
+
+    def along(self, signals: Cells, numbers: Container[int], edges: Array) -> tuple[Array, bool]:
+        """As of the text, from edges (K + 1,)."""
+        return self.given.along(signals, numbers, edges)
 
     def truth(self, t: Array) -> Array:
         """True values of the unknowns at the times t (N,), shape (N, q)."""
         return self.given.truth(t)
 
     def breakpoints(self, start: float, stop: float) -> Array:
-        """Those of the text, and the samples where an input jumps or bends."""
+        """Those of the text, the samples where an input jumps or bends, and what inputs switch."""
         corners = np.concatenate([table.corners for table in self.tables.values()])
         inner = corners[(corners > start) & (corners < stop)]
-        return np.union1d(self.given.breakpoints(start, stop), inner)
+        found = np.union1d(self.given.breakpoints(start, stop), inner)
+        if not self._switches.outputs or not start < stop:
+            return found
+        edges = np.concatenate([[start], found, [stop]])
+        t = (edges[:-1, None] + np.diff(edges)[:, None] * _LOOKS).ravel()
+        new = switched(self._switches, t, lambda t: self._known(t, 0, t)[1])
+        return with_others(edges, new, _SAME * (stop - start))[1:-1]
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
-        """As of the text, from edges (K + 1,); between them the tables are polynomials."""
-        return self.given.resolved(edges)
+        """As of the text, from edges (K + 1,), and of what follows tables: they are polynomials."""
+        edges, sure = self.given.resolved(edges)
+
+        def cells(low: Array, high: Array) -> list[list[Interval] | None]:
+            half = 0.5 * (high - low)
+            jets = {
+                k: polynomials(table.taylor(low + half, len(table.pieces) - 1, low + half), half)
+                for k, table in self.tables.items()
+            }
+            return [jets.get(k) for k in range(self.given.m)]
+
+        edges, also = self.given.along(cells, self.tables, edges)
+        return edges, sure and also
+
+    @cached_property
+    def _switches(self) -> Tape:
+        """Arguments of sign, abs, min and max that follow tables, and no outputs."""
+        tape = self.given.tape
+        followers = tape.following(self.tables) & tape.of_time
+        return tape.of([s.argument for s in tape.switches if s.argument in followers])
 
 
 def tables(
@@ -147,8 +197,9 @@ def driven(system: DescriptorSystem, found: Mapping[str, Piecewise]) -> Descript
     """The system with tables in place of the inputs of their names."""
     if not found:
         return system
+    text = cast(TextCoefficients, system.coefficients)  # a plant with a file is text
     numbers = {system.inputs.index(name): table for name, table in found.items()}
-    return replace(system, coefficients=Driven(system.coefficients, numbers, system.r))
+    return replace(system, coefficients=Driven(text, numbers, system.r))
 
 
 def located(mapping: Mapping[str, object], source: str) -> Mapping[str, object]:

@@ -15,15 +15,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import comb, factorial
+from math import factorial
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
-from gpebo_cli.model.expressions import with_others
-from gpebo_cli.model.expressions.intervals import Interval
-from gpebo_cli.model.text import TextCoefficients, switching
+from gpebo_cli.model.expressions import Tape, switched, with_others
+from gpebo_cli.model.expressions.intervals import Interval, polynomials
+from gpebo_cli.model.text import FollowsSignals, switching
 from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory, aside
 from gpebo_cli.numerics.radau import RadauRule
@@ -89,12 +89,12 @@ class Linearised:
         mesh = self.guess.mesh
         if self._switching is None or mesh.size == 1:
             return np.zeros(0)
-        found = self._switching.switched(mesh.points.ravel(), lambda t: self._along(t, 0, t)[2])
+        found = switched(self._switching, mesh.points.ravel(), lambda t: self._along(t, 0, t)[2])
         # A guess that switches more often than its elements can show slides along a jump.
         return found if len(found) <= mesh.size else np.zeros(0)
 
     @cached_property
-    def _switching(self) -> TextCoefficients | None:
+    def _switching(self) -> Tape | None:
         return switching(self.system.coefficients)
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
@@ -148,7 +148,7 @@ class Linearised:
         """On which side of each jump or kink [u; y] (order + 1, N, m + r) is, (N, number)."""
         if self._switching is None:
             return np.zeros((len(t), 0))
-        return np.asarray(self._switching.switches.taylor(t, 0, None, along[:1])[0] >= 0.0)
+        return np.asarray(self._switching.taylor(t, 0, None, along[:1])[0] >= 0.0)
 
     def _along(
         self, t: Array, order: int, inside: Array | None, signals: Array | None = None
@@ -185,7 +185,7 @@ def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bo
     ``known`` are inputs and outputs (m + r,); the edges are those of its mesh and more.
     """
     source, mesh, values = system.coefficients, known.mesh, known.values
-    if not isinstance(source, TextCoefficients):
+    if not isinstance(source, FollowsSignals):
         return mesh.edges, True
     derivatives: list[Array] = []
     steps, D = mesh.steps[:, None, None], _derivative(mesh.rule)
@@ -194,19 +194,12 @@ def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bo
         values = (D @ values) / steps
 
     def signals(low: Array, high: Array) -> list[list[Interval]]:
-        """Σ_j c_j (t − m)^j around the middle m of each cell, moved to any time of the cell."""
         half = 0.5 * (high - low)
         sampler = mesh.sampler(low + half, low + half)
         c = np.array([sampler(d) / factorial(k) for k, d in enumerate(derivatives)])
-        found: list[list[Interval]] = [[] for _ in range(c.shape[2])]
-        for k in range(len(c)):
-            later = range(k + 1, len(c))
-            away = sum((comb(j, k) * np.abs(c[j]) * half[:, None] ** (j - k) for j in later), 0.0)
-            for j, jet in enumerate(found):
-                jet.append(Interval((c[k] - away)[:, j], (c[k] + away)[:, j]))
-        return found
+        return [polynomials(each, half) for each in np.moveaxis(c, 2, 0)]
 
-    return source.along(signals, mesh.edges)
+    return source.along(signals, range(system.m, system.m + system.r), mesh.edges)
 
 
 def _product(a: Array, b: Array) -> Array:

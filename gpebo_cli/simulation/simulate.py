@@ -11,7 +11,7 @@ import numpy as np
 
 from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
-from gpebo_cli.model.text import TextCoefficients
+from gpebo_cli.model.text import FollowsSignals
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
@@ -71,7 +71,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         last[:] = [_simulate_linear(linear, window, settings)]
         return last[0].signals.states, last[0].structure.growth
 
-    plant, text, before = system, cast(TextCoefficients, system.coefficients), None
+    plant, source, before = system, cast(FollowsSignals, system.coefficients), None
     for _ in range(_LOOKS):
         effort = follow(plant, time, replace(solver, name="collocation"), solve_linear)
         found = last[0]
@@ -84,7 +84,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         cells, bounded = looked_along(plant, known)
         if len(cells) == len(x.mesh.edges):
             break
-        plant, before = replace(system, coefficients=text.with_cells(cells)), x
+        plant, before = replace(system, coefficients=source.with_cells(cells)), x
     else:
         bounded = False  # each closer look moved the solution
     if solver.name == "ivp":

@@ -13,13 +13,20 @@ intermediate value that overflows is refused even where the end result would be 
 ``1/(1 + exp(500*t))`` fails for t > 1.4 (``tanh`` does not).
 """
 
-from gpebo_cli.model.expressions.bounds import Bounds, breakpoints, halved, resolved, with_others
+from gpebo_cli.model.expressions.bounds import (
+    Bounds,
+    Cells,
+    breakpoints,
+    resolved,
+    switched,
+    with_others,
+)
 from gpebo_cli.model.expressions.nodes import divisors_of
 from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten, signal
 from gpebo_cli.model.expressions.tape import Assembly, Tape, record, taylor
 
 __all__ = [
-    "RESERVED", "Assembly", "Bounds", "Expression", "Tape", "breakpoints",
-    "divisors_of", "halved", "parse", "record", "resolved", "shorten", "signal", "taylor",
+    "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "breakpoints",
+    "divisors_of", "parse", "record", "resolved", "shorten", "signal", "switched", "taylor",
     "with_others",
 ]

@@ -6,7 +6,7 @@ when interval arithmetic says so, and is halved until it does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -30,7 +30,14 @@ _MOST_CELLS = 1 << 15
 _MOST_VALUES = 1 << 20  # of all expressions in all cells, where these are more
 _AT_ONCE = 1 << 14  # cells whose bounds are held at the same time
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one
+_ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
+_MOST_SWITCHED = 4096
 _BISECTIONS = 100  # more than enough to leave two neighbouring floats
+
+
+# From the ends of cells of time, (N,) and (N,), to Taylor coefficients of each signal anywhere in
+# them; None stands for what the tape has for it.
+Cells = Callable[[Array, Array], Sequence[list[Interval] | None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +45,8 @@ class Bounds:
     """Bounds of what a tape's expressions do over cells of time."""
 
     tape: Tape
-    # Taylor coefficients of the signals in cells; None: they are functions of time.
-    signals: Callable[[Array, Array], list[list[Interval]]] | None = None
+    # Of signals; None: they are functions of time.
+    signals: Cells | None = None
     _programs: dict[tuple[int, bool], Program | None] = field(default_factory=dict, init=False)
 
     def of(self, low: Array, high: Array, order: int, inside: Array | None = None
@@ -254,12 +261,33 @@ def _bisected(arguments: Tape, cells: Array) -> Array:
     at_low = (before == 0) & (sign(low - width, low - 0.5 * width) * after < 0)
     at_high = (after == 0) & (sign(high + width, high + 0.5 * width) * before < 0)
     between = before * after < 0
-    inner = halved(lambda t: sign(t, t), before, low, high)
+    inner = _halved(lambda t: sign(t, t), before, low, high)
     found = np.where(between, inner, np.where(at_low, low, high))
     return np.asarray(found[between | at_low | at_high])
 
 
-def halved(sign: Callable[[Array], Array], before: Array, low: Array, high: Array) -> Array:
+def switched(arguments: Tape, t: Array, signals: Callable[[Array], Array]) -> Array:
+    """Times (number,) between those of t (N,), ascending, where an argument changes its sign.
+
+    ``signals`` gives [u; y] (1, M, m + r) at any times (M,). Changes of sign that are rounding
+    of an argument are left out.
+    """
+    def at(t: Array) -> Array:
+        return np.asarray(arguments.taylor(t, 0, None, signals(t))[0])
+
+    found = at(t)
+    k, j = np.nonzero((found[1:] >= 0.0) != (found[:-1] >= 0.0))
+    size = np.maximum(np.abs(found[k, j]), np.abs(found[k + 1, j]))
+    told = size > _ROUNDING * np.abs(found).max(axis=0, initial=0.0)[j]
+    k, j = k[told], j[told]
+    if not 0 < len(k) <= _MOST_SWITCHED:
+        return np.zeros(0)
+    index = np.arange(len(j))
+    before = found[k, j] >= 0.0
+    return np.unique(_halved(lambda t: at(t)[index, j] >= 0.0, before, t[k], t[k + 1]))
+
+
+def _halved(sign: Callable[[Array], Array], before: Array, low: Array, high: Array) -> Array:
     """Where signs at times (N,), ``before`` at low (N,), change up to high (N,), to rounding."""
     for _ in range(_BISECTIONS):
         half = 0.5 * (low + high)

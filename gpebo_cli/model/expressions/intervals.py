@@ -9,6 +9,7 @@ defined in a part of a cell, or not at all, may have any value there.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -145,3 +146,17 @@ _OTHERS: dict[str, _Rule] = {
     ),
     "greater_equal": lambda _, low, high, least, *__: (1.0 * (low >= least), 1.0 * (high >= least)),
 }  # fmt: skip
+
+
+def polynomials(c: Array, half: Array) -> list[Interval]:
+    """Taylor coefficients anywhere in cells that are 2 ``half`` (N,) long, of polynomials there.
+
+    Those have coefficients c (K, N) around the middle m of each cell: Σ_j c_j (t − m)^j is moved to
+    any time of the cell.
+    """
+    found = []
+    for k in range(len(c)):
+        later = range(k + 1, len(c))
+        away = sum((comb(j, k) * np.abs(c[j]) * half ** (j - k) for j in later), np.zeros(1))
+        found.append(Interval(c[k] - away, c[k] + away))
+    return found

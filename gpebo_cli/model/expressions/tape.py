@@ -7,7 +7,7 @@ and value get the same place on the tape. A tape is flat, so it copies to other 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -159,6 +159,14 @@ class Tape:
                 known.add(place)
         return frozenset(known)
 
+    def following(self, numbers: Container[int]) -> frozenset[int]:
+        """Places in which a signal of these numbers is."""
+        found: set[int] = set()
+        for place, (operation, arguments, value) in enumerate(self.instructions):
+            if not found.isdisjoint(arguments) or (operation == "signal" and int(value) in numbers):
+                found.add(place)
+        return frozenset(found)
+
     def of(self, places: Sequence[int]) -> Tape:
         """The tape with other places as outputs, and nothing on it that these do not need."""
         last = max(places, default=-1) + 1
@@ -201,7 +209,7 @@ class Tape:
         """Jets of all places before ``stop``, those that jump decided at ``inside``.
 
         The times and signals are arrays (N,), symbols for them that record what is done, or cells
-        of time.
+        of time. A signal that is None is what the tape has for it.
         """
         deciding: list[Jet] | None = None
         if self.switches and inside is not t:
@@ -239,7 +247,8 @@ class Tape:
             elif operation == "step":
                 jet = [(inside >= value).astype(np.float64)]
             elif operation == "signal":
-                jet = places[arguments[0]] if signals is None else signals[int(value)]
+                told = None if signals is None else signals[int(value)]
+                jet = places[arguments[0]] if told is None else told
             else:
                 decided = (places if deciding is None else deciding)[arguments[-1]][0]
                 jet = jets.switched(operation, decided, [places[a] for a in arguments], wanted)
