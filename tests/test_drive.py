@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from pandas import DataFrame
 from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.special import erf
@@ -143,6 +144,26 @@ def test_what_is_narrow_in_a_table_is_found(tmp_path, width, extra):
     moved = slopes != 0.0  # on the others u is far away
     area = np.sqrt(np.pi) / 2 * np.sum(np.diff(ends)[moved] / slopes[moved])
     assert signals(plant)["x"][-1] == pytest.approx(0.5 + area, abs=1e-8)
+
+
+def test_what_is_narrow_in_a_signal_excites_a_regression(tmp_path):
+    content = {"name": "slit", "unknowns": {"a": 2.0}, "psi": [["exp(-((u - 0.7123)/1e-4)**2)"]],
+               "signals": {"u": {"file": table(tmp_path)}}}
+    estimator = {"name": "least_squares", "f0": 1e-12}
+    result = run(regression=content, estimator=estimator, time={"horizon": 3})
+    assert result.estimates["a"][0, -1] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_what_is_narrow_in_a_recorded_signal_is_found():
+    """y = θ G(u), recorded where u is slow beside it: θ by all the slits that the lines pass."""
+    t = np.linspace(0.0, 6.0, 25)
+    u = 1.5 * np.sin(1.7 * t)
+    ends = np.sqrt(np.pi) / 2 * erf((u - 0.3123) / 1e-3)
+    x = 0.2 + 0.7 * np.concatenate([[0.0], np.cumsum(np.diff(ends) / np.diff(u) * np.diff(t))])
+    plant = {**PLANT, "A": [[0]], "B": None, "inputs": {"u": 0}, "unknowns": {"a": 0.7},
+             "F": [["exp(-((u - 0.3123)/1e-3)**2)/1e-3"]]}
+    result = run(plant, data=DataFrame({"t": t, "u": u, "y": x}), estimator="least_squares")
+    assert result.estimates["a"][0, -1] == pytest.approx(0.7, rel=0.1)  # y is a line in between
 
 
 def test_a_table_drives_a_plant_whose_outputs_pass_kinks(tmp_path):

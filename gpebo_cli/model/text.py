@@ -23,6 +23,7 @@ from gpebo_cli.model.expressions import (
     divisors_of,
     record,
     resolved,
+    resolved_along,
     shorten,
 )
 
@@ -31,8 +32,6 @@ MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
 
 # Of its size before and after: a divisor that comes so near zero touches it.
 _TOUCHED = 1e-12
-_POLYNOMIAL = ("add", "subtract", "multiply", "negative", "signal")  # no narrower than a signal
-_MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,15 +168,12 @@ class TextCoefficients:
     def along(self, signals: Cells, numbers: Container[int], edges: Array) -> tuple[Array, bool]:
         """:meth:`resolved` for what follows the signals of these numbers, whose cells are given.
 
-        Other inputs are their functions of time; what follows other outputs has no cells. What is
-        made of sums and products is no narrower than the signals. From edges (K + 1,).
+        Other inputs are their functions of time; what follows other outputs has no cells. From
+        edges (K + 1,).
         """
         unknown = [k for k in range(self.m, self.m + len(self.outputs)) if k not in numbers]
         followers = self.tape.following(numbers) - self.tape.following(unknown)
-        if all(self.tape.instructions[place].operation in _POLYNOMIAL for place in followers):
-            return edges, True
-        followed = self.tape.of([place for place in self.tape.outputs if place in followers])
-        return resolved(Bounds(followed, signals), edges, _MOST_ALONG)
+        return resolved_along(self.tape, followers, signals, edges)
 
     @property
     def m(self) -> int:

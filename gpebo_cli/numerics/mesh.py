@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from itertools import pairwise
-from math import prod
+from math import factorial, prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import elements, signals, signals_numpy
 from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.model.expressions.intervals import Interval, polynomials
 from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.radau import RadauRule
 
@@ -272,11 +273,23 @@ class Trajectory:
 
     def derivative(self) -> Trajectory:
         """That of each element's polynomial, in 1/s."""
-        rule, flat = self.mesh.rule, _flat(self.values)
-        slopes = legendre.legder(np.moveaxis(rule.to_legendre @ flat, 1, 0))
-        at_points = legendre.legvander(2.0 * rule.points - 1.0, len(slopes) - 1)
-        out = 2.0 * (at_points @ np.moveaxis(slopes, 0, 1)) / self.mesh.steps[:, None, None]
+        out = _derivative(self.mesh.rule) @ _flat(self.values) / self.mesh.steps[:, None, None]
         return Trajectory(self.mesh, out.reshape(self.values.shape))
+
+    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Array:
+        """Taylor coefficients of each element's polynomial at t (N,), (order + 1, N, …)."""
+        sampler, signal = self.mesh.sampler(t, inside), self
+        found = np.empty((order + 1, len(t), *self.values.shape[2:]))
+        for k in range(order + 1):
+            found[k] = sampler(signal.values) / factorial(k)
+            signal = signal.derivative() if k < order else signal
+        return found
+
+    def cells(self, low: Array, high: Array) -> list[list[Interval]]:
+        """Taylor coefficients of each signal at any time of cells (N,), each in one element."""
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        c = self.taylor(middle, self.mesh.rule.stages, middle)
+        return [polynomials(each, half) for each in np.moveaxis(c, 2, 0)]
 
     def integral(self, *, local: bool = False) -> Trajectory:
         """∫ from the start of the mesh, by its own quadrature (order 2s − 1 at the ends).
@@ -337,6 +350,13 @@ def equal_lengths(h: Array) -> tuple[IntArray, Array]:
         first = np.minimum.reduceat(order, longer.nonzero()[0])
         group[order] = first.argsort().argsort()[longer.cumsum() - 1]
     return group, np.asarray((np.bincount(group, weights=h) / np.bincount(group))[group])
+
+
+@lru_cache(maxsize=16)
+def _derivative(rule: RadauRule) -> Array:
+    """From values at the points of the unit interval to those of the derivative there."""
+    slopes = legendre.legder(rule.to_legendre, axis=0)
+    return np.asarray(2.0 * legendre.legvander(2.0 * rule.points - 1.0, rule.stages - 1) @ slopes)
 
 
 def _flat(values: Array) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
+from gpebo_cli.model.text import FollowsSignals
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.recordings.hold import cells, held, recording_mesh
@@ -71,13 +72,17 @@ def load(
     m = system.m
     values = np.concatenate([samples.inputs, samples.outputs], axis=1)
     mesh = recording_mesh(samples.t, values, data.hold, span, system.coefficients, tol)
-    both = mesh.along(held(samples.t, values, data.hold)).values
+    both = mesh.along(held(samples.t, values, data.hold))
+    if isinstance(system.coefficients, FollowsSignals):
+        edges, _ = system.coefficients.along(both.cells, range(m + system.r), mesh.edges)
+        mesh = Mesh(edges, mesh.rule)
+        both = mesh.along(both)
     return Recording(
         table=table,
         hold=data.hold,
         span=span,
-        inputs=Trajectory(mesh, both[..., :m]),
-        outputs=Trajectory(mesh, both[..., m:]),
+        inputs=Trajectory(mesh, both.values[..., :m]),
+        outputs=Trajectory(mesh, both.values[..., m:]),
         states=_states(samples, span, smooth=data.hold == "cubic"),
     )
 

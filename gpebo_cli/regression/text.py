@@ -31,6 +31,7 @@ from gpebo_cli.model.expressions import (
     parse,
     record,
     resolved,
+    resolved_along,
 )
 from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.syntax import signal
@@ -153,10 +154,13 @@ class TextRegression:
                         f"regression {self.system.name}: its delays make {len(cuts)} corners in "
                         f"the horizon; at most {_MAX_DELAYED} are followed"
                     )
-        new = cuts[~np.isin(cuts, mesh.edges)]
-        if not len(new):
-            return mesh
-        return Mesh(np.unique(np.concatenate([mesh.edges, new])), mesh.rule)
+        mesh = Mesh(np.union1d(mesh.edges, cuts), mesh.rule)
+        known = mesh.trajectory(self._signals(signals, mesh)[0])
+        edges = mesh.edges
+        for tape in self.tapes:
+            followers = tape.following(range(known.values.shape[2]))
+            edges, _ = resolved_along(tape, followers, known.cells, edges)
+        return Mesh(edges, mesh.rule)
 
     def _signals(self, signals: Trajectory, mesh: Mesh) -> Array:
         """The signals and all operators at the points of a mesh, (1, K (s + 1), m + operators)."""

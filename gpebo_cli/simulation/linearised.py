@@ -14,19 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from math import factorial
+from functools import cached_property
 
 import numpy as np
-from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.expressions import Tape, switched, with_others
-from gpebo_cli.model.expressions.intervals import Interval, polynomials
 from gpebo_cli.model.text import FollowsSignals, switching
 from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory, aside
-from gpebo_cli.numerics.radau import RadauRule
 
 # Share of an output by which it is moved to see what depends on it: G is wrong by the square of it
 # and by rounding over it, which costs Newton's method nothing that could be seen.
@@ -163,20 +159,9 @@ class Linearised:
             known = known._replace(theta=np.zeros((order + 1, len(t), self.system.q)))
             known.theta[0] = self.theta
         there = aside(t, inside) if inside is not None and self._switching else t
-        x = self._states(there, order, inside)
+        x = self.guess.taylor(there, order, inside)
         y = _product(known.C, x) + _product(known.D, known.u) + _product(known.H, known.theta)
         return known, x, np.concatenate([known.u, y], axis=2)
-
-    def _states(self, t: Array, order: int, inside: Array | None) -> Array:
-        """Taylor coefficients of the guess, (order + 1, N, n)."""
-        sampler = self.guess.mesh.sampler(t, inside)
-        values, steps = self.guess.values, self.guess.mesh.steps[:, None, None]
-        D = _derivative(self.guess.mesh.rule)
-        x = np.empty((order + 1, len(t), values.shape[2]))
-        for k in range(order + 1):
-            x[k] = sampler(values) / factorial(k)
-            values = (D @ values) / steps
-        return x
 
 
 def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bool]:
@@ -184,33 +169,12 @@ def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bo
 
     ``known`` are inputs and outputs (m + r,); the edges are those of its mesh and more.
     """
-    source, mesh, values = system.coefficients, known.mesh, known.values
+    source, mesh = system.coefficients, known.mesh
     if not isinstance(source, FollowsSignals):
         return mesh.edges, True
-    derivatives: list[Array] = []
-    steps, D = mesh.steps[:, None, None], _derivative(mesh.rule)
-    for _ in range(values.shape[1]):
-        derivatives.append(values)
-        values = (D @ values) / steps
-
-    def signals(low: Array, high: Array) -> list[list[Interval]]:
-        half = 0.5 * (high - low)
-        sampler = mesh.sampler(low + half, low + half)
-        c = np.array([sampler(d) / factorial(k) for k, d in enumerate(derivatives)])
-        return [polynomials(each, half) for each in np.moveaxis(c, 2, 0)]
-
-    return source.along(signals, range(system.m, system.m + system.r), mesh.edges)
+    return source.along(known.cells, range(system.m, system.m + system.r), mesh.edges)
 
 
 def _product(a: Array, b: Array) -> Array:
     """Taylor coefficients of a product of matrices (K + 1, N, i, j) and (K + 1, N, j[, k])."""
     return taylor_product(a, b) if b.ndim == a.ndim else taylor_product(a, b[..., None])[..., 0]
-
-
-@lru_cache(maxsize=16)
-def _derivative(rule: RadauRule) -> Array:
-    """From values at the points of the unit interval to those of the derivative there."""
-    derivative = legendre.legder(rule.to_legendre, axis=0)
-    return np.asarray(
-        2.0 * legendre.legvander(2.0 * rule.points - 1.0, rule.stages - 1) @ derivative
-    )

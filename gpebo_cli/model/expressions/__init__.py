@@ -17,7 +17,9 @@ from gpebo_cli.model.expressions.bounds import (
     Bounds,
     Cells,
     breakpoints,
+    halved,
     resolved,
+    resolved_along,
     switched,
     with_others,
 )
@@ -27,6 +29,6 @@ from gpebo_cli.model.expressions.tape import Assembly, Tape, record, taylor
 
 __all__ = [
     "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "breakpoints",
-    "divisors_of", "parse", "record", "resolved", "shorten", "signal", "switched", "taylor",
-    "with_others",
+    "divisors_of", "halved", "parse", "record", "resolved", "resolved_along", "shorten",
+    "signal", "switched", "taylor", "with_others",
 ]

@@ -7,6 +7,7 @@ when interval arithmetic says so, and is halved until it does.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -29,6 +30,8 @@ _NARROWEST = 1e-13  # of the span; cells are not cut further
 _MOST_CELLS = 1 << 15
 _MOST_VALUES = 1 << 20  # of all expressions in all cells, where these are more
 _AT_ONCE = 1 << 14  # cells whose bounds are held at the same time
+_POLYNOMIAL = ("add", "subtract", "multiply", "negative", "signal")  # no narrower than a signal
+_MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one
 _ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
 _MOST_SWITCHED = 4096
@@ -113,6 +116,21 @@ def resolved(bounds: Bounds, edges: Array, most: int = 0) -> tuple[Array, bool]:
         )
     order = np.argsort(low)
     return np.append(_coarser(low[order], depth[order], edges), edges[-1]), not poor.any()
+
+
+def resolved_along(
+    tape: Tape, followers: AbstractSet[int], signals: Cells, edges: Array
+) -> tuple[Array, bool]:
+    """:func:`resolved` for those expressions whose places follow signals, whose cells are given.
+
+    What is made of sums and products is no narrower than the signals. From edges (K + 1,).
+    """
+    if all(tape.instructions[place].operation in _POLYNOMIAL for place in followers):
+        return edges, True
+    if len(edges) > _MOST_ALONG:
+        return edges, False
+    followed = tape.of([place for place in tape.outputs if place in followers])
+    return resolved(Bounds(followed, signals), edges, _MOST_ALONG)
 
 
 def _coarser(low: Array, depth: IntArray, edges: Array) -> Array:
@@ -261,7 +279,7 @@ def _bisected(arguments: Tape, cells: Array) -> Array:
     at_low = (before == 0) & (sign(low - width, low - 0.5 * width) * after < 0)
     at_high = (after == 0) & (sign(high + width, high + 0.5 * width) * before < 0)
     between = before * after < 0
-    inner = _halved(lambda t: sign(t, t), before, low, high)
+    inner = halved(lambda t: sign(t, t), before, low, high)
     found = np.where(between, inner, np.where(at_low, low, high))
     return np.asarray(found[between | at_low | at_high])
 
@@ -284,10 +302,10 @@ def switched(arguments: Tape, t: Array, signals: Callable[[Array], Array]) -> Ar
         return np.zeros(0)
     index = np.arange(len(j))
     before = found[k, j] >= 0.0
-    return np.unique(_halved(lambda t: at(t)[index, j] >= 0.0, before, t[k], t[k + 1]))
+    return np.unique(halved(lambda t: at(t)[index, j] >= 0.0, before, t[k], t[k + 1]))
 
 
-def _halved(sign: Callable[[Array], Array], before: Array, low: Array, high: Array) -> Array:
+def halved(sign: Callable[[Array], Array], before: Array, low: Array, high: Array) -> Array:
     """Where signs at times (N,), ``before`` at low (N,), change up to high (N,), to rounding."""
     for _ in range(_BISECTIONS):
         half = 0.5 * (low + high)
