@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from inspect import Parameter, signature
+from math import factorial
 from typing import Any
 
 import numpy as np
@@ -135,7 +136,29 @@ class FunctionCoefficients:
             once[0] = self.fixed[name]
             return np.broadcast_to(once, (order + 1, len(t), *shape))
         values = np.zeros((order + 1, len(t), *shape))
-        self._fill(name, values, t, signals)
+        # A derivative that is given is one of time alone, so with signals only values are.
+        given = self.functions[name][: 1 if signals is not None else None]
+        for k, function in enumerate(given[: order + 1]):
+            found = self._call(name, function, t, signals, np.zeros((len(t), 1)))
+            values[k] = found.real / factorial(k)
+        if len(given) > order:
+            return values
+        circle = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
+        away = np.tile(self.radius * circle, len(t))[:, None]
+        if signals is not None:
+            signals = np.repeat(signals[: order + 1], _POINTS, axis=1)
+        around = self._call(name, given[0], np.repeat(t, _POINTS), signals, away)
+        around = around.reshape(len(t), _POINTS, *shape)
+        spectrum = np.fft.fft(around, axis=1) / _POINTS
+        size = max(float(np.abs(around).max(initial=0.0)), np.finfo(float).tiny)
+        if np.abs(spectrum[:, 0] - values[0]).max(initial=0.0) > _NOT_ANALYTIC * size:
+            raise ConfigError(
+                f"plant {self.name}: {name} needs derivatives but is not analytic (or changes "
+                f"faster than the radius {self.radius:g} resolves); give a list "
+                f"[{name}, its derivative, …]"
+            )
+        for k in range(len(given), order + 1):
+            values[k] = spectrum[:, k].real / self.radius**k
         return values
 
     def breakpoints(self, start: float, stop: float) -> Array:  # noqa: ARG002
@@ -145,34 +168,6 @@ class FunctionCoefficients:
     def resolved(self, edges: Array) -> tuple[Array, bool]:
         """The same edges (K + 1,): nothing bounds what functions do between the nodes."""
         return edges, False
-
-    def _fill(self, name: str, values: Array, t: Array, signals: Array | None) -> None:
-        """Fill ``values`` (order + 1, N, …), with derivatives as far as they are given."""
-        # A derivative that is given is one of time alone, so with signals only values are.
-        given = self.functions[name][: 1 if signals is not None else None]
-        none = np.zeros((len(t), 1))
-        factorial = 1.0
-        for k in range(min(len(given), len(values))):
-            factorial *= max(k, 1)
-            values[k] = self._call(name, given[k], t, signals, none).real / factorial
-        if len(given) >= len(values):
-            return
-        circle = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
-        away = np.tile(self.radius * circle, len(t))[:, None]
-        if signals is not None:
-            signals = np.repeat(signals[: len(values)], _POINTS, axis=1)
-        around = self._call(name, given[0], np.repeat(t, _POINTS), signals, away)
-        around = around.reshape(len(t), _POINTS, *values.shape[2:])
-        spectrum = np.fft.fft(around, axis=1) / _POINTS
-        size = max(float(np.abs(around).max(initial=0.0)), np.finfo(float).tiny)
-        if np.abs(spectrum[:, 0] - values[0]).max(initial=0.0) > _NOT_ANALYTIC * size:
-            raise ConfigError(
-                f"plant {self.name}: {name} needs derivatives but is not analytic (or changes "
-                f"faster than the radius {self.radius:g} resolves); give a list "
-                f"[{name}, its derivative, …]"
-            )
-        for k in range(len(given), len(values)):
-            values[k] = spectrum[:, k].real / self.radius**k
 
     def _picked(self, name: str, matrices: Any) -> list[Any]:
         """The entries of sparse matrices, (entries,) each."""
@@ -289,31 +284,30 @@ def system_from_functions(
     r = len(names.outputs) or _rows(C, m)
     if (u is None) != (B is None):
         raise ConfigError(f"plant {name}: B and u go together; one of them is missing")
-    shapes: dict[str, tuple[int, ...]] = {
-        "E": (n, n), "A": (n, n), "B": (n, m), "F": (n, q), "C": (r, n), "u": (m,), "theta": (q,),
-        "phi": (n,), "D": (r, m), "H": (r, q),
-    }  # fmt: skip
     inputs, outputs = _labels(names.inputs, "u", m, name), _labels(names.outputs, "y", r, name)
     fixed: dict[str, Array] = {}
     functions: dict[str, tuple[Function, ...]] = {}
     signals: dict[str, frozenset[str]] = {}
     places: dict[str, Places] = {}
     whole: dict[str, tuple[int, ...]] = {}
-    entries = {
-        "E": E, "A": A, "B": B, "F": F, "C": C, "u": u, "theta": theta, "phi": phi, "D": D, "H": H
+    entries: dict[str, tuple[Any, tuple[int, ...]]] = {
+        "E": (E, (n, n)), "A": (A, (n, n)), "B": (B, (n, m)), "F": (F, (n, q)), "C": (C, (r, n)),
+        "u": (u, (m,)), "theta": (theta, (q,)), "phi": (phi, (n,)), "D": (D, (r, m)),
+        "H": (H, (r, q)),
     }  # fmt: skip
-    for key, entry in entries.items():
+    shapes = {key: shape for key, (_, shape) in entries.items()}
+    for key, (entry, shape) in entries.items():
         listed: list[Any] = list(entry) if isinstance(entry, list | tuple) else [entry]
         if entry is None:
-            fixed[key] = np.zeros(shapes[key])
+            fixed[key] = np.zeros(shape)
         elif listed and all(callable(item) for item in listed):
             functions[key] = tuple(listed)
             probe = listed[0](_PROBES) if _arguments(listed[0]) == 1 else None
             if isinstance(probe, list | tuple) and all(map(is_sparse, probe)):
                 stored = np.concatenate([np.ravel_multi_index(m.tocoo().coords, m.shape)
                                          for m in probe])
-                places[key] = np.unravel_index(np.unique(stored), shapes[key])
-                whole[key], shapes[key] = shapes[key], (len(places[key][0]),)
+                places[key] = np.unravel_index(np.unique(stored), shape)
+                whole[key], shapes[key] = shape, (len(places[key][0]),)
             count = max(map(_arguments, listed))
             if count > _MOST_ARGUMENTS.get(key, 1):
                 raise ConfigError(
@@ -323,11 +317,10 @@ def system_from_functions(
             if count > 1:
                 signals[key] = frozenset(inputs if count == 2 else (*inputs, *outputs))
         else:
-            given: Any = entry
-            value = np.asarray(given.toarray() if is_sparse(given) else given, dtype=np.float64)
-            if value.shape != shapes[key]:
+            value = np.asarray(entry.toarray() if is_sparse(entry) else entry, dtype=np.float64)
+            if value.shape != shape:
                 raise ConfigError(
-                    f"plant {name}: {key} has shape {value.shape}, expected {shapes[key]} "
+                    f"plant {name}: {key} has shape {value.shape}, expected {shape} "
                     f"(the initial state has {n} entries)"
                 )
             fixed[key] = value

@@ -59,7 +59,6 @@ class LinearSolution:
 
     trajectory: Trajectory  # values (K, s + 1, n, columns)
     error_estimate: float  # relative to each signal's own size, the largest
-    rounds: int
     errors: Array  # (n, columns) of each component of X relative to its largest value
     lost: float | None  # from when on a component's error exceeds the component
     extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each, or (1, 1, ...)
@@ -73,11 +72,7 @@ _Maps = list[Array]
 
 
 def solve(
-    problem: LinearProblem,
-    mesh: Mesh,
-    *,
-    tol: float,
-    max_elements: int,
+    problem: LinearProblem, mesh: Mesh, *, tol: float, max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None,
     known: LinearEquation | None = None,
 ) -> LinearSolution:
@@ -103,7 +98,7 @@ def solve(
         tail = _tail_of_numbers(problem, mesh, values, maps, whole, tol)
         return (maps, values, whole), tail
 
-    mesh, (maps, values, whole), tail, rounds = refine(
+    mesh, (maps, values, whole), tail = refine(
         evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name
     )
     if whole < mesh.size:
@@ -121,7 +116,7 @@ def solve(
         errors = np.maximum(errors, left)
     estimate = max(left, float(errors.max(initial=0.0)))
     return LinearSolution(
-        Trajectory(mesh, values), estimate, rounds, errors,
+        Trajectory(mesh, values), estimate, errors,
         None if lost == mesh.size else float(mesh.edges[lost + 1]), tuple(extras), last,
     )
 
@@ -399,9 +394,7 @@ def decoupled(
 
 
 def _chain(
-    maps: _Maps,
-    problem: LinearProblem,
-    mesh: Mesh,
+    maps: _Maps, problem: LinearProblem, mesh: Mesh,
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, int]:
     """Point values (K, s + 1, n, columns), and how many elements in front are finite."""

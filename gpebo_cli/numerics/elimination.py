@@ -151,11 +151,7 @@ def eliminated(D: Array, h: Array, rows: IntArray, columns: IntArray, entries: A
                     coupled[r][c] = more + (before * np.eye(s) if before.shape[2] == 1 else before)
         if filled > _FILL * d:
             raise StiffError
-    return _packed(forward + backward[::-1])
-
-
-def _packed(steps: list[tuple[int, int, Array]]) -> Factors:
-    target, source, blocks = zip(*steps, strict=True)
+    target, source, blocks = zip(*forward, *backward[::-1], strict=True)
     full, diagonal = ([b for b in {id(b): b for b in blocks}.values() if (b.shape[2] > 1) == wanted]
                       for wanted in (True, False))
     place = {id(b): k for k, b in enumerate(full + diagonal)}

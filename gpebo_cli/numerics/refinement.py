@@ -28,7 +28,7 @@ Evaluate = Callable[[Mesh, "Found | None", IntArray], tuple[Found, Array]]
 def refine(
     evaluate: Evaluate[Found], mesh: Mesh, *, tol: float, max_elements: int, name: str,
     patience: int = 1,
-) -> tuple[Mesh, Found, Array, int]:
+) -> tuple[Mesh, Found, Array]:
     """Cut the elements of ``mesh`` until the tail of each one is at most ``tol``.
 
     ``evaluate`` finds what is wanted on a mesh, and what each element leaves out of it, relative to
@@ -37,7 +37,7 @@ def refine(
     rounding: what swings within a long element may not become smaller by the first.
 
     Returns:
-        The mesh, what was found on it, the tails (K,) and the number of rounds.
+        The mesh, what was found on it, and the tails (K,).
 
     Raises:
         SolverError: if ``max_elements`` do not reach ``tol``, or rounding leaves fewer than
@@ -47,7 +47,6 @@ def refine(
     kept = np.full(mesh.size, -1)
     floor = np.full(mesh.size, np.inf)  # the tail of the element that each one was cut from
     missed = np.zeros(mesh.size)  # how many cuts had no effect
-    rounds = 1
     while True:
         found, tail = evaluate(mesh, found, kept)
         # An element that was cut and is no better than the one it comes from shows rounding.
@@ -56,7 +55,7 @@ def refine(
             missed = np.where(tail <= 0.25 * floor, 0, missed + 1)
             poor &= (missed < patience) | (tail >= _ROUNDING)
         if not poor.any():
-            return mesh, found, tail, rounds
+            return mesh, found, tail
         stuck = poor & (missed > 1)
         if stuck.sum() > max(_SOME, 0.02 * mesh.size):
             moved = Mesh(mesh.edges + 64 * EPS * np.abs(mesh.edges).max(), mesh.rule)
@@ -64,7 +63,7 @@ def refine(
             left = float(other[stuck].max())
             if np.mean(np.minimum(np.abs(other / tail - 1.0), 1.0)[stuck]) > _OTHER:
                 if left <= _LOST and (missed > 1).sum() > _MANY:
-                    return mesh, there, other, rounds
+                    return mesh, there, other
                 if left * stuck.sum() > _SOME:
                     t = mesh.edges[int(np.argmax(np.where(stuck, other, 0.0)))]
                     raise SolverError(
@@ -78,7 +77,6 @@ def refine(
         missed = missed.repeat(parts)
         mesh, kept = mesh.split(parts)
         floor = np.where(kept < 0, cut, before)
-        rounds += 1
 
 
 def resolve(
@@ -99,7 +97,7 @@ def resolve(
         found, kinds = evaluate(mesh)
         return found, unresolved_kinds(kinds, mesh.rule)
 
-    mesh, found, tail, _ = refine(on, mesh, tol=tol, max_elements=max_elements, name=name)
+    mesh, found, tail = refine(on, mesh, tol=tol, max_elements=max_elements, name=name)
     return mesh, found, float(tail.max(initial=0.0))
 
 

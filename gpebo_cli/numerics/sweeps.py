@@ -175,7 +175,7 @@ def solve(
         )
 
     try:
-        mesh, found, tail, rounds = refine(
+        mesh, found, tail = refine(
             evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name,
             patience=1 + stiff,
         )
@@ -184,7 +184,7 @@ def solve(
     errors, lost, _ = _errors(march, problem, mesh, units, found)
     return LinearSolution(
         found.trajectory,
-        max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), rounds, errors,
+        max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), errors,
         None if lost == mesh.size else float(mesh.edges[lost + 1]), found.extras,
     )
 

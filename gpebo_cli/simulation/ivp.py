@@ -86,7 +86,7 @@ def solve(
     Raises:
         SolverError: solve_ivp gave up, or the mesh cannot resolve the result.
     """
-    for rounds in range(1, _MAX_ROUNDS + 1):
+    for _ in range(_MAX_ROUNDS):
         values = _sample(problem, mesh, max(tol, 1e-13), restarts or {})
         extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
         extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in extras)
@@ -97,9 +97,7 @@ def solve(
         if not poor.any():
             estimate = float(max(tail.max(initial=0.0), 1e2 * tol))
             errors = np.full_like(sizes, estimate)
-            return LinearSolution(
-                Trajectory(mesh, values), estimate, rounds, errors, None, extras
-            )
+            return LinearSolution(Trajectory(mesh, values), estimate, errors, None, extras)
         if mesh.size + poor.sum() > max_elements:
             break
         mesh, _ = mesh.split(np.where(poor, 2, 1))

@@ -65,8 +65,8 @@ def follow(
     refused: ConfigError | None = None
     refused_until = t
     iterates, work, change = 0, 0.0, 0.0
-    at_start = np.array([t])
-    Linearised(system, _at_rest(x, t, length, solver)).taylor(at_start, 0)  # refuses by name
+    at_rest = Linearised(system, _at_rest(x, t, length, solver))
+    at_rest.taylor(np.array([t]), 0)  # refuses by name
     begin = process_time()
     while t < stop - 1e-12 * time.horizon:
         taken, done = process_time() - begin, (t - time.start) / time.horizon
@@ -77,13 +77,10 @@ def follow(
                 f"{t - time.start:.3g} s took {taken:.2g} s); shorten time.horizon, or raise "
                 "solver.max_seconds"
             )
-        length = min(length, stop - t)
-        if stop - t < 1.25 * length:
-            length = stop - t
-        window = replace(time, start=t, horizon=length)
-        start = replace(system, initial_state=x)
+        length = stop - t if stop - t < 1.25 * length else length
+        own, window = replace(system, initial_state=x), replace(time, start=t, horizon=length)
         try:
-            piece, count, spent, last = _window(start, window, solver, solve)
+            piece, count, spent, last = _window(own, window, solver, solve)
         except GpeboError as error:
             if isinstance(error, ConfigError):
                 refused, refused_until = error, t + length
