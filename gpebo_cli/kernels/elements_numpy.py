@@ -26,10 +26,7 @@ def element_maps(
     of all elements, or at one: E (P or 1, d, n), None for the identity, A likewise, f (P or 1, d,
     c), T as ``basis`` (P or 1, n, d), None for the identity, and p as ``offset`` (P or 1, n, c),
     None without T. Each element is of a ``group`` (K,), 0 … groups − 1; ``solve`` stands in for
-    :func:`solve_blocks`.
-
-    Raises:
-        LinAlgError: a system is singular.
+    :func:`solve_blocks`, and may raise LinAlgError as that does.
     """
     k, s, columns = len(h), len(D), f.shape[2]
     d, n = A.shape[1:]

@@ -39,8 +39,7 @@ _BROKEN = (ValueError, KeyError, OSError, EOFError, RuntimeError, NotImplemented
 def with_archive(mapping: Mapping[str, object], source: str, where: str) -> Mapping[str, object]:
     """The mapping of a plant's file with the matrices of the archive that it names, if any.
 
-    Raises:
-        ConfigError: it is none, lies outside of the plant's folders, or a matrix is in both.
+    ConfigError: it is none, lies outside of the plant's folders, or a matrix is in both.
     """
     file = mapping.get(ARCHIVE)
     if file is None:
@@ -58,8 +57,7 @@ def with_archive(mapping: Mapping[str, object], source: str, where: str) -> Mapp
 def read_archive(path: str) -> dict[str, Any]:
     """The matrices of an archive by name: arrays, or SciPy's sparse ones.
 
-    Raises:
-        ConfigError: no regular file, no archive of matrices, or one that is too large.
+    ConfigError: no regular file, no archive of matrices, or one that is too large.
     """
     arrays: dict[str, Any] = {}
     try:
@@ -90,8 +88,7 @@ def read_archive(path: str) -> dict[str, Any]:
 def read_mat(path: str, names: Sequence[str] | None = None) -> dict[str, Any]:
     """The arrays of numbers in a MATLAB file up to version 7 (None: all of them), by name.
 
-    Raises:
-        ConfigError: no regular file, none that can be read, or one that is too large.
+    ConfigError: no regular file, none that can be read, or one that is too large.
     """
     from scipy.io import loadmat, whosmat
 

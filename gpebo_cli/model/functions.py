@@ -84,11 +84,9 @@ class FunctionCoefficients:
         """Taylor coefficients up to ``order`` at the times t (N,); these functions do not jump.
 
         Constant matrices come as read-only broadcast arrays. What is a function of u and y is
-        evaluated along ``signals``, (J + 1, N, m + r); None: along the plant's own u.
-
-        Raises:
-            ConfigError: a function returns the wrong shape, something not finite, or is not
-                analytic where a derivative of it is needed; or y is needed and not known.
+        evaluated along ``signals``, (J + 1, N, m + r); None: along the plant's own u (ConfigError:
+        a function returns the wrong shape, something not finite, or is not analytic where a
+        derivative of it is needed; or y is needed and not known).
         """
         found = {"u": self._values("u", t, order, None)} if signals is None else {}
         for name in MATRIX_NAMES:

@@ -64,10 +64,8 @@ def matrix(
     """The entries of a matrix by row, each with its column; of a sparse one those that it has.
 
     ``value`` is a list of rows, a mapping of places, an array (rows, columns) or one of SciPy's
-    sparse ones. If it is not ``needed``, there may be no entries.
-
-    Raises:
-        ConfigError: anything else, or a size that is not that of ``down`` and ``across``.
+    sparse ones. If it is not ``needed``, there may be no entries (ConfigError: anything else, or a
+    size that is not that of ``down`` and ``across``).
     """
     n_rows, n_columns = len(down.names), len(across.names)
     if is_empty(value) and not needed:

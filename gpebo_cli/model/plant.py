@@ -273,10 +273,7 @@ def read_parameters(
     """The named expressions of a file, each of which may use those above it.
 
     Inputs and outputs are ``signals``; names that may not be used are ``elsewhere``, with what they
-    are.
-
-    Raises:
-        ConfigError: a value that is no expression of the language, or a name that cannot be one.
+    are (ConfigError: a value that is no expression of the language, or a name that cannot be one).
     """
     given = _named_values(plant, "parameters", value, "{R: 2 + sin(t)}")
     if len(given) > _MAX_PARAMETERS:

@@ -79,9 +79,8 @@ class TextCoefficients:
     ) -> Coefficients:
         """All matrices at the times ``t`` (N,) in seconds, to ``order``; see the protocol.
 
-        Raises:
-            ConfigError: an entry without a finite value or derivative; names it and the time. Or
-                a matrix depends on an output, and there are no signals.
+        ConfigError: an entry without a finite value or derivative; names it and the time. Or a
+        matrix depends on an output, and there are no signals.
         """
         if signals is None:
             for matrix, names in self.signals.items():

@@ -82,9 +82,6 @@ def solve(
     relative to each signal's own size. At ``restarts`` a map makes a new start of the limit from
     the left (n, columns); ``known`` are the coefficients at all points of ``mesh``, where they are
     at hand.
-
-    Raises:
-        SolverError: if ``max_elements`` do not reach ``tol``; names the time.
     """
 
     def evaluate(

@@ -34,14 +34,9 @@ def refine(
     ``evaluate`` finds what is wanted on a mesh, and what each element leaves out of it, relative to
     its size; it may keep what was found on the elements that have not been cut. Edges of the mesh
     stay edges. After as many cuts without effect as the ``patience`` what is left counts as
-    rounding: what swings within a long element may not become smaller by the first.
-
-    Returns:
-        The mesh, what was found on it, and the tails (K,).
-
-    Raises:
-        SolverError: if ``max_elements`` do not reach ``tol``, or rounding leaves fewer than
-            three digits; names the time.
+    rounding: what swings within a long element may not become smaller by the first. The result is
+    the mesh, what was found on it, and the tails (K,) (SolverError: if ``max_elements`` do not
+    reach ``tol``, or rounding leaves fewer than three digits; names the time).
     """
     found: Found | None = None
     kept = np.full(mesh.size, -1)
@@ -88,9 +83,6 @@ def resolve(
     ``evaluate`` gives what is wanted on a mesh, and the signals (K, s + 1, c) to resolve, each kind
     with its floor (see :func:`unresolved_kinds`); the rest is as of :func:`refine`. The result is
     the mesh, what is wanted on it, and the largest tail.
-
-    Raises:
-        SolverError: ``max_elements`` do not reach ``tol``; names the time.
     """
 
     def on(mesh: Mesh, before: Found | None, kept: IntArray) -> tuple[Found, Array]:  # noqa: ARG001

@@ -141,9 +141,6 @@ def solve(
     In place of the problem's coefficients the ``equation`` gives A, f (P or 1, d, ·) of the first
     columns and what the monitor needs, at the points of a mesh. Components have ``units`` (d,).
     Where it is ``stiff``, elements are solved and not swept over.
-
-    Raises:
-        SolverError: ``max_elements`` do not reach ``tol``; names the time.
     """
     A, _, _ = equation(mesh)
     march: March = elements.sweeps

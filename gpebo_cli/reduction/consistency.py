@@ -69,12 +69,10 @@ def jump(
         Σ_{k≥j} (−1)^{k−j} C(k, k−j) [ E^(k−j) w_k − A^(k−j) w_{k+1} ] = 0,      w_{μ+1} = 0,
 
     beside the constraints after the jump. Keeping the differential part (minimal ‖E w_0‖) was
-    rejected: where an input's impulse drives a differential state it is wrong. In
-    x1' = x3, x2' = 2 x3, 0 = x1 − u, a unit step of u moves x2 by 2, not by 0.
-
-    Raises:
-        ModelError: E or A jumps at a time where the state has an impulse, so that their product
-            means nothing, or no state after the jump satisfies the equations.
+    rejected: where an input's impulse drives a differential state it is wrong. In x1' = x3, x2' = 2
+    x3, 0 = x1 − u, a unit step of u moves x2 by 2, not by 0 (ModelError: E or A jumps at a time
+    where the state has an impulse, so that their product means nothing, or no state after the jump
+    satisfies the equations).
     """
     mu, n = structure.mu, system.n
     now = np.array([t])

@@ -100,8 +100,7 @@ class ConstantForm:
 def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
     """Of E and A (n, n), without anything known in the equations.
 
-    Raises:
-        UndecidedError: singular values do not decide the structure, or μ would exceed ``max_mu``.
+    UndecidedError: singular values do not decide the structure, or μ would exceed ``max_mu``.
     """
     n = len(E)
     rows, columns, time = scales_of(E, A)

@@ -291,12 +291,7 @@ def scaling_of(found: Entries, n: int) -> Scaling:
 
 
 def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
-    """Eliminate, with the model at N times and f (orders, N or 1, n), what is known in it.
-
-    Raises:
-        MoreOrdersError: derivatives are needed of a higher order.
-        UndecidedError: pivots do not decide the structure.
-    """
+    """Eliminate, with the model at N times and f (orders, N or 1, n) known (or UndecidedError)."""
     n, units = f.shape[2], scaling.columns
     known = np.ascontiguousarray(np.moveaxis(f, 2, 0))
     A = _Equations(found.values.A, found.places["A"], known, units)

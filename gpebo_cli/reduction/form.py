@@ -163,9 +163,6 @@ class EquationForm:
 
         Derivatives of y count as ``slopes`` (μ, 1, r), which :func:`strangeness_free` shows to be
         without effect.
-
-        Raises:
-            ModelError: a rank of the strangeness-free form changes; names the time.
         """
         system, source = self.system, self.system.coefficients
         order = 0 if self.structure is None else self.structure.mu
@@ -233,9 +230,6 @@ def hidden_constraints(
 
     In ``units`` of the states (n,), M is an orthogonal projector; ``c`` is the model to the order
     μ.
-
-    Raises:
-        ModelError: a rank differs from that of ``structure``; names the time.
     """
     mu, s, n = structure.mu, structure.scaling, system.n
     count = slice(0, 1) if structure.time_invariant else slice(None)
@@ -289,11 +283,8 @@ def strangeness_free(
     """The strangeness-free form, for a horizon that the times t (N,) span.
 
     By these times is judged which derivatives of inputs there are. ``signals`` are [u; y] there (N,
-    m + r), for matrices that follow them.
-
-    Raises:
-        ModelError: not uniquely solvable, or the index is above ``max_mu``.
-        ConfigError: a derivative is needed of an input, or of an output, of which it is not known.
+    m + r), for matrices that follow them (ConfigError: a derivative is needed of an input, or of an
+    output, of which it is not known).
     """
     system, inputs = given.system, given.inputs
     source = system.coefficients

@@ -54,10 +54,8 @@ def in_stages(
 
     Relative singular values below ``rank_tol``, and those that rounding explains, are zero.
     Rounding is looked at at ``every`` so many times. ``ranks`` have to be found; None: whatever the
-    first time has.
-
-    Raises:
-        UnclearError: they are not, or the system is not uniquely solvable, or takes more orders.
+    first time has (UnclearError: they are not, or the system is not uniquely solvable, or takes
+    more orders).
     """
     mass, noise, lost, found = E[0], _EPS, False, list[int]()
 

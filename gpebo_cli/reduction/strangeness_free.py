@@ -60,9 +60,6 @@ def strangeness_free_form(
 
     Elimination on the pivots of one reference time where that is well conditioned, singular
     vectors at the times where it is not.
-
-    Raises:
-        ModelError: a rank differs from that of ``structure``; names the time.
     """
     mu, scaling = structure.mu, structure.scaling
     if c is None:
@@ -116,9 +113,6 @@ def reduced(
     Singular vectors are taken at times where the pivots of the reference will not do. E and A are
     Taylor coefficients to the order μ (μ + 1, N or 1, n, n), f those of each column (μ + 1, N, n,
     c); at ``every`` so many times sizes are looked at.
-
-    Raises:
-        ModelError: a rank differs from that of ``structure``; names the time.
     """
     mu, s, known = structure.mu, structure.scaling, structure.reference
     e, a = scaled(E, A, s.rows, s.columns, s.time, mu + 1)

@@ -127,9 +127,6 @@ def analyse(
     Â2 = Z2ᵀN, and that of E on their kernel. Each must be the same at every time; between the
     probes, singular values that dip are followed to the bottom. What is found out about a plant
     given as text is kept with its matrices, for its next run.
-
-    Raises:
-        ModelError: no μ ≤ ``max_mu`` does it, or a rank changes; names the time and the values.
     """
     kept: dict[object, Structure] = getattr(system.coefficients, "kept", {})
     asked = start, stop, max_mu, rank_tol

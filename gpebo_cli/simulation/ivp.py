@@ -83,8 +83,7 @@ def solve(
 ) -> LinearSolution:
     """Same meaning as :func:`gpebo_cli.numerics.collocation.solve`, for E = I (n, n) only.
 
-    Raises:
-        SolverError: solve_ivp gave up, or the mesh cannot resolve the result.
+    SolverError: solve_ivp gave up, or the mesh cannot resolve the result.
     """
     for _ in range(_MAX_ROUNDS):
         values = _sample(problem, mesh, max(tol, 1e-13), restarts or {})

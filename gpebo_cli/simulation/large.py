@@ -93,11 +93,7 @@ class _Plant:
         return self.found.values
 
     def eliminate(self, mesh: Mesh) -> Explicit | ConstantForm:
-        """The explicit form from the entries at the points of a mesh.
-
-        Raises:
-            UndecidedError: there is none, or not up to the order that is allowed.
-        """
+        """The explicit form from the entries at the points of a mesh (or UndecidedError)."""
         if self.at is not mesh:
             self.entries(mesh)
         while not self.eliminated:
@@ -159,11 +155,7 @@ def large_simulation(
 def structure_of(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> Structure:
-    """The structure of a plant over a horizon, by elimination where that decides it.
-
-    Raises:
-        ModelError: see :func:`gpebo_cli.reduction.structure.analyse`.
-    """
+    """The structure of a plant over a horizon, by elimination where that decides it."""
     start, stop = time.start, time.start + time.horizon
     if system.n > SMALL:
         plant = _Plant(system, solver.max_strangeness_index + 1)

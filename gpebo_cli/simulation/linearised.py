@@ -104,11 +104,7 @@ class Linearised:
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
     ) -> Coefficients:
-        """Taylor coefficients of the linearised plant at the times t (N,); of signals u counts.
-
-        Raises:
-            ConfigError: an entry without a finite value along the guess.
-        """
+        """Taylor coefficients of the linearised plant at the times t (N,); of signals u counts."""
         source = self.system.coefficients
         known, x, along = self._along(t, order, inside, signals)
         c = source.taylor(t, order, inside, along)

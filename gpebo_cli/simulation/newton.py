@@ -55,9 +55,7 @@ def follow(
 ) -> Effort:
     """Follow the solution from ``system.initial_state``; the last thing solved is all of it.
 
-    Raises:
-        SolverError: the solution ends within the horizon; names the time and the reason.
-        ConfigError: an entry that has no finite value at the start.
+    SolverError: the solution ends within the horizon; names the time and the reason.
     """
     t, stop = time.start, time.start + time.horizon
     length, x = time.horizon, system.initial_state

@@ -208,10 +208,8 @@ def _growth_resolved(
     """The mesh with elements short enough for the state not to grow much within one.
 
     An element that is too long damps what it does not resolve. A state that has become small would
-    never be seen to grow again: its error is invisible beside the size it once had.
-
-    Raises:
-        SolverError: that takes more elements than there may be.
+    never be seen to grow again: its error is invisible beside the size it once had (SolverError:
+    that takes more elements than there may be).
     """
     n = structure.d + structure.a
     most = min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements)

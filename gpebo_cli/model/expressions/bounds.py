@@ -167,9 +167,6 @@ def breakpoints(tape: Tape, start: float, stop: float) -> Array:
     They are sorted, without repetitions, in seconds (number,). Instants of ``step`` and zeros of
     affine arguments of ``abs``, ``sign``, ``min`` and ``max`` are exact, changes of sign of other
     arguments isolated by bounds, see :func:`roots`, and bisected to rounding.
-
-    Raises:
-        ConfigError: an argument that is not finite at some time.
     """
     if not tape.jumps:
         return np.zeros(0)
@@ -199,10 +196,7 @@ def roots(tape: Tape, knots: Array, start: float, stop: float) -> Array:
     A cell is dropped if bounds keep the argument away from zero, searched by bisection where it is
     monotone, and halved else, down to rounding. (A tangential zero has no change of sign, and
     switches nothing.) Cells end at ``knots`` (B,), sorted, where something jumps. What is found is
-    unsorted.
-
-    Raises:
-        ConfigError: there are too many.
+    unsorted (ConfigError: there are too many).
     """
     places = [s.argument for s in tape.switches if s.affine is None]
     arguments = tape.of([place for place in places if place in tape.of_time])

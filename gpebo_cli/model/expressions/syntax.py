@@ -92,8 +92,7 @@ def parse(
         elsewhere: names that exist but may not be used here, with what they are ("an input").
         calls: more functions, by name how many arguments they take and what makes their node.
 
-    Raises:
-        ConfigError: anything else than an expression of the language, or one without a value.
+    ConfigError: anything else than an expression of the language, or one without a value.
     """
     if isinstance(value, bool):
         raise ConfigError(

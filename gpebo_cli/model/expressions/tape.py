@@ -90,9 +90,6 @@ class Tape:
         default t. ``signals`` are Taylor coefficients of the signals at t, (J + 1, N, number of
         signals), those beyond J being zero; what depends on a signal is decided at t. None: inputs
         are the functions of time that the tape has for them, and outputs are unknown.
-
-        Raises:
-            ConfigError: a value that is not finite; names the entry, its text and the time.
         """
         return self._in_a_row.taylor(np.asarray(t, dtype=np.float64), order, inside, signals)[0]
 
@@ -346,8 +343,7 @@ class Assembly:
 def record(expressions: Sequence[Expression], inputs: Sequence[Expression] = ()) -> Tape:
     """Record expressions on one tape; ``inputs`` stand for signals that nobody has told.
 
-    Raises:
-        ConfigError: more than MAX_INSTRUCTIONS different operations.
+    ConfigError: more than MAX_INSTRUCTIONS different operations.
     """
     instructions: dict[Instruction, int] = {}
     place_of: dict[int, int] = {}  # by id of the node; the expressions keep the nodes alive
