@@ -271,7 +271,7 @@ def _refuse_overflow(
     """LAPACK's singular values of what is not finite may take for ever."""
     with np.errstate(all="ignore"):
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
-        heaviest = float(weight.max(initial=0.0)) ** 2
+        heaviest = np.square(weight.max(initial=0.0))
         # A sum is finite only where all its terms are; a finite one says it at once.
         finite = all(
             isfinite(heaviest * x.ravel().dot(x.ravel())) or np.isfinite(x * weight).all()
