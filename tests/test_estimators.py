@@ -17,13 +17,13 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
 from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
 from gpebo_cli.estimators._following import SolvedEstimates, follow
-from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.experiment.pipeline import run_experiment, stream, stream_verdict
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import observe
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
+from gpebo_cli.settings import DataSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 T = np.linspace(0, 10, 101)
@@ -751,6 +751,43 @@ def test_estimates_that_are_not_what_the_data_say_are_told(observer):
     assert "theta1, theta2, e0_x1, e0_x2, x1, x2, x3 are up to" in warning
     assert warned(name="ls_drem", **slow | {"gamma": 10.0}) == ((), True)
     assert warned(name="least_squares", f0=0.01, initial=1e5) == ((), False)
+
+
+@settings(deadline=None, max_examples=8)
+@given(
+    st.sampled_from([{}, {"remedy": "reset", "reset_interval": 2.0}]),
+    st.sampled_from(["ls_drem", "least_squares", "gradient"]), st.floats(-8, 0), st.floats(0, 5),
+)
+def test_how_far_estimates_may_be_off_is_how_far_they_are(observer, name, small, large):
+    """Whatever is the reason: gains, the start of the estimates, what is required or not."""
+    gains = {"gamma": 10.0**-small} if name == "gradient" else {"f0": 10.0**small}
+    result = gpebo_cli.run(
+        "descriptor", estimator={"name": name, "initial": 10.0**large, **gains},
+        observer={"name": "gpebo", **observer}, time={"horizon": 5.0, "samples": 11},
+    ).details
+    told, x = result.estimation.doubts[0], result.simulation.states
+    found = np.append(result.estimation.parameters, result.estimation.states, axis=2)[0, -1]
+    truth = np.append(result.estimation.true_parameters[-1], x[-1])
+    size = np.append(np.abs(result.estimation.true_parameters).max(axis=0), np.abs(x).max(axis=0))
+    off = dict(zip([*result.estimation.names, *result.system.states],
+                   np.abs(found - truth) / size, strict=True))
+    for quantity, doubt in told.items():
+        assert off[quantity] <= 3.0 * doubt + 1e-9
+        assert doubt <= 10.0 * off[quantity] + 1e-9
+    assert told
+
+
+def test_a_stream_says_which_estimates_are_far_from_least_squares():
+    slow = {"name": "ls_drem", "gamma": 0.5, "f0": 0.01, "initial": 1e5}
+    signals = gpebo_cli.run("descriptor", observer="none").details.simulation
+    rows = signals.t, signals.inputs, signals.outputs
+    for gamma, warned in ((0.5, True), (10.0, False)):
+        online = stream(Settings(
+            plant={}, estimator=slow | {"gamma": gamma}, observer={"name": "gpebo"},
+            data=DataSettings(hold="linear"), time=TimeSettings(np.nan, np.nan),
+        ), shipped("descriptor"))(0.0, np.append(rows[1][0], rows[2][0]))  # fmt: skip
+        online.feed(*rows)
+        assert ("least squares over the same data" in stream_verdict(online)) == warned
 
 
 def test_so_they_are_of_several_recordings(tmp_path):

@@ -24,6 +24,7 @@ _SEEN = 1e-6  # part in the kernel of N beyond which a direction is not known
 _NOISE = 1e-12  # of a column of a gain in the states' own units: beyond what extensions are good to
 _MIXED = 1e-14  # over an eigenvalue of N: how far its vector may turn into the kernel's
 _LOST = 1e-3  # of a state: a larger error leaves nothing of it that one would call known
+_HIDDEN = 10.0  # times what is seen of η is what may be hidden in the kernel of N
 _TINY = 1e-100  # squares of its reciprocal are numbers
 
 
@@ -127,25 +128,39 @@ class Knowledge:
         size = np.linalg.norm(scaled, axis=2)
         return np.asarray(np.linalg.norm(scaled @ kernel, axis=2) <= slack[:, None] * size)
 
-    def resolved(self, h: Array, offset: Array, gain: Array) -> BoolArray:
+    def resolved(self, h: Array, offset: Array, gain: Array, growth: float | None) -> BoolArray:
         """Of which states (n,) x = offset + gain η something is left beside errors, at the end.
 
-        Where Φ has grown, states are small differences of large terms: neither what the kernel of N
-        leaves open, nor rounding, may then amount to more than a thousandth of them. Of h = ∫ψᵀY at
-        the end (p,), and the offset (N, n) and gain (N, n, p) at all times, NaN where nothing is
-        known.
+        Neither what the kernel of N leaves open, nor rounding, may amount to more than a thousandth
+        of them; a small ``growth`` of Φ explains no state that is smaller still beside its terms.
+        Of h = ∫ψᵀY at the end (p,), and the offset (N, n) and gain (N, n, p) at all times, NaN
+        where nothing is known.
+        """
+        small = (growth or 0.0) < LARGE
+        if small and (self.clarity[-1] >= 1.0).all():
+            return np.ones(gain.shape[1], dtype=bool)
+        error, z = self.doubt(h, gain[-1])
+        size = np.abs(offset + gain @ z).max(axis=0)
+        if small:
+            size = np.maximum(size, np.abs(gain[-1]) @ np.abs(z) / LARGE)
+        return np.asarray(error <= _LOST * size)
+
+    def doubt(self, h: Array, gain: Array) -> tuple[Array, Array]:
+        """How far gain η (n,) may be off at the end, of a gain (n, p), and the least η (p,).
+
+        By what the kernel of N leaves open and by rounding; h = ∫ψᵀY (p,).
         """
         V, spectrum, clear = self.vectors[-1], self.eigenvalues[-1], self.clarity[-1] >= 1.0
         root = np.sqrt(spectrum[clear])
         seen = V[:, clear].T @ (h / self.sizes[-1]) / root  # its norm is that of Y
         z = V[:, clear] @ (seen / root)
-        row = gain[-1] / self.sizes[-1]
-        error = np.linalg.norm(row @ V[:, ~clear], axis=1) * np.linalg.norm(z) + _NOISE * (
+        row = gain / self.sizes[-1]
+        unseen = np.linalg.norm(row @ V[:, ~clear], axis=1) * _HIDDEN * np.linalg.norm(z)
+        error = unseen + _NOISE * (
             np.linalg.norm(row @ V[:, clear] / root, axis=1) * np.linalg.norm(seen)
             + np.abs(row) @ np.abs(z)
         )
-        x = offset + gain @ (z / self.sizes[-1])
-        return np.asarray(error <= _LOST * np.abs(x).max(axis=0))
+        return np.asarray(error), z / self.sizes[-1]
 
 
 def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
 from gpebo_cli import kernels
+from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import (
     SETTLED,
@@ -31,6 +33,8 @@ _LAGS = 20  # of the residual's autocorrelation
 _SILENT = 1e-9  # of an output: a residual below that is rounding
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
 _ASTRAY = 0.02  # of a quantity's size: estimates that differ by more are different
+_EXACT = 1e-3  # of it: so do those of a law that is done, if less than
+_DONE = 30.0  # times this is what it has left of the errors it began with
 _WORSE = 3.0  # times the residual of least squares: more than that is not the noise of the data
 _FAR = 7.0  # deviations of most samples: what is farther away is no noise of theirs
 _ROUNDING = 0.35  # steps: rounding alone leaves 0.29
@@ -186,44 +190,65 @@ def evaluation(
     return evaluate_affine
 
 
-def astray(
-    root: Array, final: Array, states: Callable[[Array], Array], quantities: Sequence[str],
-    sizes: Array, determined: BoolArray, columns: IntArray,
-) -> tuple[str, ...]:
-    """A warning of final estimates that are not what least squares makes of the same data.
+def doubts(
+    root: Array, final: Array, states: Callable[[Array], Array], last: Callable[[Array], Array],
+    quantities: Sequence[str], sizes: Array, known: Knowledge, seen: BoolArray, columns: IntArray,
+    requirement: Requirement,
+) -> tuple[Mapping[str, float], tuple[str, ...]]:
+    """How far final estimates may be off, relative to each one's size, and warnings of that.
 
-    Gains and rounding can do that. There is none if the estimates explain the data nearly as well,
-    because noise makes such a difference too. ``root`` R (k, p + 1) has |R [−η; 1]|² = ∫‖Y − ψη‖²,
-    ``final`` are η̂ of all cases at the end (G, p), ``states`` makes x̂ (g, M, n) of parameters (g,
-    p), at times of which the last is the end. Of ``quantities``, names of parameters and states (p
-    + n,), a size that is NaN counts as least squares' own one. Only ``columns`` (k,) are estimated.
+    Off least squares over the same data, because of gains or rounding, and by what the data leave
+    open. There is no warning of the first if the ``requirement`` is not met, or if the estimates
+    explain the data nearly as well, because noise makes such a difference too. ``root`` R (k, p +
+    1) has |R [−η; 1]|² = ∫‖Y − ψη‖², ``final`` are η̂ of all cases at the end (G, p), ``states``
+    makes x̂ (g, M, n) of parameters (g, p), at times of which the last is the end, and ``last`` at
+    the end alone. Of ``quantities``, names of parameters and states (p + n,), a size that is NaN
+    counts as least squares' own one. ``seen`` (n,) states are determined. Only ``columns`` (k,) are
+    estimated.
     """
-    final, eta = final[np.isfinite(final).all(axis=1)], np.zeros(final.shape[1])
+    final, p = final[np.isfinite(final).all(axis=1)], final.shape[1]
     if not len(final) or not len(columns):
-        return ()
+        return {}, ()
+    eta = np.zeros(p)
     eta[columns] = least_squares(root[:, [*columns, -1]])
     least = np.linalg.norm(root @ np.append(-eta, 1.0))
     more = np.linalg.norm((final - eta) @ root[:, :-1].T, axis=1)
     best = int(np.argmin(more))
-    if more[best] <= _WORSE * least:
-        return ()
     both = np.stack([final[best], eta])
-    x = states(both)
+    x, rows = states(both), last(np.eye(p + 1, p))[:, -1]
     one, other = np.hstack([both, x[:, -1]])
     own = np.append(np.abs(eta), np.abs(x[1]).max(axis=0, initial=0.0))
-    away = np.abs(one - other) / np.maximum(np.fmax(sizes, own), _TINY)
-    far = determined & (away > _ASTRAY)
-    if not far.any():
-        return ()
-    names = ", ".join(name for name, is_far in zip(quantities, far, strict=True) if is_far)
-    size = np.linalg.norm(root[:, -1])
-    text = (
-        f"estimates.csv: at the end {names} are up to {away[far].max():.2g} of their size away "
-        f"from least squares over the same data, which leaves {least / size:.1g} of Y and they "
-        f"{np.hypot(least, more[best]) / size:.1g}: the estimator has lost digits or is not done; "
-        "use estimator=least_squares or other gains"
-    )
-    return (text,)
+    own = np.maximum(np.fmax(sizes, own), _TINY)
+    gain = np.concatenate([np.eye(p), (rows[:-1] - rows[-1]).T])
+    away, open_ = np.abs(one - other), known.doubt(root[:, :-1].T @ root[:, -1], gain)[0]
+    determined = np.append(known.parameters[-1], seen)
+    found = dict(zip(quantities, ((away + open_) / own).tolist(), strict=True))
+    # A law that is known to be done is not as far from least squares as one that may not be.
+    rest = np.exp(-requirement.evidence.get("gamma_times_integral", 0.0))
+    limit = min(_ASTRAY, max(_EXACT, _DONE * rest))
+    far = determined & (away > limit * own)
+    far &= requirement.holds and bool(more[best] > _WORSE * least)
+    vague = determined & ~far & (open_ > _EXACT * own)
+    texts = []
+    if far.any():
+        size = np.linalg.norm(root[:, -1])
+        texts.append(
+            f"estimates.csv: at the end {_listed(quantities, far)} are up to "
+            f"{(away / own)[far].max():.2g} of their size away from least squares over the same "
+            f"data, which leaves {least / size:.1g} of Y and they "
+            f"{np.hypot(least, more[best]) / size:.1g}: the estimator has lost digits or is not "
+            "done; use estimator=least_squares or other gains"
+        )
+    if vague.any():
+        texts.append(
+            f"estimates.csv: at the end {_listed(quantities, vague)} may be off by up to "
+            f"{(open_ / own)[vague].max():.1g} of their size, for want of excitation"
+        )
+    return {name: found[name] for name in compress(quantities, determined)}, tuple(texts)
+
+
+def _listed(names: Sequence[str], which: BoolArray) -> str:
+    return ", ".join(compress(names, which))
 
 
 def standing(

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from gpebo_cli.errors import GpeboError, ModelError
 from gpebo_cli.evidence.excitation import Excitation, assess, estimable
-from gpebo_cli.evidence.knowledge import LARGE, Knowledge
+from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.uncertainty import of_least_squares
 from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.findings import Assumption
@@ -166,13 +165,10 @@ def visible(
     """From what is known at the last M of the times t (N,) to which states are known, (M, n)."""
     state_map = observation.state_map
     if isinstance(state_map, AffineStateMap) and observation.names is None:
-        gain = state_map.gain(t)
-        if observation.growth is None or observation.growth < LARGE:
-            return partial(Knowledge.states, gain=gain, units=state_map.units)
-        regression, offset = observation.regression, state_map.offset(t)
-        h = regression.gram.final[:, regression.p]
+        gain, offset, growth = state_map.gain(t), state_map.offset(t), observation.growth
+        h = observation.regression.gram.final[:, observation.regression.p]
         return lambda known: (
-            known.states(gain, state_map.units) & known.resolved(h, offset, gain)
+            known.states(gain, state_map.units) & known.resolved(h, offset, gain, growth)
         )
     # What it needs of the parameters is not known: all of them.
     given = np.array([name not in observation.unseen for name in states], dtype=bool)

@@ -37,6 +37,7 @@ from gpebo_cli.experiment.uncertainty import (
     sampled_deviations,
     standard_deviations,
 )
+from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
@@ -258,14 +259,10 @@ def at_samples(
         parameters_std=None if std is None else std[..., :p],
         states_std=None if std is None else std[..., p:],
         still=still,
-        warnings=accuracy.astray(
-            online.root, made.parameters[:, -1], online.last_states,
-            [*online.parameters, *system.states],
-            np.append(sizes[0], np.where(
-                np.isnan(sizes[1]), np.abs(made.states).max(axis=(0, 1)), sizes[1]
-            )),
-            np.append(made.known.parameters[-1], made.seen[-1]), columns,
-        ) if by.requirement.holds else (),
+        doubts=online.doubts(
+            made.parameters[:, -1],
+            np.append(sizes[0], np.where(np.isnan(sizes[1]), online.largest, sizes[1])),
+        ),
     )
     with stage("excitation"):
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
@@ -376,27 +373,44 @@ def _estimate(
         found, parameters[part], estimated[part] = evaluate(eta)
         numbers[:, part] = found[: len(numbers)]
         done(part.stop)
-    checks = state_map.checks(kept, estimated)
     explaining = parameters[:, -1].copy()
     parameters[..., np.isnan(told[0])] = np.nan
     estimated[..., np.isnan(told[1])] = np.nan
     result = EstimationResult(
         cases=estimator.cases, t=kept, names=observation.parameters, parameters=parameters,
         true_parameters=truth[chosen], states=estimated, delta=lambda: estimates.delta(kept),
-        checks=checks, requirement=requirement, explaining=explaining,
+        checks=state_map.checks(kept, estimated), requirement=requirement, explaining=explaining,
         active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
-        warnings=(lambda: accuracy.astray(
-            regression.root, explaining,
-            lambda eta: state_map.at(kept)(eta[:, None].repeat(len(kept), axis=1)),
-            [*regression.parameters, *system.states], np.concatenate(sizes),
-            np.append(determined, seen), columns,
-        )) if requirement.holds and about_own and not (  # one η for all of the data, and one Y
-            regression.resets or regression.dynamics or regression.parametrisation
-            or regression.realisations or observation.bounds
-        ) else (),
+        doubts=(lambda: _doubts(
+            settings, system, observation, explaining, kept, np.concatenate(sizes), known, seen,
+            columns, requirement,
+        )) if about_own and not (  # one η for all of the data since a reset, and one Y
+            regression.dynamics or regression.parametrisation or regression.realisations
+            or observation.bounds
+        ) else ({}, ()),
         still=accuracy.still(parameters, requirement, natural),
     )
     return estimator, result, accuracy.metrics_of(numbers, observation.parameters, system)
+
+
+def _doubts(
+    settings: Settings, system: DescriptorSystem, observation: Observation, final: Array, t: Array,
+    sizes: Array, known: Knowledge, seen: BoolArray, columns: IntArray, requirement: Requirement,
+) -> tuple[Mapping[str, float], tuple[str, ...]]:
+    """Those of the ``final`` η̂ (G, p); after resets, by the data since the last of them."""
+    regression, state_map = observation.regression.segments[-1], observation.state_map
+    if observation.regression.resets:
+        since = replace(observation, regression=regression)
+        known = assess(regression, t[-1:], settings.excitation, settings.solver.tol).final
+        seen = visible(since, t[-1:], system.states)(known)[-1]
+
+    def states(t: Array) -> Callable[[Array], Array]:
+        return lambda eta: state_map.at(t)(eta[:, None].repeat(len(t), axis=1))
+
+    return accuracy.doubts(
+        regression.root, final, states(t), states(t[-1:]),
+        [*regression.parameters, *system.states], sizes, known, seen, columns, requirement,
+    )
 
 
 def _estimates(

@@ -13,8 +13,9 @@ import numpy as np
 from gpebo_cli import estimators, observers
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.evidence.excitation import WELL, Excitation
-from gpebo_cli.evidence.knowledge import LARGE, Knowledge, knowledge_of_roots
+from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
 from gpebo_cli.evidence.uncertainty import SampledDeviations
+from gpebo_cli.experiment.accuracy import doubts
 from gpebo_cli.experiment.result import Fit
 from gpebo_cli.experiment.uncertainty import MOST_CASES
 from gpebo_cli.findings import Assumption, Requirement
@@ -140,6 +141,7 @@ class Online:
         # When parameters could first be told apart, and when well.
         self._t_c: list[float | None] = [None, None]
         self._system = system
+        self.largest = np.zeros(system.n)  # |x̂| so far
         self._deviations = None if len(self.cases) > MOST_CASES else deviations
         if self._deviations is not None and isinstance(self._observer, observers.Responding):
             self._observer = self._observer.responding(self._deviations.noisy)
@@ -178,10 +180,12 @@ class Online:
         eigenvalues = sigma[:, ::-1] ** 2
         seen = known.states(gain if gain.ndim == 3 else gain[0], block.units)
         self._last = block.offset[-1], block.gain[-1], block.fit
-        if block.fit is None and (self.growth or 0.0) >= LARGE:
+        if block.fit is None:
             root = roots[-1, 0]
-            seen &= known.resolved(root[:, :p].T @ root[:, p], block.offset, gain)
-        self._final = made.parameters[:, -1].copy()
+            h = root[:, :p].T @ root[:, p]
+            seen &= known.resolved(h, block.offset, gain, self.growth)
+        self._final, self._seen = made.parameters[:, -1].copy(), seen[-1].copy()
+        self.largest = np.fmax(self.largest, np.abs(states).max(axis=(0, 1)))
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
             block.regression, made.parameters, states, made.delta, eigenvalues, known, seen,
@@ -258,6 +262,18 @@ class Online:
         return np.asarray(np.divide(
             size[-1], size[:-1], out=np.zeros(len(size) - 1), where=size[:-1] > 0.0
         ))
+
+    def doubts(
+        self, final: Array | None = None, sizes: Array | None = None
+    ) -> tuple[Mapping[str, float], tuple[str, ...]]:
+        """How far ``final`` estimates (G, p) may be off, and warnings of that; None: the newest."""
+        _, known, _ = self._newest
+        return doubts(
+            self.root, self._final if final is None else final, self.last_states, self.last_states,
+            [*self.parameters, *self._system.states],
+            np.append(self.natural_sizes, self.largest) if sizes is None else sizes,
+            known, self._seen, known.independent, self.requirement,
+        )
 
     def fit(self) -> Fit:
         """How the last estimates explain all data, from S alone: |Y − ψη̂|² = |S[−η̂; 1]|²."""

@@ -165,8 +165,8 @@ def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Arr
 def stream_verdict(online: Online) -> str:
     """The last line of a stream: how much came, and what the one of a run says."""
     excitation, fit = online.excitation(), online.fit()
-    return (
-        f"{online.count} rows, t = {online.start:.6g} to {online.reached.t:.6g}; "
-        + verdict(excitation, online.cases, online.requirement, fit=fit)
-        + online.note
-    )
+    return "; ".join([
+        f"{online.count} rows, t = {online.start:.6g} to {online.reached.t:.6g}",
+        verdict(excitation, online.cases, online.requirement, fit=fit) + online.note,
+        *online.doubts()[1],
+    ])

@@ -130,10 +130,16 @@ class EstimationResult:
     states_std: Array | None = None  # (G, M, n)
     active: Mapping[int, tuple[ActiveBound, ...]] = field(default_factory=dict)  # bounds, by case
     explaining: Array | None = None  # (G, p) at the end; one value of many where not determined
-    # What spoils the estimates though enough was there.
-    warnings: OnDemand[tuple[str, ...]] = OnDemand(tuple)
+    # How far final estimates of the best case may be off, relative to each one's size, by name;
+    # and what spoils them though enough was there. None is known where η moves.
+    doubts: OnDemand[tuple[Mapping[str, float], tuple[str, ...]]] = OnDemand(lambda: ({}, ()))
 
     __getstate__ = evaluated
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What spoils the estimates, one line each."""
+        return self.doubts[1]
 
     @cached_property
     def gains(self) -> dict[str, Array]:

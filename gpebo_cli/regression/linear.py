@@ -127,12 +127,14 @@ class LinearRegression:
         cuts = np.searchsorted(mesh.edges, [reset.time for reset in self.resets])
         out = []
         bounds = pairwise([0, *(int(cut) for cut in cuts), mesh.size])
+        scale = np.broadcast_to(self.scale, (mesh.size, self.p))
         floors = (self.floor, *(reset.floor for reset in self.resets))
         for (first, last), floor in zip(bounds, floors, strict=True):
             piece = Mesh(mesh.edges[first : last + 1], mesh.rule)
             out.append(replace(
                 self, Y=Trajectory(piece, self.Y.values[first:last]),
                 psi=Trajectory(piece, self.psi.values[first:last]), resets=(), floor=floor,
+                scale=scale[first:last],
             ))
         return tuple(out)
 

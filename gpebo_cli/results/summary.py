@@ -70,6 +70,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
             "states": simulation.error_estimate if simulation else None,
             "by_state": by_state,
             "regression": regression.error_estimate if regression else None,
+            "estimates": estimation.doubts[0] if estimation else None,
         },
         "fit": _fit(result.fit),
         "elements": simulation.elements if simulation else None,
