@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
+from inprocess import gpebo
 from plants import shipped
 from test_remedies import UNBOUNDED
 
+import gpebo_cli
 from gpebo_cli import run, system_from_functions
 from gpebo_cli.errors import ConfigError, GpeboError, ModelError
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.pipeline import stream
+from gpebo_cli.importers.matrices import from_control
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers.reduced.invariant import invariant_observer
+from gpebo_cli.results.files import remove_files
 from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 
 # a' = b with 0 = a + u: b = −u'.
@@ -65,6 +71,7 @@ def canonical(**changes):
             {"observer": {"name": "gpebo", "remedy": "reset", "reset_interval": 1e-6}},
             "observer.reset_interval = 1e-06 makes 20000000 resets; at most",
         ),
+        ({"noise": {"name": "none", "outputs": 0.1}}, "noise.outputs: noise=none has no noise"),
         ({"data": ROWS.assign(V=[True, False, True])}, "data, column V: bool is not numbers"),
     ],
 )
@@ -197,3 +204,66 @@ def test_of_a_rank_of_E_that_changes_between_two_parts_of_a_stream():
     online.feed(np.array([0.0, 0.5]), np.zeros((2, 1)), np.zeros((2, 1)))
     with pytest.raises(ModelError, match=r"rank of E changes from 1 to 2 before t = 1;"):
         online.feed(np.array([1.0]), np.zeros((1, 1)), np.zeros((1, 1)))
+
+
+CIRCUIT = "* divider\nV1 a 0 1\nR1 a b 1\nC1 b 0 1\n.end\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "files", "message"),
+    [
+        (["check", "-m"], {}, "gpebo check looks at one configuration; leave out -m"),
+        (["compare"], {}, "gpebo compare needs folders of runs or sweeps; see gpebo compare"),
+        (["report"], {}, "gpebo report needs folders of runs or sweeps; see gpebo report"),
+        (["run", "plant.labels.il='^^'"], {}, "labels.il: '^^' is not mathematics that matplotlib"),
+        (["new", "plant", "x", "--from", "m.yaml"], {"m.yaml": "a: ["}, "m.yaml is not YAML ("),
+        (["new", "plant", "x", "--from", "m.yaml"], {"m.yaml": "- 1"}, "a mapping with M, D, K, G"),
+        (["new", "plant", "x", "--from", "a.cir", "--measure", "i(q)"], {"a.cir": CIRCUIT},
+         "i(q): there is no element q"),
+        (["new", "plant", "x", "--from", "a.cir", "--measure", "v(a,b,0)"], {"a.cir": CIRCUIT},
+         "'v(a,b,0)' is neither v(node) nor i(element)"),
+        (["new", "plant", "x"], {"plant/x.yaml": ""}, "x.yaml exists already; remove it, or"),
+        (["run", "estimator=x"], {"estimator/x.yaml": "defaults: [a]\nname: drem\n"},
+         "x.yaml: a file of estimator/ has no defaults list"),
+        (["run", "experiment=x"], {"experiment/x.yaml": "# @package plant\ntime: {horizon: 1}\n"},
+         "x.yaml: only `# @package _global_` is allowed, got 'plant'"),
+        (["run", "experiment=x"], {"experiment/x.yaml":
+         "# @package _global_\nhydra: {sweeper: {params: {+a: 1}}}\n"}, "'+a=1' cannot be swept"),
+    ],
+)
+def test_of_commands(words, files, message, tmp_path):
+    """One line, exit code 2, and nothing written."""
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    folder = ["--config-dir", "."] if files and words[0] in ("run", "new") else []
+    done = gpebo(*words, *folder, cwd=tmp_path)
+    assert done.code == 2
+    assert message in done.err
+    assert done.err.count("\n") == 1
+    assert {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()} == set(files)
+
+
+def test_of_comparing_what_estimated_nothing(tmp_path):
+    assert gpebo("run", "observer=none", "figures=none", "hydra.run.dir=a", cwd=tmp_path).code == 0
+    done = gpebo("compare", "a", cwd=tmp_path)
+    assert (done.code, done.err.count("\n")) == (1, 1)
+    assert "nothing to compare: no run in these folders has estimated anything" in done.err
+
+
+def test_of_calls_from_python(tmp_path):
+    for call, error, message in (
+        (lambda: run(data={"t": [0.0, 1.0], "y": [0.0]}), ConfigError,
+         "data: arrays of the shapes t (2,), y (1,): "),
+        (lambda: run(data={"name": "csv", "file": [["a.csv"], ["b.csv"]]}), ConfigError,
+         "data.file: "),
+        (lambda: gpebo_cli.circuits, AttributeError, "module 'gpebo_cli' has no attribute 'circ"),
+        (lambda: from_control(SimpleNamespace(A=np.eye(1), dt=0.1), "p"), ConfigError,
+         "plant p: the model is in discrete time (dt = 0.1), and"),
+        (lambda: from_control(SimpleNamespace(B=np.eye(1)), "p"), ConfigError,
+         "plant p: SimpleNamespace has no A; give a state-space model"),
+        (lambda: remove_files([tmp_path]), GpeboError, f"cannot remove {tmp_path}: "),
+    ):
+        with pytest.raises(error) as caught:
+            call()
+        assert message in str(caught.value)

@@ -10,6 +10,7 @@ import keyword
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -292,11 +293,10 @@ class _Builder:
 
     def _claim(self, name: str, otherwise: str) -> str:
         """A name nobody has yet; names differ in more than case, for the reader's sake."""
-        for candidate in (name, otherwise, *(f"{otherwise}_{k}" for k in range(2, 1000))):
-            if candidate not in self._taken and not _reserved(candidate):
-                self._taken.add(candidate)
-                return candidate
-        raise ConfigError(f"{self.file}: no name is left for {name}")
+        others = chain((name, otherwise), (f"{otherwise}_{k}" for k in count(2)))
+        free = next(each for each in others if each not in self._taken and not _reserved(each))
+        self._taken.add(free)
+        return free
 
     def _initial(self, quantity: str) -> float:
         return self.netlist.initial.get(quantity, 0.0)
