@@ -13,7 +13,7 @@ import pytest
 from plants import shipped
 
 from gpebo_cli import run
-from gpebo_cli.experiment.assumptions import check, warnings
+from gpebo_cli.experiment.assumptions import examine, warnings
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import Settings
 
@@ -22,7 +22,7 @@ ROOT = Path(__file__).parent.parent
 
 def found(system, **observer):
     settings = Settings(plant={}, estimator={}, observer={"name": "gpebo", **observer})
-    return {a.name: a for a in check(settings, system)}
+    return {a.name: a for a in examine(settings, system).assumptions}
 
 
 def command(*words, cwd):

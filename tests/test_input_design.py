@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plants import shipped
 
-from gpebo_cli.experiment.assumptions import check, designable
+from gpebo_cli.experiment.assumptions import designable, examine
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.settings import NoiseSettings, Settings, TimeSettings
 
@@ -32,7 +32,8 @@ def test_the_check_says_whether_the_input_excites(current, holds):
     settings = Settings(
         plant={}, estimator={}, observer={"name": "gpebo"}, time=TimeSettings(horizon=600.0)
     )
-    found = {a.name: a for a in check(settings, shipped("battery", inputs={"current": current}))}
+    examined = examine(settings, shipped("battery", inputs={"current": current}))
+    found = {a.name: a for a in examined.assumptions}
     assert found["Assumption 2"].evidence["psi_depends_on"] == "current"
     assert found["Assumption 2"].holds is holds
 

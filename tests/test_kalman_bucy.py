@@ -16,7 +16,7 @@ from test_observer import ROTATING
 
 from gpebo_cli import run as api_run
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment.assumptions import check
+from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
@@ -219,7 +219,7 @@ def test_window_is_exciting_but_not_uniformly_observable():
     settings = replace(
         result.settings, observer={"name": "kalman_bucy"}, estimator={"name": "drem"}
     )
-    failed = [a.name for a in check(settings, result.system) if not a.holds]
+    failed = [a.name for a in examine(settings, result.system).assumptions if not a.holds]
     assert failed == ["uniform observability"]
 
 

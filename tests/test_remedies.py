@@ -23,7 +23,7 @@ from test_observer import ROTATING
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.evidence.excitation import segment_level
-from gpebo_cli.experiment.assumptions import check
+from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import largest
@@ -418,7 +418,7 @@ def test_a_fundamental_matrix_beyond_all_bounds_ends_in_one_line():
 def test_settings_that_do_not_fit(observer, message):
     system = plant_from_mapping(UNBOUNDED)
     with pytest.raises(ConfigError) as caught:
-        check(Settings(plant={}, estimator={}, observer={"name": "gpebo", **observer}), system)
+        examine(Settings(plant={}, estimator={}, observer={"name": "gpebo", **observer}), system)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -155,7 +155,7 @@ def check(
         plant, regression, config_dir, {}, observer=observer, solver=solver, noise=noise,
         data=_recording(data), time=time, excitation=excitation,
     )
-    return assumptions.check(settings, system)
+    return assumptions.examine(settings, system).assumptions
 
 
 def _in_place(

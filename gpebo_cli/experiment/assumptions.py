@@ -51,20 +51,13 @@ class Examination:
     left_out: tuple[str, ...] = ()  # states that the observer does not estimate
 
 
-def check(settings: Settings, system: DescriptorSystem) -> tuple[Assumption, ...]:
-    """All assumptions of the plant and the observer of ``settings``; never raises ModelError.
-
-    They are about ψ, which noise does not reach: signals are taken without it.
-    """
-    return examine(settings, system).assumptions
-
-
 @one_thread
 @np.errstate(all="ignore")  # as in a run
 def examine(settings: Settings, system: DescriptorSystem) -> Examination:
-    """:func:`check`, with what can be known; of a recording the observer's part only.
+    """All assumptions of the plant and the observer, with what can be known; never a ModelError.
 
-    Where the observer may choose, there is evidence of the form that it does not take, too.
+    They are about ψ, which noise does not reach: signals are taken without it. Of a recording they
+    are those of the observer only. Where that may choose, there is evidence of the other form, too.
     """
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if settings.data.name == "csv":

@@ -281,13 +281,9 @@ def at_samples(
         excitation, estimation,
         accuracy.standing(estimation, metrics, gains, system) if noisy else metrics,
         by.fit() if source.recording else None,
-        times, _never(times),
+        times, [name for name, since in times.items() if since is None],
         note=online.note + (_no_deviations(why) if noisy else _held(samples, metrics)),
     )
-
-
-def _never(times: Mapping[str, float | None]) -> list[str]:
-    return [name for name, since in times.items() if since is None]
 
 
 def _no_deviations(why: str) -> str:

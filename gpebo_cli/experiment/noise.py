@@ -34,8 +34,6 @@ from gpebo_cli.simulation.signals import Signals
 
 _SAME = 1e-6  # of T_s: an edge this near to an instant takes its place
 _RESOLVED = 1e-10  # of a sample: what a polynomial may miss of the interpolant
-_FEW = 8  # elements with the same place in their interval: below, an FFT is not worth it
-_CHUNK = 1 << 22  # numbers held at once while the interpolant is summed
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,33 +206,14 @@ def between(errors: Array, grid: SampledMesh, shape: str) -> Array:
     length = mesh.steps / grid.sample_time
     rounding = 64 * np.finfo(float).eps * float(np.abs(mesh.edges).max()) / grid.sample_time
     digits = int(-np.log10(max(rounding, 1e-12)))
-    _, kind, members = np.unique(
-        np.round(np.stack([left, length]), digits), axis=1, return_inverse=True, return_counts=True
-    )
-    kind = kind.ravel()
-    few: BoolArray = members[kind] < _FEW
+    _, kind = np.unique(np.round(np.stack([left, length]), digits), axis=1, return_inverse=True)
     spectrum = np.fft.rfft(errors, axis=0)
     frequencies = 2j * pi * np.arange(len(spectrum))[:, None] / len(errors)
-    for number in np.flatnonzero(members >= _FEW):
-        chosen = np.flatnonzero(kind == number)
+    for number in range(int(kind.max()) + 1):
+        chosen = np.flatnonzero(kind.ravel() == number)
         exact_left, exact_length = left[chosen].mean(), length[chosen].mean()
         for i, point in enumerate(rule.points):
             turned = spectrum * np.exp(frequencies * (exact_left + exact_length * point))
             shifted = np.fft.irfft(turned, n=len(errors), axis=0)
             out[chosen, i] = shifted[grid.sample[chosen]]
-    out[few] = _summed(errors, (mesh.points[few] - mesh.edges[0]) / grid.sample_time)
     return out
-
-
-def _summed(errors: Array, x: Array) -> Array:
-    """Σ_k e_k D(x − k) at x (…,), shape (…, c), term by term."""
-    count, flat = len(errors), x.ravel()
-    out = np.empty((len(flat), errors.shape[1]))
-    chunk = max(1, _CHUNK // count)
-    for i in range(0, len(flat), chunk):
-        distance = flat[i : i + chunk, None] - np.arange(count)
-        below = count * np.sin(pi * distance / count)
-        at_sample = np.abs(below) < 1e-12
-        kernel = np.where(at_sample, 1.0, np.sin(pi * distance) / np.where(at_sample, 1.0, below))
-        out[i : i + chunk] = kernel @ errors
-    return out.reshape(*x.shape, errors.shape[1])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -76,29 +77,21 @@ class OnlineEstimates:
 def joined(parts: Sequence[OnlineEstimates]) -> OnlineEstimates:
     """What consecutive samples gave, as if they had come at once."""
     regressions = [part.regression for part in parts]
-    deltas = [part.delta for part in parts if part.delta is not None]
-    return OnlineEstimates(
-        SampledRegression(
-            np.concatenate([r.t for r in regressions]),
-            np.concatenate([r.steps for r in regressions]),
-            np.concatenate([regressions[0].rows[:1], *(r.rows[1:] for r in regressions)]),
-            regressions[0].hold,
-        ),
-        np.concatenate([part.parameters for part in parts], axis=1),
-        np.concatenate([part.states for part in parts], axis=1),
-        np.concatenate(deltas, axis=1) if deltas else None,
-        np.concatenate([part.gram_eigenvalues for part in parts]),
-        Knowledge.joined([part.known for part in parts]),
-        np.concatenate([part.seen for part in parts]),
-        np.concatenate([part.extension for part in parts]),
-        *(_maybe([getattr(part, name) for part in parts], axis)
-          for name, axis in (("std", 1), ("level", 0), ("gain", -3))),
+    axes = {"parameters": 1, "states": 1, "delta": 1, "gram_eigenvalues": 0, "seen": 0,
+            "extension": 0, "std": 1, "level": 0, "gain": -3}
+    known = {name: [getattr(part, name) for part in parts] for name in axes}
+    whole: dict[str, Any] = {
+        name: None if any(part is None for part in found) else np.concatenate(found, axes[name])
+        for name, found in known.items()
+    }
+    regression = SampledRegression(
+        np.concatenate([r.t for r in regressions]), np.concatenate([r.steps for r in regressions]),
+        np.concatenate([regressions[0].rows[:1], *(r.rows[1:] for r in regressions)]),
+        regressions[0].hold,
     )
-
-
-def _maybe(parts: Sequence[Array | None], axis: int) -> Array | None:
-    known = [part for part in parts if part is not None]
-    return np.concatenate(known, axis=axis) if len(known) == len(parts) else None
+    return OnlineEstimates(
+        regression=regression, known=Knowledge.joined([part.known for part in parts]), **whole
+    )
 
 
 class Online:

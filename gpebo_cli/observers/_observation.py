@@ -125,8 +125,13 @@ class InitialError:
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """η at the times t (M,), shape (M, p)."""
         if not (_is_constant(theta) or np.isnan(theta).any()):
-            z = states(t) @ self.dual.T
-            e0 = error_of_extension(self.extension(t), theta, z, self.units)
+            W, z, q = self.extension(t), states(t) @ self.dual.T, theta.shape[1]
+            if self.units is not None:
+                W, z = W / self.units[:, None], z / self.units
+            xi_a, xi_b, Phi = W[..., 0], W[..., 1 : 1 + q], W[..., 1 + q :]
+            # Φᵀ z = Φᵀ w, because the columns of Φ lie in the range of the projector P.
+            distance = xi_a + np.einsum("mij,mj->mi", xi_b, theta) - z
+            e0 = np.einsum("mij,mj->mi", np.linalg.pinv(Phi, rcond=0.0), distance)
             return np.concatenate([theta, e0], axis=1)
         times = np.array([start[0] for start in self.later])
         starts = [(self.initial_dual, self.xi_a0), *(start[1:] for start in self.later)]
@@ -142,20 +147,6 @@ class InitialError:
 def _is_constant(theta: Array) -> bool:
     """Whether θ (M, q) is the same at all times; of a broadcast array that is known at once."""
     return theta.strides[0] == 0 or not theta.size or not (theta[1:] != theta[:-1]).any()
-
-
-def error_of_extension(W: Array, theta: Array, x: Array, units: Array | None) -> Array:
-    """e₀ = Φ⁺ (ξ_a + ξ_b θ − x) of [ξ_a | ξ_b | Φ] (M, k, 1 + p), θ (M, q) and x (M, k).
-
-    The coordinates have units (k,).
-    """
-    q = theta.shape[1]
-    if units is not None:
-        W, x = W / units[:, None], x / units
-    xi_a, xi_b, Phi = W[..., 0], W[..., 1 : 1 + q], W[..., 1 + q :]
-    # Φᵀ x = Φᵀ w, because the columns of Φ lie in the range of the projector P.
-    distance = xi_a + np.einsum("mij,mj->mi", xi_b, theta) - x
-    return np.asarray(np.einsum("mij,mj->mi", np.linalg.pinv(Phi, rcond=0.0), distance))
 
 
 def log_norm(Phi: Array) -> float:

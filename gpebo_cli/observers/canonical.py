@@ -289,19 +289,13 @@ def _unknown_input_observer(
         j = int(np.argmax(seen))
         row = np.concatenate([b.C[:, j, : n_a + 2], y[:, j : j + 1]], axis=1)
         third = mesh.trajectory(row / b.C[:, j, n_a + 2 : n_a + 3])
+    algebraic = np.stack([-f_b[:, 0], c[:, 0] * f_b[:, 0] / c[:, 1]], axis=1)
+    on_mesh = mesh.trajectory
     return UnknownInputObserver(
-        mesh=mesh,
-        M=mesh.trajectory(M),
-        from_y=mesh.trajectory(from_y),
-        forcing=mesh.trajectory(forcing),
-        G2=mesh.trajectory(1.0 / c[:, 1]),
-        y=mesh.trajectory(y[:, ell]),
-        C_a=mesh.trajectory(b.C[:, ell, :n_a]),
-        algebraic=mesh.trajectory(np.stack([-f_b[:, 0], c[:, 0] * f_b[:, 0] / c[:, 1]], axis=1)),
-        third=third,
-        start=start,
-        names=(system.states[n_a], system.states[n_a + 1]),
-        assumptions=_assumptions(system, b.N, c, mesh.trajectory(M), ell),
+        mesh, on_mesh(M), on_mesh(from_y), on_mesh(forcing), on_mesh(1.0 / c[:, 1]),
+        on_mesh(y[:, ell]), on_mesh(b.C[:, ell, :n_a]), on_mesh(algebraic), third, start,
+        (system.states[n_a], system.states[n_a + 1]),
+        _assumptions(system, b.N, c, on_mesh(M), ell),
     )
 
 

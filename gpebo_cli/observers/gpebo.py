@@ -70,13 +70,12 @@ class Gpebo:
     def __post_init__(self) -> None:
         if self.sample_time is not None:
             self._refuse_what_needs_the_past()
-        if self.bounds and not isinstance(self.remedy, Plain | OutputInjection):
+        keeps = isinstance(self.remedy, Plain | OutputInjection)
+        if self.bounds and not keeps:
             raise ConfigError(
                 "observer.bounds: parameters that change on the way have none; accepted remedies "
                 "are none and output_injection"
             )
-
-        keeps = isinstance(self.remedy, Plain | OutputInjection)
         if self.unknown_initial is not None and not keeps:
             raise ConfigError(
                 "observer.unknown_initial: with this remedy the parameters are about later states, "
@@ -157,21 +156,15 @@ class Gpebo:
         )
 
     def _refuse_what_needs_the_past(self) -> None:
-        if self.unknown_initial is not None:
+        name = next(key for key, kind in REMEDIES.items() if isinstance(self.remedy, kind))
+        asked = {
+            "unknown_initial": self.unknown_initial is not None, "bounds": bool(self.bounds),
+            f"remedy={name}": not isinstance(self.remedy, Plain),
+        }
+        for key in (key for key, is_asked in asked.items() if is_asked):
             raise ConfigError(
-                "observer.unknown_initial works in continuous time only; at samples "
-                "(observer.sample_time, streams) all initial values are unknown"
-            )
-        if self.bounds:
-            raise ConfigError(
-                "observer.bounds works in continuous time only: at samples (observer.sample_time, "
+                f"observer.{key} works in continuous time only; at samples (observer.sample_time, "
                 "streams) the past is not kept"
-            )
-        if not isinstance(self.remedy, Plain):
-            name = next(key for key, kind in REMEDIES.items() if isinstance(self.remedy, kind))
-            raise ConfigError(
-                f"observer.remedy={name} works in continuous time only; at samples "
-                "(observer.sample_time, streams) there is none"
             )
 
 

@@ -89,7 +89,7 @@ def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> Fil
     q, k = o.from_unknowns.shape[2], basis.shape[1]
     A = np.zeros((count, q + k, q + k))
     # w = P w. The range of P(t) turns; rounding outside of it is damped, or it would grow.
-    off = np.eye(k) - dual @ o.projector @ basis
+    off = np.eye(k) - dual @ o.split.projector @ basis
     damping = np.linalg.norm(o.dynamics, axis=(1, 2))[:, None, None] * off
     A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics - damping
     inward = np.zeros((count, q + k, signals.shape[1]))
@@ -130,7 +130,7 @@ def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> Fil
         offset=-(K_g @ signals)[:, :, 0],
         gain=gain,
         direct=-o.of_noise(K_g, m),
-        projector=np.broadcast_to(o.projector, (count, *o.projector.shape[1:])),
+        projector=np.broadcast_to(o.split.projector, (count, *o.split.projector.shape[1:])),
     )
 
 
@@ -419,11 +419,7 @@ class Filter:
 
     filtered: Filtered
     observability: Requirement
-
-    @property
-    def cases(self) -> tuple[Mapping[str, float], ...]:
-        """One case, which has no gains."""
-        return ({},)
+    cases: tuple[Mapping[str, float], ...] = ({},)
 
     def estimate(self, regression: LinearRegression, t: Array) -> KalmanBucyEstimates:  # noqa: ARG002
         """ζ̂ at the times t (M,)."""

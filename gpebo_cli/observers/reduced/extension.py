@@ -173,11 +173,6 @@ class ReducedSystem:
         return units_along(self.basis, self.form.units.states)
 
     @property
-    def rank(self) -> int:
-        """The number n_a of coordinates of the range of P."""
-        return int(self.first.split.rank)
-
-    @property
     def labels(self) -> tuple[str, ...]:
         """Names of w's coordinates, (k,)."""
         return self.first.split.coordinates(self.system.states, self.form.units.states)
@@ -371,7 +366,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     name = f"observer of plant {system.name}"
     # Along axes offset and gain are these components, each compared with its own state's size.
     on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
-    on_axes &= basis.shape[1] == reduced.rank  # else what is eliminated is taken from them
+    on_axes &= basis.shape[1] == reduced.first.split.rank  # else they lose what is eliminated
     axes = basis if on_axes and large and (basis.max(axis=0) == 1.0).all() else None
     monitor = _Monitor(system, basis, units, axes)
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
@@ -546,7 +541,7 @@ def assumptions(reduced: ReducedSystem, weakest: tuple[float, float]) -> tuple[A
     """Rank of E and Assumption 1, with their evidence: the ``weakest`` singular value, its time."""
     frame = reduced.first.split.frame
     left = None if frame is None else frame.remaining
-    rank = reduced.rank + (0 if left is None else left.given_up.shape[1])
+    rank = reduced.first.split.rank + (0 if left is None else left.given_up.shape[1])
     of = "smallest_singular_value" + ("" if reduced.lost is None else "_of_the_rest")
     evidence = dict(zip((of, "at"), weakest, strict=True))
     return needed(reduced.form, reduced.note, rank, evidence, holds=reduced.lost is None)

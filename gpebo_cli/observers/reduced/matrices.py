@@ -92,11 +92,6 @@ class ObserverMatrices:
         return np.concatenate([matrix[:, :, :inputs], matrix[:, :, -self.outputs :]], axis=2)
 
     @property
-    def projector(self) -> Array:
-        """P = E⁺E, (N, n, n)."""
-        return self.split.projector
-
-    @property
     def residual(self) -> Array:
         """R = I − 𝒜 Q K, (N, e + r, e + r)."""
         return orthonormal_complement(self.range)

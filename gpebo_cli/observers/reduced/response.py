@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpebo_cli.errors import SolverError
+from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
@@ -31,15 +32,9 @@ def error_system(o: ObserverMatrices, kept: IntArray | slice, inputs: int) -> Er
     g = o.of_noise(o.g_signals, inputs)
     return ErrorSystem(
         o.dynamics, o.of_noise(o.from_signals, inputs),
-        _stacked(R @ o.on_basis, o.split.basis - H @ (Q1 @ o.on_basis)),
-        _stacked(R @ g, -H @ (Q1 @ g)),
+        joined(R @ o.on_basis, o.split.basis - H @ (Q1 @ o.on_basis), axis=1),
+        joined(R @ g, -H @ (Q1 @ g), axis=1),
     )
-
-
-def _stacked(upper: Array, lower: Array) -> Array:
-    count = max(len(upper), len(lower))
-    parts = [np.broadcast_to(part, (count, *part.shape[1:])) for part in (upper, lower)]
-    return np.concatenate(parts, axis=1)
 
 
 def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) -> Array:

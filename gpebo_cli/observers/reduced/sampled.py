@@ -88,14 +88,9 @@ class SampledObserver:
         return self.form.system
 
     @property
-    def basis(self) -> Array:
-        """The basis in whose coordinates the extension is integrated, (n, k)."""
-        return self.like.split.basis
-
-    @property
     def units(self) -> Array:
-        """Of those coordinates, (k,)."""
-        return units_along(self.basis, self.form.units.states)
+        """Of the coordinates in which the extension is integrated, (k,)."""
+        return units_along(self.like.split.basis, self.form.units.states)
 
     def assumptions(self, reached: SampledState) -> tuple[Assumption, ...]:
         """What the observer needed so far, with its evidence."""
@@ -174,14 +169,14 @@ class SampledObserver:
         error: float,
     ) -> tuple[SampledState, SampledBlock]:
         """Regression and state map from [ξ_a | ξ_b | Φ], z (K, k, ·), and what errors become."""
-        system = self.system
+        system, basis = self.system, self.like.split.basis
         o, driving = self._matrices(t, t, signals)
         equations = o.equations(driving)
-        assembled = regression_signals(z, system.q, self.basis, equations)
+        assembled = regression_signals(z, system.q, basis, equations)
         Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
         growth = largest_entry(Phi[1:])
         smallest = float(o.injectivity.min())
-        of_gain, scale = term_sizes(z, system.q, self.basis, equations)
+        of_gain, scale = term_sizes(z, system.q, basis, equations)
         if before is not None:
             growth, scale[0] = max(growth, before.growth), np.maximum(scale[0], before.scale)
             smallest = min(smallest, before.injectivity)

@@ -37,8 +37,8 @@ class CurrentState:
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """ζ at the times t (M,), shape (M, q + d)."""
         dual, x = self.reduced.first.split.dual, states(t)
-        if len(dual) > self.reduced.rank:
-            x = np.einsum("mij,mj->mi", self.reduced.matrices(t, t).projector, x)
+        if len(dual) > self.reduced.first.split.rank:
+            x = np.einsum("mij,mj->mi", self.reduced.matrices(t, t).split.projector, x)
         return np.concatenate([theta, x @ dual.T], axis=1)
 
 
@@ -50,7 +50,7 @@ class CurrentCoordinates:
         """The regression about ζ and its dynamics."""
         system, solver = reduced.system, reduced.solver
         q, n, basis = system.q, system.n, reduced.basis
-        rotates = basis.shape[1] > reduced.rank
+        rotates = basis.shape[1] > reduced.first.split.rank
         k = basis.shape[1]
         # [ξ_a | ξ_b | Φ] = [0 | 0 | −I] is the identity map from ζ to w.
         identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
@@ -69,7 +69,10 @@ class CurrentCoordinates:
             a = regression_signals(z, q, basis, o.equations(signals))
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
-                a = _with_kernel(a, np.eye(n) - np.broadcast_to(o.projector, (len(t), n, n)), q)
+                # Further rows 0 = Q w, of the size of ψ.
+                kernel = a.column_scale.max(initial=0.0) * (np.eye(n) - o.split.projector)
+                rows = np.pad(np.broadcast_to(kernel, (len(t), n, n)), ((0, 0), (0, 0), (q, 0)))
+                a = replace(a, Y=np.pad(a.Y, ((0, 0), (0, n))), psi=np.hstack([a.psi, rows]))
             kinds = (*a.kinds(), (A, 0.0), (b, 0.0))
             signals_of = [(v.reshape(*mesh.points.shape, -1), floor) for v, floor in kinds]
             return (a, A, b, (o.injectivity, o.elimination)), signals_of
@@ -102,14 +105,3 @@ class CurrentCoordinates:
             growth=None,
             note=reduced.note,
         )
-
-
-def _with_kernel(a: Assembled, kernel: Array, q: int) -> Assembled:
-    """Further rows 0 = Q w, of the size of ψ."""
-    count, n = kernel.shape[:2]
-    scale = a.column_scale.max(initial=0.0)
-    rows = np.concatenate([np.zeros((count, n, q)), scale * kernel], axis=2)
-    return replace(
-        a, Y=np.concatenate([a.Y, np.zeros((count, n))], axis=1),
-        psi=np.concatenate([a.psi, rows], axis=1),
-    )

@@ -85,7 +85,7 @@ def given_injection(system: DescriptorSystem, entries: list[list[float | str]]) 
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
         values = taylor(parsed, t, 0, inside)[0].reshape(-1, n, r)
-        return np.asarray(o.split.dual @ o.projector @ values @ o.residual[:, -r:])
+        return np.asarray(o.split.dual @ o.split.projector @ values @ o.residual[:, -r:])
 
     return gain
 
@@ -106,13 +106,14 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     n = basis.shape[1]
     unstable = np.maximum(np.linalg.eigvals(A_0).real.max(axis=1, initial=0.0), 0.0)
     kappa = max(2.0 * float(np.sqrt((unstable**2).mean())), _PER_HORIZON / horizon)
-    size = max(_rms(o.residual @ o.algebraic @ basis * reduced.units), np.finfo(float).tiny)
+    norms = np.linalg.norm(o.residual @ o.algebraic @ basis * reduced.units, 2, axis=(1, 2))
+    size = max(float(np.sqrt((norms**2).mean())), np.finfo(float).tiny)
 
     def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
         o = reduced.matrices(t, inside)
         c = o.residual @ o.algebraic @ basis / size
         rows = c.shape[1]
-        inside = dual @ o.projector @ basis
+        inside = dual @ o.split.projector @ basis
         Q = kappa**2 * (inside * variances) @ transpose(inside)
         return StateSpace(
             A=np.broadcast_to(o.dynamics, (len(t), n, n)), b=np.zeros((len(t), n, 0)),
@@ -130,14 +131,7 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     )
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
-        weight = dual @ o.projector @ basis @ S.at(t, inside)[0] / size**2
+        weight = dual @ o.split.projector @ basis @ S.at(t, inside)[0] / size**2
         return np.asarray(weight @ transpose(o.algebraic @ basis) @ o.residual)
 
     return gain, S.mesh
-
-
-def _rms(matrices: Array) -> float:
-    """Root mean square over time of the spectral norm of matrices (N, …, …)."""
-    if not matrices.size:
-        return 0.0
-    return float(np.sqrt((np.linalg.norm(matrices, 2, axis=(1, 2)) ** 2).mean()))
