@@ -152,15 +152,12 @@ Mixing = Callable[[SampledRegression], Mixed]  # an extension, and Δ and η̄ a
 
 def sampled_mixing(settings: FilteredEstimator, parameters: Sequence[str]) -> Mixing:
     """The filters of an estimator at samples, and mixing; one group."""
-    filters = settings.at_samples(filter_rates(settings.rates, parameters))
+    return partial(_mixed, settings.at_samples(filter_rates(settings.rates, parameters)))
 
-    def mixed(regression: SampledRegression) -> Mixed:
-        extended = filters.update(regression)
-        return Mixed(
-            *mix_sampled(extended), lambda: ([filters.errors()], [inverse_sampled(extended)])
-        )
 
-    return mixed
+def _mixed(filters: KreisselmeierFilter, regression: SampledRegression) -> Mixed:
+    extended = filters.update(regression)
+    return Mixed(*mix_sampled(extended), lambda: ([filters.errors()], [inverse_sampled(extended)]))
 
 
 class RecursiveMixed:

@@ -18,7 +18,7 @@ from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_e
 from gpebo_cli.estimators._mixing import SINGULAR, filled
 from gpebo_cli.estimators._recursive import Mixed, integrating, quotient_of
 from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
-from gpebo_cli.estimators.least_squares import LeastSquares
+from gpebo_cli.estimators.least_squares import LeastSquares, RecursiveLeastSquares
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
@@ -83,20 +83,8 @@ class LsDrem(ResumableEstimator):
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
         part, cases = self.least_squares.recursive(parameters), self.least_squares.cases
-
-        def mixed(regression: SampledRegression) -> Mixed:
-            spectra = part.spectra(regression)
-            delta = [
-                np.prod(_shares(s, case["alpha"], case["f0"]), axis=1)
-                for s, case in zip(spectra, cases, strict=True)
-            ]
-            quotient, usable, inverse = zip(*map(quotient_of, spectra), strict=True)
-            return Mixed(
-                np.stack(delta, axis=1), np.stack(quotient, axis=1), np.stack(usable, axis=1),
-                lambda: ([integrating(regression, case["beta"]) for case in cases], inverse),
-            )
-
-        return RecursiveMixed(self, parameters, mixed, "IE", len(cases), mu)
+        mixing = partial(_mixed, part, cases)
+        return RecursiveMixed(self, parameters, mixing, "IE", len(cases), mu)
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,), each with a path of its own."""
@@ -114,6 +102,22 @@ class LsDrem(ResumableEstimator):
             condition="IE",
             realisations=regression.realisations,
         )
+
+
+def _mixed(
+    part: RecursiveLeastSquares, cases: Sequence[Mapping[str, float]], regression: SampledRegression
+) -> Mixed:
+    """Least squares at samples, and mixing; a group for each of its cases."""
+    spectra = part.spectra(regression)
+    delta = [
+        np.prod(_shares(s, case["alpha"], case["f0"]), axis=1)
+        for s, case in zip(spectra, cases, strict=True)
+    ]
+    quotient, usable, inverse = zip(*map(quotient_of, spectra), strict=True)
+    return Mixed(
+        np.stack(delta, axis=1), np.stack(quotient, axis=1), np.stack(usable, axis=1),
+        lambda: ([integrating(regression, case["beta"]) for case in cases], inverse),
+    )
 
 
 def mix_least_squares(
