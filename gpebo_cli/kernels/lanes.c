@@ -14,8 +14,7 @@ int lanes_scratch(Call *call, const npy_intp *sizes, Lane ***parts, size_t count
 void lanes_load(Lane *to, const double *from, npy_intp step, npy_intp entries, npy_intp first,
                 npy_intp used)
 {
-    EACH
-    {
+    for (int l = 0; l < LANES; l++) {
         const double *one = from + (first + (l < used ? l : used - 1)) * step;
         for (npy_intp i = 0; i < entries; i++)
             to[i][l] = one[i];
@@ -84,8 +83,7 @@ EVERY_WIDTH void lanes_from_right(Lane *C, npy_intp c, const Lane *A, const doub
 /* Exchanges row k with row best[l] in every lane; turns the signs of lanes where they differ. */
 static inline void exchange(Lane *A, npy_intp columns, npy_intp k, const double *best, double *sign)
 {
-    EACH
-    {
+    for (int l = 0; l < LANES; l++) {
         const npy_intp other = (npy_intp)best[l];
         if (other == k)
             continue;

@@ -157,7 +157,6 @@ static inline void note(const Course *course, npy_intp j, const double *error, d
         return;
     double *restrict last = course->last[j];
     const double *restrict level = course->level[j];
-#pragma omp simd
     EACH last[l] = fabs(error[l]) > level[l] ? time : last[l];
 }
 

@@ -19,7 +19,8 @@ typedef struct {
 static double largest(double so_far, const Lane *values, npy_intp entries)
 {
     for (npy_intp i = 0; i < entries; i++)
-        EACH so_far = larger(so_far, larger(fabs(values[i][l]), 0.0));
+        for (int l = 0; l < LANES; l++)
+            so_far = larger(so_far, larger(fabs(values[i][l]), 0.0));
     return so_far;
 }
 

@@ -326,7 +326,8 @@ static void amplify(const Model *m, Elimination *el, Forcing *f, npy_intp first,
     lanes_clear(reached, n * width);
     lanes_multiply(reached, width, el->inverse + d, n, terms, width, n, a, width, 1.0);
     for (npy_intp i = 0; i < n * width; i++)
-        EACH most[i] = larger(most[i], reached[i][l]);
+        for (int l = 0; l < LANES; l++)
+            most[i] = larger(most[i], reached[i][l]);
 }
 
 /* The model, B, F, u, θ, pivots, at every how many times the amplification is looked at, growth,
