@@ -69,7 +69,12 @@ class PlantDraft:
         for matrix in "EABF":
             for (row, _), terms in self._terms[matrix].items():
                 if row in rows:
-                    terms[:] = [_negative(term) for term in terms]
+                    terms[:] = [
+                        -term if not isinstance(term, str)
+                        # Texts are products, with a minus or without.
+                        else term[1:] if term.startswith("-") else f"-{term}"
+                        for term in terms
+                    ]
 
     def measure(self, names: Iterable[str], where: str) -> None:
         """Make states the outputs, in place of those there are.
@@ -130,8 +135,8 @@ class PlantDraft:
             "A": self._grid("A"),
         }
         for matrix in "BFCDH":
-            wanted = bool(self._terms[matrix]) or (matrix in "BFC" and self._size(matrix))
-            if wanted:
+            size = self._height(matrix) * len(list(self._columns(matrix)))
+            if self._terms[matrix] or (matrix in "BFC" and size):
                 text[matrix] = self._grid(matrix)
         text["initial_state"] = {name: value for name, (value, _) in self.states.items()}
         text["units"] = {
@@ -164,9 +169,14 @@ class PlantDraft:
                 lines += ["", f"{key}:"]
                 lines += [f"  {_scalar(label)}: {_scalar(item)}" for label, item in value.items()]
             else:
-                if key in ("states", "initial_state"):
-                    lines.append("")
-                lines += _flow(key, value)
+                lines += [""] * (key in ("states", "initial_state"))
+                written = [f"{key}: {_scalar(value)}"]
+                if isinstance(value, list | dict):
+                    written = yaml.safe_dump(
+                        {key: value}, default_flow_style=None, sort_keys=False, width=_WIDTH,
+                        allow_unicode=True,
+                    ).splitlines()
+                lines += written
         return "\n".join([*lines, ""])
 
     def files(self) -> dict[str, bytes]:
@@ -206,9 +216,6 @@ class PlantDraft:
 
     def _height(self, matrix: str) -> int:
         return len(self.outputs) if matrix in "CDH" else len(self.rows)
-
-    def _size(self, matrix: str) -> int:
-        return self._height(matrix) * len(list(self._columns(matrix)))
 
     def _grid(self, matrix: str) -> object:
         terms, columns = self._terms[matrix], list(self._columns(matrix))
@@ -257,13 +264,6 @@ def _nonzero(values: object) -> Iterable[tuple[int, int, Entry]]:
                 yield i, j, value if isinstance(value, str) else float(value)
 
 
-def _negative(term: Entry) -> Entry:
-    """The term with the other sign; texts are products, with a minus or without."""
-    if isinstance(term, str):
-        return term[1:] if term.startswith("-") else f"-{term}"
-    return -term
-
-
 def _sum(terms: list[Entry]) -> Entry:
     """The terms as one entry: numbers are added up, texts are joined by their signs."""
     number = sum(term for term in terms if not isinstance(term, str))
@@ -276,16 +276,6 @@ def _sum(terms: list[Entry]) -> Entry:
     for term in text[1:]:
         out += f" - {term[1:]}" if term.startswith("-") else f" + {term}"
     return out
-
-
-def _flow(key: str, value: object) -> list[str]:
-    """A key with a text, a list or a mapping, lists and mappings in brackets."""
-    if isinstance(value, list | dict):
-        return yaml.safe_dump(
-            {key: value}, default_flow_style=None, sort_keys=False, width=_WIDTH,
-            allow_unicode=True,
-        ).splitlines()
-    return [f"{key}: {_scalar(value)}"]
 
 
 def _scalar(value: object) -> str:

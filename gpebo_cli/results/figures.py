@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import wraps
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,9 +39,9 @@ MIN_GAINS = 3  # fewer points are not a curve over the gain
 
 def states(result: RunResult) -> list[Panel]:
     """Fig. 3: the true states over time, one panel per unit."""
-    known, names = _known(result), result.system.states
-    shown = result.signals.states[:, known]
-    return _by_unit(result, "states", [names[i] for i in known], shown)
+    known = _known(result)
+    names = [result.system.states[i] for i in known]
+    return _by_unit(result, "states", names, result.signals.states[:, known])
 
 
 def signals(result: RunResult) -> list[Panel]:
@@ -59,20 +59,18 @@ def regressor(result: RunResult) -> list[Panel]:
     if regression is None or not regression.parameters:
         return []
     psi, labels = regression.psi, result.system.labels
-    rows = [row for row in range(psi.shape[1]) if np.any(psi[:, row])] or [0]
-    panels = [
-        Panel(
-            "regressor ψ" if len(rows) == 1 else f"ψ, row {row + 1}",
-            tuple(
-                Curve(regression.t, psi[:, row, column], f"ψ {name}", line(column),
-                      f"for {typeset(name, labels)}")
-                for column, name in enumerate(regression.parameters)
-            ),
-            text=r"regressor $\psi$" if len(rows) == 1 else rf"$\psi$, row {row + 1}",
+    every = range(psi.shape[1])
+    rows, panels = [row for row in every if np.any(psi[:, row])] or every[:1], []
+    for row in rows:
+        curves = tuple(
+            Curve(regression.t, psi[:, row, column], f"ψ {name}", line(column),
+                  f"for {typeset(name, labels)}")
+            for column, name in enumerate(regression.parameters)
         )
-        for row in rows
-        if row < psi.shape[1]
-    ]
+        name, text = f"ψ, row {row + 1}", rf"$\psi$, row {row + 1}"
+        if len(rows) == 1:
+            name, text = "regressor ψ", r"regressor $\psi$"
+        panels.append(Panel(name, curves, text=text))
     return _with_legend(panels)
 
 
@@ -119,7 +117,7 @@ def fit(result: RunResult) -> list[Panel]:
     s, labels = result.signals, result.system.labels
     panels = []
     for i, name in enumerate(result.system.outputs):
-        unit, text = result.system.units.get(name, ""), typeset(name, labels)
+        unit, text = _unit(result, name), typeset(name, labels)
         measured, fitted = s.outputs[:, i], found.outputs[:, i]
         curves = (
             Curve(s.t, measured, f"{name} measured", style.MEASURED, f"{text} measured"),
@@ -127,7 +125,7 @@ def fit(result: RunResult) -> list[Panel]:
         )
         left = (Curve(s.t, measured - fitted, "", style.RESIDUAL),)
         panels += [
-            Panel(name, curves, unit, text, legend=True),
+            _panel(result, name, curves, legend=True),
             Panel(f"residual of {name}", left, unit, f"residual of {text}"),
         ]
     return panels
@@ -327,31 +325,30 @@ def _unit(result: RunResult, name: str) -> str:
     return units.get(name) or units.get(name.removeprefix(_INITIAL), "")
 
 
+def _panel(result: RunResult, name: str, curves: tuple[Curve, ...], **more: Any) -> Panel:
+    """The panel of one quantity, called as the plant's author calls it."""
+    text = typeset(name, result.system.labels)
+    return Panel(name, curves, _unit(result, name), text, **more)
+
+
 def _by_unit(
     result: RunResult, kind: str, names: Sequence[str], values: Array,
     measured: Array | None = None,
 ) -> list[Panel]:
     """One panel per unit, in the order in which the units appear; what was measured behind."""
-    t, labels = result.signals.t, result.system.labels
-    units = [result.system.units.get(name, "") for name in names]
+    t, texts = result.signals.t, [typeset(name, result.system.labels) for name in names]
+    by_unit: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        by_unit.setdefault(result.system.units.get(name, ""), []).append(i)
     panels = []
-    for unit in dict.fromkeys(units):
-        members = [i for i, other in enumerate(units) if other == unit]
-        behind = members if measured is not None else []
-        curves = (
-            *(
-                Curve(t, measured[:, i], f"{names[i]} measured", style.MEASURED,
-                      f"{typeset(names[i], labels)} measured")
-                for i in behind
-                if measured is not None and np.any(measured[:, i] != values[:, i])
-            ),
-            *(
-                Curve(t, values[:, i], names[i], line(k), typeset(names[i], labels))
-                for k, i in enumerate(members)
-            ),
-        )
-        name = names[members[0]] if len(members) == 1 else kind
-        text = typeset(name, labels) if len(members) == 1 else kind
+    for unit, members in by_unit.items():
+        behind = [] if measured is None else [
+            Curve(t, measured[:, i], f"{names[i]} measured", style.MEASURED, f"{texts[i]} measured")
+            for i in members if np.any(measured[:, i] != values[:, i])
+        ]
+        own = [Curve(t, values[:, i], names[i], line(k), texts[i]) for k, i in enumerate(members)]
+        curves, first = (*behind, *own), members[0]
+        name, text = (names[first], texts[first]) if len(members) == 1 else (kind, kind)
         panels.append(Panel(name, curves, unit, text, legend=len(curves) > 1))
     return panels
 
@@ -375,9 +372,7 @@ def _known(result: RunResult) -> list[int]:
 
 def _shown_cases(estimation: EstimationResult) -> list[int]:
     count = len(estimation.cases)
-    if count <= MAX_CASES:
-        return list(range(count))
-    return [int(case) for case in np.linspace(0, count - 1, MAX_CASES).round()]
+    return [int(case) for case in np.linspace(0, count - 1, min(count, MAX_CASES)).round()]
 
 
 def _note(estimation: EstimationResult) -> str:
@@ -487,38 +482,32 @@ def _estimate(
 ) -> Panel:
     """Estimates (G, M) of ``name`` with their ± 2σ, and the truth if it is known."""
     curves = _per_case(result, estimation, values)
-    deviation = _deviation(result, estimation, name)
-    if deviation is not None:
-        low, high = values[0] - 2 * deviation, values[0] + 2 * deviation
+    deviation, drawn = _deviation(result, estimation, name), values[_shown_cases(estimation)]
+    bands = [] if deviation is None else [values[0] + side * deviation for side in (-2, 2)]
+    if bands:
+        low, high = bands
         band = Curve(estimation.t, high, "± 2σ", style.SPREAD, r"$\pm\,2\sigma$", down_to=low)
         curves = (*curves, band)
-    known = bool(np.isfinite(truth.y).any())
-    if known:
+    if np.isfinite(truth.y).any():
         curves = (truth, *curves) if behind else (*curves, truth)
-    drawn = values[_shown_cases(estimation)]
-    if known:
         limits = _estimate_limits(truth.y, drawn)
     else:  # what an estimate is in the second half stands for the truth
-        bands, late = [] if deviation is None else [low, high], drawn[0, drawn.shape[1] // 2 :]
+        late = drawn[0, drawn.shape[1] // 2 :]
         limits = _estimate_limits(late, np.vstack([drawn, *bands]), abs(float(late[-1])))
-    return Panel(name, curves, _unit(result, name), typeset(name, result.system.labels),
-                 limits=limits)
+    return _panel(result, name, curves, limits=limits)
 
 
 def _state_estimates(
     result: RunResult, estimation: EstimationResult, members: Sequence[int]
 ) -> list[Panel]:
-    signals, seen, panels = result.signals, _seen(result, members), []
+    signals, known, seen, panels = result.signals, _known(result), _seen(result, members), []
     for i in members:
         name = result.system.states[i]
         truth = _truth(result, name, signals.t, signals.states[:, i])
         if i in seen:
             panels.append(_estimate(result, estimation, name, estimation.states[:, :, i], truth))
-        elif not (_known_by_data(result, name) or name in result.left_out) and np.isfinite(
-            truth.y
-        ).any():
-            panels.append(Panel(name, (truth,), _unit(result, name),
-                                typeset(name, result.system.labels), legend=True))
+        elif not (_known_by_data(result, name) or name in result.left_out or i not in known):
+            panels.append(_panel(result, name, (truth,), legend=True))
     return panels
 
 

@@ -8,7 +8,7 @@ alone: importing it takes longer than most runs.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -21,7 +21,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import EstimationResult, NoiseStatistics, RunResult
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.results.files import csv_text, write_file
+from gpebo_cli.results.files import cell, csv_text, write_file, write_text
 from gpebo_cli.schema import unknown
 
 if TYPE_CHECKING:
@@ -175,21 +175,23 @@ def write_table(path: Path, table: Table) -> None:
     """Write a table as CSV; NaN is an empty cell."""
     first = "%d" if table.header[0] == "case" else "%.17g"
     pieces = (text for piece in table.pieces for text in rows_text(piece, first))
-    write_file(path, chain([_header(table.header)], pieces))
+    head = csv_text([table.header]).encode()  # a name may need quotes; numbers never do
+    write_file(path, chain([head], pieces))
 
 
 def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics) -> None:
     """Write one row per case and parameter: its gains, the truth, and errors over the seeds."""
     names = list(estimation.gains)
-    lines = [_header(["case", *names, "parameter", "truth", "bias", "deviation", "rms", "seeds"])]
+    rows = [["case", *names, "parameter", "truth", "bias", "deviation", "rms", "seeds"]]
     for case, values in enumerate(estimation.cases):
-        own = ["" if gain not in values else f"{values[gain]:.17g}" for gain in names]
+        own = [cell(values.get(gain)) for gain in names]
         for i, name in enumerate(noise.names):
             numbers = (noise.truth[i], noise.bias[case, i], noise.deviation[case, i],
                        noise.rms[case, i])
-            cells = [str(case), *own, name, *(f"{x:.17g}" for x in numbers), str(noise.seeds)]
-            lines.append(",".join(cells).encode() + b"\n")
-    write_file(path, lines)
+            rows.append(
+                [str(case), *own, name, *(f"{x:.17g}" for x in numbers), str(noise.seeds)]
+            )
+    write_text(path, csv_text(rows))
 
 
 def _varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
@@ -200,10 +202,6 @@ def _varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
         for i, name in enumerate(estimation.names)
         if not np.isnan(truth[:, i]).any() and np.any(truth[:, i] != truth[:1, i])
     ]
-
-
-def _header(names: Sequence[str]) -> bytes:
-    return csv_text([names]).encode()  # a name may need quotes; the numbers below never do
 
 
 def rows_text(table: Array, first: str = "%.17g") -> Iterator[bytes]:
