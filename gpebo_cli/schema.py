@@ -76,16 +76,14 @@ def read(cls: type[T], mapping: object, where: str) -> T:
 
     Its fields are numbers, text, literals, lists, mappings, unions of them, or dataclasses; one
     annotated ``object`` takes anything. Keys of the mapping are the names of fields; what is absent
-    has its default. Messages begin with ``where``, the name of the whole (``solver``).
-
-    Raises:
-        ConfigError: not a mapping, an unknown or missing key, or a value of the wrong type.
+    has its default. Messages begin with ``where``, the name of the whole (ConfigError: not a
+    mapping, an unknown or missing key, or a value of the wrong type).
     """
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{where}: expected a mapping of keys to values, got {shown(mapping)}")
     if not is_dataclass(cls):
         raise TypeError(f"{cls!r} is not a dataclass")
-    hints = _hints(cls)
+    hints = _hints(cls)  # annotations are text, which is compiled to read it
     by_key, known = _by_key(cls), keys(cls)
     for key in mapping:
         if key not in known:
@@ -112,6 +110,9 @@ def keys(cls: type) -> tuple[str, ...]:
         for option in field.metadata.get("one_of", {}).values():
             found |= dict.fromkeys(keys(option))
     return tuple(found)
+
+
+_hints = lru_cache(maxsize=64)(typing.get_type_hints)
 
 
 @lru_cache(maxsize=256)
@@ -146,12 +147,6 @@ def _check_range(value: Any, field: Field[Any], where: str) -> None:
             raise ConfigError(f"{where}: expected {low:g} {upto}, got {value:g}")
     if field.metadata.get("positive") and value <= 0:
         raise ConfigError(f"{where}: expected a positive number, got {value:g}")
-
-
-@lru_cache(maxsize=64)
-def _hints(cls: type) -> dict[str, Any]:
-    """Types of a class's fields: annotations are text, which is compiled to read it."""
-    return typing.get_type_hints(cls)
 
 
 def convert(value: object, kind: Any, where: str) -> Any:
@@ -231,8 +226,8 @@ def _number(value: object) -> float | None:
 
 Accepted = Literal["positive", "nonnegative", "finite"]
 _WANTED = {
-    "positive": "a positive number", "nonnegative": "0 or a positive number",
-    "finite": "a finite number",
+    "positive": (5e-324, "a positive number"), "nonnegative": (0.0, "0 or a positive number"),
+    "finite": (-math.inf, "a finite number"),
 }
 
 
@@ -243,9 +238,9 @@ def number(
     found = _number(value)
     if found is None and hasattr(value, "item"):  # a scalar of NumPy's
         found = _number(value.item())
-    low = {"positive": 5e-324, "nonnegative": 0.0, "finite": -math.inf}[accept]
+    low, wanted = _WANTED[accept]
     if found is None or not math.isfinite(found) or found < low:
-        raise ConfigError(f"{where}: expected {_WANTED[accept]}, got {shown(value)}")
+        raise ConfigError(f"{where}: expected {wanted}, got {shown(value)}")
     if abs(found) > largest:
         raise ConfigError(f"{where}: {found:g} is too large; numbers go up to {largest:g} here")
     return found

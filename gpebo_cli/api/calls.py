@@ -35,7 +35,7 @@ Choice = str | Mapping[str, object]
 EstimatorChoice = Choice | Estimator
 Folder = str | os.PathLike[str]
 
-_SECTIONS = ("time", "excitation")
+_SECTIONS = {"time": '{"horizon": 10}', "excitation": '{"window": 1}'}  # with examples
 _CHOSEN = tuple(group for group in DATA_GROUPS if group != "plant")
 
 
@@ -229,11 +229,11 @@ def _configure(
     if regression is not None:
         plant, sections["observer"] = _in_place(regression, plant, sections["observer"], config_dir)
     config = {k: v for k, v in primary().items() if k not in ("defaults", "hydra")}
-    for name in _SECTIONS:
+    for name, example in _SECTIONS.items():
         given = sections[name]
         if given is not None and not isinstance(given, Mapping):
             raise ConfigError(
-                f"{name}: expected a mapping such as {_EXAMPLES[name]}, got {shown(given)}"
+                f"{name}: expected a mapping such as {example}, got {shown(given)}"
             )
         config[name] = {**config[name], **plain(given or {})}
     config["uncertainty"] = sections.get("uncertainty", True)
@@ -290,9 +290,6 @@ def _own(estimator: object) -> Estimator:
             f"{shown(estimator)}"
         )
     return cast("Estimator", estimator)
-
-
-_EXAMPLES = {"time": '{"horizon": 10}', "excitation": '{"window": 1}'}
 
 
 def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -> None:

@@ -227,10 +227,8 @@ def plain(config: DictConfig) -> dict[str, Any]:
     """The configuration without Hydra's section as plain data.
 
     There are no interpolations in it: a stranger's sweep can give values that Hydra's grammar turns
-    into one, and it could read environment variables or other parts of the configuration.
-
-    Raises:
-        ConfigError: an interpolation, or a value that is still missing (``???``).
+    into one, and it could read environment variables or other parts of the configuration
+    (ConfigError: an interpolation, or a value that is still missing).
     """
     content = cast("dict[str, Any]", OmegaConf.to_container(config, resolve=False))
     content.pop("hydra", None)

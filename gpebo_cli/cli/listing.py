@@ -19,11 +19,7 @@ KINDS = {
 
 
 def main(words: list[str]) -> int:
-    """Print names, titles and references of the kinds asked for, by default of all.
-
-    Raises:
-        ConfigError: there is no such kind, option or folder.
-    """
+    """Print names, titles and references of the kinds asked for, by default all (ConfigError)."""
     options = parse("list", words, CONFIG_DIR)
     folders = list(filter(None, (conf_folder(), options.config_dir)))
     kinds = list(dict.fromkeys(map(_kind, options.words))) or list(KINDS)

@@ -21,11 +21,7 @@ _WORDS = {"\t": "tab", " ": "space"}
 
 
 def write(file: str, plant: str, folder: str) -> int:
-    """Write ``folder/data/NAME.yaml`` for the recording ``file`` of a plant; the exit code.
-
-    Raises:
-        ConfigError: there is no such file or plant, or the YAML file exists already.
-    """
+    """Write ``folder/data/NAME.yaml`` for a recording of a plant; the exit code (ConfigError)."""
     names = {name: home for home in (folder, conf_folder()) for name in choices(home, "plant")}
     if plant not in names:
         raise unknown(f"--plant {plant}: there is no such plant", plant, sorted(names))

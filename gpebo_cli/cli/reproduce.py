@@ -134,11 +134,7 @@ def _draw(result: RunResult, path: Path) -> None:
 
 
 def quantity(result: RunResult, name: str, where: str) -> list[float]:
-    """What a run says of a quantity: one value, or of ``case.`` and ``final.`` one for each case.
-
-    Raises:
-        ConfigError: there is no such quantity; says which there are.
-    """
+    """One value of a run, of ``case.`` and ``final.`` one for each case (ConfigError)."""
     import numpy as np
 
     kind, _, of = name.partition(".")

@@ -63,16 +63,16 @@ def circuit_from_netlist(
     draft = builder.build()
     for output in measured or [q for q in netlist.saved if q.startswith("v(")]:
         builder.output(output)
-    draft.make_unknown(builder.source(word) for word in split_names(unknown))
+    sources = {name: e.name for name, e in builder.elements.items()}
+    draft.make_unknown(sources.get(word.lower(), word) for word in split_names(unknown))
     draft.comments.append(str(topology))
     return draft, topology
 
 
 def examine(netlist: Netlist, file: str) -> Topology:
-    """Loops and cutsets that raise the index; refuses circuits without a unique solution.
+    """Loops and cutsets that raise the index.
 
-    Raises:
-        ConfigError: a floating node, a loop of voltage sources, or a cutset of current sources.
+    A floating node, a loop of voltage sources or a cutset of current sources is a ConfigError.
     """
     from scipy.cluster.hierarchy import DisjointSet  # a third of a second to import
 
@@ -211,14 +211,14 @@ class _Builder:
             label = self._claim(node if plain else f"v{node}", f"v_{node}")
             self._node[node] = label
             self._row[node] = draft.equation(f"currents at node {node}")
-            draft.states[label] = (self._initial(f"v({node})"), "V")
+            draft.states[label] = (self.netlist.initial.get(f"v({node})", 0.0), "V")
         for e in self.netlist.elements:
             wanted = e.name.lower() in self._wanted
             if e.kind in _WITH_CURRENT or (e.kind in "RS" and wanted):
                 label = self._claim(f"i{e.name.lower()}", f"i_{e.name}")
                 self._current[e.name.lower()] = label
-                start = e.initial if e.kind == "L" and e.initial is not None else None
-                given = self._initial(f"i({e.name.lower()})")
+                start = e.initial if e.kind == "L" else None
+                given = self.netlist.initial.get(f"i({e.name.lower()})", 0.0)
                 draft.states[label] = (given if start is None else start, "A")
         for e in self.netlist.elements:
             getattr(self, f"_stamp_{e.kind}")(e)
@@ -228,14 +228,8 @@ class _Builder:
         return draft
 
     def output(self, text: str) -> None:
-        """Add an output, ``v(a)``, ``v(a,b)``, ``i(R1)`` or a sum of such, perhaps with a name.
-
-        Raises:
-            ConfigError: no such node or element, or a text that is not such a sum.
-        """
-        label, equals, body = text.partition("=")
-        if not equals:
-            label, body = "", text
+        """Add an output, ``v(a)``, ``v(a,b)``, ``i(R1)`` or a sum, named or not (ConfigError)."""
+        *label, body = text.split("=", 1)
         body = body.replace(" ", "")
         terms = list(_TERM.finditer(body))
         if not terms or "".join(match[0] for match in terms) != body:
@@ -244,22 +238,15 @@ class _Builder:
                 "a sum such as y=i(L1)+2*v(out)"
             )
         row = len(self.draft.outputs)
-        parts: list[tuple[str, float]] = []
-        units = set()
-        for match in terms:
-            factor = float(match[2] or 1.0) * (-1.0 if match[1] == "-" else 1.0)
-            for column, sign in self._quantity(match[3]):
-                parts.append((column, factor * sign))
-            units.add("V" if match[3][0].lower() == "v" else "A")
-        name = label.strip() or ("y" if len(terms) > 1 else f"y_{parts[0][0]}")
+        parts = [
+            (column, sign * float(match[2] or 1.0) * (-1.0 if match[1] == "-" else 1.0))
+            for match in terms for column, sign in self._quantity(match[3])
+        ]
+        units = {"V" if match[3][0].lower() == "v" else "A" for match in terms}
+        name = "".join(label).strip() or ("y" if len(terms) > 1 else f"y_{parts[0][0]}")
         self.draft.outputs[self._claim(name, f"{name}_")] = units.pop() if len(units) == 1 else ""
         for column, factor in parts:
             self.draft.add("C", row, column, factor)
-
-    def source(self, word: str) -> str:
-        """The input's name of an independent source."""
-        found = self.elements.get(word.lower())
-        return found.name if found is not None else word
 
     def _quantity(self, text: str) -> list[tuple[str, float]]:
         """States that make up a quantity, with their signs."""
@@ -279,17 +266,14 @@ class _Builder:
                     "unknown; measure that of a resistor, inductor or source"
                 )
             return [(self._current[name], 1.0)]
-        out = []
-        for node, sign in ((match[2], 1.0), (match[3] or GROUND, -1.0)):
-            low = node.lower()
-            if low in (GROUND, "gnd"):
-                continue
-            if low not in self._node:
+        ends = [(match[2], 1.0), (match[3] or GROUND, -1.0)]
+        ends = [(node, sign) for node, sign in ends if node.lower() not in (GROUND, "gnd")]
+        for node, _ in ends:
+            if node.lower() not in self._node:
                 raise ConfigError(
-                    f"{self.file}: there is no node {node}" + nearest(low, self._node)
+                    f"{self.file}: there is no node {node}" + nearest(node.lower(), self._node)
                 )
-            out.append((self._node[low], sign))
-        return out
+        return [(self._node[node.lower()], sign) for node, sign in ends]
 
     def _claim(self, name: str, otherwise: str) -> str:
         """A name nobody has yet; names differ in more than case, for the reader's sake."""
@@ -297,9 +281,6 @@ class _Builder:
         free = next(each for each in others if each not in self._taken and not _reserved(each))
         self._taken.add(free)
         return free
-
-    def _initial(self, quantity: str) -> float:
-        return self.netlist.initial.get(quantity, 0.0)
 
     def _value(self, e: Element) -> str:
         """A parameter that stands for the element's value."""
@@ -441,10 +422,8 @@ class _Builder:
 
     def _start_of_capacitors(self) -> None:
         """Node voltages from ``ic=`` of capacitors: those at ground first, then along chains."""
-        known: dict[str, float] = {GROUND: 0.0}
-        for node in self._node:
-            if f"v({node})" in self.netlist.initial:
-                known[node] = self.netlist.initial[f"v({node})"]
+        voltages = {node: self.netlist.initial.get(f"v({node})") for node in self._node}
+        known = {GROUND: 0.0} | {node: v for node, v in voltages.items() if v is not None}
         given = [(e.nodes, e.initial) for e in self.netlist.elements
                  if e.kind == "C" and e.initial is not None]
         before = 0
@@ -455,10 +434,9 @@ class _Builder:
                     known.setdefault(a, known[b] + across)
                 elif a in known:
                     known[b] = known[a] - across
-        for node, value in known.items():
-            if node != GROUND:
-                label = self._node[node]
-                self.draft.states[label] = (value, self.draft.states[label][1])
+        for node, label in self._node.items():
+            if node in known:
+                self.draft.states[label] = (known[node], "V")
 
     def _start_of_resistors(self) -> None:
         """Currents of resistors that nothing is said of, from the voltages that they start with."""

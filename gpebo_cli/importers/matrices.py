@@ -114,10 +114,8 @@ def read_matrices(path: Path) -> dict[str, Any]:
 
     A ``.mat`` or ``.npz`` file with E, A, B, C, D; a folder of Matrix Market files whose names end
     in ``.E.mtx``, ``_A.mtx`` or are ``B.mtx``; a linearisation by OpenModelica as Python (``.py``),
-    MATLAB (``.m``) or Julia (``.jl``) text with ``A = [...]``.
-
-    Raises:
-        ConfigError: nothing that can be read; names the file and what was expected.
+    MATLAB (``.m``) or Julia (``.jl``) text with ``A = [...]`` (ConfigError: nothing that can be
+    read; names the file and what was expected).
     """
     if path.is_dir():
         return _matrix_market(path)

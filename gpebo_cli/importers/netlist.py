@@ -37,7 +37,7 @@ _SUFFIXES = {
 }
 _WORD = re.compile(r"[A-Za-z_]\w*")
 _IN_EXPRESSION = re.compile(
-    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?[A-Za-z]*)|(?P<word>[A-Za-z_]\w*)|(?P<rest>.)"
+    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?[A-Za-z]*)|(?P<word>[A-Za-z_]\w*)"
 )
 
 
@@ -279,28 +279,22 @@ class _Reader:
         plain = number(inner.strip())
         if plain is not None:
             return plain
-        out: list[str] = []
-        for match in _IN_EXPRESSION.finditer(inner.replace("^", "**")):
+        known = {**{name: name for name in RESERVED}, **scope, "time": "t", "t": "t"}
+
+        def translated(match: re.Match[str]) -> str:
             if match["number"]:
-                found = number(match["number"])
-                plain = match["number"][-1].isdigit() or match["number"][-1] == "."
-                out.append(match["number"] if plain or found is None else repr(found))
-            elif match["word"]:
-                word = match["word"].lower()
-                if word in ("time", "t"):
-                    out.append("t")
-                elif word in scope:
-                    out.append(scope[word])
-                elif word in RESERVED:
-                    out.append(word)
-                else:
-                    raise place.error(
-                        f"{what} uses {match['word']}, which is neither a parameter nor a function"
-                        + nearest(word, [*scope, *RESERVED])
-                    )
-            else:
-                out.append(match["rest"])
-        return "".join(out).strip()
+                digits = str(match["number"])
+                found = None if digits[-1].isdigit() or digits[-1] == "." else number(digits)
+                return digits if found is None else repr(found)
+            word = match["word"].lower()
+            if word not in known:
+                raise place.error(
+                    f"{what} uses {match['word']}, which is neither a parameter nor a function"
+                    + nearest(word, [*scope, *RESERVED])
+                )
+            return known[word]
+
+        return _IN_EXPRESSION.sub(translated, inner.replace("^", "**")).strip()
 
     def _command(self, head: str, line: str, place: Place, scope: _Scope) -> None:
         rest = line[len(head) :]

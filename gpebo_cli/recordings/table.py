@@ -152,10 +152,8 @@ def read_header(
 
     ``data.columns`` says what a signal is called there. Without it, a column ``<name>_measured``,
     as ``signals.csv`` of a run with noise has it beside the truth, is what an observer gets to see,
-    and is read in place of ``<name>``.
-
-    Raises:
-        ConfigError: a column is missing or stands there twice, or a name is no signal's.
+    and is read in place of ``<name>`` (ConfigError: a column is missing or stands there twice, or a
+    name is no signal's).
     """
     names, columns, scale = [cell.strip() for cell in cells], data.columns or {}, data.scale or {}
     signals = (TIME, *system.inputs, *system.outputs)
@@ -215,9 +213,8 @@ class RowReader:
     def read(self, line: int, cells: Sequence[str]) -> list[float]:
         """The numbers of the columns that are read; NaN where a sample is allowed to be missing.
 
-        Raises:
-            ConfigError: too few or too many cells, one that is empty or not a finite number, or
-                a time that is not later than the last one.
+        Too few or too many cells, one that is empty or not a finite number, or a time that is not
+        later than the last one are a ConfigError.
         """
         header = self._header
         if len(cells) != header.width:
@@ -468,14 +465,9 @@ class LineReader:
         self._source, self._data, self._system = source, data, system
         self._rest, self._line = b"", 0
         self._reader: RowReader | None = None
-        self._header: Header | None = None
+        self.header: Header | None = None  # once it is there
         self._before: list[float] = []
         self._blank: list[tuple[int, bytes]] = []  # at the end of a table blank lines do not count
-
-    @property
-    def header(self) -> Header | None:
-        """The header, once it is there."""
-        return self._header
 
     def feed(self, piece: bytes, *, last: bool = False) -> tuple[list[list[float]], str]:
         """Rows that are complete with ``piece``, and what is wrong with the next one, if anything.
@@ -508,15 +500,15 @@ class LineReader:
                 f"{self._source}, line {number}: not UTF-8 text; save it as UTF-8"
             ) from None
         cells = split_cells(self._source, number, text, self._data)
-        if self._reader is None or self._header is None:
-            self._header = read_header(self._source, cells, self._data, self._system)
-            self._reader = RowReader(self._header, self._data)
+        if self._reader is None or self.header is None:
+            self.header = read_header(self._source, cells, self._data, self._system)
+            self._reader = RowReader(self.header, self._data)
             return
         row = self._reader.read(number, cells)
         if any(map(math.isnan, row)):
             if self._data.missing == "drop":
                 return
             both = np.array([self._before, row] if self._before else [row])
-            row = fill(self._header, self._data, both, [number])[-1].tolist()
+            row = fill(self.header, self._data, both, [number])[-1].tolist()
         self._before = row
         yield row

@@ -16,10 +16,8 @@ def write_file(path: Path, chunks: Iterable[bytes]) -> None:
     """Write ``chunks`` to ``path``; a reader sees the old file, or none, until it is complete.
 
     There is no fsync: the promise is against interruption and a full disk, not a power cut, and
-    waiting for the disk would cost more than computing what is written.
-
-    Raises:
-        GpeboError: the file cannot be written; its name and the system's reason are given.
+    waiting for the disk would cost more than computing what is written (GpeboError: the file cannot
+    be written; its name and the system's reason are given).
     """
     beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:

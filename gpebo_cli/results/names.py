@@ -27,7 +27,6 @@ WORDS = {SETTLED: "within ±2σ of the end", **METRICS}
 """Of both."""
 
 
-
 def shown_metrics(cases: Iterable[Mapping[str, object]]) -> dict[str, str]:
     """Those that say something of the cases, by their columns of ``cases.csv``, in words.
 
