@@ -20,6 +20,7 @@ Samples are boundaries of elements, so that what is held jumps between elements 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import ceil, factorial, pi
 
 import numpy as np
@@ -54,7 +55,7 @@ class NoiseLevels:
         """Which outputs are, shape (r,)."""
         return (self.outputs > 0) | (self.steps > 0)
 
-    @property
+    @cached_property
     def silent(self) -> bool:
         """Whether what is measured is what is there."""
         return not (self.inputs.any() or self.outputs.any() or self.steps.any())

@@ -108,7 +108,6 @@ class Gpebo:
         # No mesh resolves Assumption 1 failing at one time, or the other form's large rounding.
         try:
             found = self._on("auto", system, signals, few(100 * signals.mesh.size))
-            limits = few(4 * found.regression.mesh.size)
             if not found.note and not _same_on_both_forms(found, system, signals):
                 known = _told(found, system, solver)
             why = "which determines more than the equations as given"
@@ -118,6 +117,8 @@ class Gpebo:
             found, known, limits = error, (False, -1), solver
             why = "for as given its signals are not resolved"
         if known < everything and signals.mesh.size < _LONG:
+            if isinstance(found, Observation):
+                limits = few(4 * found.regression.mesh.size)
             try:
                 other = self._on("strangeness_free", system, signals, limits, _NOTE.format(why))
                 if _told(other, system, solver) > known:
