@@ -460,3 +460,15 @@ def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain):
     (f, s), decayed = _maps(mesh, mesh.steps, A, B)[0, -1], np.exp(-a * h)
     np.testing.assert_allclose(f, [decayed, 0.0, (1.0 - decayed) / a], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(s, c * f, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("sample_time", [None, 2.0])
+def test_estimates_that_noise_did_not_bring_where_they_are_have_no_deviations(sample_time):
+    """Of an error of a third deviations of 1e-4 would be all that is said."""
+    made = run("battery", observer="none", time={"horizon": 200.0, "samples": 101})
+    noisy = made["v"] + 0.002 * np.random.default_rng(0).standard_normal(101)
+    data = {"t": made.t, "current": made["current"], "v": noisy}
+    for name, known in (("gradient", False), ("least_squares", True)):
+        found = run("battery", data=data, estimator=name, observer={"sample_time": sample_time})
+        assert (found.details.estimation.parameters_std is not None) == known
+        assert ("farther from least squares" in found.verdict) != known

@@ -35,6 +35,11 @@ _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that ha
 _ASTRAY = 0.02  # of a quantity's size: estimates that differ by more are different
 _EXACT = 1e-3  # of it: so do those of a law that is done, if less than
 _DONE = 30.0  # times this is what it has left of the errors it began with
+_BEYOND = 4.0  # deviations: noise does not bring estimates farther away
+_UNFINISHED = (  # why there are no deviations
+    "what the estimator needs is not met, and estimates are farther from least squares over the "
+    "same data than noise brings them; use estimator=least_squares or other gains"
+)
 _WORSE = 3.0  # times the residual of least squares: more than that is not the noise of the data
 _FAR = 7.0  # deviations of most samples: what is farther away is no noise of theirs
 _ROUNDING = 0.35  # steps: rounding alone leaves 0.29
@@ -188,6 +193,27 @@ def evaluation(
         return numbers, kept, x_hat
 
     return evaluate_affine
+
+
+def finished(
+    std: Array | None, why: str, root: Array, final: Array, requirement: Requirement,
+    columns: IntArray,
+) -> tuple[Array | None, str]:
+    """Deviations (G, M, p + n) of what noise alone may have brought where it is, and why not all.
+
+    Those of the others are NaN: what they require is not met, and their ``final`` estimates (G, p)
+    are far from least squares over the same data. None, if there are no others. The root and the
+    columns are as of :func:`doubts`.
+    """
+    if std is None or requirement.holds or not len(columns):
+        return std, why
+    eta = np.zeros(final.shape[1])
+    eta[columns] = least_squares(root[:, [*columns, -1]])
+    far = (np.abs(final - eta) > _BEYOND * std[:, -1, : len(eta)]).any(axis=1)
+    if not far.any():
+        return std, why
+    std[far] = np.nan
+    return None if far.all() else std, _UNFINISHED
 
 
 def doubts(

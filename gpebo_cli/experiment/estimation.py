@@ -169,12 +169,35 @@ def _with_deviations(
     )
     if isinstance(found, str):
         return estimation, found
-    deviations = np.full(estimation.parameters.shape, np.nan)
-    deviations[..., columns] = found[0]
-    deviations[np.isnan(estimation.parameters)] = np.nan
-    of_states = np.where(np.isnan(estimation.states), np.nan, found[1])
-    deviations[estimation.still] = of_states[estimation.still] = np.nan
-    return replace(estimation, parameters_std=deviations, states_std=of_states), ""
+    p = estimation.parameters.shape[2]
+    std = np.full((*found[1].shape[:2], p + found[1].shape[2]), np.nan)
+    std[..., columns], std[..., p:] = found
+    std[np.isnan(np.concatenate([estimation.parameters, estimation.states], axis=2))] = np.nan
+    std[estimation.still] = np.nan
+    regression, final = observation.regression, estimation.explaining
+    if regression.resets or not _one_fit(observation) or final is None:
+        return _with(estimation, std), ""
+    told, why = accuracy.finished(
+        std, "", regression.root, final, estimation.requirement, columns
+    )
+    return _with(estimation, told), why
+
+
+def _with(estimation: EstimationResult, std: Array | None) -> EstimationResult:
+    """With deviations (G, M, p + n), or without."""
+    of_eta, of_x = (None, None) if std is None else np.split(
+        std, [estimation.parameters.shape[2]], axis=2
+    )
+    return replace(estimation, parameters_std=of_eta, states_std=of_x)
+
+
+def _one_fit(observation: Observation) -> bool:
+    """Whether there is one η for all of the data since a reset, and one Y."""
+    regression = observation.regression
+    return not (
+        regression.dynamics or regression.parametrisation or regression.realisations
+        or observation.bounds
+    )
 
 
 def _gains(observation: Observation, estimation: EstimationResult) -> Array | None:
@@ -246,24 +269,24 @@ def at_samples(
         ), online.parameters, system)
     chosen = kept_samples(1, len(t), settings.time.samples)
     kept = chosen[kept_samples(len(by.cases), len(chosen), settings.output.max_rows)]
-    p = parameters.shape[2]
     still = accuracy.still(parameters, by.requirement, online.natural_sizes)
     told = np.concatenate([parameters, states], axis=2)[:, kept]
     std, gains = made.at(kept, ~np.isnan(told) & ~still[:, None, None])
-    why = none_at_samples(len(by.cases)) if settings.uncertainty and p and std is None else ""
-    estimation = EstimationResult(
+    nobody = settings.uncertainty and parameters.size and std is None
+    std, why = accuracy.finished(
+        std, none_at_samples(len(by.cases)) if nobody else "", online.root,
+        made.parameters[:, -1], by.requirement, columns,
+    )
+    estimation = _with(EstimationResult(
         cases=by.cases, t=t[kept], names=online.parameters, parameters=parameters[:, kept],
         true_parameters=truth[kept], states=states[:, kept],
         delta=None if made.delta is None else made.delta[:, kept],
-        checks={}, requirement=by.requirement,
-        parameters_std=None if std is None else std[..., :p],
-        states_std=None if std is None else std[..., p:],
-        still=still,
+        checks={}, requirement=by.requirement, still=still,
         doubts=online.doubts(
             made.parameters[:, -1],
             np.append(sizes[0], np.where(np.isnan(sizes[1]), online.largest, sizes[1])),
         ),
-    )
+    ), std)
     with stage("excitation"):
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
         excitation = online.excitation(
@@ -276,7 +299,7 @@ def at_samples(
     return Estimated(
         online,
         RegressionResult(
-            t[chosen], rows[..., p], rows[..., :p], online.parameters, online.error_estimate
+            t[chosen], rows[..., -1], rows[..., :-1], online.parameters, online.error_estimate
         ),
         excitation, estimation,
         accuracy.standing(estimation, metrics, gains, system) if noisy else metrics,
@@ -380,10 +403,7 @@ def _estimate(
         doubts=(lambda: _doubts(
             settings, system, observation, explaining, kept, np.concatenate(sizes), known, seen,
             columns, requirement,
-        )) if about_own and not (  # one η for all of the data since a reset, and one Y
-            regression.dynamics or regression.parametrisation or regression.realisations
-            or observation.bounds
-        ) else ({}, ()),
+        )) if about_own and _one_fit(observation) else ({}, ()),
         still=accuracy.still(parameters, requirement, natural),
     )
     return estimator, result, accuracy.metrics_of(numbers, observation.parameters, system)

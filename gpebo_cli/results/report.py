@@ -137,7 +137,8 @@ def estimate_table(result: RunResult) -> list[str]:
         first = int(len(away) - np.argmax(away[::-1])) if away.any() else 0
         known = standing.get(name)
         when = estimation.t[first] if known is None else estimation.t[0] + known[case]
-        since = f"{when:.4g} s" if lasts and name in estimation.names else ""
+        lasts = lasts and name in estimation.names and math.isfinite(when)
+        since = f"{when:.4g} s" if lasts else ""
         deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
         shown = f"{value:.6g}"
         if estimation.still[case] and name in estimation.names:
