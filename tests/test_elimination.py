@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gpebo_cli.numerics.elimination import Eliminated, StiffError
+from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.sweeps import sparse
 
@@ -22,9 +23,7 @@ def system(rng, count, varying=True):
 
 
 def solved(march, matrix, f, kicks, start, h=H):
-    return march(
-        RULE.integration, h, matrix.rows, matrix.columns, matrix.entries, f, kicks, None, start
-    )
+    return march(Mesh(np.append(0.0, np.cumsum(h)), RULE), matrix, f, kicks, start, 0.0)
 
 
 def dense(A, f, kicks, start, h=H):

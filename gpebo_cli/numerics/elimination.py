@@ -17,6 +17,7 @@ import numpy as np
 from gpebo_cli.kernels import elements
 from gpebo_cli.kernels.elements_numpy import at_nodes
 from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.numerics.mesh import Mesh
 
 _SMALL = 1e-280  # terms below it have lost digits
 _FILL = 4  # blocks of size s × s per state that elimination may couple; with more A is not sparse
@@ -36,20 +37,19 @@ class Factors(NamedTuple):
 
 
 class Eliminated:
-    """As ``elements.sweeps``, without sweeps; factors of the last elements are kept."""
+    """A march, see :mod:`.sweeps`, by elimination; factors of the last elements are kept."""
 
     def __init__(self) -> None:
         self._known = dict[bytes, int]()  # where the factors of each matrix are, by its digest
         self._factors: Factors | None = None
 
     def __call__(
-        self, R: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array,
-        kicks: Array | None, _onward: Array, start: Array, *_: object,
+        self, mesh: Mesh, A: tuple[IntArray, IntArray, Array], f: Array, kicks: Array | None,
+        start: Array, _tol: float,
     ) -> tuple[Array, Array]:
         """Values (K, s + 1, d, c), and what is left of the equations (K,) if nothing is added."""
-        K, s = len(h), len(R)
-        D = np.asarray(np.linalg.inv(R), dtype=np.float64)
-        entries = at_nodes(entries, K, s)
+        h, D, (rows, columns, entries) = mesh.steps, mesh.rule.differentiation, A
+        entries = at_nodes(entries, len(h), len(D))
         pattern = rows.tobytes() + columns.tobytes()
         keys = [
             blake2b(pattern + f"{step:.12e}".encode() + each.tobytes()).digest()
@@ -74,7 +74,7 @@ class Eliminated:
             self._factors.full, self._factors.diagonal, f, kicks, start,
         )
         if kicks is not None:
-            return values, np.zeros(K)
+            return values, np.zeros(len(h))
         return values, _residual(D / h[:, None, None], rows, columns, entries, f, values)
 
 

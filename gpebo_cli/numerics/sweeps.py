@@ -12,6 +12,7 @@ is full and constant with one factorisation for all elements of one length.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -53,7 +54,9 @@ _FEW_COLUMNS = 4  # whose errors are carried one by one
 _MANY_COLUMNS = 8  # from which on maps of elements that are alike cost less than sweeps, and
 _MANY_ALIKE = 4  # how many elements of one length that takes
 
-March = Callable[..., tuple[Array, Array]]  # as elements.sweeps
+# Values (K, s + 1, d, c) of x' = A x + f on a mesh, f of the first columns, from a start (d, c),
+# with kicks (K, d, c) at right ends; and how far each element may be from a solution, relative
+March = Callable[[Mesh, "Sparse", Array, Any, Array, float], tuple[Array, Array]]
 
 
 class Sparse(NamedTuple):
@@ -143,7 +146,7 @@ def solve(
     Where it is ``stiff``, elements are solved and not swept over.
     """
     A, _, _ = equation(mesh)
-    march: March = elements.sweeps
+    march: March = partial(_sweeping, 1.0 / units)
     if stiff:
         full = len(A.columns) > _DENSE * len(A.rows) ** 2
         if full and len(A.entries) > 1:
@@ -161,7 +164,8 @@ def solve(
         mapped = not stiff and len(A.entries) == 1 and problem.start.shape[1] > _MANY_COLUMNS
         mapped = mapped and _MANY_ALIKE * equal_lengths(mesh.steps)[0].max() < mesh.size
         values, change = _swept(
-            _mapped if mapped else march, A, f, problem, mesh, units, tol, restarts or {}
+            partial(_mapped, 1.0 / units) if mapped else march, A, f, problem, mesh, tol,
+            restarts or {},
         )
         looked = Looked.at(values, mesh.rule)
         sizes = looked.sizes.reshape(mesh.size, *values.shape[2:])
@@ -178,7 +182,7 @@ def solve(
         )
     except StiffError:
         return None
-    errors, lost, _ = _errors(march, problem, mesh, units, found)
+    errors, lost, _ = _errors(march, problem, mesh, found)
     return LinearSolution(
         found.trajectory,
         max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), errors,
@@ -230,25 +234,29 @@ class _Found(NamedTuple):
     extras: tuple[Array, ...]
 
 
-def _mapped(
-    R: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array,
-    kicks: None, onward: Array, start: Array, weights: Array, tol: float, *limits: Any,
+def _sweeping(
+    weights: Array, mesh: Mesh, A: Sparse, f: Array, kicks: Array | None, start: Array, tol: float
 ) -> tuple[Array, Array]:
-    """As ``elements.sweeps`` for one constant A and many columns, by maps of elements."""
-    s, (d, c), first = len(R), start.shape, f.shape[2]
-    group, h = equal_lengths(h)
-    fixed = rows, columns, entries
-    values, changes = np.empty((len(h), s + 1, d, c)), np.zeros(len(h))
+    """Sweeps over one element after the other, with weights (d,) of the states."""
+    return elements.sweeps(
+        mesh.rule.integration, mesh.steps, *A, f, kicks, _onward(mesh), start, weights, tol, SHARE,
+        _MOST_SWEEPS,
+    )
+
+
+def _mapped(
+    weights: Array, mesh: Mesh, A: Sparse, f: Array, _kicks: None, start: Array, tol: float
+) -> tuple[Array, Array]:
+    """As :func:`_sweeping` for one constant A and many columns, by maps of elements."""
+    s, (d, c), first = mesh.rule.stages, start.shape, f.shape[2]
+    values, changes = np.empty((mesh.size, s + 1, d, c)), np.zeros(mesh.size)
     if first:
-        values[..., :first], changes = elements.sweeps(
-            R, h, *fixed, f, kicks, onward, start[:, :first], weights, tol, *limits
-        )
-    maps = []
+        values[..., :first], changes = _sweeping(weights, mesh, A, f, None, start[:, :first], tol)
+    maps, (group, h) = [], equal_lengths(mesh.steps)
     for k in np.unique(group, return_index=True)[1]:
-        own, change = elements.sweeps(
-            R, h[k : k + 1], *fixed, np.zeros((1, d, 0)), kicks, onward[:1], np.eye(d), weights,
-            max(_DIGITS * tol, 8.0 * EPS), *limits,
-        )
+        alone, nothing = Mesh(np.array([0.0, h[k]]), mesh.rule), np.zeros((1, d, 0))
+        finer = max(_DIGITS * tol, 8.0 * EPS)
+        own, change = _sweeping(weights, alone, A, nothing, None, np.eye(d), finer)
         maps.append(own[0, 1:].reshape(s * d, d))
         changes = np.maximum(changes, change)
     state = start[:, first:]
@@ -260,29 +268,24 @@ def _mapped(
 
 
 class _Solved:
-    """As ``elements.sweeps`` for one constant A, by solving (D/h ⊗ I − I ⊗ A) X = D𝟙/h x_0 + f.
-
-    See :func:`gpebo_cli.numerics.collocation.decoupled`.
-    """
+    """A march for one constant A, by solving (D/h ⊗ I − I ⊗ A) X = D𝟙/h x_0 + f."""
 
     def __init__(self, A: Sparse) -> None:
         self._A, self._factors = A.full()[0], dict[str, tuple[ComplexArray, IntArray]]()
 
     def __call__(
-        self, R: Array, h: Array, _rows: IntArray, _columns: IntArray, _entries: Array, f: Array,
-        kicks: Array | None, _onward: Array, start: Array, *_: object,
+        self, mesh: Mesh, _: Sparse, f: Array, kicks: Array | None, start: Array, _tol: float
     ) -> tuple[Array, Array]:
-        s, (d, columns) = len(R), start.shape
-        from_left = np.linalg.inv(R).sum(axis=1)[:, None, None]
-        h = equal_lengths(h)[1]
-        values, state = np.empty((len(h), s + 1, d, columns)), start
-        for k, step in enumerate(h.tolist()):
+        s, (d, columns) = mesh.rule.stages, start.shape
+        from_left = mesh.rule.differentiation.sum(axis=1)[:, None, None]
+        values, state = np.empty((mesh.size, s + 1, d, columns)), start
+        for k, step in enumerate(equal_lengths(mesh.steps)[1].tolist()):
             right = np.broadcast_to(from_left / step * state, (s, d, columns)).copy()
             points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
             right[:, :, : f.shape[2]] += f if len(f) == 1 else f[points]
             values[k, 0], values[k, 1:] = state, decoupled(s, step, right, self._solve)
             state = values[k, -1] if kicks is None else values[k, -1] + kicks[k]
-        return values, np.zeros(len(h))
+        return values, np.zeros(mesh.size)
 
     def _solve(self, shift: complex, right: ComplexArray) -> ComplexArray:
         """(shift I − A) y = r, with one factorisation for what is equal but for rounding."""
@@ -297,24 +300,21 @@ class _Solved:
 
 
 def _swept(
-    march: March, A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, units: Array, tol: float,
+    march: March, A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, tol: float,
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, Array]:
     """Values (K, s + 1, d, c), and the last change in each element (K,), or StiffError."""
     edges, state = mesh.edges.tolist(), problem.start
     cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
     pieces = []
-    enough, onward = max(_DIGITS * tol, 8.0 * EPS), _onward(mesh)
+    enough = max(_DIGITS * tol, 8.0 * EPS)
     for first, last in pairwise(cuts):
         if first:
             state = restarts[edges[first]](state)
         part = slice(first * len(mesh.rule.points), last * len(mesh.rule.points))
-        values, change = march(
-            mesh.rule.integration, mesh.steps[first:last], A.rows, A.columns,
-            A.entries if len(A.entries) == 1 else A.entries[part],
-            f if len(f) == 1 else f[part], None, onward[first:last], state, 1.0 / units, enough,
-            SHARE, _MOST_SWEEPS,
-        )
+        own = A if len(A.entries) == 1 else A._replace(entries=A.entries[part])
+        piece = Mesh(mesh.edges[first : last + 1], mesh.rule)
+        values, change = march(piece, own, f if len(f) == 1 else f[part], None, state, enough)
         if not (change <= 8.0 * enough).all() or not np.isfinite(values[-1]).all():
             raise StiffError
         pieces.append((values, change))
@@ -353,7 +353,7 @@ def _terms(
 
 
 def _errors(
-    march: March, problem: LinearProblem, mesh: Mesh, units: Array, found: _Found
+    march: March, problem: LinearProblem, mesh: Mesh, found: _Found
 ) -> Errors:
     """Errors of the solution, see :mod:`gpebo_cli.numerics.errors`.
 
@@ -376,11 +376,8 @@ def _errors(
         added, start = (x.max(axis=-1, keepdims=True) for x in (added, start))
     signs = random_signs(K, n)[..., None]
     kicks = (signs[1:] * added[:, :, None]).reshape(K, n, -1)
-    ends, _ = march(
-        rule.integration, mesh.steps, A.rows, A.columns, A.entries, np.zeros((1, n, 0)), kicks,
-        _onward(mesh), (signs[0] * start[:, None]).reshape(n, -1), 1.0 / units, _ROUGH, SHARE,
-        _MOST_SWEEPS,
-    )
+    start = (signs[0] * start[:, None]).reshape(n, -1)
+    ends, _ = march(mesh, A, np.zeros((1, n, 0)), kicks, start, _ROUGH)
     squares = ((ends[:, -1] + kicks) ** 2).reshape(K, n, -1, added.shape[2])
     systematic = np.arange(2, K + 2)[:, None, None]
     carried = np.sqrt(systematic * squares.mean(axis=2)) + np.zeros(columns)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import factorial
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -79,15 +78,8 @@ class InputDerivatives:
     @classmethod
     def of_signal(cls, inputs: Trajectory) -> InputDerivatives:
         """Those of the polynomials that stand for measured inputs (m,)."""
-
-        def taylor(t: Array, inside: Array, order: int) -> Array:
-            found, signal = [inputs(t, inside)], inputs
-            for k in range(1, order + 1):
-                signal = signal.derivative()
-                found.append(signal(t, inside) / factorial(k))
-            return np.array(found)
-
-        return cls(np.ones(inputs.values.shape[2], dtype=bool), taylor, exact=False)
+        known = np.ones(inputs.values.shape[2], dtype=bool)
+        return cls(known, lambda t, inside, k: inputs.taylor(t, k, inside), exact=False)
 
 
 @dataclass(frozen=True, eq=False)
