@@ -16,7 +16,8 @@ from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
 from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
-from gpebo_cli.estimators._following import SolvedEstimates, follow
+from gpebo_cli.estimators.drem import follow
+from gpebo_cli.estimators.least_squares import SolvedEstimates
 from gpebo_cli.experiment.pipeline import run_experiment, stream, stream_verdict
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import initial_mesh

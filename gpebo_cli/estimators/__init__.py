@@ -10,9 +10,9 @@ from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, axis, 
 from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
 from gpebo_cli.estimators._information import Information, information
 from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reached
-from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._recursive import InformationRoot, KreisselmeierFilter, ScalarLaw
 from gpebo_cli.estimators._registry import GROUP, able, build, names, settings_of
+from gpebo_cli.estimators._scalar import mix
 from gpebo_cli.estimators._segments import estimate, raised, tuned, tuned_for
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent

@@ -10,7 +10,6 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._recursive import (
     KreisselmeierFilter,
     Mixed,
@@ -18,7 +17,7 @@ from gpebo_cli.estimators._recursive import (
     inverse_sampled,
     mix_sampled,
 )
-from gpebo_cli.estimators._scalar import ScalarPath, scalar_law
+from gpebo_cli.estimators._scalar import ScalarPath, mix, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
 from gpebo_cli.model.descriptor import Array

@@ -23,7 +23,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, transpose
 from gpebo_cli.regression.errors import ErrorRecursion
 from gpebo_cli.regression.estimator import SampledEstimates
-from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.regression.samples import Filter, SampledRegression
 
 _SINGULAR = 1e-10  # below this ratio of singular values of S the quotient 𝐘/Δ is rounding
 _SINGULAR_FILTER = 1e-14  # the same for Ω, where squares have been formed
@@ -159,14 +159,6 @@ class Mixed(NamedTuple):
     behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]]
 
 
-class Filter(NamedTuple):
-    """δf' = A δf + old δY + new δY' over each step, f = 𝒴 or more."""
-
-    A: Array  # (K, s, s)
-    old: Array  # (K, s, rows)
-    new: Array  # (K, s, rows)
-
-
 def over_steps(regression: SampledRegression, values: Array, before: Array) -> Array:
     """Integrals over the steps (K, …) of values at the samples, (1, …) the one ``before`` them."""
     old, new = (share.reshape(-1, *[1] * (values.ndim - 1)) for share in regression.shares)
@@ -205,15 +197,6 @@ class Steps:
         both = had & mixed.usable & (regression.hold != "zoh")
         mean = 0.5 * (mixed.quotient + previous)
         return energy[:, 0], np.where(both[..., None], mean, mixed.quotient)[:, 0], both[:, 0]
-
-
-def integrating(regression: SampledRegression, beta: float) -> Filter:
-    """The filter of h_z, with forgetting at the rate β."""
-    p = regression.p
-    into = transpose(regression.rows[..., :p])
-    old, new = (share[:, None, None] for share in regression.shares)
-    decay = np.exp(-beta * regression.steps)[:, None, None] * np.eye(p)
-    return Filter(decay, old * into[:-1], new * into[1:])
 
 
 def _shares(x: Array, decay: Array, hold: str) -> tuple[Array, Array]:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator
-from gpebo_cli.estimators._registry import able
-from gpebo_cli.estimators._several import Several
+from gpebo_cli.estimators._registry import Several, able
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.estimator import (

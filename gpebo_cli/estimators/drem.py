@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.estimators._following import follow
-from gpebo_cli.estimators._mixed import FilteredEstimator, filter_rates
-from gpebo_cli.estimators._vector import VectorEstimates
+from gpebo_cli.estimators._mixed import FilteredEstimator, energy_requirement, filter_rates
+from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
+from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.linear import LinearRegression
 
@@ -35,6 +37,30 @@ class Drem(FilteredEstimator):
         return follow(
             extended, dynamics, self.start(names), self.gains("gamma", names), np.asarray(t)
         )
+
+
+def follow(
+    extended: Trajectory, dynamics: Dynamics, start: Array, gains: Array, t: Array
+) -> VectorEstimates:
+    """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) with Δ and 𝐘 = adj(Ω)𝒴 of [Ω | 𝒴] (p, p + 1), on its mesh.
+
+    γ∫Δ² has to be larger than the growth of η, so that the error falls.
+    """
+    values = extended.values
+    delta, Y, _ = determinant_and_adjugate_action(values[..., :-1], values[..., -1:])
+    mesh = extended.mesh
+    diagonal = Trajectory(mesh, delta[..., None, None] * np.eye(values.shape[2]))
+    law = VectorLaw(diagonal, diagonal, Trajectory(mesh, Y[..., 0]), dynamics=dynamics)
+    A = dynamics.A
+    rate = Trajectory(A.mesh, np.linalg.eigvals(A.values).real.max(axis=-1))
+    grown = max(float(rate.integral().final), 0.0)
+    mixed = Trajectory(mesh, delta)
+    energy = float(Trajectory(mesh, delta**2).integral().final)
+    requirement = energy_requirement(
+        "γ∫Δ² above the growth of the state", float(gains.min()), energy, grown + DECAY,
+        f"1 % of the initial error of a state that may grow by e^{grown:.3g}",
+    )
+    return VectorEstimates(law, start, gains, t, requirement, mixed=mixed)
 
 
 ESTIMATOR = Drem

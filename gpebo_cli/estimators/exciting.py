@@ -32,9 +32,8 @@ from gpebo_cli.estimators._mixed import (
     sampled_mixing,
     scalar_errors,
 )
-from gpebo_cli.estimators._mixing import filled, mix
-from gpebo_cli.estimators._recursive import Filter, Mixed, Steps
-from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
+from gpebo_cli.estimators._recursive import Mixed, Steps
+from gpebo_cli.estimators._scalar import ScalarPath, filled, mix, scalar_path
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
@@ -43,8 +42,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.samples import SampledRegression
-from gpebo_cli.schema import number
+from gpebo_cli.regression.samples import Filter, SampledRegression
 
 _TOLERANCE, _MAX_ELEMENTS = 1e-12, 200_000
 _KNOWN = 1e-13  # of Φ_21, from which on e_2/Φ_21 is more than rounding
@@ -62,7 +60,7 @@ class Exciting(GainEstimator):
     """
 
     gamma: object = gain(10.0, by_parameter=True, auto=True)
-    kappa: float = 1e10
+    kappa: float = field(default=1e10, metadata={"positive": True})
     rates: object = field(default=None, metadata={"key": "lambda"})
 
     @property
@@ -114,8 +112,7 @@ class Exciting(GainEstimator):
 
     def _turning(self, path: ScalarPath) -> Callable[[Array, Array], Array]:
         """φ'/Δ² = κ (π/2) e^{−κ∫Δ²} at times (N,)."""
-        kappa = number(self.kappa, "estimator.kappa")
-        energy = Trajectory(path.mesh, path.energy)
+        kappa, energy = self.kappa, Trajectory(path.mesh, path.energy)
         return lambda t, inside: 0.5 * np.pi * kappa * np.exp(-kappa * energy(t, inside))
 
     def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
@@ -155,7 +152,7 @@ class Rotation:
 
     def __init__(self, settings: Exciting, parameters: Sequence[str]) -> None:
         self._mixing, self._steps = sampled_mixing(settings.linear, parameters), Steps()
-        self._kappa = number(settings.kappa, "estimator.kappa")
+        self._kappa = settings.kappa
         self._energy, self._turned = 0.0, np.zeros(len(parameters), complex)  # ∫Δ², c e^{−iφ}
         self._inverse: Array | None = None
 

@@ -14,7 +14,7 @@ abstract and introduction were at hand, so these equations need not be its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -22,15 +22,14 @@ import numpy as np
 from gpebo_cli.estimators._base import GainEstimator, gain
 from gpebo_cli.estimators._extension import averaged, lagged
 from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
-from gpebo_cli.estimators._mixing import mix
-from gpebo_cli.estimators._recursive import Filter, Mixed, inverse_sampled, mix_sampled
+from gpebo_cli.estimators._recursive import Mixed, inverse_sampled, mix_sampled
+from gpebo_cli.estimators._scalar import mix
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.samples import Past, SampledRegression, delayed
-from gpebo_cli.schema import number
+from gpebo_cli.regression.samples import Filter, Past, SampledRegression, delayed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,17 +43,12 @@ class Instrumental(GainEstimator):
     """
 
     gamma: object = gain(1e10, by_parameter=True, auto=True)
-    delay: float = 0.5
-    settle: float = 1.0
-
-    @property
-    def seconds(self) -> tuple[float, float]:
-        """The delay d and T₀."""
-        return number(self.delay, "estimator.delay"), number(self.settle, "estimator.settle")
+    delay: float = field(default=0.5, metadata={"positive": True})
+    settle: float = field(default=1.0, metadata={"positive": True})
 
     def means(self, regression: LinearRegression) -> Trajectory:
         """Means of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c)."""
-        return averaged(regression, *self.seconds)
+        return averaged(regression, self.delay, self.settle)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
         """The estimator at samples."""
@@ -100,7 +94,7 @@ class SampledMeans:
 
     def __init__(self, settings: Instrumental, parameters: Sequence[str]) -> None:
         self._settings, self._names = settings, parameters
-        self._delay, self._span = settings.seconds  # T₀ + t − t₀
+        self._delay, self._span = settings.delay, settings.settle  # T₀ + t − t₀
         p = len(parameters)
         self._sums = np.zeros((2 * p, p + 1))
         self._past: Past | None = None

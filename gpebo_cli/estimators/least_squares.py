@@ -9,9 +9,8 @@ from itertools import repeat
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._following import SolvedEstimates
 from gpebo_cli.estimators._information import (
     Information,
     InformationAt,
@@ -19,7 +18,7 @@ from gpebo_cli.estimators._information import (
     check_held,
     information,
 )
-from gpebo_cli.estimators._recursive import InformationRoot, integrating, spectrum
+from gpebo_cli.estimators._recursive import InformationRoot, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
@@ -28,9 +27,10 @@ from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates, Unmixed
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known
-from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.regression.samples import SampledRegression, integrating
 from gpebo_cli.schema import number
 
+_DIGITS = 1e-12  # reciprocal condition of Ω below which some direction is rounding
 _FEW = 3  # gains, and
 _SMALL = 8  # parameters, from which on a few systems are solved instead of taking eigenvectors
 
@@ -234,7 +234,7 @@ class RecursiveLeastSquares:
             """δη̂ = αF δh_z."""
             filters = [integrating(regression, case["beta"]) for case in self._cases]
             return tuple(
-                ErrorRecursion(own.A, own.old, own.new, s.covariance(case["alpha"], case["f0"]))
+                ErrorRecursion(*own, s.covariance(case["alpha"], case["f0"]))
                 for own, case, s in zip(filters, self._cases, spectra, strict=True)
             )
 
@@ -253,6 +253,37 @@ def solution(s: Spectrum, alpha: float, f0: float, start: Array) -> Array:
     slowness = weight + alpha * s.eigenvalues[..., None]
     coordinates = (weight * rotated_start + alpha * s.rotated) / slowness
     return np.asarray(s.vectors @ coordinates)
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedEstimates(Unmixed):
+    """η̂ = Ω⁻¹ 𝒴 of every case, from [Ω | 𝒴] (M, p, p + 1) with Ω > 0."""
+
+    extended: tuple[Array, ...]  # (M, p, p + 1) each
+    reached: tuple[ExtensionState, ...] = ()
+
+    @property
+    def requirement(self) -> Requirement:
+        """Ω has to be regular at the horizon."""
+        sigma = [np.linalg.svd(e[-1, :, :-1], compute_uv=False) for e in self.extended]
+        worst = min(float(s[-1] / s[0]) for s in sigma)
+        return Requirement(
+            name="F⁻¹ regular", holds=worst >= _DIGITS,
+            evidence={"reciprocal_condition": worst, "needed": _DIGITS},
+            text=f"σ_min/σ_max of F⁻¹ is {worst:.2g} at the end; needed is {_DIGITS:.0e}",
+        )
+
+    def parameters(self, cases: slice, start: Array | None = None) -> Array:  # noqa: ARG002
+        """η̂ of some cases, shape (g, M, p) (SolverError: Ω is singular at one of the times)."""
+        try:
+            return np.array([
+                np.linalg.solve(e[..., :-1], e[..., -1:])[..., 0] for e in self.extended[cases]
+            ])
+        except np.linalg.LinAlgError as error:
+            raise SolverError(
+                "observer.remedy=current_coordinates: F⁻¹ is singular, because "
+                "A_0 has directions that decay too fast; use output_injection or reset"
+            ) from error
 
 
 ESTIMATOR = LeastSquares

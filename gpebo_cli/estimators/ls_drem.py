@@ -15,16 +15,15 @@ import numpy as np
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._information import Information, Spectrum, check_held
 from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
-from gpebo_cli.estimators._mixing import SINGULAR, filled
-from gpebo_cli.estimators._recursive import Mixed, integrating, quotient_of
-from gpebo_cli.estimators._scalar import ScalarPath, scalar_path
+from gpebo_cli.estimators._recursive import Mixed, quotient_of
+from gpebo_cli.estimators._scalar import SINGULAR, ScalarPath, filled, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares, RecursiveLeastSquares
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import Known
-from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.regression.samples import SampledRegression, integrating
 
 _AT_ONCE = 4096  # elements
 

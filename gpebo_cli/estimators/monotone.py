@@ -22,9 +22,8 @@ from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators._base import GainEstimator, filtered_errors, gain
 from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import energy_requirement, filter_rates, sampled_mixing
-from gpebo_cli.estimators._mixing import mix
 from gpebo_cli.estimators._recursive import Steps
-from gpebo_cli.estimators._scalar import ScalarPath
+from gpebo_cli.estimators._scalar import ScalarPath, mix
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement

@@ -105,21 +105,51 @@ def assess(
     mesh = regression.mesh
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     window = settings.window if settings.window is not None else horizon / WINDOWS
-    evidence = _Evidence(regression, t, window, tol)
     # What is looked at later must not keep what is known of this regression by now.
-    later = replace(evidence, regression=replace(regression))
+    later = replace(regression)
+
+    def known(regression: LinearRegression, at: Array) -> Knowledge:
+        return knowledge(regression.gram(at), *_beside(regression, at, tol))
+
+    def eigenvalues(at: Array) -> Array:
+        return np.maximum(symmetric_eigenvalues(later.gram(at)), 0.0)
+
     return Excitation(
-        t, window, settings.rho, regression.parameters, replace(evidence, t=t[-1:]).known(),
-        partial(_t_c, later, settings.rho), later.lambda_min, later.least_share, later.known,
-        later.eigenvalues, later.levels,
+        t, window, settings.rho, regression.parameters, known(regression, t[-1:]),
+        t_c=partial(_t_c, later, settings.rho, tol),
+        lambda_min=lambda: float(eigenvalues(t[-1:])[0, 0]) if later.p else 0.0,
+        least_share=partial(_least_share, later, t, tol), known=partial(known, later, t),
+        gram_eigenvalues=partial(eigenvalues, t),
+        pe_level=partial(segment_level, later, t, window),
     )
 
 
-def _t_c(evidence: _Evidence, rho: float | None) -> float | None:
+def _beside(regression: LinearRegression, at: Array, tol: float) -> tuple[Array, Array, float]:
+    """What sizes at some times (N,) are compared with, see :func:`knowledge`."""
+    mesh = regression.mesh
+    sizes = np.broadcast_to(regression.scale, (mesh.size, regression.p))
+    element = mesh.edges[1:-1].searchsorted(at, side="left")
+    return sizes[element], at - mesh.edges[0], tol
+
+
+def _least_share(regression: LinearRegression, t: Array, tol: float) -> Array:
+    """Of the parameters at the times t (N,); 0 some time before it is ``WELL`` for good."""
+    found = np.zeros(len(t))
+    size = _BLOCK if regression.p > _BLOCK else max(len(found), 1)
+    for last in range(len(found), 0, -size):
+        part = slice(max(last - size, 0), last)
+        at = t[part]
+        found[part] = least_share(regression.gram(at), *_beside(regression, at, tol))
+        if found[part].min() < WELL:
+            break
+    return found
+
+
+def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float | None:
     """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``."""
-    gram = evidence.regression.gram  # of parameters that move, on a mesh of its own
+    gram = regression.gram  # of parameters that move, on a mesh of its own
     ends = gram.mesh.edges[1:]
-    of_ends = knowledge(gram.values[:, -1], *evidence.beside(ends))
+    of_ends = knowledge(gram.values[:, -1], *_beside(regression, ends, tol))
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
     # or half as well as they ever are.
     told = of_ends.smallest[of_ends.margin >= 1.0]
@@ -130,59 +160,14 @@ def _t_c(evidence: _Evidence, rho: float | None) -> float | None:
         if rho is not None:
             level = symmetric_eigenvalues(matrices)[:, 0] / rho
         elif enough:
-            known = of_ends if at is ends else knowledge(matrices, *evidence.beside(at))
+            seen = _beside(regression, at, tol)
+            known = of_ends if at is ends else knowledge(matrices, *seen)
             level = np.minimum(known.smallest / enough, known.margin)
         else:
             level = 0.0 * at
         return np.asarray(np.log(np.maximum(level, _TINY)))
 
     return _first_time(gram, ends, reached)
-
-
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """What a regression says at the times t (N,)."""
-
-    regression: LinearRegression
-    t: Array
-    window: float
-    tol: float
-
-    def beside(self, at: Array) -> tuple[Array, Array, float]:
-        """What sizes are compared with, see :func:`knowledge`."""
-        mesh = self.regression.mesh
-        sizes = np.broadcast_to(self.regression.scale, (mesh.size, self.regression.p))
-        element = mesh.edges[1:-1].searchsorted(at, side="left")
-        return sizes[element], at - mesh.edges[0], self.tol
-
-    def known(self) -> Knowledge:
-        """What is known of the parameters."""
-        return knowledge(self.regression.gram(self.t), *self.beside(self.t))
-
-    def least_share(self) -> Array:
-        """Of the parameters, (N,); 0 some time before it is ``WELL`` for good."""
-        found = np.zeros(len(self.t))
-        size = _BLOCK if self.regression.p > _BLOCK else max(len(found), 1)
-        for last in range(len(found), 0, -size):
-            part = slice(max(last - size, 0), last)
-            at = self.t[part]
-            found[part] = least_share(self.regression.gram(at), *self.beside(at))
-            if found[part].min() < WELL:
-                break
-        return found
-
-    def eigenvalues(self) -> Array:
-        """Those of G, (N, p)."""
-        return np.maximum(symmetric_eigenvalues(self.regression.gram(self.t)), 0.0)
-
-    def lambda_min(self) -> float:
-        """The smallest of G at the last of the times."""
-        last = replace(self, t=self.t[-1:])
-        return float(last.eigenvalues()[0, 0]) if self.regression.p else 0.0
-
-    def levels(self) -> Array:
-        """The smallest eigenvalue over each trailing window, (N,)."""
-        return segment_level(self.regression, self.t, self.window)
 
 
 def estimable(

@@ -27,7 +27,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
-from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.regression.samples import SampledRegression, integrating
 
 _STAGES = 4  # order 7: a deviation needs three digits, and elements end at the samples
 _ELEMENTS = 500  # about so many at least
@@ -440,7 +440,8 @@ class SampledDeviations:
         Y_new[:, :, k + signals :] += D[:, :rows]
         Y_old = np.concatenate([C_old, D_old, np.zeros((count, rows, signals))], axis=2)
         if self._relative:  # with h as of least squares
-            cases = [_beside(_plain_sums(regression), cases[0]), *cases[1:]]
+            plain = integrating(regression)
+            cases = [_beside(ErrorRecursion(*plain, plain.A), cases[0]), *cases[1:]]
         out = np.empty((len(cases), count, p + n))
         for g, case in enumerate(cases):
             size = k + signals + case.A.shape[1]
@@ -495,15 +496,6 @@ class SampledDeviations:
         left = expected - (fitted**2).sum(axis=(1, 2))
         left[left <= _LEFT * expected] = np.nan
         return np.asarray(np.abs(roots[:, -1, -1]) / np.sqrt(left))
-
-
-def _plain_sums(regression: SampledRegression) -> ErrorRecursion:
-    """δh of ∫ψᵀδY."""
-    p = regression.p
-    old, new = (share[:, None, None] for share in regression.shares)
-    into = transpose(regression.rows[..., :p])
-    eye = np.broadcast_to(np.eye(p), (len(old), p, p))
-    return ErrorRecursion(eye, old * into[:-1], new * into[1:], eye)
 
 
 def _beside(a: ErrorRecursion, b: ErrorRecursion) -> ErrorRecursion:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.recordings.hold import held
 from gpebo_cli.regression.parametrisation import Parametrisation
 
@@ -45,6 +47,23 @@ class SampledRegression:
         if self.hold == "zoh":
             return np.asarray(new * self.rows[1:])
         return np.concatenate([old * self.rows[:-1], new * self.rows[1:]], axis=1)
+
+
+class Filter(NamedTuple):
+    """δf' = A δf + old δY + new δY' over each step, f = 𝒴 or more."""
+
+    A: Array  # (K, s, s)
+    old: Array  # (K, s, rows)
+    new: Array  # (K, s, rows)
+
+
+def integrating(regression: SampledRegression, beta: float = 0.0) -> Filter:
+    """The filter of h_z, with forgetting at the rate β."""
+    p = regression.p
+    into = transpose(regression.rows[..., :p])
+    old, new = (share[:, None, None] for share in regression.shares)
+    decay = np.exp(-beta * regression.steps)[:, None, None] * np.eye(p)
+    return Filter(decay, old * into[:-1], new * into[1:])
 
 
 def delayed(past: Past, t: Array, x: Array, delay: float, hold: str) -> tuple[Array, Past]:
