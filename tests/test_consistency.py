@@ -19,7 +19,7 @@ from gpebo_cli.reduction.consistency import consistent_state
 from gpebo_cli.reduction.derivative_array import balance, forcing
 from gpebo_cli.reduction.stages import in_stages
 from gpebo_cli.reduction.strangeness_free import strangeness_free_form
-from gpebo_cli.reduction.structure import analyse
+from gpebo_cli.reduction.structure import _probe_times, analyse
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.ivp import consistent_start
 from gpebo_cli.simulation.simulate import simulate
@@ -157,3 +157,25 @@ def test_scalings_undo_units(seed, n, of_E):
     changed = scaled(rows, columns, 2.0 ** rng.integers(-30, 30))
     for one, other in zip(plain[:2], changed[:2], strict=True):
         np.testing.assert_allclose(other, one, rtol=3.1, atol=0.0)
+
+
+def test_no_piece_between_jumps_goes_unprobed():
+    """A rank may be lost in one of many short pieces alone."""
+    plant = plant_from_mapping({
+        "name": "switched", "states": ["x"], "E": [[1]], "A": [["sign(sin(150*t)) - 2"]],
+        "initial_state": [1],
+    })
+    pieces = np.arange(int(20.0 * 150.0 / np.pi) + 1) * np.pi / 150.0
+    probed = np.searchsorted(pieces, _probe_times(plant, 0.0, 20.0))
+    assert np.unique(probed).tolist() == list(range(1, len(pieces) + 1))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
+    """a' = l, b' = 2l − b, 0 = a + b: 2a − b is free of l, and (1, 0) is nearest to (1, −1)/2."""
+    plant = plant_from_mapping({
+        "name": "pair", "states": ["a", "b", "l"], "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]],
+        "A": [[0, 0, 1], [0, -1, 2], [1, 1, 0]], "initial_state": [sign, 0, 0],
+    })
+    x0 = simulate(plant, TimeSettings(horizon=1.0), SolverSettings()).initial_state
+    np.testing.assert_allclose(x0, [sign / 2, -sign / 2, -sign / 6], rtol=1e-12)

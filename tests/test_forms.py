@@ -589,3 +589,17 @@ def test_states_of_very_different_sizes_turn_in_the_kernel_of_E(decades, rate):
     x, told = found.details.simulation.states, found.details.estimation.states[0, -1]
     assert None not in [found.details.estimable[name] for name in "abce"]
     assert (np.abs(told - x[-1]) < 1e-7 * np.abs(x).max(axis=0)).all()
+
+
+def test_a_failure_of_assumption_1_where_the_kernel_of_E_turns_keeps_nothing():
+    plant = {
+        "name": "turning", "states": ["a", "b", "w"], "inputs": {"u": "sin(t)"},
+        "unknowns": {"th": 1.0}, "outputs": ["y"], "C": [[0, 0, 1]], "initial_state": [0, 0, 0],
+        "E": [["cos(t)", "sin(t)", 0], [0, 0, 1], [0, 0, 0]], "B": [[0], [0], [1]],
+        "A": [[0, 0, 1], [0, 0, -1], ["cos(t)", "sin(t)", 0]], "F": [[0], [1], [0]],
+    }
+    short = {"horizon": 5.0, "samples": 21}
+    with pytest.raises(ModelError, match="Assumption 1"):
+        run(plant, time=short, observer={"name": "gpebo", "form": "given"})
+    found = run(plant, time=short, estimator="least_squares").estimates["th"].ravel()[-1]
+    assert found == pytest.approx(1.0, abs=1e-6)

@@ -255,6 +255,7 @@ def test_what_continues_and_what_is_a_comment():
     ("R1 a 0 1\nR1 a 0 2", "line 3: R1 stands in line 2 already"),
     ("D1 a 0 mod", "elements are R, L, C"),
     ("X1 a 0 filter", "ends with the name of a subcircuit, and 'filter' is none"),
+    (".subckt filter a\nR1 a 0 1\n.ends\nX1 a filtre", "'filtre' is none; did you mean filter?"),
     ("T1 a 0 b 0 z0=50 td=1n", "T is an ideal transformer with n=RATIO"),
     (".include /etc/passwd\nR1 a 0 1", "would read another file"),
     ("V1 a 0 PULSE(0 1 0 1n 1n 1u 2u)\nR1 a 0 1", "needs the number of pulses"),

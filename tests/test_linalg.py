@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from gpebo_cli.numerics.linalg import (
     affine_scan,
     determinant_and_adjugate_action,
+    inverse_or_none,
     largest_over_time,
 )
+from gpebo_cli.reduction.derivative_array import _first_of_each_part
 
 
 def adjugate(omega: np.ndarray) -> np.ndarray:
@@ -70,3 +72,23 @@ def test_the_largest_sizes_over_time_are_those_of_the_times_one_by_one(shape):
     if values.size:
         values[-1] = np.nan
         assert np.isnan(largest_over_time(values)).all()
+
+
+def test_one_singular_matrix_of_several_is_named():
+    inverse, singular = inverse_or_none(np.array([2.0 * np.eye(2), np.zeros((2, 2)), np.eye(2)]))
+    assert singular.tolist() == [False, True, False]
+    assert (inverse[[0, 2]] == [0.5 * np.eye(2), np.eye(2)]).all()
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 9))
+def test_rows_that_columns_link_in_long_chains_are_one_part(seed, count):
+    """Rows 0 to 8 in chains, shuffled, against the components that a search finds."""
+    rng = np.random.default_rng(seed)
+    rows, order = rng.permutation(9), rng.permutation(9)
+    linked = np.zeros((9, 9), dtype=bool)
+    for column, (i, j) in enumerate(zip(rows[:count], rows[1:count], strict=False)):
+        linked[[i, j], column] = True
+    parts = [sorted(rows[:count].tolist()), *([row] for row in rows[count:].tolist())]
+    first = {row: min(part, key=order.tolist().index) for part in parts for row in part}
+    assert _first_of_each_part(linked, order).tolist() == [first[row] for row in range(9)]

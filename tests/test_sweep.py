@@ -346,6 +346,13 @@ def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch
     assert "plant" not in said, "what is the same for all is left out"
 
 
+def test_a_terminal_is_shown_stages_that_take_long_unless_they_are_printed(monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    for options, shown in (({}, True), ({"quiet": True}, False), ({"loud": True}, False)):
+        with Progress(**options) as progress:
+            assert progress._timer.is_alive() == shown
+
+
 def test_stages_are_told_with_their_seconds_and_how_far_they_are(capsys):
     told = []
     with Progress(loud=True) as progress:
