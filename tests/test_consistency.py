@@ -172,10 +172,10 @@ def test_no_piece_between_jumps_goes_unprobed():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
-    """a' = l, b' = 2l − b, 0 = a + b: 2a − b is free of l, and (1, 0) is nearest to (1, −1)/2."""
+    """a' = l, b' = 3l − b, 0 = a + b: 3a − b is free of l, and (1, 0) is nearest to (1, −1)/2."""
     plant = plant_from_mapping({
         "name": "pair", "states": ["a", "b", "l"], "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]],
-        "A": [[0, 0, 1], [0, -1, 2], [1, 1, 0]], "initial_state": [sign, 0, 0],
+        "A": [[0, 0, 1], [0, -1, 3], [1, 1, 0]], "initial_state": [sign, 0, 0],
     })
     x0 = simulate(plant, TimeSettings(horizon=1.0), SolverSettings()).initial_state
-    np.testing.assert_allclose(x0, [sign / 2, -sign / 2, -sign / 6], rtol=1e-12)
+    np.testing.assert_allclose(x0, [sign / 2, -sign / 2, -sign / 8], rtol=1e-12)

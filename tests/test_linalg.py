@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -87,7 +89,7 @@ def test_rows_that_columns_link_in_long_chains_are_one_part(seed, count):
     rng = np.random.default_rng(seed)
     rows, order = rng.permutation(9), rng.permutation(9)
     linked = np.zeros((9, 9), dtype=bool)
-    for column, (i, j) in enumerate(zip(rows[:count], rows[1:count], strict=False)):
+    for column, (i, j) in enumerate(pairwise(rows[:count])):
         linked[[i, j], column] = True
     parts = [sorted(rows[:count].tolist()), *([row] for row in rows[count:].tolist())]
     first = {row: min(part, key=order.tolist().index) for part in parts for row in part}
