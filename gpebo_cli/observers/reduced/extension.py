@@ -33,7 +33,7 @@ from gpebo_cli.observers.reduced.regression import (
     OVER_TIME,
     Assembled,
     regression_signals,
-    resolved,
+    resolve,
     term_sizes,
 )
 from gpebo_cli.observers.reduced.split import comparable, initial_basis, units_along
@@ -484,7 +484,7 @@ def joined(parts: Iterable[Extension]) -> Extension:
 def _assembled(
     reduced: ReducedSystem, solution: LinearSolution, found: Assembled, *, as_found: bool
 ) -> Extension:
-    """What was found on the mesh, :func:`resolved` but for ``as_found``, and sizes of its terms.
+    """What was found on the mesh, resolved but for ``as_found``, and sizes of its terms.
 
     These are looked at where each element begins, in its middle and where it ends.
     """
@@ -492,7 +492,6 @@ def _assembled(
     K, points = values.shape[:2]
     places = [0, (points - 1) // 2, points - 1]
     scale: list[Array] = []
-    states: tuple[list[Array], list[Array]] = [], []
     for first in range(0, K, max(1, _AT_ONCE // points)):
         part = slice(first, first + max(1, _AT_ONCE // points))
         z, *seen = (
@@ -502,19 +501,9 @@ def _assembled(
         of_gain, sizes = term_sizes(z, system.q, reduced.basis, AlgebraicEquations(*seen))
         elements = len(sizes) // 3
         scale.append(sizes.reshape(elements, 3, sizes.shape[1]).max(axis=1))
-        if as_found:
-            continue
-        terms = of_gain().reshape(elements, 3, system.n, -1).max(axis=1).repeat(points, axis=0)
-        some = slice(first * points, part.stop * points)
-        here = replace(found, Y=found.Y[some], psi=found.psi[some], offset=found.offset[some],
-                       gain=found.gain[some])
-        for known, more in zip(
-            states, resolved(here, terms, reduced.form), strict=True
-        ):
-            known.append(more)
-    if not as_found:
-        offset, gain = map(np.concatenate, states)
-        found = replace(found, offset=offset, gain=gain)
+        if not as_found:
+            terms = of_gain().reshape(elements, 3, system.n, -1).max(axis=1).repeat(points, axis=0)
+            resolve(found, slice(first * points, part.stop * points), terms, reduced.form)
     sizes = np.maximum.accumulate(np.concatenate(scale), axis=0)
     *_, elimination, injectivity = map(_over_time, solution.extras)
     smallest, where = weakest(injectivity, elimination)

@@ -119,22 +119,20 @@ def regression_signals(
     return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, largest, moving)
 
 
-def resolved(
-    found: Assembled, terms: Array, form: EquationForm
-) -> tuple[Array, Array]:
-    """The state's offset (N, n) and gain (N, n, p), on hidden constraints and without noise.
+def resolve(found: Assembled, some: slice, terms: Array, form: EquationForm) -> None:
+    """Bring the state's offset and gain at some times onto hidden constraints, without noise.
 
     Hidden constraints 0 = M x + … hold but for what has gathered in z, which is taken from the
     state; entries of the gain that are rounding of their terms are zero. Whether a state is
-    determined must not hang on noise. The sizes of the gain's terms are (N, n, p).
+    determined must not hang on noise. The sizes of the gain's terms there are (N, n, p).
     """
-    n, r, offset, gain = form.system.n, form.system.r, found.offset, found.gain
+    n, r, gain = form.system.n, form.system.r, found.gain[some]
     if form.structure is not None:
         scales = form.units.states  # M is a projector in these
         rows = slice(-(n + r), -r)
-        offset = offset - scales * found.Y[:, rows]
-        gain = gain + scales[:, None] * found.psi[:, rows]
-    return offset, np.where(np.abs(gain) <= _NOISE * terms, 0.0, gain)
+        found.offset[some] -= scales * found.Y[some, rows]
+        gain += scales[:, None] * found.psi[some, rows]
+    np.copyto(gain, 0.0, where=np.abs(gain) <= _NOISE * terms)
 
 
 def term_sizes(

@@ -31,7 +31,7 @@ from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matr
 from gpebo_cli.observers.reduced.regression import (
     VANISHING,
     regression_signals,
-    resolved,
+    resolve,
     term_sizes,
 )
 from gpebo_cli.observers.reduced.response import error_system
@@ -201,9 +201,9 @@ class SampledObserver:
             errors = ErrorSteps(step, *(
                 np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
             ))
-        offset, gain = resolved(assembled, of_gain(), self.form)
+        resolve(assembled, slice(None), of_gain(), self.form)
         return state, SampledBlock(
-            regression, offset, gain, z, scale, errors, self.form.units.states
+            regression, assembled.offset, assembled.gain, z, scale, errors, self.form.units.states
         )
 
 
