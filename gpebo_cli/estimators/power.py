@@ -30,7 +30,6 @@ from gpebo_cli.regression.resets import Known
 from gpebo_cli.regression.samples import SampledRegression
 
 _TOLERANCE, _ROUNDING = 1e-11, 1e-15
-_AT_ONCE = 1024  # elements
 _INSIDE = 1e-3  # of a step: which element a node belongs to
 _ITERATIONS = 12  # of Newton's method
 _NOTHING = 1e-290  # next to the smallest number
@@ -180,10 +179,7 @@ class PowerLaw:
         out = np.empty((len(eta), len(path.t)))
         out[:, : np.searchsorted(path.t, path.mesh.edges[0], side="right")] = eta[:, None]
         step = np.ones(len(eta))  # of the element, as it turned out to be good
-        for number, (left, right) in enumerate(pairwise(path.mesh.edges.tolist())):
-            if number % _AT_ONCE == 0:  # signals of many elements at once cost little
-                edges = path.mesh.edges[number : number + _AT_ONCE + 1]
-                whole = self._signals(edges[:-1], edges[1:])
+        for left, right in pairwise(path.mesh.edges.tolist()):
             at = np.zeros(len(eta))  # share of the element that is done
             wanted = np.flatnonzero((path.t > left) & (path.t <= right))
             places = (path.t[wanted] - left) / (right - left)
@@ -191,12 +187,8 @@ class PowerLaw:
                 end = at[lanes] + step[lanes]
                 end = np.where(end > 1.0 - 1e-9, 1.0, end)
                 from_, to = (left + (right - left) * share for share in (at[lanes], end))
-                if at.any() or (end < 1.0).any():
-                    pairs, of = np.unique(np.stack([from_, to]), axis=1, return_inverse=True)
-                    delta, Y, digits = (x[of] for x in self._signals(*pairs))
-                else:
-                    same = np.full(len(lanes), number % _AT_ONCE)
-                    delta, Y, digits = (x[same] for x in whole)
+                pairs, of = np.unique(np.stack([from_, to]), axis=1, return_inverse=True)
+                delta, Y, digits = (x[of] for x in self._signals(*pairs))
                 Y = Y[np.arange(len(lanes)), :, column[lanes]]
                 values, good = self._step(to - from_, eta[lanes], gamma[lanes], delta, Y, digits)
                 step[lanes] *= np.where(good, np.where(step[lanes] < 1.0, 2.0, 1.0), 0.25)

@@ -23,7 +23,6 @@ from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.observers import Observation, StateMap
 from gpebo_cli.observers._observation import AffineStateMap
 from gpebo_cli.regression.linear import LinearRegression, least_squares
@@ -70,13 +69,9 @@ def still(parameters: Array, requirement: Requirement, natural: Array) -> BoolAr
 
 def sizes_of(truth: Array, natural: Array, x: Array) -> tuple[Array, Array]:
     """Sizes of the parameters (p,) and states (n,): by these, errors of all kinds are compared."""
-    with np.errstate(invalid="ignore"):
-        of_eta, of_x = largest_over_time(truth), largest_over_time(x)
-        for size, values in ((of_eta, truth), (of_x, x)):
-            unknown = np.isnan(size)
-            size[unknown] = np.fmax.reduce(np.abs(values[:, unknown]), axis=0)
-        # A parameter that is zero has no size but that with which it would explain Y.
-        return np.where(of_eta > _LEAST * natural, of_eta, np.fmax(of_eta, natural)), of_x
+    of_eta, of_x = (np.fmax.reduce(np.abs(values), axis=0) for values in (truth, x))
+    # A parameter that is zero has no size but that with which it would explain Y.
+    return np.where(of_eta > _LEAST * natural, of_eta, np.fmax(of_eta, natural)), of_x
 
 
 def judged_of(source: Source, p: int) -> BoolArray:

@@ -18,7 +18,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Sampling, build, sampling
-from gpebo_cli.recordings.load import Recording, load
+from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.schema import LARGEST
@@ -92,13 +92,20 @@ def recorded(
 ) -> Source:
     """Signals of a recording; nobody knows what θ was when it was made."""
     recording = load(system, settings.data, settings.time, settings.solver.tol)
-    t = _grid(settings, samples, *recording.span)
+    t, table = _grid(settings, samples, *recording.span), recording.table
+    samples_t = table.samples.t
     return Source(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
         assumptions=tuple, verdict="", derivatives=recording.derivatives,
-        recording=_sample_recording(system, recording, t), cells=recording.cells,
-        samples=recording.table.samples.t,
+        cells=recording.cells, samples=samples_t,
+        recording=RecordingResult(
+            **vars(recording.sampled(t)), file=table.header.source, sha256=table.sha256,
+            rows=len(samples_t), hold=recording.hold,
+            first=float(samples_t[0]), last=float(samples_t[-1]),
+            known_states=tuple(system.states[i] for i in table.header.known),
+            elements=recording.inputs.mesh.size,
+        ),
     )
 
 
@@ -180,17 +187,6 @@ def sample_times(step: float, start: float, stop: float) -> Array:
 def _judged(system: DescriptorSystem) -> slice:
     """Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts."""
     return slice(system.q if system.theta_varies else None)
-
-
-def _sample_recording(system: DescriptorSystem, recording: Recording, t: Array) -> RecordingResult:
-    table, sampled = recording.table, recording.sampled(t)
-    return RecordingResult(
-        **vars(sampled), file=table.header.source, sha256=table.sha256,
-        rows=len(table.samples.t), hold=recording.hold,
-        first=float(table.samples.t[0]), last=float(table.samples.t[-1]),
-        known_states=tuple(system.states[i] for i in table.header.known),
-        elements=recording.inputs.mesh.size,
-    )
 
 
 def _sample_simulation(

@@ -117,8 +117,8 @@ def standard_deviations(
         return ""
     if errors is None or not isinstance(state_map, Differentiable):
         return _IN_MATRICES
-    goes_on = isinstance(estimator, ResumableEstimator) or not regression.resets
-    if not isinstance(estimator, Affine) or not goes_on:
+    needed = ResumableEstimator if regression.resets else Affine
+    if not isinstance(estimator, Affine) or not isinstance(estimator, needed):
         return _NOT_SAID
     if len(estimator.cases) > MOST_CASES:
         return _MANY.format(len(estimator.cases))

@@ -13,18 +13,18 @@ not depend on the number of samples.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from math import prod
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import Measurements
 from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation
+from gpebo_cli.observers.reduced.response import driven
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.settings import SolverSettings
 
@@ -84,17 +84,20 @@ def condensed(
         last = max(first + 1, int(np.searchsorted(cuts, cuts[first] + _AT_ONCE, side="right")) - 1)
         window = Mesh(edges[cuts[first] : cuts[last] + 1], signals.mesh.rule)
         seen = _part(signals, window)
-        added, zeta, error = _response(errors, seen, few, window, zeta, size, solver)
+        added, zeta, error = driven(
+            errors, partial(_beyond, seen, few), window, zeta, tol=solver.tol,
+            max_elements=solver.max_elements, floor=size,
+        )
         estimate = max(estimate, error)
         part = slice(first, last)
-        Y[part] += _projected(Trajectory(added.mesh, added.values[:, :, :rows]), mesh, part)
+        Y[part] += _projected(Trajectory(added.mesh, added.values[:, :, :rows, 0]), mesh, part)
         points, near = mesh.points[part], _INSIDE * added.mesh.steps.min()
         inside = points.clip(points[:, :1] + near, points[:, -1:] - near)  # of a short element
         more = added(points.ravel(), inside.ravel())[:, rows:]
         offset[part] += more.reshape(*points.shape, -1)
         at = np.flatnonzero(np.isin(added.mesh.edges[:-1], seen.mesh.edges))
         t, t_in = added.mesh.edges[at], added.mesh.inside[at, 0]
-        full = regression.Y(t, t_in) + added.values[at, 0, :rows]
+        full = regression.Y(t, t_in) + added.values[at, 0, :rows, 0]
         own = np.concatenate([regression.psi(t, t_in), full[:, :, None]], axis=2)
         factor = np.asarray(
             np.linalg.qr(np.concatenate([factor, own.reshape(-1, p + 1)]), mode="r")
@@ -117,25 +120,9 @@ def _edges(samples: Array, cuts: Array) -> Array:
     return np.union1d(samples, cuts[near > _NEAR * (samples[k] - samples[k - 1])])
 
 
-def _response(
-    errors: ErrorsAt, signals: Trajectory, few: Measurements, window: Mesh, zeta: Array,
-    size: Array, solver: SolverSettings,
-) -> tuple[Trajectory, Array, float]:
-    """What [u; y] less the thinned ones add to Y and the offset, ζ (k, 1) at the end, an error.
-
-    ζ is resolved in terms of the ``size`` of what it is part of.
-    """
-    def coefficients(t: Array, inside: Array) -> LinearEquation:
-        e = signals(t, inside) - few.at(t, inside)
-        return errors(t, inside).driven(e[:, :, None])
-
-    problem = LinearProblem(
-        coefficients, zeta, name="observer's response to the samples", floor=size
-    )
-    solution = solve(problem, window, tol=solver.tol, max_elements=solver.max_elements)
-    z, (C, direct) = solution.trajectory, solution.extras
-    added = (C @ z.values + direct)[..., 0]
-    return Trajectory(z.mesh, added), z.final, solution.error_estimate
+def _beyond(signals: Trajectory, few: Measurements, t: Array, inside: Array) -> Array:
+    """[u; y] beyond the thinned ones at the times t (N,), (N, m + r, 1)."""
+    return (signals(t, inside) - few.at(t, inside))[:, :, None]
 
 
 def _part(signals: Measurements, window: Mesh) -> Trajectory:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from gpebo_cli.errors import SolverError
@@ -45,15 +47,31 @@ def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) 
     """
     errors = Trajectory(mesh, np.concatenate([e_u, e_y], axis=2))
     size = errors_at(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]
-    problem = LinearProblem(
-        lambda t, inside: errors_at(t, inside).driven(errors(t, inside), rows),
-        np.zeros((size, e_y.shape[-1])), name="response to noise",
+    added, _, error = driven(
+        errors_at, errors, mesh, np.zeros((size, e_y.shape[-1])), rows, tol=np.inf,
+        max_elements=mesh.size,
     )
-    solution = solve(problem, mesh, tol=np.inf, max_elements=mesh.size)
-    if solution.error_estimate > _RESPONSE:
+    if error > _RESPONSE:
         raise SolverError(
-            f"noise.seeds: the response to noise is resolved to {solution.error_estimate:.1e} only;"
-            " lower noise.sample_time or solver.tol"
+            f"noise.seeds: the response to noise is resolved to {error:.1e} only; lower "
+            "noise.sample_time or solver.tol"
         )
-    algebraic, direct = solution.extras
-    return np.asarray(algebraic @ solution.trajectory.values + direct)
+    return added.values
+
+
+def driven(
+    errors_at: ErrorsAt, errors: Callable[[Array, Array], Array], mesh: Mesh, start: Array,
+    rows: int | None = None, *, tol: float, max_elements: int, floor: Array | float = 0.0,
+) -> tuple[Trajectory, Array, float]:
+    """What errors (N, m + r, c) add to Y and the offset, or to Y (rows, c), from ζ = ``start``.
+
+    Beside it stand ζ (k, c) at the end and an error estimate. Below sizes ``floor`` (k, c) ζ is not
+    resolved for its own sake.
+    """
+    problem = LinearProblem(
+        lambda t, inside: errors_at(t, inside).driven(errors(t, inside), rows), start,
+        name="response to errors of the signals", floor=floor,
+    )
+    solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
+    z, (C, direct) = solution.trajectory, solution.extras
+    return Trajectory(z.mesh, C @ z.values + direct), z.final, solution.error_estimate
