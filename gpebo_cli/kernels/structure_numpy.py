@@ -1,8 +1,10 @@
 """Derivative arrays of a descriptor system: ranks at single times, elimination at many.
 
-In Taylor coefficients e_k = E^(k)/k!, a_k = A^(k)/k! of E and A in scaled rows, states and time,
+Kunkel & Mehrmann, Differential-Algebraic Equations (EMS 2006), chapter 3: E x' = A x + f is
+differentiated μ times. In Taylor coefficients e_k = E^(k)/k!, a_k = A^(k)/k!, x_k = x^(k)/k!, …, in
+scaled rows, states and time, this is M (x_1, …, x_{μ+1}) = N x_0 + g, free of binomials, with
 
-    M_ij = (j + 1) e_{i−j} − a_{i−j−1},   N_i = a_i,   i, j = 0 … μ.
+    M_ij = (j + 1) e_{i−j} − a_{i−j−1},   N_i = a_i,   g_i = f_i,   i, j = 0 … μ.
 
 With the rows and columns that carry the rank of M at one time in front, Z2ᵀ = [−X I] with
 X = M21 M11⁻¹ is a left kernel of M at the others, and Â2 = Z2ᵀN are the constraints. A function

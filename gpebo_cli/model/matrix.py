@@ -1,7 +1,4 @@
-"""A matrix as a plant file has it: rows, entries by place, or an array; its size is checked.
-
-Every message names the plant, the key and the entry, and where two sizes disagree, both.
-"""
+"""A matrix as a plant file has it: rows, entries by place, or an array; its size is checked."""
 
 from __future__ import annotations
 
@@ -68,20 +65,18 @@ def matrix(
     size that is not that of ``down`` and ``across``).
     """
     n_rows, n_columns = len(down.names), len(across.names)
-    if is_empty(value) and not needed:
-        return []
-    if isinstance(value, np.ndarray) or is_sparse(value):
-        return _numbers(plant, key, value, down, across)
-    if isinstance(value, Mapping) and value:
-        return _by_place(plant, key, value, down, across)
     if is_empty(value):
-        if n_rows and n_columns:
+        if needed and n_rows and n_columns:
             why = across if down.noun == "state" else down
             raise ConfigError(
                 f"{plant}: {key} is missing; {why}, so it needs {counted(n_rows, 'row')} "
                 f"of {n_columns}"
             )
         return []
+    if isinstance(value, np.ndarray) or is_sparse(value):
+        return _numbers(plant, key, value, down, across)
+    if isinstance(value, Mapping) and value:
+        return _by_place(plant, key, value, down, across)
     rows = items_of(value)
     if rows is None:
         raise ConfigError(

@@ -268,10 +268,8 @@ def _element_maps(
 
 def _is_constant(c: LinearEquation) -> bool:
     """Whether everything but the forcing is constant in time."""
-    matrices = [c.A] if c.E is None else [c.A, c.E]
-    if c.constraints is not None:
-        matrices.append(c.constraints.basis)
-    return all(len(matrix) == 1 for matrix in matrices)
+    basis = None if c.constraints is None else c.constraints.basis
+    return all(matrix is None or len(matrix) == 1 for matrix in (c.E, c.A, basis))
 
 
 def _at_points(c: LinearEquation, part: slice) -> LinearEquation:

@@ -87,9 +87,10 @@ def judged_errors(
     problem: LinearProblem, carried: Array, largest: Array, tail: Array, own: Array, noise: Array,
     made_of: Array,
 ) -> Errors:
-    """Errors from bounds of them at right ends (K, n, c), and the largest over time (n, c) each of
+    """Errors from bounds of them at right ends, ``carried`` (K, n, c).
 
-    these, tails, values, noise that shows, and what right ends are made of.
+    The others are the largest over time (n, c) of these, of tails, of values, of noise that shows,
+    and of what right ends are made of.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         through = _through_constraints(problem, own)

@@ -2,9 +2,9 @@
 
 Equations that have no derivative are constraints. Differentiated, they take the places of those
 rows of E that vanished; what vanishes then is a hidden constraint (Luenberger's shuffle), until E
-is regular. Each step is one singular value decomposition of n rows of unit length, where the
-derivative array of :mod:`.derivative_array` has (μ + 1) n of them. A singular value that is neither
-rounding nor clear of it is left to the derivative array.
+is regular. Each step is one singular value decomposition of n rows of unit length, where a
+derivative array has (μ + 1) n of them. A singular value that is neither rounding nor clear of it is
+left to the derivative array.
 """
 
 from __future__ import annotations

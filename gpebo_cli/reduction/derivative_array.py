@@ -1,14 +1,8 @@
-"""From a descriptor system of any index to an equivalent strangeness-free one.
+"""Scalings under which the ranks of a model are judged, units in which an observer sees it, and f.
 
-Kunkel & Mehrmann, Differential-Algebraic Equations (EMS 2006), chapter 3: differentiate the model
-μ times and read off, at every time, all constraints (hidden ones too) and the differential
-equations that are left. In Taylor coefficients e_k = E^(k)/k!, x_k = x^(k)/k!, … the i-th
-derivative of E x' = A x + f is, free of binomials,
-
-    Σ_j (j + 1) e_{i−j} x_{j+1} = Σ_j a_{i−j} x_j + f_i            i = 0 … μ
-
-or M (x_1, …, x_{μ+1}) = N x_0 + g with M_ij = (j + 1) e_{i−j} − a_{i−j−1}, N_i = a_i, g_i = f_i.
+What is scaled are the derivative arrays of :mod:`gpebo_cli.kernels.structure_numpy`.
 """
+
 from __future__ import annotations
 
 from collections.abc import Callable

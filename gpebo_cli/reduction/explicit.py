@@ -250,14 +250,6 @@ class _Equations:
         if known is not None:
             self.known[i] = _sum(self.known[i], product(factor, known))
 
-    def take_out(self, i: int) -> tuple[Row, Array]:
-        """Row i, which is none of them any more."""
-        row = self.row(i)
-        for k in row:
-            self.where(k).discard(i)
-        self.rows[i] = {}
-        return dict(row), self.known[i]
-
     def pivot(self, i: int, allowed: Iterable[int]) -> int:
         """A state among ``allowed`` that row i can give, in as few other rows as possible."""
         row = self.row(i)
@@ -376,7 +368,10 @@ def _without_others(
             if not free and least < len(A.units):
                 continue
             c = A.pivot(i, free or A.row(i))
-            row, known = A.take_out(i)
+            for k in A.row(i):
+                A.where(k).discard(i)
+            row, known = A.row(i), A.known[i]
+            A.rows[i] = {}
             factor = _reciprocal(row.pop(c))
             row = {k: product(factor, v) for k, v in row.items()}
             known = product(factor, known)

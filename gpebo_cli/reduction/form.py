@@ -3,10 +3,10 @@
     E x' = A x + B v + F θ,     0 = M x + M_v v + M_θ θ,     y = C x + D v + H θ
 
 v are the inputs, one where there is a known term φ, and the derivatives of inputs that hidden
-constraints contain. M = Â2⁺Â2 comes from the derivative array (:mod:`.derivative_array`): whatever
-basis Z2 of its left kernel is taken, M is the same, and as smooth as the plant. [Z1ᵀE; Â2] is
-nonsingular (theory 1), so M is injective on the kernel of E: the observer needs no output to see
-the algebraic states, whatever the index. No output is differentiated.
+constraints contain. M = Â2⁺Â2 comes from the derivative array: whatever basis Z2 of its left kernel
+is taken, M is the same, and as smooth as the plant. [Z1ᵀE; Â2] is nonsingular (theory 1), so M is
+injective on the kernel of E: the observer needs no output to see the algebraic states, whatever the
+index. No output is differentiated.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The structure of a descriptor system: its index, and how many constraints it has.
 
 Kunkel & Mehrmann, Differential-Algebraic Equations, Hypothesis 3.48: ranks of the derivative array
-(``derivative_array.py``) that have to be the same at every time.
+(``kernels/structure_numpy.py``) that have to be the same at every time.
 """
 
 from __future__ import annotations
@@ -345,7 +345,13 @@ def _judged(
     counts, exact = kernels.structure.levels(E, A, *model[2:], rank_tol, -1)
     if (counts != a).any():
         sigma = relative_singular_values(E, A, *model[2:])
-        return _Levels(a, bounds, _changes(sigma, counts, t[which]))
+        ranks, times = sigma.shape[1] - counts.astype(int), t[which]
+        k = int(np.argmax(ranks != ranks[0]))
+        value = sigma[min(k, len(sigma) - 1), min(int(ranks[k]), int(ranks[0]))]
+        return _Levels(a, bounds, (
+            f"the rank of the derivative array changes from {ranks[0]} at t = {times[0]:.6g} to "
+            f"{ranks[k]} at t = {times[k]:.6g} (singular value {value:.1e})"
+        ))
     bounds[which] = exact
     if failure := _why_not(t[which], exact, rank_tol):
         return _Levels(a, bounds, failure)
@@ -399,17 +405,6 @@ def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
         steady &= not deep[1:last].any() and bool(least[column] >= _FALL * size[column])
         dips += [(column, k) for k in places[values[places].argsort()][:_MOST_DIPS].tolist()]
     return steady, dips
-
-
-def _changes(sigma: Array, counts: Array, t: Array) -> str:
-    """That the rank of the derivative array, with so many constraints, differs at times t (N,)."""
-    ranks = sigma.shape[1] - counts.astype(int)
-    k = int(np.argmax(ranks != ranks[0]))
-    value = sigma[min(k, len(sigma) - 1), min(int(ranks[k]), int(ranks[0]))]
-    return (
-        f"the rank of the derivative array changes from {ranks[0]} at t = {t[0]:.6g} to {ranks[k]} "
-        f"at t = {t[k]:.6g} (singular value {value:.1e})"
-    )
 
 
 def _refuse_crossing(system: DescriptorSystem, t: Array, E: Array) -> None:

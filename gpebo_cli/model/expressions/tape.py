@@ -107,13 +107,22 @@ class Tape:
             jets_of_signals: list[Jet] | None = None
             if signals is not None:
                 jets_of_signals = [list(each) for each in np.moveaxis(signals[:, here], 2, 0)]
-            places = self._checked(times, order, decided, jets_of_signals)
+            known = times, order, decided, jets_of_signals
+            try:  # every invalid operation is refused, even one whose result is finite again
+                with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
+                    places = self.run(*known)
+            except FloatingPointError:
+                # Only a second, slower run can tell whose fault it was and when; or that it was
+                # nobody's: vectorised loops may raise flags for lanes that they do not return.
+                self._refuse(*known)
+                with np.errstate(all="ignore"):
+                    places = self.run(*known)
             for column, place in enumerate(self.outputs):
                 for k, coefficient in enumerate(places[place][: order + 1]):
                     result[k, column, here] = coefficient
             # Arithmetic of plain floats (coefficients equal at all times) raises no flags.
             if not np.isfinite(result[:, :, here]).all():
-                self._refuse(times, order, decided, jets_of_signals)
+                self._refuse(*known)
         return np.moveaxis(result, 1, 2)
 
     @cached_property
@@ -187,18 +196,6 @@ class Tape:
             ),
             tuple(Label(new[place], "…", "an argument", ()) for place in places),
         )
-
-    def _checked(self, t: Array, order: int, inside: Array, signals: list[Jet] | None) -> list[Jet]:
-        """Run with every invalid operation refused, even one whose result is finite again."""
-        try:
-            with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
-                return self.run(t, order, inside, signals)
-        except FloatingPointError:
-            # Only a second, slower run can tell whose fault it was and when; or that it was
-            # nobody's: vectorised loops may raise flags for lanes that they do not return.
-            self._refuse(t, order, inside, signals)
-            with np.errstate(all="ignore"):
-                return self.run(t, order, inside, signals)
 
     def run(
         self, t: Any, order: int, inside: Any, signals: Any = None, stop: int | None = None
