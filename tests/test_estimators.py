@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import reference, seen, shipped
+from plants import CONF, reference, seen, shipped
 from regressions import ETA, adjugate, fading, integrate, regression, three
 
 import gpebo_cli
 from gpebo_cli import estimators
+from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
 from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
-from gpebo_cli.estimators.drem import follow
+from gpebo_cli.estimators.drem import Drem, follow
+from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import SolvedEstimates
+from gpebo_cli.estimators.ls_drem import LsDrem
 from gpebo_cli.experiment.pipeline import run_experiment, stream, stream_verdict
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import initial_mesh
@@ -802,3 +805,21 @@ def test_so_they_are_of_several_recordings(tmp_path):
     details = gpebo_cli.run("descriptor", estimator=slow, data=several).details
     assert details.estimation.requirement.holds
     assert "least squares over the same data" in "".join(details.warnings)
+
+
+@pytest.mark.parametrize("path", sorted((CONF / "estimator").glob("*.yaml")), ids=lambda p: p.stem)
+def test_defaults_from_python_are_those_of_the_files(path):
+    content = parse(path.read_text(encoding="utf-8"), str(path))
+    del content["title"]
+    assert estimators.build(content) == estimators.build({"name": content["name"]})
+
+
+def test_what_fct_hands_on_is_declared_as_where_it_goes():
+    own = {each.name: each for each in fields(FiniteTime)}
+    for inner, other in ((Drem, set()), (LsDrem, {"gamma"})):  # γ of ls_drem is another number
+        for each in fields(inner):
+            if each.name not in other:
+                mine = own[each.name]
+                assert (mine.default, mine.metadata) == (each.default, each.metadata)
+    assert own["gamma"].metadata["gain"].by_parameter
+    assert own["gamma"].metadata["gain"].auto

@@ -94,6 +94,7 @@ def test_of_runs(settings, message):
         ({"A": [[[1], 1], [1, 0]]}, "A[0][0] is a list; write a number or an expression"),
         ({"A": [[" ", 1], [1, 0]]}, "A[0][0] = ' ': it is empty; write a number"),
         ({"A": [["t" + " " * 10**6 + "t", 1], [1, 0]]}, "it has 1000002 characters, more than"),
+        ({"A": [["d(d(abs(sin(t))))", 1], [1, 0]]}, "d(.) of something that jumps"),
         ({"A": [["step(3)", 1], [1, 0]]}, "the argument of step does not depend on t"),
         ({"A": [["sin(t, t)", 1], [1, 0]]}, "sin takes one argument, not 2"),
         ({"A": [["max(t)", 1], [1, 0]]}, "max takes two arguments, not 1"),

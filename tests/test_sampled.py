@@ -219,6 +219,15 @@ def test_assumption_1_is_judged_by_its_weakest_sample():
     (one,) = (a for a in found.assumptions if a.name == "Assumption 1")
     smallest = one.evidence["smallest_singular_value_at_least"]
     assert smallest == pytest.approx(0.5 / np.sqrt(1.25), rel=1e-4)
+    t = np.arange(0.0, 6.0, 0.01)
+    u, y = signals(system, t)
+    online = Online(Settings(plant={}, estimator={"name": "least_squares"},
+                             observer={"name": "gpebo", "form": "given"}),
+                    system, "zoh", 0.0, np.append(u[0], y[0]))
+    for part in (slice(0, 200), slice(200, 400), slice(400, 600)):  # π is in the second one
+        online.feed(t[part], u[part], y[part])
+    (one,) = (a for a in online.assumptions if a.name == "Assumption 1")
+    assert one.evidence["smallest_singular_value_at_least"] == pytest.approx(smallest, rel=1e-4)
 
 
 def test_what_is_remembered_does_not_grow():
