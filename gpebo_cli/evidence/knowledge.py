@@ -93,16 +93,20 @@ class Knowledge:
             return np.arange(self.parameters.shape[1])
         V, spectrum, level = self.vectors[-1], self.eigenvalues[-1], self.level[-1]
         normalised = (V * np.maximum(spectrum, 0.0)) @ V.T
-        chosen = np.flatnonzero(self.parameters[-1]).tolist()
+        first = np.flatnonzero(self.parameters[-1]).tolist()
+        rest, chosen = np.flatnonzero(~self.parameters[-1]).tolist(), list[int]()
         left = normalised.copy()  # what those that are chosen do not explain of the others
-        for j in [*chosen, *np.flatnonzero(~self.parameters[-1]).tolist()]:
+        while first or rest:
+            # Of those that may stand for one another the one with the most to say comes first.
+            j = max(first or rest, key=left.diagonal().__getitem__)
+            (first or rest).remove(j)
             more = [*chosen, j]
-            if j not in chosen:  # no eigenvalue is above what is left of a column
+            if not self.parameters[-1, j]:  # no eigenvalue is above what is left of a column
                 if not left[j, j] >= 0.5 * level[j]:
                     continue
                 if np.linalg.eigvalsh(normalised[np.ix_(more, more)])[0] < level[more].max():
                     continue
-                chosen = more
+            chosen = more
             left -= np.outer(left[:, j], left[j] / left[j, j])
         return np.sort(np.array(chosen, dtype=np.intp))
 
