@@ -17,6 +17,7 @@ from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
 from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
+from gpebo_cli.estimators._scalar import scalar_law, scalar_path
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import SolvedEstimates
@@ -792,6 +793,27 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
         ), shipped("descriptor"))(0.0, np.append(rows[1][0], rows[2][0]))  # fmt: skip
         online.feed(*rows)
         assert ("least squares over the same data" in stream_verdict(online)) == warned
+
+
+@pytest.mark.parametrize("gain", [1e10, 1e24, 1e30])
+def test_a_gain_that_makes_up_for_rounding_does_not_break_the_scalar_law(gain):
+    """Δ and η̄ jump from point to point by rounding: no element is short enough for that."""
+    mesh = initial_mesh(0.0, 2.0, [], 8, radau_rule(5))
+
+    def signals(t, inside):
+        delta = 1e-12 * np.sin(1e9 * t + 1.0)
+        eta = np.array([1.4, -2.0]) + 1e-6 * np.sin(np.outer(1e8 * t, [1.0, 3.0]))
+        return delta, delta[:, None] * eta, np.full(len(t), 1e-6)
+
+    delta, Y, digits = (
+        x.reshape(*mesh.points.shape, *x.shape[1:]) for x in signals(mesh.points.ravel(), 0)
+    )
+    path = scalar_path(
+        mesh, signals, delta, digits, Y / delta[..., None], np.linspace(0.0, 2.0, 5), 0.0)
+    found = scalar_law(path, np.array([1.0, 1.0]), np.array([[gain]]))
+    reached = np.exp(-gain * path.energy[-1, -1])
+    np.testing.assert_allclose(
+        found[0, -1], [1.4, -2.0] + reached * np.array([-0.4, 3.0]), atol=1e-5)
 
 
 def test_so_they_are_of_several_recordings(tmp_path):

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from plants import shipped
 from random_systems import largest_error, random_system, run_system
 from test_cli import gpebo
@@ -49,6 +51,31 @@ def test_states_that_are_rounding_of_a_grown_extension_are_not_told(seed, horizo
     result = run_system(plant, float(horizon), form="given", **settings)
     assert sum(result.estimable[name] is not None for name in plant["states"]) == told
     assert largest_error(result) < 1e-2  # lines between samples have an error of 3e-3
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.floats(-5.2, -3.0), st.lists(st.floats(-6, 6), min_size=3, max_size=3),
+       st.permutations(range(3)))
+def test_of_columns_that_are_nearly_equal_one_is_estimated(small, sizes, order):
+    """A, A + ε B and B: two of them suffice, but not the first two, which leave no digits."""
+    psi = np.array([[1.0, 0.0], [1.0, 10.0**small], [0.0, 1.0]])[order] * 10.0 ** np.c_[sizes]
+    found = knowledge((psi @ psi.T)[None], np.linalg.norm(psi, axis=1), np.ones(1))
+    assert len(found.independent) == 2
+    assert order.index(2) in found.independent
+
+
+def test_an_unknown_without_effect_is_not_told_after_resets():
+    """Its column of the Gram matrix is nothing, until a reset leaves rounding there."""
+    plant = {
+        "name": "idle", "states": ["x1", "x2"], "unknowns": {"k": 1.4, "idle": 1.2},
+        "outputs": ["y"], "E": [[1, 0], [0, "2+sin(t)"]], "A": [[0.3, "1-t"], ["cos(t)", -0.7]],
+        "F": [["cos(3*t)", 0], [0.3, 0]], "C": [[1.1, 0.7]], "initial_state": [1, -2],
+    }
+    result = run(plant, time={"horizon": 4, "samples": 11},
+                 observer={"remedy": "reset", "reset_interval": 0.7}).details
+    assert result.estimable["idle"] is None
+    assert result.estimable["k"] is not None
+    assert result.excitation.final.sizes[-1, 1] < 1e-90  # of the column of "idle"
 
 
 def test_unknowns_that_only_their_sum_is_told_of_do_not_spoil_the_rest():

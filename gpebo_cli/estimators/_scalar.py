@@ -29,7 +29,7 @@ MixedSignals = Callable[[Array, Array], tuple[Array, Array, Array]]
 # the second as linear in I between neighbouring points, which is then accurate enough.
 _CONSTANT, _SMALL = 1e-13, 1e-8
 _TOLERANCE = 1e-10
-_MAX_ELEMENTS = 100_000
+_MAX_ELEMENTS = 20_000
 _ROUNDING = 1e-15  # relative error of Ω; σ_max/σ_min times that is the one of 𝐘/Δ
 _UNKNOWN = 0.1  # relative error of 𝐘/Δ from which on it says nothing
 _SLACK = 30.0  # how far above its mean rounding may show in a polynomial's last coefficients
@@ -58,6 +58,10 @@ class ScalarPath:
         return self.signals(t, t)[0]
 
 
+class _UnresolvedError(Exception):
+    """What η̂ follows is rounding, which no element is short enough for."""
+
+
 def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     """Estimates (g, M, p) at the times of the path.
 
@@ -72,10 +76,15 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     lanes = elements * path.mesh.points.shape[1] * path.quotient.shape[2] * path.mesh.rule.stages
     batch = max(1, _LANES // lanes)
     starts = np.broadcast_to(start, (len(gains), start.shape[-1]))
-    return np.concatenate([
-        _integrate(path, starts[i : i + batch], gains[i : i + batch])
-        for i in range(0, len(gains), batch)
-    ])
+    try:
+        return np.concatenate([
+            _integrate(path, starts[i : i + batch], gains[i : i + batch])
+            for i in range(0, len(gains), batch)
+        ])
+    except _UnresolvedError:
+        # Gains that make up for a Δ of rounding make η̂ follow η̄ from one rounding to the next.
+        # Where that ends is compared with least squares.
+        return linear_law(path, start, gains)
 
 
 def _variation(path: ScalarPath, gain: float, start: Array) -> tuple[float, float]:
@@ -175,10 +184,7 @@ def _resolved(
             return mesh, values
         parts = wanted_parts(tail, poor, _TOLERANCE, mesh.rule.stages)
         if parts.sum() > _MAX_ELEMENTS:
-            raise SolverError(
-                f"the estimator is not resolved near t = {mesh.edges[int(np.argmax(tail))]:.6g} "
-                f"with {_MAX_ELEMENTS} elements; lower its gain"
-            )
+            raise _UnresolvedError
         finer, kept = mesh.split(parts)
         ends, new = np.repeat(ends, parts, axis=0), kept < 0
         made, made_noise = _element_maps(path, finer, ends, gains, new)

@@ -74,6 +74,9 @@ class ExtensionState:
             left = (share * (q.T @ left)).T
             left *= _share(left, limit * np.sqrt(len(left)))
         values = U @ left @ np.column_stack([right @ U.T, rhs])
+        # What nothing was known of, and what no other one has become, is no rounding of others.
+        idle = ~omega.any(axis=0) & (reset.transform == np.eye(len(omega))).all(axis=0)
+        values[idle], values[:, :-1][:, idle] = 0.0, 0.0
         return replace(self, values=reset.keep * values)
 
     def carries(self, reset: Reset) -> Array:
