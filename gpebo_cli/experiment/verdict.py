@@ -122,7 +122,7 @@ def simulation_note(simulated: SimulationResult | None, tol: float) -> str:
     told = newton_note(simulated)
     if simulated.error_estimate > _AMPLIFIED * tol:
         told += (
-            "; the plant amplifies errors: its simulation is good to "
+            "; the simulation is not as good as solver.tol, only to "
             f"{simulated.error_estimate:.1e} of each state's size"
         )
     return told

@@ -30,11 +30,12 @@ _NARROWEST = 1e-13  # of the span; cells are not cut further
 _MOST_CELLS = 1 << 15
 _MOST_VALUES = 1 << 20  # of all expressions in all cells, where these are more
 _AT_ONCE = 1 << 14  # cells whose bounds are held at the same time
-_POLYNOMIAL = ("add", "subtract", "multiply", "negative", "signal")  # no narrower than a signal
+# No narrower than a signal; kinks and jumps are edges.
+_POLYNOMIAL = {"add", "subtract", "multiply", "negative", "signal", "abs", "sign", "min", "max"}
 _MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one
 _ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
-_MOST_SWITCHED = 4096
+_MOST_SWITCHED = 1 << 16
 _BISECTIONS = 100  # more than enough to leave two neighbouring floats
 
 
