@@ -146,7 +146,12 @@ class Mesh:
         if len(bounds) > _MANY_PIECES + 1:
             return self
         rows = values.transpose(2, 0, 1)  # all times of one in a row: that is fast
-        allowed = tol * _scale_so_far(rows, counts)
+        # Sizes so far, floored as in signal_scale, and at a share of the final one: the foot of a
+        # pulse costs nothing.
+        size = np.maximum.accumulate(np.abs(rows).max(axis=2), axis=1)
+        size = np.maximum(size, _FOOT * size[:, -1:])
+        level = SHARE * np.maximum.reduceat(size, counts.cumsum() - counts, axis=0)
+        allowed = tol * np.maximum(size, np.maximum(level, _TINY).repeat(counts, axis=0))
         stays = np.ones(self.size + 1, dtype=bool)
         free = np.ones(self.size, dtype=bool)
         for count in _JOINED:
@@ -407,18 +412,6 @@ def predicted_tail(last: Array, rule: RadauRule, scale: Array) -> Array:
     used = last[:, -len(rule.to_next) :]
     predicted = np.minimum(used / size, 1.0) ** rule.to_next[:, None]
     return np.asarray(size[:, 0] * predicted.max(axis=1))
-
-
-def _scale_so_far(values: Array, counts: IntArray) -> Array:
-    """Sizes (c, K) of components (c, K, s + 1) up to each element, floored as :func:`signal_scale`.
-
-    Also floored at a share of the final size, so that the foot of a pulse costs nothing. Components
-    of one kind, ``counts`` of them, stand together and share a floor.
-    """
-    size = np.maximum.accumulate(np.abs(values).max(axis=2), axis=1)
-    size = np.maximum(size, _FOOT * size[:, -1:])
-    level = SHARE * np.maximum.reduceat(size, counts.cumsum() - counts, axis=0)
-    return np.asarray(np.maximum(size, np.maximum(level, _TINY).repeat(counts, axis=0)))
 
 
 def signal_scale(values: Array) -> Array:

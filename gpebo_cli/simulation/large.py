@@ -307,10 +307,8 @@ def _result(
     wrong += VALUE * EPS * form.loss * made_of
     scale = np.maximum(np.where(own > NOTHING * made_of, own, made_of), _TINY)
     state_errors = np.where(wrong > 0.0, wrong / scale, 0.0)
-    jumps = []
-    for cut in map(float, cuts):
-        k = int(np.searchsorted(mesh.edges, cut))
-        jumps.append((cut, x[k - 1, -1], Jump(x[k, 0], np.zeros((0, len(x0))))))
+    at, none = np.searchsorted(mesh.edges, cuts).tolist(), np.zeros((0, len(x0)))
+    jumps = [(float(mesh.edges[k]), x[k - 1, -1], Jump(x[k, 0], none)) for k in at]
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
         structure=plant.structure(), initial_state=x0, jumps=tuple(jumps),

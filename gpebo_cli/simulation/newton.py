@@ -121,7 +121,6 @@ def _window(
         if alike:  # what makes so many more of them at one tolerance does not converge
             most = max(_FEW_ELEMENTS, _MORE_ELEMENTS * guess.mesh.size)
             own = replace(own, max_elements=min(own.max_elements, most))
-        was_full = full
         try:
             found, rate = solve(linear, time, own)
         except SolverError:
@@ -141,7 +140,7 @@ def _window(
             return found, count, work, expected
         if not np.isfinite(change) or (count > 2 and change > _SHRINKS * before):
             break
-        guess, before = found, change
+        guess, before, was_full = found, change, full
     why = ""
     if len(along.switched):
         why = (

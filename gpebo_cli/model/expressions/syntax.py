@@ -14,7 +14,7 @@ import numbers
 import re
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 from gpebo_cli.errors import ConfigError
@@ -167,17 +167,14 @@ def _syntax_tree(text: str) -> ast.expr:
         raise FoldError(reason) from None
 
 
+@dataclass(frozen=True, slots=True)
 class _Reader:
     """One text's walk; collects the named expressions it meets."""
 
-    def __init__(
-        self, names: Mapping[str, Expression], elsewhere: Mapping[str, str],
-        calls: Mapping[str, tuple[int, Callable[..., Node]]],
-    ) -> None:
-        self.names = names
-        self.elsewhere = elsewhere
-        self.calls = calls
-        self.used: dict[str, Expression] = {}
+    names: Mapping[str, Expression]
+    elsewhere: Mapping[str, str]
+    calls: Mapping[str, tuple[int, Callable[..., Node]]]
+    used: dict[str, Expression] = field(default_factory=dict)
 
     def read(self, tree: ast.expr, depth: int) -> Node:
         """The node of a syntax tree; raises FoldError for whatever the language lacks."""
@@ -196,7 +193,8 @@ class _Reader:
                 return self.read(operand, depth + 1)
             case ast.Call(func=ast.Name(id=name)):
                 return self._call(name, tree, depth)
-        raise FoldError(f"{_describe(tree)} has no meaning here; {_ACCEPTED}")
+        what = _DESCRIBED.get(type(tree), f"this kind of expression ({type(tree).__name__})")
+        raise FoldError(f"{what} has no meaning here; {_ACCEPTED}")
 
     def _binary(self, tree: ast.BinOp, depth: int) -> Node:
         # a + b + c + ... leans to the left, one level per term: walk it down without recursion.
@@ -254,12 +252,7 @@ class _Reader:
             raise FoldError("a number in it is too large") from None
 
 
-def _describe(tree: ast.expr) -> str:
-    match tree:
-        case ast.Attribute():
-            return "a dot after a name (attribute)"
-        case ast.Call():
-            return "a call of something that is not a name"
-        case ast.UnaryOp():
-            return "this unary operator"
-    return f"this kind of expression ({type(tree).__name__})"
+_DESCRIBED = {
+    ast.Attribute: "a dot after a name (attribute)", ast.UnaryOp: "this unary operator",
+    ast.Call: "a call of something that is not a name",
+}
