@@ -18,19 +18,12 @@ _DELAY = 1.0  # seconds: what is quicker than this needs no progress
 
 def display(*more: ProgressColumn) -> Display:
     """A bar on stderr that is gone at the end: what, how far, how long still."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import console, progress
 
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(24), *more, TimeElapsedColumn(),
-        TextColumn("left:"), TimeRemainingColumn(),
-        console=Console(stderr=True), transient=True, speed_estimate_period=3600.0,
+    return progress.Progress(
+        progress.TextColumn("{task.description}"), progress.BarColumn(24), *more,
+        progress.TimeElapsedColumn(), progress.TextColumn("left:"), progress.TimeRemainingColumn(),
+        console=console.Console(stderr=True), transient=True, speed_estimate_period=3600.0,
     )
 
 

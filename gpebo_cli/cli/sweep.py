@@ -172,7 +172,8 @@ def _launch(
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     forks = type(launcher).__name__ == "JoblibLauncher"
     if forks:
-        how = {"initializer": workers.follow_or_end, "initargs": (os.getpid(),)}
+        followed = partial(workers.follow, must=True)
+        how = {"initializer": followed, "initargs": (os.getpid(),)}
         cast("Any", launcher).joblib |= how  # arguments of joblib.Parallel
     for first in range(0, len(waiting), size):
         numbers = waiting[first : first + size]

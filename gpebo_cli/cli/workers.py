@@ -90,23 +90,19 @@ def _wait(thread: Thread, patience: float) -> None:
             raise ChildProcessError("a worker died while it was sending a result")
 
 
-def follow(starter: int) -> None:
-    """End this process as soon as ``starter``, which it descends from, has ended."""
+def follow(starter: int, *, must: bool = False) -> None:
+    """End this process as soon as ``starter``, which it descends from, has ended.
+
+    One that it does not descend from is not followed, or, where it ``must``, has ended already.
+    """
 
     def watch() -> None:
         while starter in ancestors():
             sleep(_INTERVAL)
         os._exit(1)
 
-    if starter != os.getpid() and starter in ancestors():
+    if starter != os.getpid() and (must or starter in ancestors()):
         Thread(target=watch, daemon=True).start()
-
-
-def follow_or_end(starter: int) -> None:
-    """Follow ``starter``, unless it has ended already: then end."""
-    if starter not in ancestors():
-        os._exit(1)
-    follow(starter)
 
 
 def ancestors() -> list[int]:

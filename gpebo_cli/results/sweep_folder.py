@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.reading import finite, open_regular, strict_json
+from gpebo_cli.reading import open_regular, strict_json
 from gpebo_cli.results.files import cell, csv_text, remove_files, write_text
+from gpebo_cli.schema import read
 
 PLAN = "sweep.json"
 RESULT = "result.json"
@@ -88,23 +89,14 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
 
     A file that is no result, or of other overrides, counts as none: the job is missing.
     """
-    missing = JobRecord(number, overrides, "missing")
     try:
         with open_regular(job_folder(folder, number) / RESULT) as stream:
-            content: Any = strict_json(stream.read())
-        if content["status"] not in ("done", "failed") or content["overrides"] != dict(overrides):
-            return missing
-        return JobRecord(
-            number,
-            overrides,
-            content["status"],
-            float(content["seconds"]),
-            str(content["error"]),
-            [{str(k): None if v is None else finite(v) for k, v in case.items()}
-             for case in content["cases"]],
-        )
-    except (ConfigError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return missing
+            record = read(JobRecord, strict_json(stream.read()), RESULT)
+    except (ConfigError, OSError, ValueError, RecursionError):
+        record = None
+    if record is None or record.status == "missing" or record.overrides != dict(overrides):
+        return JobRecord(number, overrides, "missing")
+    return replace(record, job=number)
 
 
 def read_records(folder: Path, plan: Plan) -> list[JobRecord]:
