@@ -100,7 +100,13 @@ def run(
         >>> bool(abs(result.errors["il"][1, -1]) < 1e-6)
         True
     """
-    own = None if estimator is None or isinstance(estimator, str | Mapping) else _own(estimator)
+    own = None if isinstance(estimator, str | Mapping) else estimator
+    has = all(hasattr(own, name) for name in ("cases", "estimate"))
+    if own is not None and (isinstance(own, type) or not has):
+        raise ConfigError(
+            "estimator: expected a name, a mapping or an object with cases and estimate, got "
+            f"{shown(estimator)}"
+        )
     config, system, settings = _configure(
         plant, regression, config_dir, {} if own else gains, observer=observer,
         estimator=None if own else estimator, solver=solver, noise=noise, data=_recording(data),
@@ -280,16 +286,6 @@ def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
     if not isinstance(data, str | os.PathLike):
         return {"name": "csv", "frame": data}
     return {"name": "csv", "file": os.fspath(data)}
-
-
-def _own(estimator: object) -> Estimator:
-    """An estimator that is an object of the caller's (ConfigError: it is none)."""
-    if isinstance(estimator, type) or not all(hasattr(estimator, k) for k in ("cases", "estimate")):
-        raise ConfigError(
-            "estimator: expected a name, a mapping or an object with cases and estimate, got "
-            f"{shown(estimator)}"
-        )
-    return cast("Estimator", estimator)
 
 
 def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -> None:

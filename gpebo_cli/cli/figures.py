@@ -36,14 +36,14 @@ def main(words: list[str]) -> int:
         raise ConfigError(f"--check {check}: there is no such folder")
 
     # Only now, when the words are known to be good: half a second of imports.
-    from gpebo_cli.results import gallery
+    from gpebo_cli.results import circuit, gallery
     from gpebo_cli.results.files import make_folder, write_text
     from gpebo_cli.results.provenance import provenance
-    from gpebo_cli.results.studies import STUDIES
+    from gpebo_cli.results.studies import STUDIES, Study
 
     folder = Path(options.values.get("--output", _OUTPUT))
     names = names or list(STUDIES)
-    if gallery.lacks_circuit(names):
+    if not circuit.available() and any(STUDIES.get(n, Study()).is_the_papers for n in names):
         sys.stderr.write("Fig. 1 is left out: it needs schemdraw, pip install 'gpebo[figures]'\n")
     make_folder(folder)
     sections: list[Section] = []

@@ -30,6 +30,8 @@ class Options:
         values: by the long name of an option, the last one where it was given twice.
         switches: those that were given, by their long names.
         words: the rest, in order.
+        quiet: whether only errors and warnings are wanted.
+        loud: whether stages and what the solvers did are wanted, too.
     """
 
     def __init__(
@@ -38,6 +40,8 @@ class Options:
         self.values = values
         self.switches = switches
         self.words = words
+        self.quiet = "--quiet" in switches
+        self.loud = "--verbose" in switches
 
     @property
     def config_dir(self) -> str | None:
@@ -48,16 +52,6 @@ class Options:
         if not os.path.isdir(folder):
             raise ConfigError(f"--config-dir {given}: there is no such folder")
         return folder
-
-    @property
-    def quiet(self) -> bool:
-        """Whether only errors and warnings are wanted."""
-        return "--quiet" in self.switches
-
-    @property
-    def loud(self) -> bool:
-        """Whether stages and what the solvers did are wanted, too."""
-        return "--verbose" in self.switches
 
 
 PLAIN = Options({}, frozenset(), ())

@@ -78,13 +78,6 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def lacks_circuit(names: Sequence[str]) -> bool:
-    """Whether one of the recipes wants the circuit drawn and there is nothing to draw it with."""
-    return not circuit.available() and any(
-        name in STUDIES and STUDIES[name].is_the_papers for name in names
-    )
-
-
 def write_references(folder: Path, recipe: str, figures: Mapping[str, list[Panel]]) -> None:
     """Write the reference tables of a recipe to ``folder``/recipe."""
     make_folder(folder / recipe)

@@ -75,8 +75,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "fit": _fit(result.fit),
         "elements": simulation.elements if simulation else None,
         "timings": dict(result.timings),
-        "versions": made_by.versions,
-        "git": {"commit": made_by.git.commit, "dirty": made_by.git.dirty} if made_by.git else None,
+        **asdict(made_by),
     }
 
 
@@ -135,11 +134,10 @@ def _recording(recording: RecordingResult | None) -> dict[str, Any] | None:
 def _fit(fit: Fit | None) -> dict[str, Any] | None:
     if fit is None:
         return None
-    listed = fit.residual if len(fit.residual) <= MAX_LISTED_CASES else None
     finite = fit.residual[np.isfinite(fit.residual)]
     return {
         "rms_Y": fit.size,
-        "rms_residual": listed,
+        "rms_residual": fit.residual if len(fit.residual) <= MAX_LISTED_CASES else None,
         "least_rms_residual": finite.min() if finite.size else None,
         "white": fit.white,
         "noise_ratio": fit.ratio,
