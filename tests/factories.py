@@ -109,7 +109,6 @@ def make_result(
         lambda_min=float(eigenvalues[-1].min(initial=np.inf)),
         parameters=tuple(parameters),
         known=known,
-        least_share=known.share.min(axis=1, initial=1.0),
         final=known.at(slice(-1, None)),
     )
     coarse = t[::thin]

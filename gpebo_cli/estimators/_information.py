@@ -50,10 +50,6 @@ class Information:
         sampler = self.gram.mesh.sampler(t, inside)
         return InformationAt(sampler(self.gram.values), sampler(self.memory.values))
 
-    def spectrum(self, t: Array, inside: Array | None = None) -> Spectrum:
-        """G_z = V diag(λ) Vᵀ at the times t (M,)."""
-        return self.at(t, inside).spectrum
-
 
 @dataclass(frozen=True, eq=False)
 class InformationAt:

@@ -53,16 +53,11 @@ class FilteredEstimator(ResumableEstimator):
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Extend, mix, and keep what the closed form needs at the times t (M,)."""
-        names = regression.parameters
         before = known[0].values if known else None
-        extended = self.extend(regression, filter_rates(self.rates, names), before)
-        return MixedEstimates(
-            groups=(mix(extended, t, regression.floor),),
-            at_end=lambda: (reached(self.size(regression), extended, known),),
-            start=self.start(names),
-            gains=self.gains("gamma", names),
-            condition="Δ not in L2",
-            realisations=regression.realisations,
+        extended = self.extend(regression, filter_rates(self.rates, regression.parameters), before)
+        return mixed_estimates(
+            self, regression, (mix(extended, t, regression.floor),),
+            lambda: (reached(self.size(regression), extended, known),),
         )
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
@@ -246,3 +241,15 @@ class MixedEstimates:
             pieces.append(eta)
         estimates = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
         return estimates.reshape(*estimates.shape[:2], len(self.start), *self.realisations)
+
+
+def mixed_estimates(
+    settings: GainEstimator, regression: LinearRegression, groups: tuple[ScalarPath, ...],
+    at_end: Callable[[], tuple[ExtensionState, ...]] = tuple, condition: str = "Δ not in L2",
+) -> MixedEstimates:
+    """The estimates with the gains γ of some settings, of mixed regressions."""
+    names = regression.parameters
+    return MixedEstimates(
+        groups, settings.start(names), settings.gains("gamma", names), condition, at_end,
+        realisations=regression.realisations,
+    )

@@ -60,9 +60,6 @@ class InformationRoot:
 def spectrum(root: Array, memory: Array) -> Spectrum:
     """G_z = V diag(σ²) Vᵀ and Vᵀh_z = σ c from S = [U diag(σ) Vᵀ | U c], shape (K, …)."""
     p = root.shape[-1] - 1
-    if p == 0:
-        none = np.zeros((len(root), 0))
-        return Spectrum(none, none[:, :, None], none[:, :, None], memory)
     U, sigma, Vt = np.linalg.svd(root[..., :p, :p])
     order = np.arange(p)[::-1]  # ascending, as of eigenvalues
     U, sigma, Vt = U[..., order], sigma[..., order], Vt[..., order, :]

@@ -21,7 +21,12 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
 from gpebo_cli.estimators._extension import averaged, lagged
-from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
+from gpebo_cli.estimators._mixed import (
+    MixedEstimates,
+    RecursiveMixed,
+    mixed_estimates,
+    scalar_errors,
+)
 from gpebo_cli.estimators._recursive import Mixed, inverse_sampled, mix_sampled
 from gpebo_cli.estimators._scalar import mix
 from gpebo_cli.model.descriptor import Array
@@ -63,14 +68,8 @@ class Instrumental(GainEstimator):
         names, means = regression.parameters, self.means(regression)
         rows = means.values.reshape(-1, *means.values.shape[2:])
         square = (self.left(rows, names) @ rows).reshape(*means.values.shape[:2], len(names), -1)
-        return MixedEstimates(
-            groups=(mix(Trajectory(means.mesh, square), np.asarray(t), regression.floor),),
-            at_end=lambda: (),
-            start=self.start(names),
-            gains=self.gains("gamma", names),
-            condition="Δ not in L2",
-            realisations=regression.realisations,
-        )
+        path = mix(Trajectory(means.mesh, square), np.asarray(t), regression.floor)
+        return mixed_estimates(self, regression, (path,))
 
     def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
         """δ𝒴' = (ζδY − δ𝒴)/(T₀ + t) of all means, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂), of every case."""

@@ -78,7 +78,7 @@ class LeastSquares(ResumableEstimator):
         def at(
             case: Mapping[str, float], info: Information, t: Array, inside: Array
         ) -> ErrorSystem:
-            s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
+            s, into = info.at(t, inside).spectrum, transpose(regression.psi(t, inside))
             rate = s.forgetting(case["alpha"], case["f0"], case["beta"], self.covariance_bound)
             A = -rate[:, None, None] * np.eye(regression.p)
             C = s.covariance(case["alpha"], case["f0"])

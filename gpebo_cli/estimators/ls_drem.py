@@ -14,7 +14,12 @@ import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._information import Information, Spectrum, check_held
-from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
+from gpebo_cli.estimators._mixed import (
+    MixedEstimates,
+    RecursiveMixed,
+    mixed_estimates,
+    scalar_errors,
+)
 from gpebo_cli.estimators._recursive import Mixed, quotient_of
 from gpebo_cli.estimators._scalar import SINGULAR, ScalarPath, filled, scalar_path
 from gpebo_cli.estimators.least_squares import LeastSquares, RecursiveLeastSquares
@@ -68,7 +73,7 @@ class LsDrem(ResumableEstimator):
         def at(
             case: Mapping[str, float], info: Information, gain: Array, t: Array, inside: Array
         ) -> ErrorSystem:
-            s, into = info.spectrum(t, inside), transpose(regression.psi(t, inside))
+            s, into = info.at(t, inside).spectrum, transpose(regression.psi(t, inside))
             rate = s.forgetting(case["alpha"], case["f0"], case["beta"], part.covariance_bound)
             delta, weights = _adjugate(s, case["alpha"], case["f0"])
             adjugate = (s.vectors * weights[:, None]) @ transpose(s.vectors)
@@ -90,16 +95,12 @@ class LsDrem(ResumableEstimator):
         part = self.least_squares
         check_held(regression, len(part.cases))
         infos = part.informations(regression, known)
-        return MixedEstimates(
-            groups=tuple(
-                mix_least_squares(info, case["alpha"], case["f0"], t, regression.floor)
-                for info, case in zip(infos, part.cases, strict=True)
-            ),
-            at_end=lambda: tuple(info.reached for info in infos),
-            start=self.start(regression.parameters),
-            gains=self.gains("gamma", regression.parameters),
-            condition="IE",
-            realisations=regression.realisations,
+        groups = tuple(
+            mix_least_squares(info, case["alpha"], case["f0"], t, regression.floor)
+            for info, case in zip(infos, part.cases, strict=True)
+        )
+        return mixed_estimates(
+            self, regression, groups, lambda: tuple(info.reached for info in infos), "IE"
         )
 
 
@@ -130,7 +131,7 @@ def mix_least_squares(
     mesh = info.gram.mesh
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
-        s = info.spectrum(t, inside)
+        s = info.at(t, inside).spectrum
         delta, weights = _adjugate(s, alpha, f0)
         Y, digits = s.vectors @ (weights[..., None] * s.rotated), s.digits
         if in_own_units:

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from gpebo_cli.evidence.knowledge import Knowledge, knowledge, least_share
+from gpebo_cli.evidence.knowledge import Knowledge, knowledge
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, BoolArray
@@ -27,7 +27,6 @@ WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hun
 _TINY = float(np.finfo(float).tiny)
 _PLACES, _SAME_TIME = 17, 1e-14  # in a bracket; of the horizon
 _AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
-_BLOCK = 16  # times that are looked at together, from the end on, of more parameters than that
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -47,8 +46,6 @@ class Excitation:
     final: Knowledge  # at the last of the times
     t_c: OnDemand[float | None] = OnDemand()  # first time at which all can be told apart
     lambda_min: OnDemand[float] = OnDemand()  # at the horizon
-    # (N,) of all parameters' ``known.share``, 0 some time before it is ``WELL`` for good
-    least_share: OnDemand[Array] = OnDemand()
     known: OnDemand[Knowledge] = OnDemand()
     gram_eigenvalues: OnDemand[Array] = OnDemand()  # (N, p)
     # (N,) smallest eigenvalue of the Gram matrix over the trailing window
@@ -95,7 +92,7 @@ class Excitation:
         """From when on all parameters are well determined."""
         if not self.parameters or not (self.final.share >= WELL).all():
             return None
-        return since(self.t, self.least_share[:, None] >= WELL)[0]
+        return since(self.t, self.known.share.min(axis=1, initial=1.0)[:, None] >= WELL)[0]
 
 
 def assess(
@@ -118,8 +115,7 @@ def assess(
         t, window, settings.rho, regression.parameters, known(regression, t[-1:]),
         t_c=partial(_t_c, later, settings.rho, tol),
         lambda_min=lambda: float(eigenvalues(t[-1:])[0, 0]) if later.p else 0.0,
-        least_share=partial(_least_share, later, t, tol), known=partial(known, later, t),
-        gram_eigenvalues=partial(eigenvalues, t),
+        known=partial(known, later, t), gram_eigenvalues=partial(eigenvalues, t),
         pe_level=partial(segment_level, later, t, window),
     )
 
@@ -130,19 +126,6 @@ def _beside(regression: LinearRegression, at: Array, tol: float) -> tuple[Array,
     sizes = np.broadcast_to(regression.scale, (mesh.size, regression.p))
     element = mesh.edges[1:-1].searchsorted(at, side="left")
     return sizes[element], at - mesh.edges[0], tol
-
-
-def _least_share(regression: LinearRegression, t: Array, tol: float) -> Array:
-    """Of the parameters at the times t (N,); 0 some time before it is ``WELL`` for good."""
-    found = np.zeros(len(t))
-    size = _BLOCK if regression.p > _BLOCK else max(len(found), 1)
-    for last in range(len(found), 0, -size):
-        part = slice(max(last - size, 0), last)
-        at = t[part]
-        found[part] = least_share(regression.gram(at), *_beside(regression, at, tol))
-        if found[part].min() < WELL:
-            break
-    return found
 
 
 def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float | None:

@@ -14,7 +14,6 @@ from functools import cached_property
 
 import numpy as np
 
-from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 
 LARGE = 1e3  # of Φ: above it, states may be differences of terms that leave nothing of them
@@ -173,30 +172,14 @@ def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> 
     ``terms`` (M, p) or (p,) are sizes of the terms that the columns of ψ are made of, ``elapsed``
     (M,) the seconds that G has been gathered for. ψ is resolved to ``tol``, relative to its terms.
     """
-    normalised, sizes, level = _normalised(gram, terms, elapsed, tol)
-    spectrum, vectors = np.linalg.eigh(normalised)
-    return Knowledge(sizes, spectrum, vectors, level)
-
-
-def least_share(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Array:
-    """The smallest ``share`` (M,) of :func:`knowledge`, by inverses; 1 if there is nothing."""
-    normalised, _, _ = _normalised(gram, terms, elapsed, tol)
-    least = np.einsum("mjj->mj", normalised).min(axis=1, initial=1.0)
-    seen = np.flatnonzero(least > 0.0)
-    inverse = np.abs(np.einsum("mjj->mj", inverses(normalised[seen])))
-    least[seen] = 1.0 / inverse.max(axis=1, initial=1.0)
-    return np.asarray(least)
-
-
-def _normalised(
-    gram: Array, terms: Array, elapsed: Array, tol: float
-) -> tuple[Array, Array, Array]:
-    """N (M, p, p), the sizes and the levels of the columns (M, p)."""
     p = gram.shape[1]
     energy = np.einsum("mjj->mj", gram[..., :p])
     sizes, level = _sizes(np.sqrt(np.maximum(energy, 0.0)), terms, elapsed, tol)
     factors = np.where(level < 1.0, 1.0 / sizes, 0.0)
-    return gram[..., :p] * factors[:, :, None] * factors[:, None, :], sizes, level
+    spectrum, vectors = np.linalg.eigh(
+        gram[..., :p] * factors[:, :, None] * factors[:, None, :]
+    )
+    return Knowledge(sizes, spectrum, vectors, level)
 
 
 def knowledge_of_roots(root: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:

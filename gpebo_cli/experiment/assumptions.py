@@ -6,6 +6,7 @@ first stage that cannot be carried out and reports that stage as the failed assu
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
@@ -169,11 +170,8 @@ def visible(
 
 
 def _named(error: GpeboError) -> str:
-    text = str(error)
-    for number in range(1, 8):
-        if f"Assumption {number}" in text:
-            return f"Assumption {number}"
-    return "Rank of E" if "rank of E" in text else "Observer"
+    found = re.search(r"Assumption \d", str(error))
+    return found[0] if found else "Rank of E" if "rank of E" in str(error) else "Observer"
 
 
 _SOLVABILITY = "uniquely solvable, with constant characteristic values (μ, d, a)"

@@ -245,7 +245,7 @@ class Online:
             t[shown], window, self._rho, tuple(self.parameters), known.at(_NEWEST),
             self._t_c[0] if self._t_c[1] is None else self._t_c[1],
             float(eigenvalues[-1, 0]) if self.parameters else 0.0,
-            lambda: known.share.min(axis=1, initial=1.0), known, eigenvalues, pe_level,
+            known, eigenvalues, pe_level,
         )
 
     @property

@@ -119,12 +119,8 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
         raise ConfigError(
             "observer=none simulates the plant, and data=csv does not; choose one of them"
         )
-    if recorded and (settings.noise.seeds > 1 or levels.steps.any()):
-        raise ConfigError(
-            "noise.seeds and noise.quantisation are for simulations; a recording (data=csv) has "
-            "its own noise, of which noise.outputs and noise.inputs say how large it is"
-        )
     if recorded:
+        _refuse_made_up(settings, levels)
         return
     if not levels.silent:
         check_samples(time.horizon, settings.noise.sample_time, settings.solver.max_elements)
@@ -135,16 +131,20 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
         )
 
 
+def _refuse_made_up(settings: Settings, levels: NoiseLevels) -> None:
+    if settings.noise.seeds > 1 or levels.steps.any():
+        raise ConfigError(
+            "noise.seeds and noise.quantisation are for simulations; what is recorded or streamed "
+            "has its own noise, of which noise.outputs and noise.inputs say how large it is"
+        )
+
+
 def check_stream(settings: Settings, system: DescriptorSystem) -> None:
     """Refuse what would need later rows of a recording, whose rows come one after the other.
 
     ConfigError: names the key and what it may be.
     """
-    if settings.noise.seeds > 1 or noise_levels(settings.noise, system).steps.any():
-        raise ConfigError(
-            "noise.seeds and noise.quantisation are for simulations; what is streamed has its own "
-            "noise, of which noise.outputs and noise.inputs say how large it is"
-        )
+    _refuse_made_up(settings, noise_levels(settings.noise, system))
     if settings.data.hold == "cubic":
         raise ConfigError(
             "data.hold=cubic needs to know the samples to come; a stream takes zoh or linear"
