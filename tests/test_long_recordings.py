@@ -10,6 +10,7 @@ import pytest
 from gpebo_cli import run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
+from gpebo_cli.experiment.accuracy import _varies_slowly
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
@@ -183,6 +184,14 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch):
 def test_an_estimator_without_its_map_is_refused_before_a_file_is_read():
     with pytest.raises(ConfigError, match="monotone is for a regression with S and box"):
         run("battery", data={"file": "nowhere.csv"}, estimator="monotone")
+
+
+def test_a_slow_misfit_far_below_the_noise_is_told_and_white_noise_is_not():
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((300, 1000, 2))
+    wave = 0.25 * np.sin(np.linspace(0.0, 12.0, 1000))[:, None]
+    assert np.mean([_varies_slowly(e) for e in white]) < 0.04
+    assert np.mean([_varies_slowly(e + wave) for e in white]) > 0.9
 
 
 def test_noise_in_the_matrices_is_named():

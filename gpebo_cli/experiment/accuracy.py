@@ -29,6 +29,9 @@ from gpebo_cli.regression.linear import LinearRegression, least_squares
 
 _LATE = 0.25  # of a run: its end, where a deviation swings
 _LAGS = 20  # of the residual's autocorrelation
+_FEWEST = 8  # samples within the span, to look at them alone
+_SLOW = 8  # one in so many of a residual's cosines is slow
+_RARE = 0.005  # chance of each sum below which they are not those of white noise
 _SILENT = 1e-9  # of an output: a residual below that is rounding
 _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that has no size of its own
 _ASTRAY = 0.02  # of a quantity's size: estimates that differ by more are different
@@ -327,6 +330,22 @@ def fit_of(
     )
 
 
+def _varies_slowly(residual: Array) -> bool:
+    """Whether a residual (N, r) has more in its slowest cosines than white noise.
+
+    In its slowest 4, 8, 16, …: what is small and slow hides from single lags.
+    """
+    from scipy.fft import dct  # as long to import as a small run takes
+    from scipy.special import fdtrc
+
+    spectrum = dct(residual, axis=0, norm="ortho")[1:] ** 2
+    (count, outputs), slow = spectrum.shape, len(spectrum) // _SLOW
+    some = 2 ** np.arange(2, slow.bit_length())
+    sums = (spectrum / spectrum[slow:].mean(axis=0)).sum(axis=1).cumsum()[some - 1]
+    chances = fdtrc(some * outputs, (count - slow) * outputs, sums / (some * outputs))
+    return bool(chances.min(initial=1.0) < _RARE)
+
+
 def _step(y: Array) -> float:
     """What an output (N,) is rounded to; 0.0 where most changes are no multiples of one step."""
     change = np.abs(np.diff(y))
@@ -364,7 +383,7 @@ def _explained(
     fit = replace(fit, outputs=fitted)
     samples = t if source.samples is None else source.samples
     samples = samples[(samples >= t[0]) & (samples <= t[-1])]
-    if every and len(samples) > len(t):
+    if every and len(samples) > _FEWEST:
         u, y = source.inputs(samples), source.outputs(samples)
         t, fitted = samples, outputs(samples, samples, u, y)
     # Two samples apart: between samples the signals are interpolated and no noise is white.
@@ -395,7 +414,7 @@ def _explained(
                 system.outputs, map(_step, y.T), np.sqrt(power / count), strict=True
             ) if own < _ROUNDING * step
         ],
-        correlation=correlation, lag=stride * step,
+        correlation=correlation, slow=_varies_slowly(residual[:, seen]), lag=stride * step,
         in_matrices=tuple(name for name in system.outputs if name in names),
         band=1.96 / np.sqrt(count * seen.sum()),
     )

@@ -19,8 +19,7 @@ from gpebo_cli.findings import Assumption, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.settings import Settings
 
-_TOGETHER = 1.7  # bands of a sum of correlations, which one white noise in a thousand leaves
-_OUTSIDE = 0.15  # share of correlations outside a band that white noise leaves with 5 % of them
+_OUTSIDE = 0.2  # share of correlations outside a band that white noise leaves with 5 % of them
 
 
 @dataclass(frozen=True)
@@ -169,6 +168,7 @@ class Fit:
     size: float  # the same of ‖Y‖
     outputs: Array | None = None  # (N, r) ŷ of the best case at the times of the signals
     correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
+    slow: bool = False  # whether more of it than of white noise varies slowly
     lag: float = np.nan  # seconds
     band: float = np.nan  # 95 % of the correlations of white noise are within
     far: Sequence[tuple[str, int, float]] = ()  # outputs, samples far from most, time of the first
@@ -181,9 +181,8 @@ class Fit:
         """Whether the residual looks like white noise; None: it was not looked at."""
         if self.correlation is None:
             return None
-        rho, band = self.correlation, self.band
-        together = abs(rho.sum()) / np.sqrt(len(rho))  # small ones of one sign: a slow misfit
-        return bool((np.abs(rho) > band).mean() <= _OUTSIDE and together <= _TOGETHER * band)
+        outside = np.abs(self.correlation) > self.band
+        return bool(outside.mean() <= _OUTSIDE) and not self.slow
 
     @property
     def best(self) -> int:
