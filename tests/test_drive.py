@@ -112,9 +112,10 @@ def test_mistakes_are_named(tmp_path, given, said):
         signals({**PLANT, "inputs": {"u": {"file": table(tmp_path)} | given}})
 
 
-def test_an_experiment_stays_within_the_table(tmp_path):
-    plant = {**PLANT, "inputs": {"u": {"file": table(tmp_path)}}}
-    with pytest.raises(ConfigError, match=r"is of t = 0 to 3, and the experiment needs t = "):
+@pytest.mark.parametrize("others", [{}, {"phi": ["-y**3"]}])
+def test_an_experiment_stays_within_the_table(tmp_path, others):
+    plant = {**PLANT, **others, "inputs": {"u": {"file": table(tmp_path)}}}
+    with pytest.raises(ConfigError, match=r"is of t = 0 to 3, and the experiment needs t = 4;"):
         run(plant, observer="none", time={"horizon": 4})
 
 

@@ -59,8 +59,8 @@ class Piecewise:
     pieces: Array  # (degree + 1, N - 1), coefficients of powers of t − t_k
     corners: Array  # samples (C,) where neighbouring pieces are not one polynomial
 
-    def taylor(self, t: Array, order: int, inside: Array) -> Array:
-        """Taylor coefficients (order + 1, M) at times t (M,) (ConfigError)."""
+    def cover(self, t: Array) -> None:
+        """Refuse times t (M,) beyond the samples (ConfigError)."""
         first, last = self.t[0], self.t[-1]
         slack = _ROUNDING * max(abs(first), abs(last))
         if len(t) and (t.min() < first - slack or t.max() > last + slack):
@@ -69,6 +69,10 @@ class Piecewise:
                 f"{self.where} is of t = {first:g} to {last:g}, and the experiment needs "
                 f"t = {beyond:g}; set time.start and time.horizon, or give a longer table"
             )
+
+    def taylor(self, t: Array, order: int, inside: Array) -> Array:
+        """Taylor coefficients (order + 1, M) at times t (M,) (ConfigError)."""
+        self.cover(t)
         k = np.clip(np.searchsorted(self.t, inside, side="right") - 1, 0, len(self.t) - 2)
         since, degree = t - self.t[k], len(self.pieces) - 1
         found = np.zeros((order + 1, len(t)))
@@ -147,6 +151,8 @@ class Driven:
 
     def breakpoints(self, start: float, stop: float) -> Array:
         """Those of the text, the samples where an input jumps or bends, and what inputs switch."""
+        for table in self.tables.values():
+            table.cover(np.array([start, stop]))
         corners = np.concatenate([table.corners for table in self.tables.values()])
         inner = corners[(corners > start) & (corners < stop)]
         found = np.union1d(self.given.breakpoints(start, stop), inner)

@@ -63,6 +63,8 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         if simulation.lost is not None:
             raise nothing_left(f"plant {system.name}", simulation.lost)
         return simulation
+    # Windows would try a table that is too short up to its end.
+    system.coefficients.breakpoints(time.start, time.start + time.horizon)
     last: list[Simulation] = []
 
     def solve_linear(
