@@ -845,3 +845,9 @@ def test_what_fct_hands_on_is_declared_as_where_it_goes():
                 assert (mine.default, mine.metadata) == (each.default, each.metadata)
     assert own["gamma"].metadata["gain"].by_parameter
     assert own["gamma"].metadata["gain"].auto
+
+
+@pytest.mark.parametrize("last", [np.nan, 2e300, 0.0])
+def test_one_wrong_gain_of_many_is_refused(last):
+    with pytest.raises(ConfigError, match=r"estimator\.gamma"):
+        estimators.build({"name": "drem", "gamma": [1.0] * 9 + [last]}).cases(["a"])

@@ -1,4 +1,4 @@
-"""Change of units: physics stays the same, and so does everything that is said about it."""
+"""Change of units and signs: physics stays the same, and all that is said about it does."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def test_a_simulation_is_the_same_in_any_units(name, decades):
 def doubt_of_t_c(a):
     """What rounding leaves open of t_c, in seconds.
 
-    Eigenvalues of a p × p matrix with unit diagonal are rounded by p ε, in either run: this over
-    their slope at the level that t_c asks for, half the last one where that is small. A column of
-    ψ that begins as zero counts from ten of its errors on: there it is known to a tenth.
+    Eigenvalues of a p × p matrix with unit diagonal are rounded by p ε: this over their slope at
+    the level that t_c asks for, half the last one where that is small. A column of ψ that begins
+    as zero counts from ten of its errors on: there it is known to a tenth. Twice, for two runs.
     """
     if a.t_c is None or a.t_c <= a.t[0]:
         return 0.0
     if a.normalised_min[1] >= WELL:
-        return 0.1 * a.t_c
+        return 2.0 * 0.1 * a.t_c
     i = int(np.searchsorted(a.t, a.t_c))
     slope = (a.normalised_min[i] - a.normalised_min[i - 1]) / (a.t[i] - a.t[i - 1])
     return 2.0 * len(a.parameters) * EPS / slope

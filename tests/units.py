@@ -20,12 +20,13 @@ class Units(NamedTuple):
 
 
 def drawn(rng, system, *, decades):
-    """Powers of ten between 1e-6 and 1e6, or any factors between."""
+    """Powers of ten between 1e-6 and 1e6, or any factors between; of either sign, but of time."""
     def factors(count):
         power = rng.integers(-6, 7, count) if decades else rng.uniform(-6, 6, count)
         return 10.0**power
 
-    return Units(*(factors(n) for n in (system.n, system.q, system.m, system.r, system.n)),
+    return Units(*(factors(n) * rng.choice([-1.0, 1.0], n)
+                   for n in (system.n, system.q, system.m, system.r, system.n)),
                  float(factors(1)[0]))
 
 
