@@ -168,7 +168,8 @@ def test_a_narrow_pulse_along_an_output_is_seen(width):
 
 
 @pytest.mark.parametrize(("what", "least"), [
-    ("gpebo_cli.model.text._MOST_ALONG", 2), ("gpebo_cli.simulation.simulate._LOOKS", 1),
+    ("gpebo_cli.model.expressions.bounds._MOST_ALONG", 2),
+    ("gpebo_cli.simulation.simulate._LOOKS", 1),
 ])
 def test_a_pulse_along_an_output_that_is_not_followed_far_enough_is_said(what, least, monkeypatch):
     monkeypatch.setattr(what, least)
