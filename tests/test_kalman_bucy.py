@@ -25,7 +25,7 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers import SignalNoise, observe
 from gpebo_cli.observers._riccati import run_filter
-from gpebo_cli.observers.kalman_bucy import filter_model, noise_model
+from gpebo_cli.observers.kalman_bucy import NoiseModel, filter_model
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
@@ -76,7 +76,8 @@ def test_model_holds_on_the_true_state_whatever_the_noise(name):
     s, basis, o = in_basis(system, t, t, u, y)
 
     def zeta(at: Array) -> Array:
-        P = observer_matrices(EquationForm(system, Units.plain(system)), at, at, 1e-10).projector
+        form = EquationForm(system, Units.plain(system))
+        P = observer_matrices(form, at, at, 1e-10).split.projector
         w = (P @ signals.states(at)[..., None])[..., 0] @ basis
         return np.concatenate([np.broadcast_to(system.theta, (len(at), system.q)), w], axis=1)
 
@@ -118,7 +119,8 @@ def normalised_errors(name: str, outputs: float, inputs: float, seeds: int) -> t
         system, t, inside, signals.inputs(t, inside), signals.outputs(t, inside)
     )
     n, q = s.A.shape[1], system.q
-    intensities = noise_model(noise, np.zeros(n), np.full(n, 10.0), 1e-3)
+    intensities = NoiseModel(
+        noise.variances * sample_time, np.zeros(n), np.full(n, 1e-6 * 10.0 * sample_time))
 
     def model(t: Array, inside: Array):
         s, basis, _ = in_basis(

@@ -252,27 +252,17 @@ def doubts(
     limit = min(_ASTRAY, max(_EXACT, _DONE * rest))
     far = determined & (away > limit * own)
     far &= requirement.holds and bool(more[best] > _WORSE * least)
-    vague = determined & ~far & (open_ > _EXACT * own)
-    texts = []
-    if far.any():
-        size = np.linalg.norm(root[:, -1])
-        texts.append(
-            f"estimates.csv: at the end {_listed(quantities, far)} are up to "
-            f"{(away / own)[far].max():.2g} of their size away from least squares over the same "
-            f"data, which leaves {least / size:.1g} of Y and they "
-            f"{np.hypot(least, more[best]) / size:.1g}: the estimator has lost digits or is not "
-            "done; use estimator=least_squares or other gains"
-        )
-    if vague.any():
-        texts.append(
-            f"estimates.csv: at the end {_listed(quantities, vague)} may be off by up to "
-            f"{(open_ / own)[vague].max():.1g} of their size, for want of excitation"
-        )
-    return {name: found[name] for name in compress(quantities, determined)}, tuple(texts)
-
-
-def _listed(names: Sequence[str], which: BoolArray) -> str:
-    return ", ".join(compress(names, which))
+    told = {name: found[name] for name in compress(quantities, determined)}
+    if not far.any():
+        return told, ()
+    size = np.linalg.norm(root[:, -1])
+    text = (
+        f"estimates.csv: at the end {', '.join(compress(quantities, far))} are up to "
+        f"{(away / own)[far].max():.2g} of their size away from least squares over the same data, "
+        f"which leaves {least / size:.1g} of Y and they {np.hypot(least, more[best]) / size:.1g}: "
+        "the estimator has lost digits or is not done; use estimator=least_squares or other gains"
+    )
+    return told, (text,)
 
 
 def standing(

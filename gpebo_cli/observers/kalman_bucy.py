@@ -189,18 +189,6 @@ class NoiseModel:
         )
 
 
-def noise_model(
-    noise: SignalNoise, process: Array, variances: Array, regularisation: float
-) -> NoiseModel:
-    """Intensities, with ``process`` and the ``variances`` of P0, (n,) each.
-
-    What is known at the start counts as what is least known.
-    """
-    varies = np.where(variances > 0.0, variances, variances.max(initial=0.0) or 1.0)
-    exact = regularisation**2 * noise.sample_time * varies
-    return NoiseModel(noise.variances * noise.sample_time, process, exact)
-
-
 @dataclass(frozen=True)
 class KalmanBucy:
     """Unknown parameters are constant states; it estimates by itself.
@@ -266,7 +254,12 @@ class KalmanBucy:
         process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
         points, inside = mesh.points.ravel(), mesh.inside.ravel()
         known_of = reduced(points, inside)
-        model_noise = noise_model(noise, process, variances, self.regularisation)
+        # What is known at the start counts as what is least known.
+        varies = np.where(variances > 0.0, variances, variances.max(initial=0.0) or 1.0)
+        model_noise = NoiseModel(
+            noise.variances * noise.sample_time, process,
+            self.regularisation**2 * noise.sample_time * varies,
+        )
         regularised = bool(model_noise.measured(known_of, steps(inside))[2].any())
         # What w is beside the part of x that is known may be rounding of that, added up.
         turns = 1.0 + float(np.abs(known_of.A).max() * (mesh.edges[-1] - mesh.edges[0]))
@@ -283,6 +276,14 @@ class KalmanBucy:
             x = offset + np.einsum("ksij,ksj->ksi", gain, estimate[..., 0])
             return [(x, 0.0), (gain.reshape(*gain.shape[:2], -1), 0.0)]
 
+        used: dict[str, float | int | str | None] = {
+            f"intensity_{name}": float(value)
+            for name, value in zip((*system.inputs, *system.outputs), model_noise.signals,
+                                   strict=True)
+        }
+        share = f"{self.regularisation:g} of each equation's own under P0 "
+        if regularised:
+            used["regularised_with"] = f"noise of {share}at {noise.sample_time:g} s"
         name = f"Kalman-Bucy filter of plant {system.name}"
         filtered = run_filter(
             model, start[:, None], P0, mesh, tol=solver.tol, max_elements=solver.max_elements,
@@ -309,7 +310,10 @@ class KalmanBucy:
             error_estimate=max(evidence.error_estimate, filtered.error_estimate),
             assumptions=(
                 *evidence.assumptions,
-                _measurement_noise(system, model_noise, noise, self.regularisation * regularised),
+                Assumption(
+                    "Measurement noise", "its covariance V(t) is positive definite, regularised "
+                    "where the noise leaves it singular", True, used,
+                ),
                 Assumption(
                     observability.name,
                     "the observability Gramian over windows of a tenth of the horizon stays away "
@@ -319,10 +323,8 @@ class KalmanBucy:
             growth=None,
             estimator=Filter(filtered, observability),
             names=names,
-            note=note + (
-                f"; measurement noise regularised: {self.regularisation:g} of each equation's own "
-                "under P0 (observer.regularisation)"
-            ) * regularised,
+            note=note
+            + f"; measurement noise regularised: {share}(observer.regularisation)" * regularised,
         )
 
 
@@ -365,23 +367,6 @@ def _uniform_observability(
             f"over windows of {window:.3g} s, λ_min of the observability Gramian falls to "
             f"{level:.3g} of P0⁻¹ (from t = {at:.4g} s on; evidence needs {needed:.2g})"
         ),
-    )
-
-
-def _measurement_noise(
-    system: DescriptorSystem, model: NoiseModel, noise: SignalNoise, regularisation: float
-) -> Assumption:
-    used: dict[str, float | int | str | None] = {
-        f"intensity_{name}": float(value)
-        for name, value in zip((*system.inputs, *system.outputs), model.signals, strict=True)
-    }
-    if regularisation > 0.0:
-        what = f"noise of {regularisation:g} of each equation's own under P0 "
-        used["regularised_with"] = f"{what}at {noise.sample_time:g} s"
-    return Assumption(
-        "Measurement noise",
-        "its covariance V(t) is positive definite, regularised where the noise leaves it singular",
-        True, used,
     )
 
 
