@@ -154,24 +154,21 @@ def information(
     With a bound M ≥ 1/f₀ forgetting is β = β₀ (1 − ‖F‖/M), else β = β₀ ≥ 0, where α and f₀ do not
     matter.
     """
-    level = largest(regression.gram.final)
+    level, before = largest(regression.gram.final), 1.0
     if known is not None:
-        level = max(level, known.level)
+        level, before = max(level, known.level), known.memory
     if beta == 0.0:
-        memory = np.ones(regression.outer.values.shape[:2])
         gram = regression.gram
         if known is not None:
             gram = Trajectory(gram.mesh, gram.values + known.values)
-            memory *= known.memory
+        memory = np.full(regression.outer.values.shape[:2], before)
         return Information(gram, Trajectory(regression.mesh, memory), level)
     if bound is None:
         start = None if known is None else beta * known.values
         # β ∫ e^{−β(t−s)} (·) ds
         filtered = low_pass(regression.outer, np.array(beta), start)
         mesh = filtered.mesh
-        memory = np.exp(-beta * (mesh.points - mesh.edges[0]))
-        if known is not None:
-            memory *= known.memory
+        memory = before * np.exp(-beta * (mesh.points - mesh.edges[0]))
         return Information(
             Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory), level
         )

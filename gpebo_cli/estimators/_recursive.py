@@ -237,14 +237,18 @@ class KreisselmeierFilter:
 def inverse_sampled(extended: Array) -> Array:
     """Ω⁻¹ (K, p, p) of [Ω | 𝒴] (K, p, p + 1), zero where it is rounding."""
     omega = extended[..., :-1]
-    delta, adjugate, reciprocal = determinant_and_adjugate_action(omega)
-    usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))[:, None, None]
-    return np.divide(adjugate, delta[:, None, None], out=np.zeros_like(omega), where=usable)
+    return _solved(omega, np.broadcast_to(np.eye(omega.shape[-1]), omega.shape))[1]
 
 
 def mix_sampled(extended: Array) -> tuple[Array, Array, BoolArray]:
     """Δ (K, 1), η̄ (K, 1, p) and where it is usable (K, 1), from [Ω | 𝒴] (K, p, p + 1)."""
-    delta, Y, reciprocal = determinant_and_adjugate_action(extended[..., :-1], extended[..., -1])
+    delta, quotient, usable = _solved(extended[..., :-1], extended[..., -1:])
+    return delta[:, None], quotient[:, None, :, 0], usable[:, None]
+
+
+def _solved(omega: Array, rhs: Array) -> tuple[Array, Array, BoolArray]:
+    """det(Ω) (K,), Ω⁻¹b (K, p, c), zero where that is rounding, and where it is not (K,)."""
+    delta, action, reciprocal = determinant_and_adjugate_action(omega, rhs)
     usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))
-    quotient = np.divide(Y, delta[:, None], out=np.zeros_like(Y), where=usable[:, None])
-    return delta[:, None], quotient[:, None], usable[:, None]
+    zero, where = np.zeros_like(action), usable[:, None, None]
+    return delta, np.divide(action, delta[:, None, None], out=zero, where=where), usable

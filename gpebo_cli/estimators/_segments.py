@@ -81,11 +81,7 @@ class Nothing(Unmixed):
 
     count: int  # of cases
     times: int
-
-    @property
-    def requirement(self) -> Requirement:
-        """Nothing is required."""
-        return Requirement("none", True, {}, "there is nothing to estimate")
+    requirement = Requirement("none", True, {}, "there is nothing to estimate")
 
     def parameters(self, cases: slice) -> Array:
         """Empty arrays for some cases, (g, M, 0)."""

@@ -17,7 +17,7 @@ from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest, symmetric_eigenvalues
-from gpebo_cli.numerics.mesh import Mesh, Sampler, Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.regression.samples import SampledRegression
@@ -254,22 +254,14 @@ def window_level(outer: Trajectory, t: Array, window: float) -> Array:
 
 def between(signal: Trajectory, a: Array, b: Array) -> Array:
     """∫ of a signal (rows, c) from a to b ≥ a (N,) in its mesh, whole elements summed afresh."""
-    mesh, R = signal.mesh, signal.mesh.rule.integration
-    start, stop = mesh.sampler(a), mesh.sampler(b)
-    totals = mesh.steps[:, None, None] * np.tensordot(signal.values[:, 1:], R[-1], axes=(1, 0))
-
-    def within(places: Sampler) -> Array:
-        """Integrals from the left ends of elements to places in them."""
-        weights = np.zeros_like(places.weights)
-        weights[:, 1:] = mesh.steps[places.element, None] * (places.weights[:, 1:] @ R)
-        return Sampler(places.element, weights)(signal.values)
-
-    # Sums of totals[first:last] for every window: pairs of indices to reduceat.
-    padded = np.concatenate([totals, np.zeros_like(totals[:1])])
+    start, stop = signal.mesh.sampler(a), signal.mesh.sampler(b)
+    local = signal.integral(local=True).values
+    # Sums over whole elements for every window: pairs of indices to reduceat.
+    padded = np.concatenate([local[:, -1], np.zeros_like(local[:1, -1])])
     pairs = np.stack([start.element, stop.element], axis=1).ravel().astype(np.intp)
     whole = np.add.reduceat(padded, pairs, axis=0)[::2]
     several = (start.element < stop.element)[:, None, None]
-    return np.asarray(np.where(several, whole, 0.0) + within(stop) - within(start))
+    return np.asarray(np.where(several, whole, 0.0) + stop(local) - start(local))
 
 
 def sampled_window_level(regression: SampledRegression, window: float) -> Array:

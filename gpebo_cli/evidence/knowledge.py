@@ -122,9 +122,7 @@ class Knowledge:
         last = gain[len(gain) - len(kernel) :]
         if units is not None:  # the row of a state that no parameter has part in is rounding
             own = np.abs(gain) / units[:, None]
-            whole = own.max(axis=1, initial=0.0)
-            if not np.isfinite(whole).all():
-                whole = own.max(axis=1, initial=0.0, where=np.isfinite(own))
+            whole = own.max(axis=1, initial=0.0, where=np.isfinite(own))
             whole = np.maximum.accumulate(whole)[-len(last) :, None]
             last = np.where(own[-len(last) :] <= _NOISE * whole, 0.0, last)
         scaled = last / self.sizes[:, None, :]

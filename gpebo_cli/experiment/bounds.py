@@ -27,7 +27,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import AffineStateMap, Observation
 from gpebo_cli.regression.estimator import Estimates, Weighing
-from gpebo_cli.schema import number, unknown
+from gpebo_cli.schema import check_keys, number, unknown
 
 _TOLERANCE = 1e-10  # of a quantity's size: by less no bound is violated
 _UNMOVED = 1e-12  # share of a state's largest gain, below which no estimate moves it
@@ -71,9 +71,7 @@ def bounded(
     state_map, p = observation.state_map, observation.regression.p
     if not isinstance(state_map, AffineStateMap):
         raise ConfigError("observer.bounds: the state of this observer is not affine in parameters")
-    for kind in given:
-        if kind not in ("states", "unknowns"):
-            raise ConfigError(f"observer.bounds.{kind}: accepted are states and unknowns")
+    check_keys(given, ("states", "unknowns"), "observer.bounds")
     eye = np.eye(p)[:, columns]
     unknowns = _sides(given.get("unknowns", {}), system.unknowns, "observer.bounds.unknowns")
     gram = observation.regression.gram(t)[:, columns][:, :, columns]

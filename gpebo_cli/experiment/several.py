@@ -14,7 +14,6 @@ from itertools import accumulate
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment.result import RecordingResult
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
@@ -40,12 +39,12 @@ def joined_source(sources: Sequence[Source]) -> Source:
         ])
 
     known = [set(each.known_states) for each in recordings]
-    recording = RecordingResult(
-        t=t, inputs=together("inputs"), outputs=together("outputs"), states=together("states"),
+    recording = replace(
+        recordings[0], t=t, inputs=together("inputs"), outputs=together("outputs"),
+        states=together("states"),
         file=", ".join(each.file for each in recordings),
         sha256=", ".join(each.sha256 for each in recordings),
-        rows=sum(each.rows for each in recordings), hold=recordings[0].hold,
-        first=recordings[0].first, last=recordings[-1].last + shifts[-1],
+        rows=sum(each.rows for each in recordings), last=recordings[-1].last + shifts[-1],
         known_states=tuple(
             name for name in recordings[0].known_states if all(name in each for each in known)
         ),

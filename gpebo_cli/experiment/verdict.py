@@ -163,7 +163,5 @@ def _best_case(metrics: Metrics) -> int | None:
 
 def _least(values: Array) -> int | None:
     """Place of the least finite value of (g,), None if there is none."""
-    if len(values) == 1:
-        return 0 if isfinite(values[0]) else None
     place = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
     return place if isfinite(values[place]) else None
