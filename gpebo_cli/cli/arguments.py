@@ -66,12 +66,9 @@ class Arguments:
     @property
     def of_a_sweep(self) -> str:
         """A word that only a sweep understands, or nothing."""
-        known = {"--dry-run": self._dry_run, "resume": self.resume, "fail_fast": self.fail_fast}
-        return next((word for word, given in known.items() if given), "")
-
-    @property
-    def _dry_run(self) -> bool:
-        return "--dry-run" in self.given.switches
+        if "--dry-run" in self.given.switches:
+            return "--dry-run"
+        return "resume" if self.resume else "fail_fast" if self.fail_fast else ""
 
     @property
     def for_hydra(self) -> list[str]:
@@ -83,7 +80,7 @@ class Arguments:
             words += [f"hydra.sweeper.resume={folder}", f"hydra.sweep.dir={folder}"]
         if self.fail_fast:
             words.append(f"hydra.sweeper.fail_fast={self.fail_fast}")
-        orders = {"dry_run": self._dry_run, "quiet": self.given.quiet}
+        orders = {"dry_run": "--dry-run" in self.given.switches, "quiet": self.given.quiet}
         return words + [f"hydra.sweeper.{key}=true" for key, given in orders.items() if given]
 
     @property
