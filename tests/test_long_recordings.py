@@ -175,10 +175,10 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch):
     t = np.linspace(0.0, 40.0, 2001)
     data = {"t": t, "current": 2.0 + np.sin(t), "v": 3.7 - 0.03 * np.sin(t)}
     monkeypatch.setattr("gpebo_cli.errors._MOST", 0.005)
-    with pytest.raises(ConfigError, match=r"2000 samples would take some 0.01\d* GB .*; "
-                       r"time.horizon=15.6 fits, and .* \(data.file=- < FILE\)$"):
+    with pytest.raises(ConfigError, match=r"2000 samples would take some 0.00\d* GB .*; "
+                       r"time.horizon=20.8 fits, and .* \(data.file=- < FILE\)$"):
         run("battery", data=data)
-    run("battery", data=data, time={"horizon": 15.5})
+    run("battery", data=data, time={"horizon": 20.5})
 
 
 def test_an_estimator_without_its_map_is_refused_before_a_file_is_read():

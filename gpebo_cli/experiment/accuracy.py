@@ -29,7 +29,6 @@ from gpebo_cli.regression.linear import LinearRegression, least_squares
 
 _LATE = 0.25  # of a run: its end, where a deviation swings
 _LAGS = 20  # of the residual's autocorrelation
-_FEWEST = 8  # samples within the span, to look at them alone
 _SLOW = 8  # one in so many of a residual's cosines is slow
 _RARE = 0.005  # chance of each sum below which they are not those of white noise
 _SILENT = 1e-9  # of an output: a residual below that is rounding
@@ -373,7 +372,7 @@ def _explained(
     fit = replace(fit, outputs=fitted)
     samples = t if source.samples is None else source.samples
     samples = samples[(samples >= t[0]) & (samples <= t[-1])]
-    if every and len(samples) > _FEWEST:
+    if every:
         u, y = source.inputs(samples), source.outputs(samples)
         t, fitted = samples, outputs(samples, samples, u, y)
     # Two samples apart: between samples the signals are interpolated and no noise is white.

@@ -175,20 +175,12 @@ def _with_deviations(
     std[np.isnan(np.concatenate([estimation.parameters, estimation.states], axis=2))] = np.nan
     std[estimation.still] = np.nan
     regression, final = observation.regression, estimation.explaining
-    if regression.resets or not _one_fit(observation) or final is None:
-        return _with(estimation, std), ""
+    if regression.resets or final is None or not _one_fit(observation):
+        return estimation.with_deviations(std), ""
     told, why = accuracy.finished(
         std, "", regression.root, final, estimation.requirement, columns
     )
-    return _with(estimation, told), why
-
-
-def _with(estimation: EstimationResult, std: Array | None) -> EstimationResult:
-    """With deviations (G, M, p + n), or without."""
-    of_eta, of_x = (None, None) if std is None else np.split(
-        std, [estimation.parameters.shape[2]], axis=2
-    )
-    return replace(estimation, parameters_std=of_eta, states_std=of_x)
+    return estimation.with_deviations(told), why
 
 
 def _one_fit(observation: Observation) -> bool:
@@ -277,7 +269,7 @@ def at_samples(
         std, none_at_samples(len(by.cases)) if nobody else "", online.root,
         made.parameters[:, -1], by.requirement, columns,
     )
-    estimation = _with(EstimationResult(
+    estimation = EstimationResult(
         cases=by.cases, t=t[kept], names=online.parameters, parameters=parameters[:, kept],
         true_parameters=truth[kept], states=states[:, kept],
         delta=None if made.delta is None else made.delta[:, kept],
@@ -286,7 +278,7 @@ def at_samples(
             made.parameters[:, -1],
             np.append(sizes[0], np.where(np.isnan(sizes[1]), online.largest, sizes[1])),
         ),
-    ), std)
+    ).with_deviations(std)
     with stage("excitation"):
         window = settings.excitation.window or (t[-1] - t[0]) / WINDOWS
         excitation = online.excitation(

@@ -7,7 +7,7 @@ figures and ``summary.json``; nothing in here knows about files, pandas or matpl
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 
@@ -139,6 +139,11 @@ class EstimationResult:
     def warnings(self) -> tuple[str, ...]:
         """What spoils the estimates, one line each."""
         return self.doubts[1]
+
+    def with_deviations(self, std: Array | None) -> EstimationResult:
+        """The same with deviations (G, M, p + n); None: nobody knows."""
+        of_eta, of_x = (None, None) if std is None else np.split(std, [len(self.names)], axis=2)
+        return replace(self, parameters_std=of_eta, states_std=of_x)
 
     @cached_property
     def gains(self) -> dict[str, Array]:

@@ -21,7 +21,7 @@ from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import SolverSettings
 
-_HELD = 4  # arrays of every kind that are alive at once; measured
+_HELD = 3  # arrays of every kind that are alive at once; measured
 
 ByName = float | Sequence[float] | Mapping[str, float]
 
