@@ -319,6 +319,18 @@ def test_true_error_is_within_ten_tolerances_and_ten_estimates(name, tol):
     assert error <= 10 * result.error_estimate
 
 
+@pytest.mark.parametrize("rate", [-1.0, 1.0, 2.0])
+def test_the_independent_path_knows_how_far_its_errors_have_grown(rate):
+    plant = {"name": "p", "states": ["x"], "outputs": ["y"], "C": [[1]], "E": [[1]],
+             "inputs": {"u": f"cos(t) - ({rate})*sin(t)"}, "A": [[rate]], "B": [[1]],
+             "initial_state": [0.0]}
+    found = run(plant, time={"horizon": 9, "samples": 91}, solver="ivp",
+                observer="none").details.simulation
+    error = np.abs(found.states[:, 0] - np.sin(found.t)).max()
+    assert error <= 3.0 * found.error_estimate
+    assert found.error_estimate <= max(1e-6, 1e3 * error)
+
+
 def test_an_independent_integration_of_the_hand_reduced_circuit():
     """e1 = −V is algebraic; e2 and il are a plain ODE that a student would write down."""
 
