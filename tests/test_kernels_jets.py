@@ -80,6 +80,14 @@ def test_taylor_coefficients(lines, order, count, off):
     np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * size)
 
 
+@pytest.mark.parametrize("order", [0, 3])
+def test_each_function(order):
+    """Where all others are finite, too: what is not finite is left to NumPy."""
+    tape = tape_of(*(text.replace("{}", "t/2") for text in (*UNARY, *BINARY)))
+    one, other = by_both(lambda: tape.taylor(np.linspace(0.1, 1.5, 8), order))
+    np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
+
+
 @pytest.mark.parametrize("size", [1e-300, 1e-9, 1.0, 30.0, 1e3, 9e4, 1e6, 1e15])
 def test_sine_and_cosine_to_the_last_place(size):
     """Also next to multiples of π/2, where a sloppy reduction of the angle leaves nothing."""
