@@ -22,6 +22,7 @@ from gpebo_cli.model.expressions import RESERVED, record
 from gpebo_cli.model.plant import read_parameters
 from gpebo_cli.schema import nearest, shown
 
+_NO_NAMES = {*RESERVED, *keyword.kwlist}
 _WITH_CURRENT = "LVEHT"  # kinds whose current is an unknown
 _QUANTITY = re.compile(r"([vi])\((\w+)(?:,(\w+))?\)", re.IGNORECASE)
 _ORDER = "CLKRSVEHTIGF"  # of the kinds in a plant: what is differentiated first, what drives last
@@ -124,10 +125,6 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
 
 
-def _reserved(name: str) -> bool:
-    return name in RESERVED or keyword.iskeyword(name)
-
-
 def _branches_of(e: Element) -> list[tuple[str, str]]:
     """Pairs of nodes between which an element carries a current."""
     if e.kind == "T":
@@ -207,7 +204,7 @@ class _Builder:
             draft.parameters[self._claim(key, key)] = value
         nodes = {node for e in self.netlist.elements for node in e.nodes} - {GROUND}
         for node in sorted(nodes, key=_natural):
-            plain = node.isidentifier() and not _reserved(node)
+            plain = node.isidentifier() and node not in _NO_NAMES
             label = self._claim(node if plain else f"v{node}", f"v_{node}")
             self._node[node] = label
             self._row[node] = draft.equation(f"currents at node {node}")
@@ -278,7 +275,7 @@ class _Builder:
     def _claim(self, name: str, otherwise: str) -> str:
         """A name nobody has yet; names differ in more than case, for the reader's sake."""
         others = chain((name, otherwise), (f"{otherwise}_{k}" for k in count(2)))
-        free = next(each for each in others if each not in self._taken and not _reserved(each))
+        free = next(each for each in others if each not in self._taken and each not in _NO_NAMES)
         self._taken.add(free)
         return free
 
