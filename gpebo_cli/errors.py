@@ -38,7 +38,7 @@ def check_memory(
     """Refuse what would hold more than a run may: a machine that swaps stands still.
 
     ``what`` asks for it, the setting and its value; it would hold so many ``numbers`` of 8 bytes
-    each, estimated. What would be ``accepted`` is told of the share of them that a run may hold.
+    each, estimated. ``accepted`` says what would be, of the share of them that a run may hold.
 
     Raises:
         ConfigError: names the setting, what it would need, and the limit.

@@ -74,11 +74,7 @@ class Measurements:
         return np.concatenate([self.inputs(there, inside), self.outputs(there, inside)], axis=1)
 
     def check_memory(self, system: DescriptorSystem) -> None:
-        """Refuse a recording of more samples than there is memory for what is made of each.
-
-        Raises:
-            ConfigError: says how much they would take, and what would be accepted.
-        """
+        """Refuse a recording whose samples make more than memory holds (ConfigError)."""
         if self.wanted is None:
             return
         start, stop = self.span
