@@ -174,7 +174,10 @@ class NoiseModel:
     def state_space(
         self, s: FilterModel, q: int, split: Split, steps: Array | float = 1.0
     ) -> StateSpace:
-        """The model with its covariances, one column of signals, w in the basis of a split."""
+        """The model with its covariances, one column of signals, w in the basis of a split.
+
+        ``steps`` (N,) are as in :meth:`measured`.
+        """
         Zt = transpose(s.rows)
         SDt, V, _ = self.measured(s, steps)
         signals = self.signals * np.reshape(steps, (-1, 1, 1))
