@@ -181,17 +181,12 @@ def power(a: Node, b: Node) -> Node:
     return _node("power", a, value=b.value)
 
 
-def sign(x: float) -> float:
-    """-1, 0 or 1."""
-    return float((x > 0) - (x < 0))
-
-
 FUNCTIONS: dict[str, Callable[[float], float]] = {
     **{name: getattr(math, name) for name in (
         "sin", "cos", "tan", "exp", "log", "sqrt", "sinh", "cosh", "tanh", "asin", "acos", "atan",
         "asinh", "acosh", "atanh", "erf",
     )},
-    "abs": abs, "sign": sign,
+    "abs": abs, "sign": lambda x: float((x > 0) - (x < 0)),
 }
 
 
