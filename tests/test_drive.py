@@ -167,6 +167,21 @@ def test_what_is_narrow_in_a_recorded_signal_is_found():
     assert result.estimates["a"][0, -1] == pytest.approx(0.7, rel=0.1)  # y is a line in between
 
 
+@pytest.mark.parametrize("observer", [{"name": "gpebo", "sample_time": 0.05}, {"name": "kalman_bucy"}])
+def test_what_is_narrow_between_samples_reaches_the_observer(observer):
+    """F is a pulse of 1e-4 s; a model that misses it says that the parameter is not excited."""
+    plant = {
+        "name": "pulse", "states": ["x", "z"], "unknowns": {"a": 1.5}, "outputs": ["y"],
+        "E": [[1, 0], [0, 1]], "A": [[-0.2, 1], [0, -0.1]], "C": [[1, 0]],
+        "F": [[0], ["exp(-((t - 3.3127)/1e-4)**2)/1e-4"]], "initial_state": [1, 0.5],
+    }
+    simulated = run(plant, observer="none", time={"horizon": 5, "samples": 101})
+    recorded = DataFrame({"t": simulated.t, "y": simulated["y"]})
+    estimator = {"name": "least_squares", "f0": 1e-9}
+    result = run(plant, data=recorded, observer=observer, estimator=estimator)
+    assert result.estimates["a"][0, -1] == pytest.approx(1.5, abs=0.03)
+
+
 def test_a_table_drives_a_plant_whose_outputs_pass_kinks(tmp_path):
     """x' = −max(x, 0) − |u| + 1 + u beside the same with the kinks' times put in by hand."""
     plant = {**PLANT, "A": [[0]], "phi": ["1 - max(y, 0) - abs(u)"], "initial_state": {"x": -0.5},

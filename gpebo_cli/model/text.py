@@ -32,6 +32,7 @@ MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
 
 # Of its size before and after: a divisor that comes so near zero touches it.
 _TOUCHED = 1e-12
+_KEPT = 16  # edges of cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +162,8 @@ class TextCoefficients:
             if self.cells is not None:
                 inner = (self.cells > edges[0]) & (self.cells < edges[-1])
                 edges = np.union1d(edges, self.cells[inner])
+            if len(self._resolved) >= _KEPT:
+                self._resolved.clear()  # a stream asks for ever new ones
             self._resolved[key] = resolved(self._bounds, edges)
         return self._resolved[key]
 

@@ -73,8 +73,11 @@ def load(
     values = np.concatenate([samples.inputs, samples.outputs], axis=1)
     mesh = recording_mesh(samples.t, values, data.hold, span, system.coefficients, tol)
     both = mesh.along(held(samples.t, values, data.hold))
+    # What is narrow between samples: functions of time, then those of signals.
+    edges, _ = system.coefficients.of_time.resolved(mesh.edges)
     if isinstance(system.coefficients, FollowsSignals):
-        edges, _ = system.coefficients.along(both.cells, range(m + system.r), mesh.edges)
+        edges, _ = system.coefficients.along(both.cells, range(m + system.r), edges)
+    if len(edges) > len(mesh.edges):
         mesh = Mesh(edges, mesh.rule)
         both = mesh.along(both)
     return Recording(

@@ -140,10 +140,12 @@ class SampledObserver:
             noise = (o.dynamics, o.of_noise(o.from_signals, self.system.m)) if self.errors else ()
             return LinearEquation(None, o.dynamics, f, noise)
 
-        cuts = self.system.coefficients.breakpoints(float(times[0]), float(times[-1]))
+        source = self.system.coefficients
+        cuts = source.breakpoints(float(times[0]), float(times[-1]))
+        cells, _ = source.of_time.resolved(edges(times, cuts))
         problem = LinearProblem(coefficients, start, name=f"observer of plant {self.system.name}")
         return solve(
-            problem, Mesh(edges(times, cuts), radau_rule(_STAGES)),
+            problem, Mesh(cells, radau_rule(_STAGES)),
             tol=max(self.solver.tol, TOLERANCE), max_elements=self.solver.max_elements,
         )
 
