@@ -167,7 +167,9 @@ def test_what_is_narrow_in_a_recorded_signal_is_found():
     assert result.estimates["a"][0, -1] == pytest.approx(0.7, rel=0.1)  # y is a line in between
 
 
-@pytest.mark.parametrize("observer", [{"name": "gpebo", "sample_time": 0.05}, {"name": "kalman_bucy"}])
+@pytest.mark.parametrize(
+    "observer", [{"name": "gpebo", "sample_time": 0.05}, {"name": "kalman_bucy"}]
+)
 def test_what_is_narrow_between_samples_reaches_the_observer(observer):
     """F is a pulse of 1e-4 s; a model that misses it says that the parameter is not excited."""
     plant = {
