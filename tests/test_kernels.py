@@ -91,16 +91,20 @@ def _carried(rng, k=6, s=5, n=3, c=2, constant=False):
     )
 
 
-def _swept(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True):
+def _series(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True, most=4):
     """x' = A x + f with a third of the entries, none of them in one row."""
     i, j = np.nonzero(rng.uniform(size=(d, d)) < 0.35 * (np.arange(d) != 1)[:, None])
-    points = 1 if constant else k * (s + 1)
+    parts = rng.integers(1, most, size=k)
+    count, degrees = (1, 1) if constant else (parts.sum(), 3)
+    there = rng.integers(0, 2, size=(count, degrees))
     return (
-        radau_rule(s).integration, rng.uniform(0.1, 0.3, size=k),
-        np.searchsorted(i, np.arange(d + 1)), j, rng.normal(size=(points, len(i))),
-        rng.normal(size=(points, d, forced)), rng.normal(size=(k, d, c)) if kicked else None,
-        rng.normal(size=(k, s, s + 1)), rng.normal(size=(d, c)),
-        np.ones(d), 1e-15, 1e-3, 60,
+        radau_rule(s).nodes, rng.uniform(0.1, 0.3, size=k), parts,
+        np.searchsorted(i, np.arange(d + 1)), j,
+        rng.normal(size=(count, len(i), degrees)) * there[:, None],
+        1.0 * np.maximum.accumulate(there[:, ::-1], axis=1)[:, ::-1],
+        rng.normal(size=(parts.sum(), 2, d, forced)),
+        rng.normal(size=(k, d, c)) if kicked else None, rng.normal(size=(d, c)),
+        np.exp(rng.normal(size=d)), 1e-15, 1e-3,
     )
 
 
@@ -247,9 +251,9 @@ CASES: list[tuple[str, str, Case]] = [
         {}, {"k": 2}, {"k": 9, "constant": True}, {"k": 1, "s": 2, "n": 1, "c": 1},
         {"s": 14, "n": 5},
     )),
-    *(("elements", "sweeps", partial(_swept, **options)) for options in (
+    *(("elements", "series", partial(_series, **options)) for options in (
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
-        {"k": 1, "d": 1, "c": 3, "forced": 3}, {"c": 12},
+        {"k": 1, "d": 1, "c": 3, "forced": 3}, {"c": 12}, {"most": 9},
     )),
     *(("elements", "substituted", partial(_steps, **options)) for options in (
         {}, {"s": 14, "c": 1, "one": True}, {"forced": 0, "kicked": False},

@@ -1,4 +1,4 @@
-"""Large sparse plants: elimination and sweeps against derivative array and dense collocation."""
+"""Large sparse plants: elimination and series against derivative array and dense collocation."""
 
 import os
 import subprocess
@@ -488,6 +488,24 @@ def test_elements_that_are_cut_may_have_more_entries():
     t = np.linspace(0.0, 6.0, 31)
     expected = solve(problem, last, tol=1e-9, max_elements=500).trajectory(t)
     np.testing.assert_allclose(found.trajectory(t), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize(("rate", "logarithm"), [
+    (lambda t: 1.0 / (t + 0.05), lambda t: np.log(20.0 * t + 1.0)),  # powers do not fall
+    (lambda t: 30.0 * np.cos(60.0 * t), lambda t: 0.5 * np.sin(60.0 * t)),  # nor converge at first
+])
+def test_series_of_coefficients_with_poles_or_that_swing(rate, logarithm):
+    def coefficients(t, inside):
+        A = np.zeros((len(t), 9, 9))
+        A[:, range(9), range(9)] = rate(t)[:, None]
+        return LinearEquation(None, A, np.zeros((len(t), 9, 0)))
+
+    problem = LinearProblem(coefficients, np.ones((9, 2)), name="rates")
+    mesh = initial_mesh(0.0, 2.0, [], 20, radau_rule(14))
+    found = sweeps.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
+    t = np.linspace(0.0, 2.0, 31)
+    error = np.abs(found.trajectory(t) / np.exp(logarithm(t))[:, None, None] - 1.0).max()
+    assert error <= found.error_estimate * 10.0 <= 1e-6
 
 
 def test_units_of_many_states_are_those_that_singular_values_give(monkeypatch):

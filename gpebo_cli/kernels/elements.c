@@ -164,8 +164,7 @@ static int solve_group(const Equation *q, const npy_intp *members, npy_intp coun
     return 1;
 }
 
-/* D, h, E, A, f, T, p, the group of each element (ascending from 0 as they first appear), how many
-   there are -> responses to the left end of each group, particular solutions. */
+/* Responses of groups, numbered as they first appear, to left ends, and particular solutions. */
 static Outcome element_maps(Call *call)
 {
     const npy_intp K = SIZE(K), s = SIZE(s), d = SIZE(d), n = SIZE(n), columns = SIZE(c);
@@ -184,8 +183,7 @@ static Outcome element_maps(Call *call)
         return ERROR;
     if (SIZE(P) != 1 && SIZE(P) != K * (s + 1))
         return refused("points of all elements", SIZE(P));
-    npy_intp *sizes = members + K;
-    memset(sizes, 0, groups * sizeof(npy_intp));
+    npy_intp *sizes = memset(members + K, 0, groups * sizeof(npy_intp));
     for (npy_intp k = 0; k < K; k++) {
         if (group[k] < 0 || group[k] >= groups)
             return refused("a group", group[k]);
@@ -248,8 +246,7 @@ EVERY_WIDTH static npy_intp link_up(double *out, const double *H, npy_intp apart
     return whole;
 }
 
-/* Maps of the elements (or one for all), particular solutions, start -> values at the points, and
-   how many elements in front are finite. */
+/* Maps, particular solutions, start -> values, and how many elements in front are finite. */
 static Outcome chain(Call *call)
 {
     call->out[1][0] = (double)link_up(call->out[0], call->in[0], call->step[0], call->in[1],
@@ -257,8 +254,7 @@ static Outcome chain(Call *call)
     return DONE;
 }
 
-/* What element k adds to the errors, kinds (2, C): what its polynomial leaves out, and rounding.
-   Raises most (4, C), see elements_numpy.py; `shown` has room for 5 C numbers. */
+/* What element k adds to the errors, kinds (2, C); raises most (4, C), see elements_numpy.py. */
 EVERY_WIDTH static void own_errors(const Call *call, npy_intp k, double *shown, double *most,
                                    double *kinds)
 {
@@ -338,165 +334,169 @@ static Outcome carried_errors(Call *call)
     return DONE;
 }
 
-#define MOST_STAGES 16 /* of a rule; its nodes lie side by side: loops have this length */
-#define AT_ONCE 8 /* columns: their sums are in registers, and what is swept over in the cache */
-typedef double Nodes[MOST_STAGES];
+#define MOST_STAGES 16 /* of a rule */
+#define MOST_ORDERS 48 /* of a series */
+#define AT_ONCE 8      /* columns: their sums are in registers, and their series in the cache */
+typedef double Columns[AT_ONCE];
 /* Not unrolled before they are vectorised: else sums are kept in memory, at twice the time. */
-#define EACH_NODE _Pragma("omp simd") for (int j = 0; j < MOST_STAGES; j++)
-
-/* Everything about one element and some of the columns while sweeping. */
-typedef struct {
-    npy_intp s, d, columns, forced; /* forced: 0 where f is zero, and only its first one is read */
-    const npy_intp *row, *column;   /* of the entries of A */
-    const Nodes *R, *A, *f;         /* h Rᵀ; entries; (d, columns) forcing */
-    Nodes *X;                       /* (d, columns) */
-    const double *left, *weight;    /* (d, columns) at the left end; (d,) */
-    double *size, *change;          /* (d,) */
-} Swept;
-
+#define EACH_COLUMN _Pragma("omp simd") for (int b = 0; b < AT_ONCE; b++)
 #define MAXIMUM(a, b) ((a) > (b) ? (a) : (b)) /* or b where a is no number */
 
-/* Row i of a sweep in `count` columns from c on; their sums are independent, and done together. */
-INLINE void sweep_row(const Swept *q, npy_intp i, npy_intp c, const npy_intp count)
+/* X' = A X + f in a part of an element, d rows and some of the columns. */
+typedef struct {
+    npy_intp d, columns, forced, stride;  /* forced columns of them, of f's rows of `stride` */
+    npy_intp degrees, orders;             /* how many powers of the time A and f have */
+    const npy_intp *row, *column;         /* of the entries of A */
+    const double *A, *f, *decay, *weight; /* (e, degrees), (orders, d, stride), (degrees,), (d,) */
+    double h, tol, share, *size, *change; /* these two in units, (d,) and zeros */
+    Columns *terms;                       /* (MOST_ORDERS, d); the first is the left end */
+} Part;
+
+/* The largest size in a row. */
+INLINE double largest_size(const double *row)
 {
-    Nodes sum[AT_ONCE], next[AT_ONCE];
-    for (npy_intp k = 0; k < count; k++)
-        EACH_NODE sum[k][j] = q->f[(i * q->columns + c + k) * q->forced][j];
-    for (npy_intp e = q->row[i]; e < q->row[i + 1]; e++) {
-        const double *a = q->A[e];
-        const Nodes *X = (const Nodes *)q->X + q->column[e] * q->columns + c;
-        for (npy_intp k = 0; k < count; k++)
-            EACH_NODE sum[k][j] += a[j] * X[k][j];
-    }
-    for (npy_intp k = 0; k < count; k++)
-        EACH_NODE next[k][j] = q->left[i * q->columns + c + k];
-    for (npy_intp l = 0; l < q->s; l++) {
-        const double *R = q->R[l];
-        for (npy_intp k = 0; k < count; k++) {
-            const double x = sum[k][l];
-            EACH_NODE next[k][j] += R[j] * x;
+    Columns size;
+    EACH_COLUMN size[b] = fabs(row[b]);
+    for (int width = AT_ONCE / 2; width; width /= 2)
+        for (int b = 0; b < width; b++)
+            size[b] = MAXIMUM(size[b + width], size[b]);
+    return size[0];
+}
+
+/* The largest change of the rows, relative to each row's size so far or a share of all. */
+INLINE double largest_change(const Part *q)
+{
+    Columns all = {0.0}, found = {0.0};
+    for (npy_intp i = 0; i < q->d; i += AT_ONCE)
+        EACH_COLUMN all[b] = MAXIMUM(q->size[i + b], all[b]);
+    const double least = larger(q->share * largest_size(all), DBL_MIN);
+    for (npy_intp i = 0; i < q->d; i += AT_ONCE)
+        EACH_COLUMN found[b] =
+            MAXIMUM(q->change[i + b] / MAXIMUM(q->size[i + b], least), found[b]);
+    return largest_size(found);
+}
+
+/* How many terms (k + 1) X_{k+1} = h (Σ A_j X_{k−j} + f_k) until none to follow counts, or 0. */
+EVERY_WIDTH static npy_intp expanded(const Part *q)
+{
+    double size[MOST_ORDERS] = {1.0};
+    for (npy_intp k = 0; k + 1 < MOST_ORDERS && size[k] <= DBL_MAX; k++) {
+        const npy_intp d = q->d, known = k < q->degrees ? k + 1 : q->degrees;
+        const Columns *last = (const Columns *)q->terms + k * d;
+        double bound = k + 1 < q->orders ? INFINITY : 0.0;
+        for (npy_intp i = 0; i < d; i++) {
+            Columns sum = {0.0};
+            double *next = q->terms[(k + 1) * d + i];
+            for (npy_intp b = 0; k < q->orders && b < q->forced; b++)
+                sum[b] = q->f[(k * d + i) * q->stride + b];
+            for (npy_intp e = q->row[i]; e < q->row[i + 1]; e++) {
+                const Columns *x = last + q->column[e];
+                const double *A = q->A + e * q->degrees;
+                for (npy_intp j = 0; j < known; j++, x -= d) {
+                    const double a = A[j];
+                    EACH_COLUMN sum[b] += a * (*x)[b];
+                }
+            }
+            EACH_COLUMN next[b] = q->h / (double)(k + 1) * sum[b];
+            q->change[i] = q->weight[i] * largest_size(next);
+            q->size[i] = MAXIMUM(q->change[i], q->size[i]);
         }
+        size[k + 1] = largest_change(q);
+        for (npy_intp j = 0; j < q->degrees && j <= k + 1; j++)
+            bound = larger(q->decay[j] * size[k + 1 - j], bound);
+        if (bound <= q->tol)
+            return k + 2;
     }
-    Nodes change = {0.0}, size = {0.0};
-    for (npy_intp k = 0; k < count; k++) {
-        double *X = q->X[i * q->columns + c + k];
-        EACH_NODE change[j] = MAXIMUM(fabs(next[k][j] - X[j]), change[j]);
-        EACH_NODE size[j] = MAXIMUM(fabs(next[k][j]), size[j]);
-        EACH_NODE X[j] = next[k][j];
-    }
-    for (int width = MOST_STAGES / 2; width; width /= 2)
-        for (int j = 0; j < width; j++) {
-            change[j] = MAXIMUM(change[j + width], change[j]);
-            size[j] = MAXIMUM(size[j + width], size[j]);
+    return 0;
+}
+
+/* The sums of so many terms at some times, one `apart` from the other, rows one `next` to it. */
+EVERY_WIDTH static void summed(const Part *q, npy_intp count, const double *times, npy_intp some,
+                               double *out, npy_intp apart, npy_intp next)
+{
+    for (npy_intp i = 0; i < q->d; i++)
+        for (npy_intp j = 0; j < some; j++) {
+            double power = 1.0;
+            Columns sum = {0.0};
+            for (npy_intp k = 0; k < count; k++, power *= times[j]) {
+                const double *x = q->terms[k * q->d + i];
+                EACH_COLUMN sum[b] += power * x[b];
+            }
+            for (npy_intp b = 0; b < q->columns; b++)
+                out[j * apart + i * next + b] = sum[b];
         }
-    q->change[i] = MAXIMUM(change[0], q->change[i]);
-    q->size[i] = MAXIMUM(size[0], q->size[i]);
 }
 
-/* One sweep over all rows, from the last to the first if `back`: X_i = x_i + h R (A_i X + f_i). */
-EVERY_WIDTH static void sweep(const Swept *q, int back)
+/* All parts of element k from the left end in the terms: X at the nodes, and the right end in its
+   place; 0 if a series does not converge. */
+static int through_element(const Call *call, Part *q, npy_intp k, npy_intp part, npy_intp first,
+                           double *so_far, double *out)
 {
-    for (npy_intp row = 0; row < q->d; row++) {
-        npy_intp c = 0, i = back ? q->d - 1 - row : row;
-        q->change[i] = 0.0;
-        for (; c + AT_ONCE <= q->columns; c += AT_ONCE)
-            sweep_row(q, i, c, AT_ONCE);
-        for (; c + 3 <= q->columns; c += 3)
-            sweep_row(q, i, c, 3);
-        for (; c < q->columns; c++)
-            sweep_row(q, i, c, 1);
+    const npy_intp s = SIZE(s), d = q->d, all = SIZE(c), parts = call->index[2][k];
+    const double *nodes = call->in[0], end = 1.0;
+    int converged = 1;
+    q->h = call->in[1][k] / (double)parts;
+    for (npy_intp i = 0, node = 0, some = 0; i < parts; i++, node += some, some = 0) {
+        double times[MOST_STAGES];
+        q->A = call->in[5] + part * call->step[5];
+        q->decay = call->in[6] + part * call->step[6];
+        q->f = call->in[7] + first + part++ * call->step[7];
+        for (npy_intp r = 0; r < d; r++)
+            q->size[r] = so_far[r] = larger(q->weight[r] * largest_size(q->terms[r]), so_far[r]);
+        const npy_intp count = expanded(q);
+        converged &= count > 0;
+        for (; node + some < s && (i + 1 == parts || nodes[node + some] * parts <= i + 1); some++)
+            times[some] = nodes[node + some] * parts - i;
+        summed(q, count, times, some, out + node * d * all, d * all, all);
+        summed(q, count, &end, 1, q->terms[0], 0, AT_ONCE);
     }
+    return converged;
 }
 
-/* The largest change of the last sweep, relative to each row's size so far or a share of all. */
-static double largest_change(const Swept *q, double share)
-{
-    double all = DBL_MIN, found = 0.0;
-    for (npy_intp i = 0; i < q->d; i++)
-        all = larger(q->weight[i] * q->size[i], all);
-    for (npy_intp i = 0; i < q->d; i++)
-        found = larger(q->weight[i] * q->change[i] / larger(q->weight[i] * q->size[i], share * all),
-                       found);
-    return found <= DBL_MAX ? found : INFINITY;
-}
-
-/* X' = A X + f over all elements by fixed-point iteration; see elements_numpy.py. */
-static Outcome sweeps(Call *call)
+/* X' = A X + f over all elements by series; see elements_numpy.py. */
+static Outcome series(Call *call)
 {
     const npy_intp K = SIZE(K), s = SIZE(s), d = SIZE(d), entries = SIZE(e), all = SIZE(c);
-    const npy_intp forced = SIZE(f), *row = call->index[2], *column = call->index[3];
-    const double *R = call->in[0], *h = call->in[1], *kicks = call->in[6], *onward = call->in[7];
-    const double tol = call->number[10], share = call->number[11];
-    if (s > MOST_STAGES || (SIZE(P) != 1 && SIZE(P) != K * (s + 1)))
-        return refused("stages, or points of all elements", SIZE(P));
-    if (forced > all || (SIZE(Q) != 1 && SIZE(Q) != K * (s + 1)))
-        return refused("columns, or points of the forcing", SIZE(Q));
+    const npy_intp *parts = call->index[2], *row = call->index[3], *column = call->index[4];
+    npy_intp sum = 0;
+    for (npy_intp k = 0; k < K; sum += parts[k++])
+        if (parts[k] < 1)
+            return refused("parts", parts[k]);
+    if (s > MOST_STAGES || SIZE(f) > all || (SIZE(P) != 1 && SIZE(P) != sum))
+        return refused("stages, columns, or parts of all elements", SIZE(P));
     for (npy_intp i = 0; i <= d; i++)
         if (row[i] < (i ? row[i - 1] : 0) || row[i] > entries)
             return refused("a row's first entry", row[i]);
     for (npy_intp e = 0; e < entries; e++)
         if (column[e] < 0 || column[e] >= d)
             return refused("a column", column[e]);
-    const npy_intp width = all < AT_ONCE ? all : AT_ONCE, block = d * width;
-    double *memory = scratch(call, (entries + 2 * block + 2 * s + 1) * MOST_STAGES + block + 2 * d);
-    if (memory == NULL)
+    const npy_intp rows = (d / AT_ONCE + 1) * AT_ONCE;
+    double *size = scratch(call, MOST_ORDERS * AT_ONCE * d + 3 * rows), *so_far = size + rows;
+    if (size == NULL)
         return ERROR;
-    Nodes *A = (Nodes *)memory, *f = A + entries, *X = f + block, *hR = X + block, *W = hR + s;
-    double *left = (double *)(W + s + 1), *size = left + block, *change = size + d;
-    memset(call->out[1], 0, K * sizeof(double));
-    memset(A, 0, entries * sizeof(Nodes));
-    for (npy_intp first = 0; first < all; first += width) {
-        const npy_intp b = all - first < width ? all - first : width;
-        Swept q = {.s = s, .d = d, .columns = b, .forced = first < forced, .row = row, .X = X};
-        q.column = column, q.R = (const Nodes *)hR, q.A = (const Nodes *)A, q.left = left;
-        q.f = (const Nodes *)f, q.weight = call->in[9], q.size = size, q.change = change;
-        memset(size, 0, d * sizeof(double));
+    Columns *terms = (Columns *)(so_far + 2 * rows);
+    memset(size, 0, 3 * rows * sizeof(double));
+    for (npy_intp k = 0; k < K; k++)
+        call->out[1][k] = call->number[11];
+    for (npy_intp first = 0; first < all; first += AT_ONCE) {
+        const npy_intp c = all - first < AT_ONCE ? all - first : AT_ONCE, left = SIZE(f) - first;
+        Part q = {.d = d, .columns = c, .stride = SIZE(f), .row = row, .column = column};
+        q.forced = left < 0 ? 0 : left < c ? left : c, q.tol = call->number[11];
+        q.degrees = SIZE(g), q.orders = SIZE(u), q.weight = call->in[10], q.terms = terms;
+        q.share = call->number[12], q.size = size, q.change = so_far + rows;
+        memset(so_far, 0, d * sizeof(double));
+        memset(terms, 0, d * sizeof(Columns));
         for (npy_intp i = 0; i < d; i++)
-            for (npy_intp c = 0; c < b; c++)
-                left[i * b + c] = call->in[8][i * all + first + c];
-        for (npy_intp k = 0; k < K; k++) {
-            double *out = call->out[0] + k * (s + 1) * d * all + first, found = INFINITY;
-            const double *values = call->in[4] + k * (s + 1) * call->step[4];
-            const double *given = call->in[5] + k * (s + 1) * call->step[5] + first;
-            memset(hR, 0, (2 * s + 1) * sizeof(Nodes));
-            memset(f, 0, d * b * sizeof(Nodes));
-            for (npy_intp j = 0; j < s; j++) {
-                for (npy_intp l = 0; l < s; l++)
-                    hR[l][j] = h[k] * R[j * s + l];
-                for (npy_intp l = 0; l <= s; l++)
-                    W[l][j] = onward[(k * s + j) * (s + 1) + l];
-                for (npy_intp e = 0; e < entries && (k == 0 || call->step[4]); e++)
-                    A[e][j] = values[(j + 1) * call->step[4] + e];
-                for (npy_intp i = 0; i < d; i++)
-                    for (npy_intp c = 0; c < b && first + c < forced; c++)
-                        f[i * b + c][j] = given[(j + 1) * call->step[5] + i * forced + c];
-            }
-            for (npy_intp i = 0; i < d * b; i++) {
-                Nodes x;
-                EACH_NODE x[j] = left[i];
-                for (npy_intp l = 0; k > 0 && l <= s; l++) { /* as before, to begin with */
-                    const double *at = l ? &X[i][l - 1] : out + (i / b - (s + 1) * d) * all + i % b;
-                    EACH_NODE x[j] += W[l][j] * (*at - X[i][s - 1]);
-                }
-                memcpy(X[i], x, sizeof(Nodes));
-                size[i / b] = larger(fabs(left[i]), size[i / b]);
-            }
-            for (npy_intp m = 0; m < SIZE(m) && found > tol; m++) {
-                sweep(&q, m & 1);
-                found = largest_change(&q, share);
-                if (!(found <= DBL_MAX))
-                    break;
-            }
-            call->out[1][k] = larger(larger(found, tol), call->out[1][k]);
+            memcpy(terms[i], call->in[9] + i * all + first, c * sizeof(double));
+        for (npy_intp k = 0, part = 0; k < K; part += parts[k++]) {
+            double *out = call->out[0] + k * (s + 1) * d * all + first;
             for (npy_intp i = 0; i < d; i++)
-                for (npy_intp c = 0; c < b; c++) {
-                    double *at = out + i * all + c;
-                    at[0] = left[i * b + c];
-                    for (npy_intp j = 0; j < s; j++)
-                        at[(j + 1) * d * all] = X[i * b + c][j];
-                    left[i * b + c] = X[i * b + c][s - 1];
-                    left[i * b + c] += kicks ? kicks[(k * d + i) * all + first + c] : 0.0;
-                }
+                memcpy(out + i * all, terms[i], c * sizeof(double));
+            if (!through_element(call, &q, k, part, first, so_far, out + d * all))
+                call->out[1][k] = INFINITY;
+            for (npy_intp i = 0; i < d && call->in[8] != NULL; i++)
+                for (npy_intp b = 0; b < c; b++)
+                    terms[i][b] += call->in[8][(k * d + i) * all + first + b];
         }
     }
     return DONE;
@@ -561,7 +561,7 @@ const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
     {"carried_errors", "Ktnc tt u K?nn K?nc K?nv K+nw K # # # # v=n+c", "Knc 5nc", carried_errors},
-    {"sweeps", "ss K @d+ @e P?e Q?df |Kdc Kss+ dc d # # %m", "Ks+dc K", sweeps},
+    {"series", "s K @K @d+ @e P?eg P?g P?udf |Kdc dc d # #", "Ks+dc K", series},
     {"substituted", "Ks @K @m @m @m GFss GTs Q?df |Kdc dc", "Ks+dc", substituted},
     {NULL, NULL, NULL, NULL},
 };

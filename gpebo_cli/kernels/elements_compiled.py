@@ -55,5 +55,5 @@ def carried_errors(
     return found
 
 
-sweeps = _compiled.sweeps
+series = _compiled.series
 substituted = _compiled.substituted

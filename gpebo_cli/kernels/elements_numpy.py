@@ -9,6 +9,7 @@ import numpy as np
 from gpebo_cli.kernels.arrays import Array, IntArray
 
 _EPS, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
+_ORDERS = 48  # of a series
 
 
 def element_maps(
@@ -168,53 +169,53 @@ def carried_errors(
         return carried, most.max(axis=1)
 
 
-def sweeps(
-    R: Array, h: Array, rows: IntArray, indices: IntArray, entries: Array, f: Array,
-    kicks: Array | None, onward: Array, start: Array, weights: Array, tol: float,
-    share: float, most: int,
+def series(
+    nodes: Array, h: Array, parts: IntArray, rows: IntArray, indices: IntArray, A: Array,
+    decay: Array, f: Array, kicks: Array | None, start: Array, weights: Array, tol: float,
+    share: float,
 ) -> tuple[Array, Array]:
-    """Values at all points of X' = A X + f by fixed-point iteration, one element after the other.
+    """Values at all points of X' = A X + f by series in time, one element after the other.
 
-    ``X ← x_0 + h R (A X + f)`` until nothing changes by more than ``tol``, relative to the largest
-    a row has been so far, or to a ``share`` of the largest of all rows, times their weights.
-
-    R is the integration matrix of the rule (s, s), h the lengths (K,). A stands by rows: where each
-    begins (d + 1,) in the columns of its entries, ``indices`` (e,), and these (P or 1, e) at the K
-    (s + 1) points of all elements, or at one; f (P or 1, d, f) is of the first columns of X.
-    ``kicks`` (K, d, c) or None are added to X at the end of each element; it begins with what
-    ``onward`` (K, s, s + 1) makes of the points before, and at the first left end with ``start``
-    (d, c). Weights are 1 over the unit of each row (d,); ``most`` sweeps are made over one element.
+    ``(k + 1) X_{k+1} = h (Σ A_j X_{k−j} + f_k)`` until nothing that can follow is larger than
+    ``tol``, relative to the largest a row has been so far, or to a ``share`` of the largest of all
+    rows, times their weights (d,). Nodes of the rule (s,) are in (0, 1], h are lengths (K,), and
+    each element has so many equal ``parts`` (K,), P in all, each with a series: in powers of its
+    time, which ends at 1, the entries of A have coefficients (P or 1, e, g), from each power on at
+    most ``decay`` (P or 1, g) relative to the entry, and the first columns of X f (P or 1, u, d,
+    f). Each row of A begins somewhere (d + 1,) in the columns ``indices`` (e,). ``kicks`` (K, d, c)
+    or None are added to X at the end of each element; it begins with ``start`` (d, c).
 
     Returns:
-        (K, s + 1, d, c), before what is added; and the last relative changes (K,), or ``tol``.
+        (K, s + 1, d, c), before what is added; ``tol`` (K,), or ∞ and zeros if 48 terms fail.
     """
-    s, d, columns = len(R), *start.shape
-    values, changes = np.empty((len(h), s + 1, d, columns)), np.full(len(h), np.inf)
-    all_rows = np.repeat(np.arange(d), np.diff(rows))
-    A = np.zeros((1 if len(entries) == 1 else s, d, d))
-    forcing = np.zeros((s, d, columns))
-    size, state = np.abs(start).max(axis=1, initial=0.0), start
-    for k, step in enumerate(h):
-        points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
-        A[:, all_rows, indices] = entries if len(entries) == 1 else entries[points]
-        forcing[:, :, : f.shape[2]] = f if len(f) == 1 else f[points]
-        X = np.repeat(state[None], s, axis=0)
-        if k:
-            X += np.tensordot(onward[k], values[k - 1] - values[k - 1, -1], axes=1)
-        size = np.maximum(size, np.abs(state).max(axis=1, initial=0.0))
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(2 * most):  # each row uses the old ones: that is slower by half
-                following = state + step * np.tensordot(R, A @ X + forcing, axes=1)
-                change = weights * np.abs(following - X).max(axis=(0, 2), initial=0.0)
-                X = following
-                size = np.maximum(size, np.abs(X).max(axis=(0, 2), initial=0.0))
-                level = np.maximum(weights * size, share * (weights * size).max(initial=_TINY))
-                changes[k] = (change / level).max(initial=0.0)
-                if not changes[k] > tol:
-                    break
-        changes[k] = max(changes[k], tol) if np.isfinite(changes[k]) else np.inf
-        values[k, 0], values[k, 1:] = state, X
-        state = X[-1] if kicks is None else X[-1] + kicks[k]
+    (d, columns), all_rows = start.shape, np.repeat(np.arange(len(rows) - 1), np.diff(rows))
+    values, changes = np.empty((len(h), len(nodes) + 1, d, columns)), np.full(len(h), tol)
+    matrices, forcing = np.zeros((A.shape[2], d, d)), np.zeros((_ORDERS, d, columns))
+    size, state, part = np.zeros(d), start, 0
+    for k, count in enumerate(parts.tolist()):
+        values[k, 0] = state
+        for i in range(count):
+            matrices[:, all_rows, indices] = A[part % len(A)].T
+            forcing[: f.shape[1], :, : f.shape[3]] = f[part % len(f)]
+            size = np.maximum(size, weights * np.abs(state).max(axis=1, initial=0.0))
+            terms, largest, sizes, left = [state], size, [1.0], np.inf
+            while len(terms) < _ORDERS and np.isfinite(sizes[0]) and not left <= tol:
+                pairs = zip(matrices, reversed(terms), strict=False)
+                right = sum((a @ x for a, x in pairs), forcing[len(terms) - 1])
+                terms.append(h[k] / count / len(terms) * right)
+                moved = weights * np.abs(terms[-1]).max(axis=1, initial=0.0)
+                largest = np.maximum(largest, moved)
+                least = max(share * largest.max(initial=0.0), _TINY)
+                sizes.insert(0, (moved / np.maximum(largest, least)).max(initial=0.0))
+                left = max(a * b for a, b in zip(decay[part % len(decay)], sizes, strict=False))
+                left = left if len(terms) > f.shape[1] else np.inf
+            if not left <= tol:
+                changes[k], terms = np.inf, [np.zeros((d, columns))]
+            here = (nodes * count > i) & ((nodes * count <= i + 1) | (i + 1 == count))
+            powers = (nodes[here, None] * count - i) ** np.arange(len(terms))
+            values[k, 1:][here] = np.tensordot(powers, np.array(terms), axes=1)
+            state, part = np.sum(terms, axis=0), part + 1
+        state = state if kicks is None else state + kicks[k]
     return values, changes
 
 
@@ -228,7 +229,7 @@ def substituted(
     target t is the source; else b_t += B x_s. With ``left`` D𝟙/h (K, s), the ``place`` of each
     element (K,) among the G factors, the target, source and B of each step (m,), where B are so
     many in ``full``, transposed (G, F, s, s), and counted on in ``diagonal`` (G, T, s); the rest is
-    as of :func:`sweeps`.
+    as of :func:`series`.
     """
     (K, s), (d, columns), F = left.shape, start.shape, full.shape[1]
     values, state = np.empty((K, s + 1, d, columns)), start

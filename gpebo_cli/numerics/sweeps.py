@@ -1,22 +1,23 @@
-"""Large systems that are not stiff, x' = A x + f with few entries: fixed-point sweeps.
+"""Large systems that are not stiff, x' = A x + f with few entries: series in time.
 
-An element needs no factorisation where h‖A‖ is modest: ``X ← x_0 + h R (A X + f)`` at its nodes
-converges like (h‖A‖)^k/k!, and a sweep costs as much as the entries of A. The equations that are
-solved are those of collocation, so what holds for their solution holds here. Errors are carried on
-by the same sweeps, to two digits.
+An element needs no factorisation where h‖A‖ is modest: with A and f in powers of the time, as their
+values at points say, terms ``(k + 1) X_{k+1} = h (Σ A_j X_{k−j} + f_k)`` fall like (h‖A‖)^k/k!,
+and one costs as much as the entries of A. Errors are carried on by the same series, to two digits.
 
-Where h‖A‖ is not modest, the same equations are solved directly: by :mod:`.elimination`, or where A
-is full and constant with one factorisation for all elements of one length.
+Where h‖A‖ is not modest, equations of collocation are solved: by :mod:`.elimination`, or where A is
+full and constant with one factorisation for all elements of one length.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
+from math import factorial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, IntArray
@@ -41,18 +42,16 @@ from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
 
 LENGTH = 4.0  # h‖A‖ of an element at most
-_MOST_SWEEPS = 80
+_MOST_PARTS = 16  # of an element, each with its series, where coefficients
+_DECAY = 2.5  # are to decay like powers of 1 over this
 MOST_ELEMENTS = 800  # with more of them the system counts as stiff
-_DIGITS = 1e-2  # of the tolerance, to which sweeps go on
-_BEYOND = 1.5  # lengths of elements, up to which polynomials are a beginning for the next ones
+_DIGITS = 1e-2  # of the tolerance, to which series go on
 _ROUGH = 0.02  # to which errors are carried
 _LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
 _WORTH = 0.5  # columns times that share, from which on it is multiplied as if it were
 _TINY = float(np.finfo(float).tiny)
 _FEW_COLUMNS = 4  # whose errors are carried one by one
-_MANY_COLUMNS = 8  # from which on maps of elements that are alike cost less than sweeps, and
-_MANY_ALIKE = 4  # how many elements of one length that takes
 
 # Values (K, s + 1, d, c) of x' = A x + f on a mesh, f of the first columns, from a start (d, c),
 # with kicks (K, d, c) at right ends; and how far each element may be from a solution, relative
@@ -139,14 +138,14 @@ def solve(
     units: Array, tol: float, max_elements: int,
     restarts: Mapping[float, Callable[[Array], Array]] | None = None, stiff: bool = False,
 ) -> LinearSolution | None:
-    """As :func:`gpebo_cli.numerics.collocation.solve`, or None where sweeps will not do.
+    """As :func:`gpebo_cli.numerics.collocation.solve`, or None where series will not do.
 
     In place of the problem's coefficients the ``equation`` gives A, f (P or 1, d, ·) of the first
     columns and what the monitor needs, at the points of a mesh. Components have ``units`` (d,).
-    Where it is ``stiff``, elements are solved and not swept over.
+    Where it is ``stiff``, elements are solved, without series.
     """
     A, _, _ = equation(mesh)
-    march: March = partial(_sweeping, 1.0 / units)
+    march: March = partial(_series, 1.0 / units)
     if stiff:
         full = len(A.columns) > _DENSE * len(A.rows) ** 2
         if full and len(A.entries) > 1:
@@ -161,19 +160,15 @@ def solve(
 
     def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
         A, f, extras = equation(mesh)
-        mapped = not stiff and len(A.entries) == 1 and problem.start.shape[1] > _MANY_COLUMNS
-        mapped = mapped and _MANY_ALIKE * equal_lengths(mesh.steps)[0].max() < mesh.size
-        values, change = _swept(
-            partial(_mapped, 1.0 / units) if mapped else march, A, f, problem, mesh, tol,
-            restarts or {},
-        )
+        values, change = _swept(march, A, f, problem, mesh, tol, restarts or {})
         looked = Looked.at(values, mesh.rule)
         sizes = looked.sizes.reshape(mesh.size, *values.shape[2:])
         made_of, moved = _terms(A, f, mesh, values, sizes)
         found = _Found(A, Trajectory(mesh, values), looked, sizes, change, made_of, moved, extras)
-        return found, unresolved_signals(
+        tail = unresolved_signals(
             problem, mesh.rule, values, extras, made_of.max(axis=0), tol, looked
         )
+        return found, np.maximum(tail, np.isinf(change))  # zeros where no series converges
 
     try:
         mesh, found, tail = refine(
@@ -234,37 +229,54 @@ class _Found(NamedTuple):
     extras: tuple[Array, ...]
 
 
-def _sweeping(
+def _series(
     weights: Array, mesh: Mesh, A: Sparse, f: Array, kicks: Array | None, start: Array, tol: float
 ) -> tuple[Array, Array]:
-    """Sweeps over one element after the other, with weights (d,) of the states."""
-    return elements.sweeps(
-        mesh.rule.integration, mesh.steps, *A, f, kicks, _onward(mesh), start, weights, tol, SHARE,
-        _MOST_SWEEPS,
+    """Series in time over one element after the other, with weights (d,) of the states."""
+    size = np.maximum(np.abs(A.entries).max(axis=0), _TINY)
+    terms, parts = _powers(A.entries, size, mesh, tol)
+    decay = (np.abs(terms) / size).max(axis=2, initial=0.0)
+    decay = np.maximum.accumulate(decay[:, ::-1], axis=1)[:, ::-1]
+    forced = _powers(f.reshape(len(f), -1), np.abs(f).max(axis=0).ravel(), mesh, tol, parts)[0]
+    return elements.series(
+        mesh.rule.nodes, mesh.steps, parts, A.rows, A.columns, terms.swapaxes(1, 2), decay,
+        forced.reshape(*forced.shape[:2], *f.shape[1:]), kicks, start, weights, tol, SHARE,
     )
 
 
-def _mapped(
-    weights: Array, mesh: Mesh, A: Sparse, f: Array, _kicks: None, start: Array, tol: float
-) -> tuple[Array, Array]:
-    """As :func:`_sweeping` for one constant A and many columns, by maps of elements."""
-    s, (d, c), first = mesh.rule.stages, start.shape, f.shape[2]
-    values, changes = np.empty((mesh.size, s + 1, d, c)), np.zeros(mesh.size)
-    if first:
-        values[..., :first], changes = _sweeping(weights, mesh, A, f, None, start[:, :first], tol)
-    maps, (group, h) = [], equal_lengths(mesh.steps)
-    for k in np.unique(group, return_index=True)[1]:
-        alone, nothing = Mesh(np.array([0.0, h[k]]), mesh.rule), np.zeros((1, d, 0))
-        finer = max(_DIGITS * tol, 8.0 * EPS)
-        own, change = _sweeping(weights, alone, A, nothing, None, np.eye(d), finer)
-        maps.append(own[0, 1:].reshape(s * d, d))
-        changes = np.maximum(changes, change)
-    state = start[:, first:]
-    for k, X in enumerate(values):
-        X[0, :, first:] = state
-        np.matmul(maps[group[k]], state, out=X[1:].reshape(s * d, c)[:, first:])
-        state = X[-1, :, first:]
-    return values, changes
+def _powers(
+    values: Array, size: Array, mesh: Mesh, tol: float, parts: IntArray | None = None
+) -> tuple[Array, IntArray]:
+    """Functions (N or 1, w) in powers of the time in each part of elements, (P or 1, g, w).
+
+    Degrees that are smaller than ``tol`` of the size (w,) are left out. How many ``parts`` each
+    element has, (K,), is such that coefficients decay, if that is not said.
+    """
+    rule, w = mesh.rule, values.shape[1]
+    if len(values) == 1 or not w:
+        return values[:1, None], np.ones(mesh.size, dtype=np.intp) if parts is None else parts
+    terms = rule.to_legendre @ values.reshape(mesh.size, rule.stages + 1, w)
+    counts = (np.abs(terms) > tol * size).any(axis=(0, 2))
+    terms = terms[:, : 1 + int(np.flatnonzero(counts).max(initial=0))]
+    degrees = np.arange(terms.shape[1])
+    if parts is None:
+        sizes = (np.abs(_legendre_powers(len(degrees), 1) @ terms) / size).max(axis=2)[:, 1:]
+        rates = ((sizes * (sizes > tol)) ** (1.0 / degrees[1:])).max(axis=1, initial=0.0)
+        parts = np.ceil(np.clip(_DECAY * rates, 1.0, _MOST_PARTS)).astype(np.intp)
+    found, first = np.empty((parts.sum(), len(degrees), w)), parts.cumsum() - parts
+    for count in set(parts.tolist()):
+        some, changed = parts == count, _legendre_powers(len(degrees), count)
+        found[first[some, None] + np.arange(count)] = changed @ terms[some, None]
+    return found, parts
+
+
+@lru_cache
+def _legendre_powers(degrees: int, parts: int) -> Array:
+    """Legendre polynomials on [0, 1] in powers of time in each part, (parts, powers, degrees)."""
+    left = 2.0 * np.arange(parts) / parts - 1.0
+    slopes = [legendre.legval(left, legendre.legder(np.eye(degrees), m)) for m in range(degrees)]
+    each = [(2.0 / parts) ** m / factorial(m) * slope for m, slope in enumerate(slopes)]
+    return np.array(each).transpose(2, 0, 1)
 
 
 class _Solved:
@@ -315,24 +327,13 @@ def _swept(
         own = A if len(A.entries) == 1 else A._replace(entries=A.entries[part])
         piece = Mesh(mesh.edges[first : last + 1], mesh.rule)
         values, change = march(piece, own, f if len(f) == 1 else f[part], None, state, enough)
-        if not (change <= 8.0 * enough).all() or not np.isfinite(values[-1]).all():
+        if (change[np.isfinite(change)] > 8.0 * enough).any() or not np.isfinite(values[-1]).all():
             raise StiffError
         pieces.append((values, change))
         state = values[-1, -1]
     if len(pieces) == 1:
         return pieces[0]
     return np.concatenate([v for v, _ in pieces]), np.concatenate([c for _, c in pieces])
-
-
-def _onward(mesh: Mesh) -> Array:
-    """From the points of the element before each one to its nodes, (K, s, s + 1).
-
-    What polynomials are beyond their elements is nearly what follows, and nearly halves the sweeps.
-    Where they would have to reach far, their last value is.
-    """
-    ratio = mesh.steps / np.append(np.inf, mesh.steps[:-1])
-    places = 1.0 + np.where(ratio <= _BEYOND, ratio, 0.0)[:, None] * mesh.rule.nodes
-    return mesh.rule.interpolation(places.ravel()).reshape(*places.shape, -1)
 
 
 def _terms(
@@ -352,9 +353,7 @@ def _terms(
     return np.abs(values[:, 0]) + h * within, h * within + late * moved
 
 
-def _errors(
-    march: March, problem: LinearProblem, mesh: Mesh, found: _Found
-) -> Errors:
+def _errors(march: March, problem: LinearProblem, mesh: Mesh, found: _Found) -> Errors:
     """Errors of the solution, see :mod:`gpebo_cli.numerics.errors`.
 
     Of many columns the largest error at each place is carried on, for all of them.
@@ -364,7 +363,7 @@ def _errors(
     sizes = found.sizes
     size, last = np.maximum(sizes, _TINY), found.looked.last
     tail = predicted_tail(last, rule, size.reshape(K, -1)).reshape(sizes.shape)
-    # As in numerics.errors; and what sweeps have not finished.
+    # As in numerics.errors; and what series leave out.
     added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * sizes
     added += EPS * (END * found.made_of + found.moved)
     start = EPS * np.abs(values[0, 0])
@@ -377,7 +376,8 @@ def _errors(
     signs = random_signs(K, n)[..., None]
     kicks = (signs[1:] * added[:, :, None]).reshape(K, n, -1)
     start = (signs[0] * start[:, None]).reshape(n, -1)
-    ends, _ = march(mesh, A, np.zeros((1, n, 0)), kicks, start, _ROUGH)
+    ends, change = march(mesh, A, np.zeros((1, n, 0)), kicks, start, _ROUGH)
+    kicks[~np.isfinite(change)] = np.inf
     squares = ((ends[:, -1] + kicks) ** 2).reshape(K, n, -1, added.shape[2])
     systematic = np.arange(2, K + 2)[:, None, None]
     carried = np.sqrt(systematic * squares.mean(axis=2)) + np.zeros(columns)

@@ -1,4 +1,4 @@
-"""Simulate a large plant: elimination, then sweeps over its entries, or solves where it is stiff.
+"""Simulate a large plant: elimination, then series in time, or solves where it is stiff.
 
 A sparse plant is eliminated entry by entry at all times. A constant one that is full, or of which
 pivots do not tell the structure, is reduced once, by singular values.
@@ -142,7 +142,7 @@ class _Plant:
 def large_simulation(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> Simulation | None:
-    """:func:`gpebo_cli.simulation.simulate.simulate`, or None where elimination or sweeps fail."""
+    """:func:`gpebo_cli.simulation.simulate.simulate`, or None where elimination or series fail."""
     mesh, cuts, bounded = first_mesh(system, time, solver)
     plant = _Plant(system, solver.max_strangeness_index + 1)
     try:
@@ -184,13 +184,11 @@ def _simulated(
     if stiff:
         longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), _TINY)
 
-    def looked_at(t: Array) -> Coefficients:
-        return entries(system.coefficients, t, 0).values
-
     given, c, used = mesh, plant.found.values, plant.found.places["u"][0]
     beside = _beside_inputs(plant.found, np.abs(system.initial_state))[used]
     mesh, c = inputs_resolved(
-        system, plant.entries, looked_at, mesh, c, beside, solver, bounded=bounded
+        system, plant.entries, lambda t: entries(system.coefficients, t, 0).values, mesh, c, beside,
+        solver, bounded=bounded,
     )
     if mesh is given:
         mesh, c = known_joined(system, plant.entries, mesh, c, cuts, MARGIN * tol)
@@ -238,7 +236,7 @@ def _simulated(
 
 
 def _no_coefficients(t: Array, inside: Array) -> LinearEquation:
-    raise NotImplementedError  # sweeps get the equation by mesh
+    raise NotImplementedError  # the equation is given by mesh
 
 
 def _beside_inputs(found: Entries, size: Array) -> Array:
