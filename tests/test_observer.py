@@ -168,7 +168,7 @@ def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
     system = plant_from_mapping(ROTATING)
     t = np.linspace(0, 5, 23)
     o = observer_matrices(EquationForm(system, Units.plain(system)), t, t, 1e-10)
-    R, P = o.residual, o.projector
+    R, P = o.residual, o.split.projector
     np.testing.assert_allclose(R @ R, R, atol=1e-13)
     np.testing.assert_allclose(R @ o.algebraic @ (np.eye(4) - P), 0, atol=1e-13)
 

@@ -229,7 +229,7 @@ def test_summary_has_the_evidence(tmp_path: Path) -> None:
     assert summary["estimator_requirement"]["name"] == "Δ not in L2"
     by_state = dict.fromkeys(STATES, 1e-13) | {"iv": 3e-13}
     assert summary["error_estimate"] == {
-        "states": 3e-13, "by_state": by_state, "regression": 2e-13,
+        "states": 3e-13, "by_state": by_state, "regression": 2e-13, "estimates": {},
     }
     assert [case["gains"] for case in summary["cases"]] == [{"gamma": 1e10}, {"gamma": 1e8}]
     assert summary["git"] == {"commit": "c0ffee", "dirty": False}

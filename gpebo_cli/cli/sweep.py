@@ -91,7 +91,8 @@ def run_sweep(
 
     A job is a list of overrides, its number is its place; ``hydra.sweeper`` of ``config``, from
     which all start, says where to go on and when to stop. The launcher runs
-    :func:`run_sweep_job` somewhere and returns when all is done.
+    :func:`run_sweep_job` somewhere and returns when all is done (ConfigError: a key of
+    ``hydra.sweep`` that a sweep does not have).
     """
     orders = config.hydra.sweeper
     folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()
