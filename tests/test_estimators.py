@@ -168,17 +168,17 @@ def exciting_ode(gamma, kappa, lam):
 
 
 def means_ode(gamma, delay, settle, rows):
-    """Means of [ψ(t) ; ψ(t − d)]ᵀ[ψ | Y]; all of them that are named, squared up."""
+    """Means of [ψ(t) ; ψ(t − d)]ᵀ[ψ | Y]: of rows K that are named; Δ² is det KᵀK where many."""
     def f(t, x):
         psi, Y = signals(t)
         before = three(t - delay) * (t >= delay)
         means = x[:24].reshape(6, 4)
         product = np.outer(np.concatenate([psi, before]), np.append(psi, Y))
         kept = means[rows]
-        if len(rows) > 3:
-            kept = kept[:, :3].T @ kept
-        omega, delta = kept[:, :3], np.linalg.det(kept[:, :3])
-        law = gamma * delta * (adjugate(omega) @ kept[:, 3] - delta * x[24:])
+        square = kept[:, :3].T @ kept if len(rows) > 3 else kept
+        delta = np.linalg.det(square[:, :3])
+        law = gamma * (adjugate(square[:, :3]) @ square[:, 3] - delta * x[24:])
+        law *= 1.0 if len(rows) > 3 else delta
         return np.concatenate([((product - means) / (settle + t)).ravel(), law])
 
     return f, np.concatenate([np.zeros(24), START]), slice(24, 27)
@@ -310,6 +310,14 @@ def test_instruments_and_annihilators_take_the_bias_away():
     assert error["least_squares"] > 0.3
     assert error["instrumental"] < 0.01
     assert error["annihilator"] < 0.01
+
+
+def test_an_annihilator_does_not_square_the_condition():
+    """Columns of ψ over ten decades: normal equations, whose condition is 1e20, lose η."""
+    units = np.array([1e5, 1.0, 1e-5])
+    scaled = regression(lambda t: three(t) * units, ETA / units)
+    found = run("annihilator", scaled, np.array([T[-1]]), gamma=1e20)[0, -1]
+    np.testing.assert_allclose(found * units, ETA, rtol=1e-4)
 
 
 def test_nothing_delayed_has_arrived_before_the_delay():

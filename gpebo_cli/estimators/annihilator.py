@@ -7,9 +7,10 @@ something in common with the perturbed columns of ψ only. Of the means of [ψ(t
 
     𝒴 = Ω η + B b,   b the unknown bias, B the unit vectors of the perturbed rows of ψ(t),
 
-and N with N B = 0 annihilates it: (NΩ)ᵀNΩ η = (NΩ)ᵀN𝒴, then mixing. The rows of ψ(t − d) stay, w
-being forgotten within d; without perturbed columns this is least squares on twice the rows. The
-choice of rows is ours. Of the paper only the abstract and introduction were at hand, so these
+and N with N B = 0 annihilates it: with NΩ = QR, R η = QᵀN𝒴, then mixing. That is the least squares
+solution of NΩ η = N𝒴, without squaring its condition. The rows of ψ(t − d) stay, w being forgotten
+within d; without perturbed columns this is least squares on twice the rows. The choice of rows is
+ours. Of the paper only the abstract and introduction were at hand, so these
 equations need not be its own.
 """
 
@@ -38,7 +39,7 @@ class Annihilator(Instrumental):
     perturbed: list[str] = field(default_factory=list)
 
     def left(self, means: Array, names: Sequence[str]) -> Array:
-        """(NΩ)ᵀN (N, p, 2p) of [Ω | 𝒴] (N, 2p, p + c).
+        """QᵀN (N, p, 2p) of [Ω | 𝒴] (N, 2p, p + c), R having no negative diagonal.
 
         ConfigError: a perturbed parameter that there is not.
         """
@@ -46,8 +47,10 @@ class Annihilator(Instrumental):
             if name not in names:
                 what = f"estimator.perturbed: there is no parameter {shown(name)}"
                 raise unknown(what, name, names, "the parameters are")
-        kept = [name not in self.perturbed for name in names] + [True] * len(names)
-        return np.asarray(transpose(means[..., : len(names)]) * np.array(kept))
+        kept = np.array([name not in self.perturbed for name in names] + [True] * len(names))
+        Q, R = np.linalg.qr(kept[:, None] * means[..., : len(names)])
+        sign = np.where(np.diagonal(R, axis1=-2, axis2=-1) < 0.0, -1.0, 1.0)
+        return np.asarray(transpose(sign[..., None, :] * Q) * kept)
 
 
 ESTIMATOR = Annihilator
