@@ -379,15 +379,13 @@ def test_means_at_samples_are_sums_over_the_samples(perturbed):
         lengths = np.repeat([block.steps[k], since], 3)[:, None]
         Z += lengths * np.hstack([rows[k][:, :3], before]).T @ rows[k]
         means = Z / (settle + now)
-        if perturbed:
-            kept = np.delete(means, 1, axis=0)
-            means = kept[:, :3].T @ kept
-        else:
-            means = means[3:]
-        delta = np.linalg.det(means[:, :3])
+        kept = np.delete(means, 1, axis=0) if perturbed else means[3:]
+        delta = np.linalg.det(kept[:, :3]) if not perturbed else np.prod(
+            np.linalg.svd(kept[:, :3], compute_uv=False)
+        )
         assert made.delta[0, k] == pytest.approx(delta, rel=1e-9, abs=1e-12)
         if abs(delta) > 1e-12:
-            goal = np.linalg.solve(means[:, :3], means[:, 3])
+            goal = np.linalg.lstsq(kept[:, :3], kept[:, 3])[0]
             eta = goal + np.exp(-gain * delta**2 * block.steps[k]) * (eta - goal)
         expected.append(eta)
     np.testing.assert_allclose(made.parameters[0], expected, atol=1e-9)
