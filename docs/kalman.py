@@ -79,9 +79,8 @@ def errors(result: RunResult) -> tuple[Array, Array]:
     E = system.coefficients.taylor(np.zeros(1), 0).E[0, 0]
     chosen = np.flatnonzero(np.abs(E).max(axis=0) > 0)
     error = estimation.states[0][:, chosen] - result.simulation.states[:, chosen]
-    nothing = np.full((1, len(estimation.t)), np.nan)
-    stated = [estimation.checks.get(f"{system.states[i]}_std", nothing)[0] for i in chosen]
-    return error, np.stack(stated, axis=1)
+    stated = estimation.states_std
+    return error, np.full(error.shape, np.nan) if stated is None else stated[0][:, chosen]
 
 
 def table(rows: list[tuple[str, dict[str, Any], float]]) -> str:
