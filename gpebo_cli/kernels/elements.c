@@ -371,8 +371,7 @@ INLINE double largest_change(const Part *q)
         EACH_COLUMN all[b] = MAXIMUM(q->size[i + b], all[b]);
     const double least = larger(q->share * largest_size(all), DBL_MIN);
     for (npy_intp i = 0; i < q->d; i += AT_ONCE)
-        EACH_COLUMN found[b] =
-            MAXIMUM(q->change[i + b] / MAXIMUM(q->size[i + b], least), found[b]);
+        EACH_COLUMN found[b] = MAXIMUM(q->change[i + b] / MAXIMUM(q->size[i + b], least), found[b]);
     return largest_size(found);
 }
 
