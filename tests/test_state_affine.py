@@ -438,3 +438,9 @@ def test_a_solution_that_slides_along_a_jump_is_refused_in_time():
     }
     with pytest.raises(SolverError, match=r"cannot be followed beyond t = 2\.7731\d*"):
         run(plant, time={"horizon": 10.0, "samples": 11})
+
+
+def test_a_transistor_that_is_almost_off_acts_all_the_same():
+    """Its small currents are derivatives and no rounding: without them Newton's method fails."""
+    result = run("published/transistor", observer="none", time={"horizon": 0.05, "samples": 11})
+    assert result.details.simulation.error_estimate < 1e-7

@@ -28,7 +28,7 @@ from gpebo_cli.numerics.mesh import Trajectory, aside
 # and by rounding over it, which costs Newton's method nothing that could be seen.
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
-_NO_MORE = 1e-14  # of a right side: what an output moves it by is rounding up to that
+_NO_MORE = 1e-15  # of a right side: what an output moves it by is rounding up to that
 _SAME = 1e-12  # of the span: instants closer than this to another are that one
 
 
