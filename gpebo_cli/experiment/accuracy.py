@@ -204,13 +204,19 @@ def finished(
     """
     if std is None or requirement.holds or not len(columns):
         return std, why
-    eta = np.zeros(final.shape[1])
-    eta[columns] = least_squares(root[:, [*columns, -1]])
+    eta = _about(root, columns)
     far = (np.abs(final - eta) > _BEYOND * std[:, -1, : len(eta)]).any(axis=1)
     if not far.any():
         return std, why
     std[far] = np.nan
     return None if far.all() else std, _UNFINISHED
+
+
+def _about(root: Array, columns: IntArray) -> Array:
+    """η (p,) of least squares about some of the parameters, the others being zero."""
+    eta = np.zeros(root.shape[1] - 1)
+    eta[columns] = least_squares(root[:, [*columns, -1]])
+    return eta
 
 
 def doubts(
@@ -232,8 +238,7 @@ def doubts(
     final, p = final[np.isfinite(final).all(axis=1)], final.shape[1]
     if not len(final) or not len(columns):
         return {}, ()
-    eta = np.zeros(p)
-    eta[columns] = least_squares(root[:, [*columns, -1]])
+    eta = _about(root, columns)
     least = np.linalg.norm(root @ np.append(-eta, 1.0))
     more = np.linalg.norm((final - eta) @ root[:, :-1].T, axis=1)
     best = int(np.argmin(more))

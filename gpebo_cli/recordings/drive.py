@@ -31,7 +31,6 @@ from gpebo_cli.settings import DataSettings
 
 _ROUNDING = 1e-12  # of the largest time: by how much an experiment may exceed the samples
 _LOOKS = np.linspace(0.0, 1.0, 9)  # of a piece, where one looks at the sign of what switches
-_SAME = 1e-12  # of the span: instants closer than this to another are that one
 
 
 @dataclass(frozen=True)
@@ -161,7 +160,7 @@ class Driven:
         edges = np.concatenate([[start], found, [stop]])
         t = (edges[:-1, None] + np.diff(edges)[:, None] * _LOOKS).ravel()
         new = switched(self._switches, t, lambda t: self._known(t, 0, t)[1])
-        return with_others(edges, new, _SAME * (stop - start))[1:-1]
+        return with_others(edges, new)[1:-1]
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
         """As of the text, from edges (K + 1,), and of what follows tables: they are polynomials."""

@@ -26,7 +26,7 @@ _SURPRISE = 100.0  # times what the nodes let expect: then something stands betw
 _LOOK_ROUNDS = 8
 _NOTHING = 1e-12  # of what an input stands beside: less is rounding
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
-MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
+_MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
 SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
 
@@ -42,17 +42,19 @@ def first_mesh(
     return Mesh(edges, mesh.rule), cuts, bounded
 
 
-def inputs_resolved(
+def known_resolved(
     system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients],
     looked_at: Callable[[Array], Coefficients], mesh: Mesh, c: Coefficients, beside: Array,
-    solver: SolverSettings, *, bounded: bool,
+    solver: SolverSettings, cuts: Array, longest: float, *, bounded: bool,
 ) -> tuple[Mesh, Coefficients]:
     """The mesh on which nothing is overlooked and inputs are resolved, and the model there.
 
     It begins with a mesh and the model ``c`` there; ``evaluated`` gives it on others, ``looked_at``
     its values at any times. Inputs compare with sizes ``beside`` them (m,). ``bounded``: nothing
-    narrow hides between the nodes.
+    narrow hides between the nodes. Where no element has to be cut, they are joined as far as known
+    functions are resolved all the same, up to the ``longest`` (s); the cuts (B,) stay.
     """
+    given = mesh
     for _ in range(0 if bounded else _LOOK_ROUNDS):
         overlooked = _overlooked(system, c, looked_at, mesh, solver.tol, beside)
         if not overlooked.any():
@@ -73,7 +75,10 @@ def inputs_resolved(
         before = np.repeat(tail, parts)
         mesh, _ = mesh.split(parts)
         c = evaluated(mesh)
-    return mesh, c
+    if mesh is not given or 2.0 * float(mesh.steps.min()) > longest:
+        return mesh, c
+    joined = _joined(system, mesh, c, cuts, _MARGIN * solver.tol, longest)
+    return (mesh, c) if joined.size == mesh.size else (joined, evaluated(joined))
 
 
 def least_beside(terms: Array, inputs: IntArray, m: int) -> Array:
@@ -87,24 +92,20 @@ def least_beside(terms: Array, inputs: IntArray, m: int) -> Array:
     return np.where(np.isfinite(least), least, 0.0)
 
 
-def known_joined(
-    system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients], mesh: Mesh,
-    c: Coefficients, cuts: Array, tol: float, longest: float = np.inf,
-) -> tuple[Mesh, Coefficients]:
-    """Elements joined where known functions are resolved all the same; the cuts (B,) stay.
+def _joined(
+    system: DescriptorSystem, mesh: Mesh, c: Coefficients, cuts: Array, tol: float, longest: float
+) -> Mesh:
+    """Elements joined where known functions are resolved all the same.
 
     The mesh is kept with the matrices of a text, as :func:`gpebo_cli.reduction.structure.analyse`
     keeps what it finds.
     """
-    if 2.0 * float(mesh.steps.min()) > longest:
-        return mesh, c
     kept: dict[object, Mesh] = getattr(system.coefficients, "kept", {})
     asked = mesh.edges.tobytes(), mesh.rule, len(c.E), cuts.tobytes(), tol, longest
     if asked not in kept:
         values, counts = _known_kinds(system, c, mesh)
         kept[asked] = mesh.joined(values, counts, tol, cuts, longest)
-    joined = mesh if kept[asked].size == mesh.size else kept[asked]
-    return joined, c if joined is mesh else evaluated(joined)
+    return kept[asked]
 
 
 def _overlooked(

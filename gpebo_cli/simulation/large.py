@@ -32,14 +32,7 @@ from gpebo_cli.reduction.explicit import (
 )
 from gpebo_cli.reduction.structure import Structure, analyse, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
-from gpebo_cli.simulation.known import (
-    MARGIN,
-    SHORT,
-    first_mesh,
-    inputs_resolved,
-    known_joined,
-    least_beside,
-)
+from gpebo_cli.simulation.known import SHORT, first_mesh, known_resolved, least_beside
 from gpebo_cli.simulation.signals import Signals, Simulation
 
 SMALL = 8  # states, up to which dense matrices are faster in any case
@@ -184,14 +177,12 @@ def _simulated(
     if stiff:
         longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), _TINY)
 
-    given, c, used = mesh, plant.found.values, plant.found.places["u"][0]
+    used = plant.found.places["u"][0]
     beside = _beside_inputs(plant.found, np.abs(system.initial_state))[used]
-    mesh, c = inputs_resolved(
-        system, plant.entries, lambda t: entries(system.coefficients, t, 0).values, mesh, c, beside,
-        solver, bounded=bounded,
+    mesh, _ = known_resolved(
+        system, plant.entries, lambda t: entries(system.coefficients, t, 0).values, mesh,
+        plant.found.values, beside, solver, cuts, np.inf, bounded=bounded,
     )
-    if mesh is given:
-        mesh, c = known_joined(system, plant.entries, mesh, c, cuts, MARGIN * tol)
     parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
     if not parts.sum() <= solver.max_elements:
         return None

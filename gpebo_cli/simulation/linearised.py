@@ -29,7 +29,6 @@ from gpebo_cli.numerics.mesh import Trajectory, aside
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
 _NO_MORE = 1e-15  # of a right side: what an output moves it by is rounding up to that
-_SAME = 1e-12  # of the span: instants closer than this to another are that one
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +76,7 @@ class Linearised:
         """Those of functions of time, and where outputs of the guess pass a jump or a kink."""
         found = self.system.coefficients.breakpoints(start, stop)
         inner = self.switched[(self.switched > start) & (self.switched < stop)]
-        return with_others(np.array([start, *found, stop]), inner, _SAME * (stop - start))[1:-1]
+        return with_others(np.array([start, *found, stop]), inner)[1:-1]
 
     @cached_property
     def switched(self) -> Array:

@@ -22,14 +22,7 @@ from gpebo_cli.reduction.strangeness_free import StrangenessFree, direct_part, s
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.simulation.known import (
-    MARGIN,
-    SHORT,
-    first_mesh,
-    inputs_resolved,
-    known_joined,
-    least_beside,
-)
+from gpebo_cli.simulation.known import SHORT, first_mesh, known_resolved, least_beside
 from gpebo_cli.simulation.large import SMALL, large_simulation
 from gpebo_cli.simulation.linearised import Linearised, looked_along
 from gpebo_cli.simulation.newton import follow
@@ -194,13 +187,11 @@ def _known_resolved(
     terms = _beside_inputs(c)
     if solver.name == "ivp":
         return mesh, c, terms
-    given, beside = mesh, terms(np.abs(system.initial_state))
-    mesh, c = inputs_resolved(
-        system, evaluated, lambda t: system.coefficients.taylor(t, 0), mesh, c, beside, solver,
-        bounded=bounded,
+    mesh, c = known_resolved(
+        system, evaluated, lambda t: system.coefficients.taylor(t, 0), mesh, c,
+        terms(np.abs(system.initial_state)), solver, cuts,
+        longest if structure.steady and structure.d > _QUICK else 0.0, bounded=bounded,
     )
-    if mesh is given and structure.steady and structure.d > _QUICK:
-        mesh, c = known_joined(system, evaluated, mesh, c, cuts, MARGIN * solver.tol, longest)
     return mesh, c, terms
 
 

@@ -180,11 +180,15 @@ def breakpoints(tape: Tape, start: float, stop: float) -> Array:
 
     found, near = np.sort(roots(tape, exact, start, stop)), _SAME * (stop - start)
     found = found[np.diff(found, prepend=-np.inf) > near]
-    return with_others(np.array([start, *exact, stop]), found, near)[1:-1]
+    return with_others(np.array([start, *exact, stop]), found)[1:-1]
 
 
-def with_others(known: Array, others: Array, near: float) -> Array:
-    """Times ``known`` (A,), sorted, and those ``others`` (B,) that are not so ``near`` to one."""
+def with_others(known: Array, others: Array, near: float | None = None) -> Array:
+    """Times ``known`` (A,), sorted, and those ``others`` (B,) that are not so ``near`` to one.
+
+    None: by more than rounding of the span between the first and the last.
+    """
+    near = _SAME * (known[-1] - known[0]) if near is None else near
     place = np.searchsorted(known, others)
     before, after = known[np.maximum(place - 1, 0)], known[np.minimum(place, len(known) - 1)]
     new = np.minimum(np.abs(others - before), np.abs(after - others)) > near
