@@ -6,7 +6,7 @@ import pytest
 from gpebo_cli.numerics.elimination import Eliminated, StiffError
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.numerics.sweeps import sparse
+from gpebo_cli.numerics.series import sparse
 
 S, D = 5, 12
 RULE = radau_rule(S)

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import OnDemand
-from gpebo_cli.numerics import sweeps
+from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import SHARE, initial_mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
@@ -321,9 +321,9 @@ def test_initial_values_that_cannot_be_the_unknown_ones(observer, says):
         observed(observer.pop("unknown_initial"), **observer)
 
 
-def test_the_swept_extension_is_that_of_dense_elements(monkeypatch):
+def test_the_extension_by_series_is_that_of_dense_elements(monkeypatch):
     found = observed(None)
-    monkeypatch.setattr(extension.sweeps, "sparse", lambda *_: None)
+    monkeypatch.setattr(extension.series, "sparse", lambda *_: None)
     dense = observed(None)
     for name in ("x3", "x12"):  # before the end parameters are hardly told apart
         one, other = found.estimates[name][0, -1], dense.estimates[name][0, -1]
@@ -478,7 +478,7 @@ def test_elements_that_are_cut_may_have_more_entries():
     mesh = initial_mesh(0.0, 6.0, [], 7, radau_rule(8))
     problem = LinearProblem(coefficients, np.eye(d), name="pulse")
     first = coefficients(mesh.points.ravel(), None).A[:, 0, d - 1]
-    found = sweeps.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
+    found = series.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
     last = found.trajectory.mesh
     assert last.size > mesh.size
     again = coefficients(last.points.ravel(), None).extras[0]
@@ -502,7 +502,7 @@ def test_series_of_coefficients_with_poles_or_that_swing(rate, logarithm):
 
     problem = LinearProblem(coefficients, np.ones((9, 2)), name="rates")
     mesh = initial_mesh(0.0, 2.0, [], 20, radau_rule(14))
-    found = sweeps.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
+    found = series.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
     t = np.linspace(0.0, 2.0, 31)
     error = np.abs(found.trajectory(t) / np.exp(logarithm(t))[:, None, None] - 1.0).max()
     assert error <= found.error_estimate * 10.0 <= 1e-6

@@ -24,7 +24,7 @@ _FILL = 4  # blocks of size s × s per state that elimination may couple; with m
 
 
 class StiffError(Exception):
-    """Sweeps do not converge, or elimination fills what is sparse."""
+    """Series do not converge, or elimination fills what is sparse."""
 
 
 class Factors(NamedTuple):
@@ -37,7 +37,7 @@ class Factors(NamedTuple):
 
 
 class Eliminated:
-    """A march, see :mod:`.sweeps`, by elimination; factors of the last elements are kept."""
+    """A march, see :mod:`.series`, by elimination; factors of the last elements are kept."""
 
     def __init__(self) -> None:
         self._known = dict[bytes, int]()  # where the factors of each matrix are, by its digest

@@ -13,7 +13,7 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.entries import Entries, entries
-from gpebo_cli.numerics import sweeps
+from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution
 from gpebo_cli.numerics.errors import EPS, NOTHING, VALUE
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, initial_mesh, legendre_tail
@@ -127,9 +127,9 @@ class _Plant:
             smallest_singular_value=form.pivot, time_invariant=len(self.matrix().entries) == 1,
         )
 
-    def matrix(self) -> sweeps.Sparse:
+    def matrix(self) -> series.Sparse:
         """M."""
-        return sweeps.Sparse(*self.form.matrix)
+        return series.Sparse(*self.form.matrix)
 
 
 def large_simulation(
@@ -173,7 +173,7 @@ def _simulated(
         return None  # what jumps then is for the derivative array to say
     M, units = plant.matrix(), form.units
     shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh), units).max(), _TINY)
-    stiff = bool(np.ceil(mesh.steps / longest).sum() > sweeps.MOST_ELEMENTS)
+    stiff = bool(np.ceil(mesh.steps / longest).sum() > series.MOST_ELEMENTS)
     if stiff:
         longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), _TINY)
 
@@ -199,7 +199,7 @@ def _simulated(
     floor_z = SHARE * np.abs(form.reduced(x0))[:, None]
     floor = form.sizes_from(floor_z)
 
-    def equation(mesh: Mesh) -> sweeps.Equation:
+    def equation(mesh: Mesh) -> series.Equation:
         form = plant.eliminate(mesh)
         return plant.matrix(), form.f[:, :, None], ()
 
@@ -217,7 +217,7 @@ def _simulated(
     problem = LinearProblem(
         _no_coefficients, z0[:, None], monitor, f"plant {system.name}", floor_z, apart=True,
     )
-    solution = sweeps.solve(
+    solution = series.solve(
         problem, equation, mesh, units=units, tol=tol, max_elements=solver.max_elements,
         stiff=stiff,
     )

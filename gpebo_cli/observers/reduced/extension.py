@@ -13,7 +13,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
-from gpebo_cli.numerics import sweeps
+from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.linalg import exact_product, largest_over_time
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
@@ -377,9 +377,9 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
         points, inside = _over_time(mesh.points), _over_time(mesh.inside)
         known = equations(reduced.first, measured(reduced.form, points, inside, u, y))
-    swept = sweeps.solve_dense(problem, mesh, **limits, known=known) if large else None
-    if swept is not None:
-        return _assembled(reduced, _in_units(swept, units), monitor.latest, as_found=True)
+    marched = series.solve_dense(problem, mesh, **limits, known=known) if large else None
+    if marched is not None:
+        return _assembled(reduced, _in_units(marched, units), monitor.latest, as_found=True)
     known, large, monitor.axes = None if large else known, False, None
     if len(windows) > 1:
         return joined(_over(windows, reduced, problem, monitor))

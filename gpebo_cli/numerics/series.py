@@ -160,7 +160,7 @@ def solve(
 
     def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
         A, f, extras = equation(mesh)
-        values, change = _swept(march, A, f, problem, mesh, tol, restarts or {})
+        values, change = _marched(march, A, f, problem, mesh, tol, restarts or {})
         looked = Looked.at(values, mesh.rule)
         sizes = looked.sizes.reshape(mesh.size, *values.shape[2:])
         made_of, moved = _terms(A, f, mesh, values, sizes)
@@ -311,7 +311,7 @@ class _Solved:
         return np.asarray(solved, dtype=np.complex128)
 
 
-def _swept(
+def _marched(
     march: March, A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, tol: float,
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, Array]:
