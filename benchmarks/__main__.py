@@ -19,7 +19,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks import circuit, cold, floor, gains, growth, ladders, problems, recordings, sweeps
+from benchmarks import circuit, cold, gains, growth, ladders, problems, recordings, sweeps
 from benchmarks import kernels as ablation
 from benchmarks.measure import Row
 from benchmarks.page import PARTS, page
@@ -54,7 +54,6 @@ MEASURE: dict[str, Callable[[], Measured]] = {
     "problems": lambda: (problems.rows(), {"deriving": problems.deriving()}),
     "cold": lambda: (cold.rows(), {}),
     "growth": _growth,
-    "floor": lambda: ([], {"table": floor.table()}),
     "recordings": lambda: ([], {"rows": recordings.table()}),
     "sweeps": lambda: ([], {"rows": sweeps.table()}),
 }

@@ -1,4 +1,4 @@
-"""Time and peak memory over the horizon, the number of states, gains and samples.
+"""Time and peak memory over the horizon, the number of gains and of samples.
 
 Each point is a process of its own: ``python -m benchmarks.growth AXIS VALUE`` prints one line of
 JSON. Memory is what the work adds to the peak that the imports reach.
@@ -23,8 +23,6 @@ ROOT = Path(__file__).parent.parent
 AXES: dict[str, tuple[str, tuple[int, ...]]] = {
     "horizon": ("the circuit experiment, horizon in s", (20, 200, 2_000, 20_000)),
     "descriptor": ("the descriptor experiment, horizon in s", (20, 200, 2_000, 20_000)),
-    "lti": ("a chain with constant elements, states", (3, 10, 30, 60, 100, 200)),
-    "ltv": ("a chain with time-varying elements, states", (3, 10, 20, 40)),
     "gains": ("the circuit experiment, gains", (1, 10, 100, 1_000, 10_000, 100_000, 200_000)),
     "samples": ("the circuit experiment, samples", (1_000, 10_000, 100_000, 1_000_000)),
 }
@@ -53,39 +51,8 @@ def experiment(
     return run
 
 
-def chain(n: int, *, varying: bool) -> Callable[[], object]:
-    """Simulate an RC ladder driven by a voltage at its first node: index 2, n states.
-
-    n − 1 node voltages and the source's current; ``C_i v_i' = (v_{i−1} − 2 v_i + v_{i+1})/R``.
-    """
-    from gpebo_cli.model.plant import plant_from_mapping
-    from gpebo_cli.settings import SolverSettings, TimeSettings
-    from gpebo_cli.simulation.simulate import simulate
-
-    nodes = n - 1
-    E = [["0"] * n for _ in range(n)]
-    A = [["0"] * n for _ in range(n)]
-    for i in range(nodes):
-        E[i][i] = f"1 + 0.3*cos(t + {i})" if varying else f"{1 + 0.5 * (i % 3)}"
-        A[i][i] = "-2" if 0 < i < nodes - 1 else "-1"
-        if i > 0:
-            A[i][i - 1] = A[i - 1][i] = "1"
-    A[0][nodes] = A[nodes][0] = "1"
-    mapping = {
-        "name": "chain", "states": [*(f"v{i}" for i in range(nodes)), "i"],
-        "inputs": {"u": "sin(t)"}, "outputs": ["y"], "E": E, "A": A,
-        "B": [*([0] for _ in range(nodes)), [-1]], "C": [[0] * (n - 1) + [1]],
-        "initial_state": [0] * n,
-    }
-    system = plant_from_mapping(mapping, "chain")
-    when, solver = TimeSettings(horizon=20.0), SolverSettings(tol=1e-9)
-    return lambda: simulate(as_new(system), when, solver)
-
-
 def work(axis: str, value: int) -> Callable[[], object]:
     """What is timed at one point."""
-    if axis in ("lti", "ltv"):
-        return chain(value, varying=axis == "ltv")
     if axis == "descriptor":
         return experiment(value, name="descriptor")
     return experiment(**{axis: value})  # type: ignore[arg-type]
@@ -93,7 +60,7 @@ def work(axis: str, value: int) -> Callable[[], object]:
 
 def point(axis: str, value: int) -> dict[str, float]:
     """Seconds (the best of up to three runs) and bytes, in this process."""
-    work("lti", 3)()  # imports, and whatever else is done once
+    experiment()()  # imports, and whatever else is done once
     run = work(axis, value)
     before = _peak()
     taken: list[float] = []
@@ -170,15 +137,12 @@ def plot(axes: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     panels_of = (
-        (("horizon", "descriptor"), "horizon (s)"), (("lti", "ltv"), "states"),
-        (("gains",), "gains"), (("samples",), "samples"),
+        (("horizon", "descriptor"), "horizon (s)"), (("gains",), "gains"),
+        (("samples",), "samples"),
     )
     columns = [([a for a in axes if a["axis"] in keys], label) for keys, label in panels_of]
-    names = {
-        "horizon": "circuit", "descriptor": "descriptor", "lti": "constant", "ltv": "time-varying"
-    }
     figure, panels = plt.subplots(
-        2, 4, figsize=(11, 5.2), sharex="col", sharey="row", layout="constrained"
+        2, 3, figsize=(8.5, 5.2), sharex="col", sharey="row", layout="constrained"
     )
     for column, (group, label) in enumerate(columns):
         for row, (key, unit) in enumerate((("seconds", 1.0), ("bytes", 2.0**20))):
@@ -188,12 +152,12 @@ def plot(axes: list[dict[str, Any]], path: Path) -> None:
                 if not shown:
                     continue
                 x, y = np.array(shown).T
-                name = names.get(axis["axis"], "measured")
+                name = "descriptor" if axis["axis"] == "descriptor" else "circuit"
                 panel.loglog(x, y, "o-" if k == 0 else "s--", color=f"C{k}", label=name)
                 if k == 0:
                     panel.loglog(x, y[-1] * x / x[-1], ":", color="0.5", label="slope 1")
             panel.grid(visible=True, alpha=0.3)
-            if row == 0 and column < 2:
+            if row == column == 0:
                 panel.legend(fontsize=8)
         panels[1, column].set_xlabel(label)
     panels[0, 0].set_ylabel("seconds")

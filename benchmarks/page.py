@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from math import log
 from typing import Any
 
 Data = dict[str, Any]
 Row = dict[str, Any]
-PARTS = ("circuit", "gains", "problems", "cold", "growth", "floor", "recordings", "sweeps")
+PARTS = ("circuit", "gains", "problems", "cold", "growth", "recordings", "sweeps")
 
 
 def page(data: Data) -> str:
@@ -19,7 +19,6 @@ def page(data: Data) -> str:
         "problems": ("Published DAE problems", _problems),
         "cold": ("The command, cold", _cold),
         "growth": ("Growth", _growth),
-        "floor": ("The floor: LAPACK alone", _floor),
         "recordings": ("Long recordings", _recordings),
         "sweeps": ("Sweeps", _sweeps),
     }
@@ -87,9 +86,13 @@ def _ratio(row: Row) -> str:
     return "–" if row["ratio"] is None else f"{_digits(row['ratio'])} ×"
 
 
+def _valid(row: Row) -> bool:
+    """Whether both have solved the problem, so that their times can be compared."""
+    return row["verdict"] in ("ours faster", "peer faster")
+
+
 def _verdict(row: Row) -> str:
-    good = row["verdict"] in ("ours faster", "peer faster")
-    return row["verdict"] if good else f"**{row['verdict']}**"
+    return row["verdict"] if _valid(row) else f"**{row['verdict']}**"
 
 
 def _rows_table(rows: Sequence[Row], *, named: bool = False) -> str:
@@ -145,10 +148,7 @@ def _reached(data: Data) -> str:
 
 
 def _best(rows: Sequence[Row], who: str) -> str:
-    valid = [
-        row for row in rows
-        if row["peer"].startswith(who) and row["verdict"] in ("ours faster", "peer faster")
-    ]
+    valid = [row for row in rows if row["peer"].startswith(who) and _valid(row)]
     if not valid:
         return f"no {who} solver meets the target"
     texts = []
@@ -163,7 +163,7 @@ def _best(rows: Sequence[Row], who: str) -> str:
 def _problem_score(rows: Sequence[Row]) -> str:
     names = list(dict.fromkeys(row["name"] for row in rows))
     solved = {row["name"] for row in rows if row["verdict"] != "our error too large"}
-    valid = [row for row in rows if row["verdict"] in ("ours faster", "peer faster")]
+    valid = list(filter(_valid, rows))
     ahead = sum(row["verdict"] == "ours faster" for row in valid)
     return (
         f"{len(solved)} of {len(names)} solved; of {len(rows)} runs of peers {len(valid)} solve "
@@ -172,10 +172,9 @@ def _problem_score(rows: Sequence[Row]) -> str:
 
 
 def _exponents(axes: Sequence[dict[str, Any]]) -> str:
-    shown = [axis for axis in axes if axis["axis"] not in ("lti", "ltv")]
     return "; ".join(
         f"{axis['axis']}: time ^{_exponent(axis['seconds_exponent'])}, "
-        f"memory ^{_exponent(axis['bytes_exponent'])}" for axis in shown
+        f"memory ^{_exponent(axis['bytes_exponent'])}" for axis in axes
     )
 
 
@@ -232,9 +231,6 @@ def _problems(part: Data, rows: list[Row]) -> list[str]:
     cells = {(row["name"], row["peer"]): row for row in rows}
     names = list(dict.fromkeys(row["name"] for row in rows))
     index = {entry["name"]: str(entry["index"]) for entry in part.get("deriving", [])}
-    mark: Callable[[Row], str] = lambda row: (  # noqa: E731
-        _ratio(row) if row["verdict"].endswith("ahead") else _verdict(row).replace(": error", "")
-    )
     return [
         ("The problems of `tests/data/problems`, each over its own interval, the error of all "
         "states at 21 times against the solution in closed form. Ours starts from the plant's "
@@ -249,7 +245,8 @@ def _problems(part: Data, rows: list[Row]) -> list[str]:
             ["problem", "index", *peers],
             [
                 (name, index.get(name, ""),
-                 *(mark(cells[name, peer]) if (name, peer) in cells else "" for peer in peers))
+                 *("" if row is None else _ratio(row) if _valid(row) else _verdict(row)
+                   for row in (cells.get((name, peer)) for peer in peers)))
                 for name in names
             ],
         ),
@@ -304,7 +301,7 @@ def _growth(part: Data, _: list[Row]) -> list[str]:
         ("Each point in a process of its own, tolerance 1e-9; memory is what the work adds to the "
         "peak that imports reach. Exponents (time, memory) are slopes over the last three points."),
         table(["over", "value", "time", "memory", "exponents"], lines),
-        "![Time and memory over horizon, states, gains and samples](img/growth.png)",
+        "![Time and memory over horizon, gains and samples](img/growth.png)",
         *_ladders(part.get("ladders", [])),
     ]
 
@@ -350,26 +347,6 @@ def _slope(rows: list[Data], key: str, *, varying: bool) -> str:
     times = {row["n"]: row[key] for row in rows
              if row["kind"] == "index 1" and row["varying"] == varying and key in row}
     return f"{log(times[101] / times[11]) / log(101 / 11):.2f}"
-
-
-def _floor(part: Data, _: list[Row]) -> list[str]:
-    return [
-        ("The calls of `numpy.linalg` and `scipy.linalg` that a run without the compiled kernels "
-        "makes (`GPEBO_KERNELS=numpy`) are recorded and made again on the same arrays, with "
-        "nothing in between: the floor of a program in NumPy; products of matrices are not "
-        "counted. The rest of that run is spent in NumPy and Python themselves, and kernels make "
-        "this part smaller."),
-        table(
-            ["", "whole", "whole over LAPACK", "in NumPy", "LAPACK alone", "its share", "calls"],
-            [
-                (e["name"], duration(e["seconds"]), f"{_digits(e['over_floor'])} ×",
-                 duration(e["numpy_seconds"]), duration(e["lapack_seconds"]),
-                 f"{100 * e['share']:.0f} %",
-                 ", ".join(f"{count} {name}" for name, count in e["calls"].items()))
-                for e in part["table"]
-            ],
-        ),
-    ]
 
 
 def _recordings(part: Data, _: list[Row]) -> list[str]:
