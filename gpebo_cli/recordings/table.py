@@ -1,8 +1,8 @@
 """A recording as a table: which columns are the plant's signals, and their numbers, row by row.
 
-:class:`RowReader` says what a row may be, for files and for streams. Of a file pandas reads the
-rows, in pieces; where it meets anything but plain numbers the rows are read again one by one, to
-name the mistake with its source, line (the header is line 1) and column.
+:class:`RowReader` says what a row may be, for files and for streams. Of a file NumPy reads the
+rows; where it meets anything but plain numbers they are read again one by one, to name the mistake
+with its source, line (the header is line 1) and column.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ _WORDS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}  # as data.
 _NUMBER = r"[ \t]*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[ \t]*"
 MISSING = ("", "-", "nan", "na", "n/a", "null", "none")  # where data.missing allows it
 _BLANK = b" \t\r"
-_PIECE = 1 << 16  # rows that are text at the same time
+# Quotes, and what NumPy takes for spaces or the end of a line; or there are no rows at all.
+_UNUSUAL = re.compile(rb'["\0\v\f\r\x1c-\x1f\x80-\xff]|\A\s*\Z')
 _MOST_BYTES, _MOST_CELLS = 500_000_000, 25_000_000
 _LONGEST_LINE, _MOST_BLANK = 1 << 20, 1000
 _DATE = "a date and time as in 2024-05-31T12:00:00.250"
@@ -334,11 +335,10 @@ def _table(
 
 
 def _read_body(header: Header, data: DataSettings, body: bytes) -> Array:
-    """The rows below the header, (N, columns): by pandas, or one by one."""
-    plain = data.missing == "refuse" and data.time_unit != "datetime" and not data.gaps
-    if plain and not re.search(rb'\A\xef\xbb\xbf|["\r\v\f\0]', body) and _even(header, data, body):
-        values = _by_pandas(header, data, body)
-        if values is not None and not np.any(np.diff(values[:, 0]) <= 0):
+    """The rows below the header, (N, columns): by NumPy, or one by one."""
+    if data.time_unit != "datetime" and not data.gaps and _UNUSUAL.search(body) is None:
+        values = _plain_rows(header, data, body)
+        if values is not None and (np.diff(values[:, 0]) > 0).all():
             return values
     reader, numbers = RowReader(header, data), array("d")
     for line, text in enumerate(body.split(b"\n") if body else (), start=2):
@@ -347,37 +347,22 @@ def _read_body(header: Header, data: DataSettings, body: bytes) -> Array:
     return np.array(numbers).reshape(-1, len(header.names))
 
 
-def _even(header: Header, data: DataSettings, body: bytes) -> bool:
-    """Whether all lines have as many cells as the header."""
-    character = separator(data).encode()
-    if len(character) != 1 or not body:
-        return False
-    letters = np.frombuffer(body, dtype=np.uint8)
-    ends = np.append(np.flatnonzero(letters == ord("\n")), len(letters))
-    marks = np.flatnonzero(letters == ord(character))
-    return bool((np.diff(np.searchsorted(marks, ends), prepend=0) == header.width - 1).all())
-
-
-def _by_pandas(header: Header, data: DataSettings, body: bytes) -> Array | None:
-    """Rows of nothing but finite numbers, or None."""
-    from pandas import read_csv
-
-    number = re.compile(_NUMBER.replace(r"\.", re.escape(data.decimal))).fullmatch
-    pieces = []
-    for piece in read_csv(
-        io.BytesIO(body), header=None, names=list(range(header.width)), dtype=str,
-        usecols=list(header.positions), na_filter=False, skip_blank_lines=False,
-        sep=separator(data), quoting=csv.QUOTE_NONE, lineterminator="\n", chunksize=_PIECE,
-    ):
-        columns = [piece[k].tolist() for k in header.positions]
-        if not all(all(map(number, cells)) for cells in columns):
+def _plain_rows(header: Header, data: DataSettings, body: bytes) -> Array | None:
+    """Rows of nothing but numbers, which are all as wide as the header, or None."""
+    if data.decimal != ".":
+        if b"." in body:
             return None
-        if data.decimal != ".":
-            columns = [[cell.replace(data.decimal, ".") for cell in cells] for cells in columns]
-        numbers = np.array([list(map(float, cells)) for cells in columns])
-        pieces.append(numbers.T * header.scale)
-    values = np.concatenate(pieces)
-    return values if (np.abs(values) <= LARGEST).all() else None
+        body = body.replace(data.decimal.encode(), b".")
+    kinds = [(str(k), "f8" if k in header.positions else "S1") for k in range(header.width)]
+    try:
+        rows = np.loadtxt(
+            io.BytesIO(body), kinds, comments=None, delimiter=separator(data), ndmin=1
+        )
+    except ValueError:
+        return None
+    values = np.stack([rows[str(k)] for k in header.positions], axis=1) * header.scale
+    whole = len(rows) == body.count(b"\n") + 1  # it passes over empty lines
+    return values if whole and (np.abs(values) <= LARGEST).all() else None
 
 
 def _frame(path: str, kind: str, content: bytes) -> DataFrame:
