@@ -24,7 +24,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, build
-from gpebo_cli.observers.reduced.response import respond
+from gpebo_cli.regression.errors import respond
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.results.files import write_text
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings

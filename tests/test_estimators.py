@@ -20,7 +20,7 @@ from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
 from gpebo_cli.estimators._scalar import scalar_law, scalar_path
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
-from gpebo_cli.estimators.least_squares import SolvedEstimates
+from gpebo_cli.estimators.least_squares import solved
 from gpebo_cli.estimators.ls_drem import LsDrem
 from gpebo_cli.experiment.pipeline import run_experiment, stream, stream_verdict
 from gpebo_cli.model.plant import plant_from_mapping
@@ -706,10 +706,9 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     assert found.evidence["gamma_times_integral"] == pytest.approx(share * (1.0 + np.log(100.0)))
     # And where η̂ = Ω⁻¹𝒴, the last Ω of every case has to be regular.
     ends = [np.diag([1.0, 4.0]), np.diag([1e-11 if holds else 1e-13, 1.0])]
-    extended = tuple(np.array([[[0, 0, 0], [0, 0, 0]], np.eye(2, 3), np.eye(2, 3)]) for _ in ends)
-    for whole, end in zip(extended, ends, strict=True):
-        whole[-1, :, :2] = end
-    assert SolvedEstimates(extended).requirement.holds == holds
+    extended = np.tile(np.eye(2, 3), (2, 3, 1, 1))
+    extended[:, -1, :, :2] = ends
+    assert solved(extended).requirement.holds == holds
 
 
 # A plain field as an axis -----------------------------------------------------------------------

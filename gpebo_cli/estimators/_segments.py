@@ -14,10 +14,10 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.estimator import (
     Estimates,
     Estimator,
+    Found,
     Moving,
     Resumable,
     ResumableEstimates,
-    Unmixed,
 )
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
@@ -53,8 +53,9 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
     At a reset η̂ becomes T η̂ + τ and the extension ``ExtensionState.after``. A time at which
     there is a reset belongs to what follows it.
     """
-    if not regression.p:
-        return Nothing(len(estimator.cases), len(t))
+    if not regression.p:  # constraints alone determine the states
+        nothing = Requirement("none", True, {}, "there is nothing to estimate")
+        return Found(np.zeros((len(estimator.cases), len(t), 0)), nothing)
     if regression.dynamics is not None:
         moving = able(estimator, Moving, _FOLLOW)
         return moving.estimate_moving(regression, regression.dynamics, t)
@@ -73,19 +74,6 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
         times = np.append(own, segment.mesh.edges[-1])
         parts.append(resumable.resume(segment, times, known))
     return Chain(tuple(parts), regression.resets)
-
-
-@dataclass(frozen=True)
-class Nothing(Unmixed):
-    """Estimates of a regression without parameters: constraints alone determine the states."""
-
-    count: int  # of cases
-    times: int
-    requirement = Requirement("none", True, {}, "there is nothing to estimate")
-
-    def parameters(self, cases: slice) -> Array:
-        """Empty arrays for some cases, (g, M, 0)."""
-        return np.zeros((len(range(self.count)[cases]), self.times, 0))
 
 
 @dataclass(frozen=True, eq=False)

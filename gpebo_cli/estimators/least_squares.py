@@ -24,7 +24,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
-from gpebo_cli.regression.estimator import SampledEstimates, Unmixed
+from gpebo_cli.regression.estimator import Found, SampledEstimates, Unmixed
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known
 from gpebo_cli.regression.samples import SampledRegression, integrating
@@ -115,7 +115,7 @@ class LeastSquares(ResumableEstimator):
 
     def estimate_moving(
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
-    ) -> SolvedEstimates:
+    ) -> Found:
         """η̂ = F 𝒴 with F⁻¹ and 𝒴 from (f₀ I, f₀ η̂₀), at the times t (M,).
 
         They forget at the rate β + ρ (ConfigError: forgetting with a bound).
@@ -129,13 +129,13 @@ class LeastSquares(ResumableEstimator):
         start = self.start(regression.parameters)
         prior = np.column_stack([np.eye(p), start])
         ones = np.ones(p)
-        return SolvedEstimates(tuple(
+        return solved(np.array([
             filtered(
                 regression.outer, case["beta"] * ones, case["alpha"] * ones, dynamics,
                 case["f0"] * prior,
             )(t)
             for case in self.cases
-        ))
+        ]))
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> LeastSquaresEstimates:
         """Everything but the gains, at the times t (M,).
@@ -148,6 +148,24 @@ class LeastSquares(ResumableEstimator):
             self.cases, [at[id(info)] for info in infos], self.start(regression.parameters),
             tuple(info.reached for info in infos), regression.realisations,
         )
+
+
+def solved(extended: Array) -> Found:
+    """η̂ = F 𝒴 from [F⁻¹ | 𝒴] of every case (cases, M, p, p + 1) (SolverError: F⁻¹ is singular)."""
+    sigma = np.linalg.svd(extended[:, -1, :, :-1], compute_uv=False)
+    worst = float((sigma[:, -1] / sigma[:, 0]).min())
+    try:
+        eta = np.linalg.solve(extended[..., :-1], extended[..., -1:])[..., 0]
+    except np.linalg.LinAlgError as error:
+        raise SolverError(
+            "observer.remedy=current_coordinates: F⁻¹ is singular, because "
+            "A_0 has directions that decay too fast; use output_injection or reset"
+        ) from error
+    return Found(np.asarray(eta, dtype=np.float64), Requirement(
+        name="F⁻¹ regular", holds=worst >= _DIGITS,
+        evidence={"reciprocal_condition": worst, "needed": _DIGITS},
+        text=f"σ_min/σ_max of F⁻¹ is {worst:.2g} at the end; needed is {_DIGITS:.0e}",
+    ))
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,37 +271,6 @@ def solution(s: Spectrum, alpha: float, f0: float, start: Array) -> Array:
     slowness = weight + alpha * s.eigenvalues[..., None]
     coordinates = (weight * rotated_start + alpha * s.rotated) / slowness
     return np.asarray(s.vectors @ coordinates)
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedEstimates(Unmixed):
-    """η̂ = Ω⁻¹ 𝒴 of every case, from [Ω | 𝒴] (M, p, p + 1) with Ω > 0."""
-
-    extended: tuple[Array, ...]  # (M, p, p + 1) each
-    reached: tuple[ExtensionState, ...] = ()
-
-    @property
-    def requirement(self) -> Requirement:
-        """Ω has to be regular at the horizon."""
-        sigma = [np.linalg.svd(e[-1, :, :-1], compute_uv=False) for e in self.extended]
-        worst = min(float(s[-1] / s[0]) for s in sigma)
-        return Requirement(
-            name="F⁻¹ regular", holds=worst >= _DIGITS,
-            evidence={"reciprocal_condition": worst, "needed": _DIGITS},
-            text=f"σ_min/σ_max of F⁻¹ is {worst:.2g} at the end; needed is {_DIGITS:.0e}",
-        )
-
-    def parameters(self, cases: slice, start: Array | None = None) -> Array:  # noqa: ARG002
-        """η̂ of some cases, shape (g, M, p) (SolverError: Ω is singular at one of the times)."""
-        try:
-            return np.array([
-                np.linalg.solve(e[..., :-1], e[..., -1:])[..., 0] for e in self.extended[cases]
-            ])
-        except np.linalg.LinAlgError as error:
-            raise SolverError(
-                "observer.remedy=current_coordinates: F⁻¹ is singular, because "
-                "A_0 has directions that decay too fast; use output_injection or reset"
-            ) from error
 
 
 ESTIMATOR = LeastSquares

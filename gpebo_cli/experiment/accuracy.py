@@ -24,7 +24,7 @@ from gpebo_cli.experiment.sources import Source
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.observers import Observation, StateMap
-from gpebo_cli.observers._observation import AffineStateMap
+from gpebo_cli.observers._base import AffineStateMap
 from gpebo_cli.regression.linear import LinearRegression, least_squares
 
 _LATE = 0.25  # of a run: its end, where a deviation swings

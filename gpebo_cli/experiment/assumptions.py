@@ -23,7 +23,7 @@ from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.observers import Measurements, Observation, Observer, build
-from gpebo_cli.observers._observation import AffineStateMap
+from gpebo_cli.observers._base import AffineStateMap
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.constant import scales_of

@@ -41,7 +41,7 @@ from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
-from gpebo_cli.observers._observation import AffineStateMap, Differentiable, Filtering
+from gpebo_cli.observers._base import AffineStateMap, Differentiable, Filtering
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals

@@ -28,7 +28,7 @@ from gpebo_cli.experiment.pace import Pace
 from gpebo_cli.experiment.result import NoiseStatistics
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.observers._observation import Observation, Response
+from gpebo_cli.observers._base import Observation, Response
 from gpebo_cli.regression.estimator import Estimator
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import NoiseSettings

@@ -19,7 +19,7 @@ from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.mesh import Mesh
-from gpebo_cli.observers._observation import Differentiable, Observation
+from gpebo_cli.observers._base import Differentiable, Observation
 from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.estimator import Affine, Estimator
 from gpebo_cli.regression.linear import LinearRegression

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from gpebo_cli.model.descriptor import Array
 
@@ -33,14 +33,12 @@ class LinearEquation(NamedTuple):
 Monitor = Callable[[Array, tuple[Array, ...]], Iterable[tuple[Any, float | Array]]]
 
 
-class Renewal(Protocol):
+class Renewal(NamedTuple):
     """An equivalent value at every edge to continue with: a basis whose columns grow is changed."""
 
-    def state(self, reached: Array) -> Array:
-        """What (n, columns) replaces the limit from the left."""
-
-    def error(self, reached: Array, error: Array) -> Array:
-        """What becomes of small errors (e, n, columns) of that limit."""
+    state: Callable[[Array], Array]  # what replaces the limit from the left (n, columns)
+    # What becomes of small errors (e, n, columns) of that limit, which is the first argument
+    error: Callable[[Array, Array], Array]
 
 
 @dataclass(frozen=True)

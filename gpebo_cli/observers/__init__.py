@@ -17,23 +17,21 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import (
+    AffineStateMap,
     AtSamples,
+    InitialError,
     Measurements,
+    Observation,
     Observer,
     Reached,
     Recursion,
     Responding,
     Sampling,
     SignalNoise,
-    initial_extension,
-    output_scale,
-)
-from gpebo_cli.observers._observation import (
-    AffineStateMap,
-    InitialError,
-    Observation,
     StateMap,
     Truth,
+    initial_extension,
+    output_scale,
 )
 from gpebo_cli.registry import Registry
 from gpebo_cli.regression.linear import LinearRegression

@@ -34,7 +34,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, Monitor
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, Monitor, Renewal
 
 _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
 # Standard deviations below this share of the largest one, each in its unit (see _units), are
@@ -91,22 +91,16 @@ def pair(P: Array, estimate: Array) -> Array:
     return np.block([[np.eye(n), np.zeros((n, g))], [P, estimate]])
 
 
-class _Restart:
-    """(X₁, X₂ | x₁, x₂) ← (I, P | 0, ζ̂)."""
-
-    def state(self, reached: Array) -> Array:
-        return pair(*quotient(reached))
-
-    def error(self, reached: Array, error: Array) -> Array:
-        """δP = (δX₂ − P δX₁) X₁⁻¹ and δζ̂ = δx₂ − P δx₁ − δP x₁."""
-        n = len(reached) // 2
-        P, _ = quotient(reached)
-        rest = error[:, n:] - P @ error[:, :n]
-        dP = rest[..., :n] @ np.linalg.inv(reached[:n, :n])
-        out = np.zeros_like(error)
-        out[:, n:, :n] = dP
-        out[:, n:, n:] = rest[..., n:] - dP @ reached[:n, n:]
-        return out
+def _error_of_pair(reached: Array, error: Array) -> Array:
+    """δP = (δX₂ − P δX₁) X₁⁻¹ and δζ̂ = δx₂ − P δx₁ − δP x₁."""
+    n = len(reached) // 2
+    P, _ = quotient(reached)
+    rest = error[:, n:] - P @ error[:, :n]
+    dP = rest[..., :n] @ np.linalg.inv(reached[:n, :n])
+    out = np.zeros_like(error)
+    out[:, n:, :n] = dP
+    out[:, n:, n:] = rest[..., n:] - dP @ reached[:n, n:]
+    return out
 
 
 def _in_front(lost: BoolArray, found: list[Kind]) -> list[Kind]:
@@ -207,7 +201,8 @@ def run_filter(
         return _in_front(grown > _GROWTH, found)
 
     problem = LinearProblem(
-        coefficients, pair(P0 / variance, start), signals, name, renewal=_Restart()
+        coefficients, pair(P0 / variance, start), signals, name,
+        renewal=Renewal(lambda reached: pair(*quotient(reached)), _error_of_pair),
     )
     try:
         # The rounding of P(0) is what is left to resolve of a P that has fallen so far.

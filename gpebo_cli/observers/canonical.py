@@ -33,13 +33,15 @@ from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._base import Measurements, initial_extension, output_scale
-from gpebo_cli.observers._observation import (
+from gpebo_cli.observers._base import (
     InitialError,
+    Measurements,
     Observation,
     Reconstruction,
     StateMap,
+    initial_extension,
     log_norm,
+    output_scale,
 )
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.schema import unknown

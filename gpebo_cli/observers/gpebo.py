@@ -14,8 +14,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, GpeboError, SolverError
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.observers._base import Measurements, Sampling
-from gpebo_cli.observers._observation import AffineStateMap, Observation
+from gpebo_cli.observers._base import AffineStateMap, Measurements, Observation, Sampling
 from gpebo_cli.observers.reduced.condensed import condensed, thinned
 from gpebo_cli.observers.reduced.extension import reduced_system
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer

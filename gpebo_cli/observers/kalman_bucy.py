@@ -36,9 +36,15 @@ from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers._base import Measurements, SignalNoise
+from gpebo_cli.observers._base import (
+    AffineStateMap,
+    Filtering,
+    Measurements,
+    Observation,
+    Reconstruction,
+    SignalNoise,
+)
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
-from gpebo_cli.observers._observation import AffineStateMap, Filtering, Observation, Reconstruction
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
 from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
@@ -46,7 +52,7 @@ from gpebo_cli.observers.reduced.split import Split
 from gpebo_cli.observers.remedies.current_coordinates import CurrentState
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.reduction.form import EquationForm
-from gpebo_cli.regression.estimator import Unmixed
+from gpebo_cli.regression.estimator import Found
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings, SolverSettings
@@ -409,18 +415,6 @@ class Filter:
     observability: Requirement
     cases: tuple[Mapping[str, float], ...] = ({},)
 
-    def estimate(self, regression: LinearRegression, t: Array) -> KalmanBucyEstimates:  # noqa: ARG002
+    def estimate(self, regression: LinearRegression, t: Array) -> Found:  # noqa: ARG002
         """ζ̂ at the times t (M,)."""
-        return KalmanBucyEstimates(self.filtered.at(t)[1][None, :, :, 0], self.observability)
-
-
-@dataclass(frozen=True, eq=False)
-class KalmanBucyEstimates(Unmixed):
-    """ζ̂ at fixed times."""
-
-    values: Array  # (1, M, n)
-    requirement: Requirement
-
-    def parameters(self, cases: slice) -> Array:
-        """ζ̂ of some cases, (g, M, n)."""
-        return self.values[cases]
+        return Found(self.filtered.at(t)[1][None, :, :, 0], self.observability)

@@ -11,12 +11,13 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers._base import Measurements, Sampling
-from gpebo_cli.observers._observation import (
+from gpebo_cli.observers._base import (
     AffineStateMap,
+    Measurements,
     Observation,
     Reconstruction,
     SampledBlock,
+    Sampling,
     StateMap,
     Truth,
 )

@@ -5,8 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
+from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.problem import LinearEquation
+from gpebo_cli.numerics.collocation import solve
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+
+_RESPONSE = 1e-6  # error of the response to noise, which is known to no more digits than that
 
 
 class ErrorSystem(NamedTuple):
@@ -21,13 +28,6 @@ class ErrorSystem(NamedTuple):
     B: Array  # (N, S, I)
     C: Array  # (N, O, S)
     D: Array  # (N, O, I)
-
-
-    def driven(self, errors: Array, rows: int | None = None) -> LinearEquation:
-        """s' and as extras C and D i, for errors i (N, I, c), perhaps of the first outputs only."""
-        return LinearEquation(
-            None, self.A, self.B @ errors, (self.C[:, :rows], self.D[:, :rows] @ errors)
-        )
 
 
 # (times (N,), inside (N,)) -> the system there
@@ -52,3 +52,47 @@ class ErrorRecursion(NamedTuple):
     old: Array  # (K, S, rows)
     new: Array  # (K, S, rows)
     C: Array  # (K, p, S)
+
+
+def respond(mesh: Mesh, errors_at: ErrorsAt, rows: int, e_u: Array, e_y: Array) -> Array:
+    """What errors e_u (K, s + 1, m, c) and e_y (K, s + 1, r, c) add to Y, (K, s + 1, rows, c).
+
+    All columns in one solve on the mesh of the regression, in whose elements errors are smooth
+    (SolverError: the mesh does not resolve the response).
+    """
+    errors = Trajectory(mesh, np.concatenate([e_u, e_y], axis=2))
+    size = errors_at(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1]
+    added, _, error = driven(
+        errors_at, errors, mesh, np.zeros((size, e_y.shape[-1])), rows, tol=np.inf,
+        max_elements=mesh.size,
+    )
+    if error > _RESPONSE:
+        raise SolverError(
+            f"noise.seeds: the response to noise is resolved to {error:.1e} only; lower "
+            "noise.sample_time or solver.tol"
+        )
+    return added.values
+
+
+def driven(
+    errors_at: ErrorsAt, errors: Callable[[Array, Array], Array], mesh: Mesh, start: Array,
+    rows: int | None = None, *, tol: float, max_elements: int, floor: Array | float = 0.0,
+) -> tuple[Trajectory, Array, float]:
+    """What errors (N, m + r, c) add to Y and the offset, or to Y (rows, c), from ζ = ``start``.
+
+    Beside it stand ζ (k, c) at the end and an error estimate. Below sizes ``floor`` (k, c) ζ is not
+    resolved for its own sake.
+    """
+
+    def coefficients(t: Array, inside: Array) -> LinearEquation:
+        system, e = errors_at(t, inside), errors(t, inside)
+        return LinearEquation(
+            None, system.A, system.B @ e, (system.C[:, :rows], system.D[:, :rows] @ e)
+        )
+
+    problem = LinearProblem(
+        coefficients, start, name="response to errors of the signals", floor=floor
+    )
+    solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
+    z, (C, direct) = solution.trajectory, solution.extras
+    return Trajectory(z.mesh, C @ z.values + direct), z.final, solution.error_estimate

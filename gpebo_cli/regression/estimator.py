@@ -45,6 +45,18 @@ class Unmixed:
         """There is no Δ at any of the times t (M,)."""
 
 
+@dataclass(frozen=True, eq=False)
+class Found(Unmixed):
+    """Estimates of every case that are at hand."""
+
+    values: Array  # (cases, M, p)
+    requirement: Requirement
+
+    def parameters(self, cases: slice) -> Array:
+        """η̂ of some cases, (g, M, p)."""
+        return self.values[cases]
+
+
 class Estimator(Protocol):
     """Settings of one estimator; immutable."""
 

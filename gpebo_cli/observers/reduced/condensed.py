@@ -22,10 +22,8 @@ from numpy.polynomial import legendre
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers._base import Measurements
-from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation
-from gpebo_cli.observers.reduced.response import driven
-from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
+from gpebo_cli.observers._base import AffineStateMap, InitialError, Measurements, Observation
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem, driven
 from gpebo_cli.settings import SolverSettings
 
 _MANY = 8  # elements of the signals for each of those that they are thinned to

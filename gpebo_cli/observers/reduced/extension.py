@@ -18,8 +18,14 @@ from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.linalg import exact_product, largest_over_time
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._base import ByName, Measurements, initial_extension, output_scale
-from gpebo_cli.observers._observation import largest_entry, log_norm
+from gpebo_cli.observers._base import (
+    ByName,
+    Measurements,
+    initial_extension,
+    largest_entry,
+    log_norm,
+    output_scale,
+)
 from gpebo_cli.observers.reduced.matrices import (
     AlgebraicEquations,
     Injection,

@@ -34,6 +34,7 @@ from gpebo_cli.observers.reduced.split import (
 )
 from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
+from gpebo_cli.regression.errors import ErrorSystem
 
 _LACKING = 1e-8  # of the largest singular value of what constraints say of w: it is rounding
 
@@ -95,6 +96,19 @@ class ObserverMatrices:
     def residual(self) -> Array:
         """R = I − 𝒜 Q K, (N, e + r, e + r)."""
         return orthonormal_complement(self.range)
+
+    def errors(self, kept: IntArray | slice, inputs: int) -> ErrorSystem:
+        """What errors e of [u; y], m inputs, add to Y (rows ``kept`` (k,)) and to the offset.
+
+        ζ' = A_0 ζ + b_0(e),    δY = R (𝒜 ζ + g_y(e)),    δoffset = ζ − K (𝒜 ζ + g_y(e))
+        """
+        R, H, Q1 = self.residual[:, kept], self.elimination, transpose(self.range)
+        g = self.of_noise(self.g_signals, inputs)
+        return ErrorSystem(
+            self.dynamics, self.of_noise(self.from_signals, inputs),
+            joined(R @ self.on_basis, self.split.basis - H @ (Q1 @ self.on_basis), axis=1),
+            joined(R @ g, -H @ (Q1 @ g), axis=1),
+        )
 
     def equations(self, signals: Array) -> AlgebraicEquations:
         """The algebraic equations with the signals [v; y], (N, v + r, 1)."""

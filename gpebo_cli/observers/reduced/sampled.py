@@ -24,8 +24,7 @@ from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers._base import ByName
-from gpebo_cli.observers._observation import InitialError, SampledBlock, largest_entry
+from gpebo_cli.observers._base import ByName, InitialError, SampledBlock, largest_entry
 from gpebo_cli.observers.reduced.extension import begin_at, choose_form, measured, needed, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import (
@@ -34,7 +33,6 @@ from gpebo_cli.observers.reduced.regression import (
     resolve,
     term_sizes,
 )
-from gpebo_cli.observers.reduced.response import error_system
 from gpebo_cli.observers.reduced.split import comparable, split_in_frame, units_along
 from gpebo_cli.recordings.hold import edges, held
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives
@@ -199,7 +197,7 @@ class SampledObserver:
         errors = None
         if step is not None:
             own = slice(-system.r, None) if self.regression == "paper" else slice(None)
-            _, _, C, D = error_system(o, own, system.m)
+            _, _, C, D = o.errors(own, system.m)
             errors = ErrorSteps(step, *(
                 np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
             ))

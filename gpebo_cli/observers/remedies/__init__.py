@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from gpebo_cli.observers._observation import Observation
+from gpebo_cli.observers._base import Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.remedies.current_coordinates import CurrentCoordinates
 from gpebo_cli.observers.remedies.noise_free import NoiseFree

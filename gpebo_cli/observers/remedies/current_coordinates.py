@@ -20,7 +20,7 @@ import numpy as np
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
-from gpebo_cli.observers._observation import AffineStateMap, Observation
+from gpebo_cli.observers._base import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions
 from gpebo_cli.observers.reduced.matrices import weakest
 from gpebo_cli.observers.reduced.regression import Assembled, regression_signals

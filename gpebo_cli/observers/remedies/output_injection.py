@@ -30,7 +30,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
-from gpebo_cli.observers._observation import Observation
+from gpebo_cli.observers._base import Observation
 from gpebo_cli.observers._riccati import StateSpace, run_filter
 from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.observers._observation import AffineStateMap, InitialError, Observation, Truth
+from gpebo_cli.observers._base import AffineStateMap, InitialError, Observation, Truth
 from gpebo_cli.observers.reduced.extension import Extension, ReducedSystem, assumptions, extend
-from gpebo_cli.observers.reduced.response import errors_of, respond
+from gpebo_cli.regression.errors import respond
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import Reset
 
@@ -47,7 +47,9 @@ def observation(
     noisy = np.arange(system.m + system.r) >= system.m  # of a recording, unless levels are said
     if noise is not None and noise.variances.any():
         noisy = noise.variances > 0.0
-    errors = None if reduced.form.noise_enters(noisy) else errors_of(reduced, kept)
+    errors = None if reduced.form.noise_enters(noisy) else (
+        lambda t, inside: reduced.matrices(t, inside).errors(kept, system.m)
+    )
     return Observation(
         regression=LinearRegression(
             Y=mesh.trajectory(final.Y[:, some]), psi=mesh.trajectory(final.psi[:, some]),

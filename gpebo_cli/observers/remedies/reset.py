@@ -27,7 +27,7 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._observation import InitialError, Observation, log_norm
+from gpebo_cli.observers._base import InitialError, Observation, log_norm
 from gpebo_cli.observers.reduced.extension import Extension, ReducedSystem, Start, extend, joined
 from gpebo_cli.observers.reduced.split import comparable
 from gpebo_cli.observers.remedies.plain import observation
