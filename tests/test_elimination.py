@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gpebo_cli.numerics.elimination import Eliminated, StiffError
+from gpebo_cli.numerics.elimination import StiffError, by_elimination
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.series import sparse
@@ -22,8 +22,8 @@ def system(rng, count, varying=True):
     return A, sparse(A)
 
 
-def solved(march, matrix, f, kicks, start, h=H):
-    return march(Mesh(np.append(0.0, np.cumsum(h)), RULE), matrix, f, kicks, start, 0.0)
+def solved(matrix, f, kicks, start, h=H):
+    return by_elimination(Mesh(np.append(0.0, np.cumsum(h)), RULE), matrix, f, kicks, start, 0.0)
 
 
 def dense(A, f, kicks, start, h=H):
@@ -49,25 +49,9 @@ def test_the_solution_is_that_of_dense_systems(varying, kicked):
     A, matrix = system(rng, len(H), varying)
     f, start = rng.normal(size=(len(H) * (S + 1), D, 1)), rng.normal(size=(D, 2))
     kicks = rng.normal(size=(len(H), D, 2)) if kicked else None
-    values, left = solved(Eliminated(), matrix, f, kicks, start)
+    values, left = solved(matrix, f, kicks, start)
     np.testing.assert_allclose(values, dense(A, f, kicks, start), rtol=1e-10, atol=1e-13)
     assert left.max() < 1e-14
-
-
-def test_factors_that_are_kept_are_those_of_their_elements():
-    rng = np.random.default_rng(2)
-    A, matrix = system(rng, len(H))
-    f, start = rng.normal(size=(len(H) * (S + 1), D, 1)), rng.normal(size=(D, 1))
-    march = Eliminated()
-    solved(march, matrix, f, None, start)
-    order = [3, 0, 2, 2]
-    points = (np.array(order)[:, None] * (S + 1) + np.arange(S + 1)).ravel()
-    h = np.array([0.7, 0.2, 0.01, 0.01])  # the second element is another one
-    again = matrix._replace(entries=matrix.entries[points])
-    values, _ = solved(march, again, f, None, start, h)
-    np.testing.assert_allclose(
-        values, dense(A[points], f, None, start, h), rtol=1e-10, atol=1e-13
-    )
 
 
 def test_pivots_that_harm_are_seen():
@@ -76,7 +60,7 @@ def test_pivots_that_harm_are_seen():
     real = float(largest[np.abs(largest.imag) < 1e-9].real[0])
     A = -np.eye(D)[None]
     A[0, 0, 0], A[0, 0, 1], A[0, 1, 0] = real / H[0] * (1.0 + 1e-13), 1.0, -1.0
-    _, left = solved(Eliminated(), sparse(A), np.zeros((1, D, 0)), None, np.ones((D, 1)), H[:1])
+    _, left = solved(sparse(A), np.zeros((1, D, 0)), None, np.ones((D, 1)), H[:1])
     assert left.max() > 1e-13
 
 
@@ -84,4 +68,4 @@ def test_what_elimination_fills_is_refused():
     A = np.random.default_rng(3).normal(size=(1, 60, 60))
     A[0][np.random.default_rng(4).uniform(size=(60, 60)) < 0.75] = 0.0
     with pytest.raises(StiffError):
-        solved(Eliminated(), sparse(A), np.zeros((1, 60, 0)), None, np.ones((60, 1)))
+        solved(sparse(A), np.zeros((1, 60, 0)), None, np.ones((60, 1)))

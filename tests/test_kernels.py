@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from gpebo_cli import kernels
+from gpebo_cli.numerics.elimination import steps_of
 from gpebo_cli.numerics.linalg import affine_scan, largest
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.derivative_array import forcing
@@ -108,15 +109,15 @@ def _series(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True, most
     )
 
 
-def _steps(rng, k=5, s=4, d=3, c=2, forced=1, kicked=True, one=False):
-    """Steps of an elimination, of which the last blocks are diagonal."""
-    target, source = rng.integers(0, d, size=(2, 20))
+def _stiff(rng, k=5, s=4, c=2, forced=1, kicked=True, one=False):
+    """A ring of five states, which elimination fills, one row of it empty."""
+    rows, columns = np.array([0, 3, 6, 9, 9, 12]), np.array([0, 1, 4, 0, 1, 2, 1, 2, 3, 0, 3, 4])
     points = 1 if one else k * (s + 1)
     return (
-        rng.normal(size=(k, s)), rng.integers(0, 3, size=k), target, source,
-        rng.integers(0, 5, size=20), 0.3 * rng.normal(size=(3, 2, s, s)),
-        0.3 * rng.normal(size=(3, 3, s)), rng.normal(size=(points, d, forced)),
-        rng.normal(size=(k, d, c)) if kicked else None, rng.normal(size=(d, c)),
+        radau_rule(s).differentiation, np.full(k, 0.3) if one else rng.uniform(0.1, 0.3, size=k),
+        *steps_of(rows.tobytes(), columns.tobytes()), rng.normal(size=(points, 12)),
+        rng.normal(size=(points, 5, forced)), rng.normal(size=(k, 5, c)) if kicked else None,
+        rng.normal(size=(5, c)),
     )
 
 
@@ -255,7 +256,7 @@ CASES: list[tuple[str, str, Case]] = [
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
         {"k": 1, "d": 1, "c": 3, "forced": 3}, {"c": 12}, {"most": 9},
     )),
-    *(("elements", "substituted", partial(_steps, **options)) for options in (
+    *(("elements", "stiff", partial(_stiff, **options)) for options in (
         {}, {"s": 14, "c": 1, "one": True}, {"forced": 0, "kicked": False},
     )),
     ("signals", "tails", _signal),
@@ -355,6 +356,7 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("chain", _maps, 2, np.s_[:-1]),
     *(("carried_errors", _carried, place, np.s_[:-1]) for place in (1, 3, 4, 5, 6, 7)),
     *(("carried_errors", _carried, place, np.s_[:, :-1]) for place in (0, 3, 4, 5, 6)),
+    *(("stiff", _stiff, place, np.s_[:-1]) for place in (0, 1, 2, 5, 6, 7, 8)),
     ("tails", _signal, 1, np.s_[:-1]),
     ("tails", partial(_signal, least=True), 6, np.s_[:-1]),
     ("sample", _samples, 1, np.s_[:-1]),

@@ -230,27 +230,20 @@ static inline int all_finite(const double *values, npy_intp count)
     return !bad;
 }
 
-/* Values (K, s + 1, n, columns) ; returns how many elements in front are finite. */
-EVERY_WIDTH static npy_intp link_up(double *out, const double *H, npy_intp apart, const double *P,
-                                    const double *state, npy_intp K, npy_intp s, npy_intp n,
-                                    npy_intp columns)
+/* Maps, particular solutions, start -> values, and how many elements in front are finite. */
+EVERY_WIDTH static Outcome chain(Call *call)
 {
-    const npy_intp block = n * columns;
-    npy_intp whole = 0;
-    for (npy_intp k = 0; k < K; k++, out += (s + 1) * block) {
+    const npy_intp s = SIZE(s), n = SIZE(n), c = SIZE(c), block = n * c;
+    const double *state = call->in[2];
+    double *out = call->out[0], whole = 0.0;
+    for (npy_intp k = 0; k < SIZE(K); k++, out += (s + 1) * block) {
         memcpy(out, state, block * sizeof(double));
-        affine(out + block, H + k * apart, out, P + k * s * block, s * n, n, columns);
-        whole += whole == k && all_finite(out, (s + 1) * block);
+        affine(out + block, call->in[0] + k * call->step[0], out, call->in[1] + k * s * block,
+               s * n, n, c);
+        whole += whole == (double)k && all_finite(out, (s + 1) * block);
         state = out + s * block;
     }
-    return whole;
-}
-
-/* Maps, particular solutions, start -> values, and how many elements in front are finite. */
-static Outcome chain(Call *call)
-{
-    call->out[1][0] = (double)link_up(call->out[0], call->in[0], call->step[0], call->in[1],
-                                      call->in[2], SIZE(K), SIZE(s), SIZE(n), SIZE(c));
+    call->out[1][0] = whole;
     return DONE;
 }
 
@@ -501,56 +494,140 @@ static Outcome series(Call *call)
     return DONE;
 }
 
-/* The steps of an elimination in one element: right-hand sides b and solutions x (d, c, s). */
-EVERY_WIDTH static void substitute(const Call *call, npy_intp g, double *b, double *x)
+#define EACH_NODE _Pragma("omp simd") for (int n = 0; n < MOST_STAGES; n++)
+typedef double Nodes[MOST_STAGES]; /* zeros after the last stage */
+
+/* D/h ⊗ I − A of an element: full blocks of s rows, transposed, and diagonal ones behind them. */
+typedef struct {
+    npy_intp s, full;
+    Nodes *block, *diagonal;
+} Blocks;
+
+/* to += B by. */
+INLINE void apply(const Blocks *q, npy_intp place, const double *by, double *to)
 {
-    const npy_intp s = SIZE(s), size = SIZE(c) * s, F = SIZE(F);
-    for (npy_intp m = 0; m < SIZE(m); m++) {
-        const npy_intp t = call->index[2][m], from = call->index[3][m], block = call->index[4][m];
-        double *by = (t == from ? b : x) + from * size, *to = (t == from ? x : b) + t * size;
-        const double *B = call->in[5] + (g * F + block) * s * s;
-        const double *diagonal = call->in[6] + (g * SIZE(T) + block - F) * s;
-        for (npy_intp i = 0; i < size; i += s) {
-            if (block < F)
-                combine(to + i, to + i, by + i, s, B, s, s);
-            for (npy_intp j = 0; block >= F && j < s; j++)
-                to[i + j] += diagonal[j] * by[i + j];
+    const double *row = place < q->full ? q->block[place * q->s] : q->diagonal[place - q->full];
+    Nodes sum;
+    EACH_NODE sum[n] = to[n];
+    for (npy_intp j = 0; place < q->full && j < q->s; j++, row += MOST_STAGES)
+        EACH_NODE sum[n] += by[j] * row[n];
+    if (place >= q->full)
+        EACH_NODE sum[n] += by[n] * row[n];
+    EACH_NODE to[n] = sum[n];
+}
+
+/* A block's inverse in its place, by row pivots; not finite where there is none. */
+INLINE void invert(Nodes *a, npy_intp s)
+{
+    npy_intp other[MOST_STAGES];
+    for (npy_intp k = 0; k < s; k++) {
+        Nodes factor = {0.0}, row;
+        for (npy_intp i = 0; i < s; i++) { /* at once: a row just written to is slow to read */
+            factor[i] = a[i][k];
+            a[i][k] = 0.0;
         }
-        if (t == from)
-            memset(by, 0, size * sizeof(double));
+        double most = fabs(factor[k]);
+        for (npy_intp i = other[k] = k; i < s; i++)
+            if (fabs(factor[i]) > most)
+                most = fabs(factor[other[k] = i]);
+        EACH_NODE row[n] = a[other[k]][n];
+        row[k] = 1.0;
+        EACH_NODE row[n] *= 1.0 / factor[other[k]];
+        memcpy(a[other[k]], a[k], sizeof(Nodes));
+        factor[other[k]] = factor[k];
+        for (npy_intp i = 0; i < s; i++)
+            EACH_NODE a[i][n] -= factor[i] * row[n];
+        memcpy(a[k], row, sizeof(Nodes));
+    }
+    for (npy_intp k = s - 1; k >= 0; k--)
+        for (npy_intp i = 0; i < s && other[k] != k; i++)
+            swap_rows(a[i] + k, a[i] + other[k], 1);
+}
+
+/* Eliminates in element k: inverts pivots, and adds products left · pivot · right to blocks. */
+EVERY_WIDTH static void factorise(const Call *call, const Blocks *q, npy_intp k)
+{
+    const npy_intp s = q->s, d = SIZE(d), *from = call->index[2], *step = call->index[3];
+    Nodes slopes[MOST_STAGES + 1] = {{0.0}};
+    for (npy_intp i = 0; i < s; i++) {
+        const double *A = call->in[5] + (k * (s + 1) + 1 + i) * call->step[5];
+        for (npy_intp e = 0; e < SIZE(e); e++)
+            q->diagonal[e][i] = A[e];
+        for (npy_intp j = 0; j < s; j++)
+            slopes[i][j] = call->in[0][j * s + i] / call->in[1][k];
+    }
+    for (npy_intp r = 0; r < q->full * s; r++) {
+        const npy_intp own = r < d * s, e = from[r / s], i = r % s;
+        memcpy(q->block[r], slopes[own ? i : s], sizeof(Nodes));
+        if (e >= 0)
+            q->block[r][i] += own ? -q->diagonal[e][i] : q->diagonal[e][i];
+    }
+    for (npy_intp m = 0; m < SIZE(o); m++, step += 4) {
+        const npy_intp right = step[3] - q->full;
+        Nodes *to = q->block + step[0] * s, *pivot = q->block + step[2] * s;
+        if (to == pivot)
+            invert(to, s);
+        for (npy_intp i = 0; i < s && to != pivot; i++) {
+            Nodes row = {0.0}, sum = {0.0};
+            if (right < 0)
+                apply(q, step[2], q->block[step[3] * s + i], row);
+            else
+                EACH_NODE row[n] = q->diagonal[right][i] * pivot[i][n];
+            apply(q, step[1], row, sum);
+            EACH_NODE to[i][n] += step[0] < d ? -sum[n] : sum[n];
+        }
     }
 }
 
-/* Solves one element after the other by the steps of an elimination; see elements_numpy.py. */
-static Outcome substituted(Call *call)
+/* Solves one element after the other by elimination; see elements_numpy.py. */
+EVERY_WIDTH static Outcome stiff(Call *call)
 {
-    const npy_intp s = SIZE(s), d = SIZE(d), c = SIZE(c), forced = SIZE(f), size = d * c;
-    const npy_intp blocks = SIZE(F) + SIZE(T), limit[] = {SIZE(G), d, d, blocks};
-    for (int i = 1; i < 5; i++)
-        for (npy_intp m = 0; m < (i > 1 ? SIZE(m) : SIZE(K)); m++)
-            if (call->index[i][m] < 0 || call->index[i][m] >= limit[i - 1])
-                return refused("an index", call->index[i][m]);
-    if (forced > c || (SIZE(Q) != 1 && SIZE(Q) != SIZE(K) * (s + 1)))
-        return refused("columns, or points of the forcing", SIZE(Q));
-    double *b = scratch(call, (2 * s + 1) * size), *x = b + s * size, *state = x + s * size;
-    if (b == NULL)
+    const npy_intp K = SIZE(K), s = SIZE(s), d = SIZE(d), c = SIZE(c), forced = SIZE(f);
+    const npy_intp B = SIZE(B), all = B + SIZE(e), size = d * c, width[] = {1, 4, 3};
+    const npy_intp count[] = {B, SIZE(o), SIZE(m)}, step = call->step[6];
+    const npy_intp limit[][4] = {{SIZE(e)}, {B, all, B, all}, {d, d, all}};
+    for (int i = 0; i < 3; i++)
+        for (npy_intp m = 0; m < count[i] * width[i]; m++)
+            if (call->index[2 + i][m] < -!i || call->index[2 + i][m] >= limit[i][m % width[i]])
+                return refused("an index", call->index[2 + i][m]);
+    if (s > MOST_STAGES || forced > c || B < d || (SIZE(P) != 1 && SIZE(P) != K * (s + 1)) ||
+        (SIZE(Q) != 1 && SIZE(Q) != K * (s + 1)))
+        return refused("stages, columns, blocks, or points of all elements", s);
+    const npy_intp rows = B * s + SIZE(e) + 2 * size;
+    Blocks q = {s, B, (Nodes *)scratch(call, rows * MOST_STAGES + size), NULL};
+    if (q.block == NULL)
         return ERROR;
-    memcpy(state, call->in[9], size * sizeof(double));
-    for (npy_intp k = 0; k < SIZE(K); k++) {
+    Nodes *b = memset(q.block, 0, rows * sizeof(Nodes)), *x = b + rows - size, slope = {0.0};
+    double *state = memcpy(b + rows, call->in[8], size * sizeof(double));
+    q.diagonal = b + B * s;
+    b = x - size;
+    for (npy_intp i = 0; i < s * s; i++)
+        slope[i / s] += call->in[0][i];
+    for (npy_intp k = 0; k < K; k++) {
         double *out = call->out[0] + k * (s + 1) * size;
-        const npy_intp step = call->step[7];
-        const double *f = call->in[7] + (k * (s + 1) + 1) * step, *left = call->in[0] + k * s;
+        const double *f = call->in[6] + (k * (s + 1) + 1) * step, h = call->in[1][k];
+        if (k == 0 || call->step[5] || h != call->in[1][k - 1])
+            factorise(call, &q, k);
         memcpy(out, state, size * sizeof(double));
+        memset(x, 0, size * sizeof(Nodes));
         for (npy_intp i = 0; i < size; i++)
             for (npy_intp j = 0; j < s; j++)
-                b[i * s + j] = left[j] * state[i] +
-                               (i % c < forced ? f[j * step + i / c * forced + i % c] : 0.0);
-        memset(x, 0, s * size * sizeof(double));
-        substitute(call, call->index[1][k], b, x);
+                b[i][j] = slope[j] / h * state[i] +
+                          (i % c < forced ? f[j * step + i / c * forced + i % c] : 0.0);
+        for (npy_intp m = 0; m < SIZE(m) * c; m++) {
+            const npy_intp *now = call->index[4] + m / c * 3;
+            double *to = b[now[0] * c + m % c];
+            if (now[0] != now[1]) {
+                apply(&q, now[2], x[now[1] * c + m % c], to);
+                continue;
+            }
+            apply(&q, now[2], to, x[now[0] * c + m % c]);
+            memset(to, 0, sizeof(Nodes));
+        }
         for (npy_intp i = 0; i < size; i++) {
             for (npy_intp j = 0; j < s; j++)
-                out[(j + 1) * size + i] = x[i * s + j];
-            state[i] = x[i * s + s - 1] + (call->in[8] ? call->in[8][k * size + i] : 0.0);
+                out[(j + 1) * size + i] = x[i][j];
+            state[i] = x[i][s - 1] + (call->in[7] ? call->in[7][k * size + i] : 0.0);
         }
     }
     return DONE;
@@ -561,6 +638,6 @@ const Kernel element_kernels[] = {
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
     {"carried_errors", "Ktnc tt u K?nn K?nc K?nv K+nw K # # # # v=n+c", "Knc 5nc", carried_errors},
     {"series", "s K @K @d+ @e P?eg P?g P?udf |Kdc dc d # #", "Ks+dc K", series},
-    {"substituted", "Ks @K @m @m @m GFss GTs Q?df |Kdc dc", "Ks+dc", substituted},
+    {"stiff", "ss K @B @o4 @m3 P?e Q?df |Kdc dc", "Ks+dc", stiff},
     {NULL, NULL, NULL, NULL},
 };

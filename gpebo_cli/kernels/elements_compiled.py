@@ -56,4 +56,4 @@ def carried_errors(
 
 
 series = _compiled.series
-substituted = _compiled.substituted
+stiff = _compiled.stiff

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gpebo_cli.kernels.arrays import Array, IntArray
+from gpebo_cli.kernels.arrays import Array, IntArray, inverses
 
 _EPS, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 _ORDERS = 48  # of a series
@@ -219,30 +219,43 @@ def series(
     return values, changes
 
 
-def substituted(
-    left: Array, place: IntArray, target: IntArray, source: IntArray, block: IntArray, full: Array,
-    diagonal: Array, f: Array, kicks: Array | None, start: Array,
+def stiff(
+    D: Array, h: Array, origin: IntArray, products: IntArray, steps: IntArray, A: Array, f: Array,
+    kicks: Array | None, start: Array,
 ) -> Array:
     """Values of (D/h ⊗ I − A) X = D𝟙/h x_0 + f by elimination, one element after the other.
 
-    With a right-hand side b, and x = 0, in each step x_t += B b_t and then b_t = 0, where the
-    target t is the source; else b_t += B x_s. With ``left`` D𝟙/h (K, s), the ``place`` of each
-    element (K,) among the G factors, the target, source and B of each step (m,), where B are so
-    many in ``full``, transposed (G, F, s, s), and counted on in ``diagonal`` (G, T, s); the rest is
-    as of :func:`series`.
+    There are full blocks (s, s): D/h less a diagonal one for each state, and others that are zero
+    or a diagonal one to begin with. Diagonal ones are entries A (P or 1, e) at the nodes: those
+    that ``origin`` (B,) says, or none for −1; their own numbers are from B on. ``products`` (o, 4)
+    say what is done to block t with l, p and r: it becomes its inverse if t is p, else l p r is
+    added, or taken from a state's own. Then, with a right-hand side b and x = 0, ``steps`` (m, 3)
+    say target t, source i and block Z: x_t += Z b_t and then b_t = 0, if t is i; else b_t += Z x_i.
+    The rest is as of :func:`series`, with f (Q or 1, d, f).
     """
-    (K, s), (d, columns), F = left.shape, start.shape, full.shape[1]
+    (K, s), (d, columns) = (len(h), len(D)), start.shape
+    diagonal = np.moveaxis(at_nodes(A, K, s), 2, 0)[..., None] * np.eye(s)
+    none = np.zeros((K, s, s))
+    blocks = [
+        D / h[:, None, None] - (diagonal[e] if e >= 0 else none) if i < d
+        else diagonal[e] if e >= 0 else none for i, e in enumerate(origin.tolist())
+    ]
+    blocks += list(diagonal)
+    for t, left, pivot, right in products.tolist():
+        if t == pivot:
+            blocks[t] = inverses(blocks[t])
+        else:
+            more = blocks[left] @ blocks[pivot] @ blocks[right]
+            blocks[t] = blocks[t] - more if t < d else blocks[t] + more
     values, state = np.empty((K, s + 1, d, columns)), start
-    steps = list(zip(target.tolist(), source.tolist(), block.tolist(), strict=True))
-    for k, g in enumerate(place.tolist()):
-        right = state[:, None] * left[k, :, None]
+    for k, slope in enumerate(D.sum(axis=1) / h[:, None]):
+        right = state[:, None] * slope[:, None]
         given = f if len(f) == 1 else f[k * (s + 1) + 1 : (k + 1) * (s + 1)]
         right[:, :, : f.shape[2]] += np.moveaxis(given, 0, 1)
         b, x = list(right), [np.zeros((s, columns))] * d
-        for t, r, i in steps:
-            by = b[t] if t == r else x[r]
-            term = full[g, i].T @ by if i < F else diagonal[g, i - F, :, None] * by
-            if t == r:
+        for t, i, block in steps.tolist():
+            term = blocks[block][k] @ (b[t] if t == i else x[i])
+            if t == i:
                 x[t], b[t] = x[t] + term, np.zeros((s, columns))
             else:
                 b[t] = b[t] + term

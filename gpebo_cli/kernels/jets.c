@@ -138,22 +138,6 @@ static PyObject *repeated(PyArrayObject *once, npy_intp times)
     return view;
 }
 
-/* The same as an array of its own, to write into; NULL with an exception. */
-static PyObject *filled(PyArrayObject *once, npy_intp times)
-{
-    npy_intp shape[MOST_AXES];
-    memcpy(shape, PyArray_DIMS(once), PyArray_NDIM(once) * sizeof(npy_intp));
-    shape[1] = times;
-    PyObject *out = PyArray_SimpleNew(PyArray_NDIM(once), shape, NPY_DOUBLE);
-    const npy_intp entries = PyArray_SIZE(once) / shape[0];
-    double *to = out ? PyArray_DATA((PyArrayObject *)out) : NULL;
-    const double *from = PyArray_DATA(once);
-    for (npy_intp k = 0; out && k < shape[0]; k++, from += entries)
-        for (npy_intp i = 0; i < times; i++, to += entries)
-            memcpy(to, from, entries * sizeof(double));
-    return out;
-}
-
 enum { FIRST = 7 }; /* argument that is a matrix */
 
 /* Whether the matrices and the targets in them fit; marks those that vary. */
@@ -202,7 +186,11 @@ static PyObject *make_matrices(const Call *call, const int *varies, double **out
     PyObject *answer = PyTuple_New(matrices);
     for (npy_intp m = 0; answer != NULL && m < matrices; m++) {
         PyArrayObject *once = call->array[FIRST + m];
-        PyObject *matrix = varies[m] ? filled(once, SIZE(N)) : repeated(once, SIZE(N));
+        PyObject *view = repeated(once, SIZE(N)), *matrix = view;
+        if (view != NULL && varies[m]) { /* then it is written into */
+            matrix = PyArray_NewCopy((PyArrayObject *)view, NPY_CORDER);
+            Py_DECREF(view);
+        }
         if (matrix == NULL) {
             Py_DECREF(answer);
             return NULL;

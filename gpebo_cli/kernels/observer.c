@@ -128,21 +128,10 @@ static int prepare(Call *call, Frame *f)
    many times there are of E⁺, of 𝒜, of G and of the dynamics -> see observer_numpy.py. */
 static Outcome in_frame(Call *call)
 {
-    Frame f = {.n = SIZE(n),
-               .m = SIZE(m),
-               .q = SIZE(q),
-               .r = SIZE(r),
-               .d = SIZE(d),
-               .b = SIZE(b),
-               .e = SIZE(e),
-               .all = SIZE(i),
-               .width = SIZE(d) + SIZE(q) + SIZE(k),
-               .rows = call->in[5],
-               .scale = call->in[6],
-               .domain = call->in[7],
-               .range = call->in[8],
-               .kernel = call->in[9],
-               .equations = call->in[10]};
+    Frame f = {.rows = call->in[5], .scale = call->in[6], .domain = call->in[7]};
+    f.range = call->in[8], f.kernel = call->in[9], f.equations = call->in[10];
+    f.n = SIZE(n), f.m = SIZE(m), f.q = SIZE(q), f.r = SIZE(r), f.d = SIZE(d), f.b = SIZE(b);
+    f.e = SIZE(e), f.all = SIZE(i), f.width = SIZE(d) + SIZE(q) + SIZE(k);
     const npy_intp N = SIZE(N), n = f.n, k = f.m + f.r, all = f.all, width = f.width;
     const npy_intp times[] = {SIZE(x), SIZE(y), SIZE(z), SIZE(w)};
     for (int i = 0; i < 4; i++)

@@ -34,21 +34,4 @@ int orthogonalise(double *W, npy_intp rows, npy_intp length, double *sigma);
 /* Sorts sigma (count,) from large to small, and the rows of W (count, length) with it. */
 void sort_down(double *sigma, double *W, npy_intp count, npy_intp length);
 
-/* C = A B for matrices by rows, A (rows, inner), B (inner, columns); C may be neither. */
-static inline void multiply(double *restrict C, const double *restrict A, const double *restrict B,
-                            npy_intp rows, npy_intp inner, npy_intp columns)
-{
-    for (npy_intp i = 0; i < rows; i++) {
-        double *restrict row = C + i * columns;
-        for (npy_intp j = 0; j < columns; j++)
-            row[j] = 0.0;
-        for (npy_intp k = 0; k < inner; k++) {
-            const double a = A[i * inner + k];
-            const double *restrict b = B + k * columns;
-            for (npy_intp j = 0; j < columns; j++)
-                row[j] += a * b[j];
-        }
-    }
-}
-
 #endif

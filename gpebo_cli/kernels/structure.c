@@ -1,6 +1,7 @@
 /* Derivative arrays at single times: singular values, and where they carry their rank. */
 #include "structure.h"
 
+#include "elements.h"
 #include "orthogonal.h"
 
 /* What there is to see at one time. */
@@ -145,7 +146,8 @@ static int look_at(const Model *m, npy_intp t, npy_intp constraints, double rank
     for (npy_intp i = 0; i < a; i++)
         for (npy_intp j = 0; j < size; j++)
             look->Z2[i * size + look->order[j]] = look->W[i * size + j];
-    multiply(look->A2, look->Z2, look->a, a, size, n); /* N is a_0 … a_mu, one below the other */
+    for (npy_intp i = 0; i < a; i++) /* N is a_0 … a_mu, one below the other */
+        combine(look->A2 + i * n, NULL, look->Z2 + i * size, size, look->a, n, n);
     triangularise(look->A2, a, n, look->mirrors, look->order);
     if (!triangular_values(look->A2, a, n, look->square, look->sigma))
         return 0;
@@ -194,12 +196,10 @@ static Outcome levels(Call *call)
     return DONE;
 }
 
-/* Rows and columns of left (size, size) that carry its rank, `count` of them first and the others
-   behind them, each in their order: elimination with complete pivoting. 0 if a pivot is zero. */
+/* Flags `count` rows and columns of left (size, size) that carry its rank, by elimination with
+   complete pivoting. 0 if a pivot is zero. */
 static int pivots(double *left, npy_intp size, npy_intp count, npy_intp *rows, npy_intp *columns)
 {
-    for (npy_intp i = 0; i < size; i++)
-        rows[i] = columns[i] = 0;
     for (npy_intp k = 0; k < count; k++) {
         npy_intp best = 0;
         for (npy_intp i = 1; i < size * size; i++)
@@ -223,21 +223,8 @@ static int pivots(double *left, npy_intp size, npy_intp count, npy_intp *rows, n
     return 1;
 }
 
-/* Turns flags (size,) into the places that are flagged, followed by those that are not. */
-static void flagged_first(npy_intp *flags, npy_intp size, npy_intp *memory)
-{
-    npy_intp next = 0;
-    for (npy_intp i = 0; i < size; i++)
-        if (flags[i])
-            memory[next++] = i;
-    for (npy_intp i = 0; i < size; i++)
-        if (!flags[i])
-            memory[next++] = i;
-    memcpy(flags, memory, size * sizeof(npy_intp));
-}
-
-/* The model, a time, rank_tol -> [constraints], smallest singular values, rows and columns of M
-   that carry its rank (in front), Z1ᵀ in the first rows. */
+/* The model, a time, rank_tol -> [constraints], smallest singular values, flags of the rows and
+   columns of M that carry its rank, Z1ᵀ in the first rows. */
 static Outcome reference(Call *call)
 {
     Model m;
@@ -261,8 +248,6 @@ static Outcome reference(Call *call)
     derivative_array(&m, look.e, look.a, look.M);
     if (!pivots(look.M, size, size - a, call->index_out[2], call->index_out[3]))
         return DECLINED;
-    flagged_first(call->index_out[2], size, look.order);
-    flagged_first(call->index_out[3], size, look.order);
     return DONE;
 }
 

@@ -27,7 +27,7 @@ from gpebo_cli.numerics.collocation import (
     decoupled,
     unresolved_signals,
 )
-from gpebo_cli.numerics.elimination import Eliminated, StiffError
+from gpebo_cli.numerics.elimination import StiffError, by_elimination
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.mesh import (
     SHARE,
@@ -150,7 +150,7 @@ def solve(
         full = len(A.columns) > _DENSE * len(A.rows) ** 2
         if full and len(A.entries) > 1:
             return None
-        march = _Solved(A) if full else Eliminated()
+        march = _Solved(A) if full else by_elimination
     else:
         parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh), units) / LENGTH)
         if not np.maximum(parts, 1.0).sum() <= min(MOST_ELEMENTS, max_elements):
