@@ -91,7 +91,7 @@ def chain(cells):
 PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, chain]
 
 
-def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0):
+def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1):
     E, A, B, C = build(cells)
     n = len(E)
 
@@ -102,7 +102,7 @@ def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0):
     return load_plant({
         "name": build.__name__, "states": [f"x{k}" for k in range(n)], "inputs": {"u": u},
         "outputs": ["y1", "y2"], "E": text(E, "1 + 0.3*cos(t + {})"),
-        "A": text(rate * A, "1 + 0.2*sin(t + {})"), "B": B.tolist(), "C": C.tolist(),
+        "A": text(rate * A, f"1 + 0.2*sin({swing}*t + {{}})"), "B": B.tolist(), "C": C.tolist(),
         "initial_state": [1.0, 0.5, *[0.1] * (n - 2)],
     })
 
@@ -218,6 +218,23 @@ def test_a_stiff_varying_plant_that_elimination_would_fill_is_left_to_dense_coll
 
     system = plant(full, varying=True, cells=12)
     assert large.large_simulation(system, TIME, SolverSettings()) is None
+
+
+def test_coefficients_that_swing_are_resolved_before_anything_is_solved(monkeypatch):
+    """Elements are solved on one mesh, and as well as they are by dense collocation."""
+    solved, march = [], series._marched
+
+    def counted(*arguments):
+        solved.append(arguments[4].size)
+        return march(*arguments)
+
+    monkeypatch.setattr(series, "_marched", counted)
+    system, time = plant(ladder, varying=True, swing=200), TimeSettings(horizon=0.5)
+    found = large.large_simulation(system, time, SolverSettings(tol=1e-9))
+    assert len(solved) == 1
+    dense = simulate._simulate_linear(system, time, SolverSettings(tol=1e-10))
+    off = np.abs(found.signals.states.final - dense.signals.states.final)
+    assert (off <= found.state_errors * np.abs(dense.signals.states.values).max(axis=(0, 1))).all()
 
 
 def by_place(matrix, rows, columns):

@@ -43,7 +43,7 @@ from gpebo_cli.numerics.refinement import refine
 
 LENGTH = 4.0  # h‖A‖ of an element at most
 _MOST_PARTS = 16  # of an element, each with its series, where coefficients
-_DECAY = 2.5  # are to decay like powers of 1 over this
+_DECAY = 1.6  # are to decay like powers of 1 over this
 MOST_ELEMENTS = 800  # with more of them the system counts as stiff
 _DIGITS = 1e-2  # of the tolerance, to which series go on
 _ROUGH = 0.02  # to which errors are carried

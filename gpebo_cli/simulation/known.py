@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import accumulate, pairwise
+from typing import TypeVar
 
 import numpy as np
 
@@ -28,6 +29,7 @@ _NOTHING = 1e-12  # of what an input stands beside: less is rounding
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
 _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
 # of them takes more degrees
+Known = TypeVar("Known")
 SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
 
 
@@ -61,24 +63,38 @@ def known_resolved(
             break
         mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
         c = evaluated(mesh)
-    before: Array | float = np.inf
-    while system.m and "u" not in system.coefficients.constant:
-        u = c.u[0].reshape(*mesh.points.shape, -1)
-        tail = unresolved(u, mesh.rule, SHARE * beside)
-        if tail.max() <= solver.tol:
-            break
-        poor = (tail > solver.tol) & ((tail < 0.25 * before) | (tail > 1e-6))
-        parts = wanted_parts(tail, poor, solver.tol, mesh.rule.stages)
-        too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
-        if not poor.any() or too_short.any() or parts.sum() > solver.max_elements:
-            break
-        before = np.repeat(tail, parts)
-        mesh, _ = mesh.split(parts)
-        c = evaluated(mesh)
+    if system.m and "u" not in system.coefficients.constant:
+        def tail(mesh: Mesh, c: Coefficients) -> Array:
+            u = c.u[0].reshape(*mesh.points.shape, -1)
+            return unresolved(u, mesh.rule, SHARE * beside)
+
+        mesh, c = cut_where(tail, evaluated, mesh, c, solver.tol, solver.max_elements)
     if mesh is not given or 2.0 * float(mesh.steps.min()) > longest:
         return mesh, c
     joined = _joined(system, mesh, c, cuts, _MARGIN * solver.tol, longest)
     return (mesh, c) if joined.size == mesh.size else (joined, evaluated(joined))
+
+
+def cut_where(
+    tail_of: Callable[[Mesh, Known], Array], evaluated: Callable[[Mesh], Known], mesh: Mesh,
+    known: Known, tol: float, max_elements: int,
+) -> tuple[Mesh, Known]:
+    """Elements cut until what is known there, and need not be solved for, has small tails.
+
+    ``tail_of`` says how large they are (K,); cuts end where only rounding is left, or there would
+    be too many elements. The result is the mesh, and what is known on it.
+    """
+    before: Array | float = np.inf
+    while True:
+        tail = tail_of(mesh, known)
+        poor = (tail > tol) & ((tail < 0.25 * before) | (tail > 1e-6))
+        parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
+        too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
+        if not poor.any() or too_short.any() or parts.sum() > max_elements:
+            return mesh, known
+        before = np.repeat(tail, parts)
+        mesh, _ = mesh.split(parts)
+        known = evaluated(mesh)
 
 
 def least_beside(terms: Array, inputs: IntArray, m: int) -> Array:

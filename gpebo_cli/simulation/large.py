@@ -16,7 +16,15 @@ from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution
 from gpebo_cli.numerics.errors import EPS, NOTHING, VALUE
-from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, initial_mesh, legendre_tail
+from gpebo_cli.numerics.mesh import (
+    SHARE,
+    Kind,
+    Mesh,
+    Trajectory,
+    initial_mesh,
+    legendre_tail,
+    unresolved,
+)
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.consistency import Jump
@@ -32,7 +40,13 @@ from gpebo_cli.reduction.explicit import (
 )
 from gpebo_cli.reduction.structure import Structure, analyse, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
-from gpebo_cli.simulation.known import SHORT, first_mesh, known_resolved, least_beside
+from gpebo_cli.simulation.known import (
+    SHORT,
+    cut_where,
+    first_mesh,
+    known_resolved,
+    least_beside,
+)
 from gpebo_cli.simulation.signals import Signals, Simulation
 
 SMALL = 8  # states, up to which dense matrices are faster in any case
@@ -131,6 +145,17 @@ class _Plant:
         """M."""
         return series.Sparse(*self.form.matrix)
 
+    def matrix_tail(self, mesh: Mesh, form: Explicit | ConstantForm) -> Array:
+        """How far each element is from resolving M times its length, where that is below 1 (K,)."""
+        M, units = self.matrix(), form.units
+        if len(M.entries) == 1:
+            return np.zeros(mesh.size)
+        of_row = np.repeat(np.arange(form.d), np.diff(M.rows))
+        rates = (M.entries * (units[M.columns] / units[of_row])).reshape(*mesh.points.shape, -1)
+        tail = unresolved(rates * mesh.steps[:, None, None], mesh.rule, 1.0)
+        tail[0] *= 2.0**mesh.rule.stages  # what begins at zero is small in the first element
+        return tail
+
 
 def large_simulation(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
@@ -194,7 +219,11 @@ def _simulated(
         finer = 8.0 ** -np.arange(np.floor(np.log2(mesh.steps[0] / shortest) / 3.0), 0.0, -1.0)
         edges = np.insert(mesh.edges, 1, mesh.edges[0] + mesh.steps[0] * finer)
         mesh = Mesh(edges, mesh.rule)
-    form = plant.eliminate(mesh)
+    # Known coefficients are resolved before anything is solved: that costs far less.
+    mesh, form = cut_where(
+        plant.matrix_tail, plant.eliminate, mesh, plant.eliminate(mesh), tol,
+        solver.max_elements,
+    )
     x0, z0 = _start(plant)
     floor_z = SHARE * np.abs(form.reduced(x0))[:, None]
     floor = form.sizes_from(floor_z)
