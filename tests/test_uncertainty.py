@@ -18,6 +18,7 @@ from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.results.report import run_lines
 from gpebo_cli.settings import DataSettings, NoiseSettings, Settings, TimeSettings
 
@@ -58,7 +59,7 @@ def test_the_mean_of_white_samples():
     t = np.array([0.1, 0.25, 1.0, 7.03, 10.0])
     of_eta, of_x = deviations(
         directly, summing(f0), np.full((5, 1, 1), 2.0), np.linspace(0, 10, 5),
-        np.arange(100) * step, np.array([sigma**2]), t,
+        Rows(np.arange(100) * step, lines=False), np.array([sigma**2]), t,
     )
     whole = np.floor(t / step + 1e-9)
     part = t - whole * step
@@ -78,7 +79,7 @@ def test_the_level_is_that_of_the_residual_less_what_the_fit_takes():
             lambda t, sample=sample: np.repeat(sample, t.shape[1]).reshape(*t.shape, 1),
             ["a"], 5.0, 5,
         )
-        found.append(noise_level(directly, regression, mesh_edges[:-1], np.ones(1)) ** 2)
+        found.append(noise_level(directly, regression, Rows(mesh_edges, False), np.ones(1)) ** 2)
     assert np.mean(found) == pytest.approx(0.09, rel=4.0 * np.sqrt(2.0 / 4.0 / 400))
 
 
@@ -150,28 +151,60 @@ TANK = {
 }
 
 
-@pytest.mark.parametrize("t", [
-    [0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 4.0, 4.2, 4.4, 4.6],  # a pause, most of the horizon
-    np.linspace(0.0, 3.0, 8),  # fewer rows than the mesh has elements
-])
-def test_of_a_recording_every_row_counts_as_one_error(t):
-    """What each row's error does by itself; held instead of interpolated it may do a bit more."""
-    t = np.array(t)
-    data = {"t": t, "u": 1.0 + np.sin(3 * t), "y": np.cos(t)}
-    noise = {"name": "gaussian", "outputs": 0.1}
+PAUSE = np.array([0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 4.0, 4.2, 4.4, 4.6])  # most of the horizon
+UNEVEN = np.cumsum(np.random.default_rng(0).uniform(0.1, 1.0, 8))
 
-    def final(**changes):
-        found = run(TANK, data=data | changes, noise=noise, estimator="least_squares").details
-        of = found.estimation
-        return np.append(of.parameters[0, -1], of.states[0, -1]), np.append(
-            of.parameters_std[0, -1], of.states_std[0, -1]
+
+@pytest.mark.parametrize(("times", "hold", "estimator", "more"), [
+    ([PAUSE], "linear", {"name": "least_squares"}, {}),
+    ([PAUSE], "zoh", {"name": "least_squares"}, {}),
+    ([UNEVEN], "linear", {"name": "least_squares", "beta": 0.3}, {}),
+    ([UNEVEN], "linear", {"name": "gradient"}, {"remedy": "reset", "reset_times": [2.0, 3.0]}),
+    ([PAUSE, UNEVEN], "linear", {"name": "least_squares"}, {}),
+])
+def test_of_a_recording_every_row_counts_as_one_error(times, hold, estimator, more, tmp_path):
+    """Variances of what each row's error does by itself add up, in pauses, too; of two files."""
+    noise = {"name": "gaussian", "outputs": 0.1}
+    files = [tmp_path / f"{k}.csv" for k in range(len(times))]
+
+    def found(rows=-1):
+        """With an error in one of all rows."""
+        for t, file in zip(times, files, strict=True):
+            y = np.cos(t) + 0.1 * (np.arange(len(t)) == rows)
+            rows -= len(t)
+            table = np.column_stack([t, 1.0 + np.sin(3 * t), y])
+            np.savetxt(file, table, delimiter=",", header="t,u,y", comments="")
+        of = run(
+            TANK, data={"file": list(map(str, files)), "hold": hold}, noise=noise,
+            estimator=estimator, time={"samples": 7}, observer={"name": "gpebo", **more},
+        ).details.estimation
+        return (
+            np.concatenate([of.parameters[0], of.states[0]], axis=1),
+            np.concatenate([of.parameters_std[0], of.states_std[0]], axis=1),
         )
 
-    base, std = final()
-    each = [final(y=data["y"] + 0.1 * (np.arange(len(t)) == j))[0] - base for j in range(len(t))]
-    ratio = std / np.linalg.norm(each, axis=0)
-    assert (ratio > 0.85).all(), ratio
-    assert (ratio < 1.8).all(), ratio
+    base, std = found()
+    each = [found(row)[0] - base for row in range(sum(map(len, times)))]
+    known = np.isfinite(base)
+    assert known[2:].all()
+    known[:, 2] &= "remedy" not in more  # e₀ since a reset is about an estimate
+    np.testing.assert_allclose(std[known], np.linalg.norm(each, axis=0)[known], rtol=1e-3)
+
+
+def test_the_level_of_a_recording_with_a_pause_has_no_bias(tmp_path):
+    """E σ̂² = σ²: the squares of what each row's error by itself would be taken for."""
+    def deviation(y, noise="none"):
+        table = np.column_stack([PAUSE, 1.0 + np.sin(3 * PAUSE), y])
+        np.savetxt(tmp_path / "r.csv", table, delimiter=",", header="t,u,y", comments="")
+        of = run(
+            TANK, data=str(tmp_path / "r.csv"), time={"samples": 3},
+            estimator="least_squares", noise=noise,
+        ).details.estimation
+        return of.parameters_std[0, -1, 0]
+
+    one = deviation(PAUSE, {"name": "gaussian", "outputs": 1.0})
+    found = sum((deviation(row) / one) ** 2 for row in np.eye(len(PAUSE)))
+    assert found == pytest.approx(1.0, abs=0.06)  # four rows of eleven are what is fitted
 
 
 @pytest.mark.parametrize("rows", [2, 3])

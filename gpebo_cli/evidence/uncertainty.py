@@ -2,12 +2,12 @@
 
 ψ contains no noise, so the errors of everything between the samples of u and y and the estimates
 are linear in those samples' errors (theory 12). With the errors ζ of the observer and s of the
-estimator, and e constant from one sample to the next,
+estimator, and e that of the last sample, or the straight line from it to the next one's,
 
     [ζ; s]' = 𝔽 [ζ; s] + 𝔹 e,      δη̂ = C s,      δx̂ = gain C s + X ζ + W e.
 
-A factor L of the covariance, L Lᵀ = cov [ζ; s; e], goes from sample to sample by orthogonal
-transformations: no variance can become negative, whatever the rounding.
+A factor L of the covariance, L Lᵀ = cov [ζ; s; e], e both of them, goes from sample to sample by
+orthogonal transformations: no variance can become negative, whatever the rounding.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
@@ -36,6 +37,7 @@ _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
 _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
 _GROUPS = 2000  # of samples, by which many of them are replaced at first
+_PAUSE = 5.0  # times the median step: rows on both sides of a longer one are alone
 _PER_ELAPSED = 64  # groups at least, since the start, at first
 _AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
 _BESIDE = 8  # errors that stand beside each other in a factor
@@ -44,21 +46,20 @@ _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a directio
 
 
 def deviations(
-    observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, instants: Array,
+    observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, rows: Rows,
     variances: Array, t: Array, starts: Array | None = None,
 ) -> tuple[Array, Array]:
     """One standard deviation of η̂ (M, p) and of x̂ (M, n) at the times t (M,), ascending.
 
     ``observer`` takes errors of [u; y] to those of Y and of the state's offset, ``estimator`` those
     of Y to those of η̂; the gain is that of x = offset + gain η (M, n, p). ψ is smooth between
-    ``edges`` (K + 1,), in seconds. Errors are held from one of the ``instants`` of samples to the
-    next, and ``variances`` are those of each sample of [u; y] (m + r,). ζ begins anew at the edges
-    ``starts``, of several experiments; None: at the first one only.
+    ``edges`` (K + 1,), in seconds, and ``variances`` are those of [u; y] in each of the rows (m +
+    r,). ζ begins anew at the edges ``starts``, of several experiments; None: at the first one only.
     """
-    most, per, before = len(instants) // _GROUPS, _PER_ELAPSED, list[Array]()
+    most, per, before = len(rows.t) // _GROUPS, _PER_ELAPSED, list[Array]()
     anew = edges[:1] if starts is None else starts
     while True:
-        groups = _grouped(instants, edges[-1], t, anew, most, per)
+        groups = _grouped(rows, edges[-1], t, anew, most, per)
         *found, _ = propagated(
             observer, estimator, gain, edges, groups, variances, t, None, starts
         )
@@ -74,89 +75,134 @@ def _agree(coarse: Array, fine: Array) -> bool:
 
 
 class Groups(NamedTuple):
-    """Samples in groups: one error for each, that moves integrals as all of its own together do."""
+    """Rows in groups: one error for each, that moves integrals as all of its own together do."""
 
-    starts: Array  # (G,) the times of their first samples
-    shares: Array  # (G,) of a sample's deviation: √(Σ h²)/Σ h over the steps h in the group
-    others: Array  # the times of all other samples
+    starts: Array  # (G,) the times of their first rows, and
+    after: Array  # (G,) of the rows behind these
+    shares: Array  # (G,) of a row's deviation
+    others: Array  # the times of all other rows
+    lines: bool  # as of the rows
+
+    def weights(self, t: Array, group: IntArray, until: Array) -> Array:
+        """Shares at times t (…,) of the errors that count there, (1 or 2, …).
+
+        Of a group's own one and of the next one's, which it gives way to ``until`` (G,).
+        """
+        if not self.lines:
+            return np.ones((1, *t.shape))
+        tau = (t - self.starts[group]) / (until - self.starts)[group]
+        return np.asarray([1.0 - tau, tau])
 
 
-def _grouped(
-    instants: Array, end: float, t: Array, starts: Array, most: int, per: int
-) -> Groups:
-    """Samples (N,) up to ``end`` in groups of up to ``most``.
+def _grouped(rows: Rows, end: float, t: Array, starts: Array, most: int, per: int) -> Groups:
+    """Rows (N,) up to ``end`` in groups of up to ``most``.
 
-    After k samples from a start they are of up to k/``per``. The sample at or before a time of
-    ``t`` or ``starts`` is the first one of its group.
+    After k rows from a start they are of up to k/``per``. The row at or before a time of ``t`` or
+    ``starts`` is the first one of its group, and so are those on both sides of a pause.
     """
     if most <= 1:
-        return each_alone(instants)
+        return each_alone(rows)
+    instants, lines = rows
+    if not lines:  # nothing is held from the end on
+        instants = instants[: np.searchsorted(instants, end)]
+    count = len(instants)
     near = 1e-6 * float(np.diff(instants).min())
 
     def at(times: Array) -> IntArray:
         return np.searchsorted(instants, times + near, side="right").clip(1) - 1
 
+    steps = np.diff(instants, append=max(end, instants[-1]))
+    pauses = np.flatnonzero(steps > _PAUSE * np.median(steps))
     fresh = at(starts)
-    bounds = np.unique(np.concatenate([[0], at(t), fresh, [len(instants)]]))
+    bounds = np.unique(np.concatenate([
+        [0, count - 1, count], at(t), fresh, pauses, (pauses + 1).clip(max=count)
+    ]))
     origins = fresh[np.searchsorted(fresh, bounds, side="right").clip(1) - 1]
-    first: list[int] = []
+    found: list[int] = []
     for (k, stop), origin in zip(pairwise(bounds.tolist()), origins.tolist(), strict=False):
         while k < stop:
-            first.append(k)
+            found.append(k)
             k += max(1, min(most, (k - origin) // per))  # noqa: PLW2901
-    steps = np.diff(instants, append=end)
-    whole, squares = (np.add.reduceat(steps**power, first) for power in (1, 2))
-    return Groups(instants[first], np.sqrt(squares) / whole, np.delete(instants, first))
+    first = np.array(found)
+    if lines:  # what each row counts for, and what the first ones of groups do, with lines between
+        own, whole = (_of_lines(x) for x in (instants, instants[first]))
+        group = np.repeat(np.arange(len(first)), np.diff(first, append=count))
+        tau = (instants - instants[first][group]) / np.diff(instants[first], append=np.inf)[group]
+        squares = np.bincount(group, (1.0 - tau) * own**2)
+        squares[1:] += np.bincount(group, tau * own**2)[:-1]
+    else:
+        whole, squares = (np.add.reduceat(steps**power, first) for power in (1, 2))
+    return Groups(
+        instants[first], instants[(first + 1).clip(max=count - 1)], np.sqrt(squares) / whole,
+        np.delete(instants, first), lines,
+    )
 
 
-def each_alone(instants: Array) -> Groups:
-    """Samples (N,), each with its own error."""
-    return Groups(instants, np.ones(len(instants)), instants[:0])
+def _of_lines(t: Array) -> Array:
+    """∫ of what straight lines between times (N,) make of 1 at one of them and 0 at the others."""
+    half = 0.5 * np.diff(t)
+    return np.asarray(np.append(half, 0.0) + np.append(0.0, half))
+
+
+def each_alone(rows: Rows) -> Groups:
+    """Rows, each with its own error."""
+    t = rows.t
+    return Groups(t, np.append(t[1:], np.inf), np.ones(len(t)), t[:0], rows.lines)
 
 
 def propagated(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, groups: Groups,
     variances: Array, t: Array, L: Array | None, starts: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """:func:`deviations` of grouped samples; the third is L (size, ·) of cov [ζ; s; e] at the end.
+    """:func:`deviations` of grouped rows; the third is L (size, ·) of cov [ζ; s; e] at the end.
 
     It starts from ``L`` at the first edge; None: everything is known there. ``gain`` is (M, n, p).
     """
     n, p = gain.shape[1:]
-    mesh, fresh, shares = _mesh(edges, groups)
-    if L is not None:  # an error of the last sample is held on
-        fresh[0] = bool((np.abs(groups.starts - edges[0]) < 1e-3 * mesh.steps[0]).any())
+    mesh, fresh, group = _mesh(edges, groups)
+    until = np.append(groups.starts[1:], np.inf)
     sampler = mesh.sampler(t)
     of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
     zeta, own = (x(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1] for x in (observer, estimator))
-    stretch = max(1, _CHUNK // ((zeta + own) * mesh.rule.stages) ** 2)
+    size, signals = zeta + own, len(variances)
+    stretch = max(1, _CHUNK // (size * mesh.rule.stages) ** 2)
     anew = np.zeros(mesh.size, dtype=bool)
     if starts is not None:
         anew[np.searchsorted(mesh.edges, starts)] = True
+    anew[0] = L is None  # else an error of the last row goes on
+    fresh[0] &= anew[0] or _among(mesh.edges[:1], groups.starts, 1e-3 * mesh.steps[0])[0]
+    beside = group[:, None] + np.arange(1 + groups.lines)  # the errors that count in an element
+    shares = groups.shares[beside.clip(max=len(groups.shares) - 1)]
     for first in range(0, mesh.size, stretch):
         part = slice(first, first + stretch)
         joint = _joint(observer, estimator, mesh, part, n)
-        maps = _maps(mesh, mesh.steps[part], joint.A, joint.B)  # of [ζ; s]
-        size = zeta + own
+        weights = groups.weights(mesh.points[part, 1:], group[part, None], until)
+        B = np.concatenate([each[..., None, None] * joint.B for each in weights], axis=3)
+        maps = _maps(mesh, mesh.steps[part], joint.A, B)  # of [ζ; s]
         chosen = (sampler.element >= first) & (sampler.element < first + stretch)
-        element, weights = sampler.element[chosen], sampler.weights[chosen]
+        element, places = sampler.element[chosen], sampler.weights[chosen]
         wanted, place = np.unique(element - first, return_inverse=True)
         factors, L = _factors(
-            maps[:, -1], fresh[part] | anew[part], shares[part, None] * np.sqrt(variances), L,
-            anew[part], zeta, wanted,
+            maps[:, -1], fresh[part], anew[part], shares[part, :, None] * np.sqrt(variances), L,
+            zeta, wanted,
         )
         if not len(wanted):
             continue
         before = factors[place]
-        here = np.einsum("ms,msij->mij", weights[:, 1:], maps[element - first])
-        here[:, :, :size] += weights[:, 0, None, None] * np.eye(size)
+        here = np.einsum("ms,msij->mij", places[:, 1:], maps[element - first])
+        here[:, :, :size] += places[:, 0, None, None] * np.eye(size)
         reached = here @ before  # of [ζ; s] (M, size, ·)
         inside = mesh.inside[element, 1]
         o, e = observer(t[chosen], inside), estimator(t[chosen], inside)
         eta = e.C @ reached[:, zeta:]
         rows = o.C.shape[1] - n  # of Y; those of the offset stand below
+        # Errors of one row and the one behind it, not of many.
+        now = groups.weights(t[chosen], group[element], groups.after) / shares[element].T
+        e_now = sum(
+            each[:, None, None] * before[:, size + k * signals : size + (k + 1) * signals]
+            for k, each in enumerate(now)
+        )
         x = gain[chosen] @ eta
-        e_now = before[:, size:] / shares[element, None, None]  # of one sample, not of many
         x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ e_now
         of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
     return of_eta, of_x, np.zeros((0, 0)) if L is None else L
@@ -190,7 +236,7 @@ def after_reset(
 
 def of_least_squares(
     observer: ErrorsAt, regression: LinearRegression, known: Knowledge, gain: Array,
-    instants: Array, variances: Array,
+    rows: Rows, variances: Array,
 ) -> tuple[Array, Array]:
     """One standard deviation at the end of what least squares make of the data, (p,) and (n,).
 
@@ -203,73 +249,89 @@ def of_least_squares(
     inverse = np.where(seen, 1.0 / np.where(seen, known.eigenvalues[-1], 1.0), 0.0)
     inverse = (V * inverse) @ V.T / known.sizes[-1] / known.sizes[-1][:, None]
     of_eta, of_x = deviations(
-        observer, _sums(regression, inverse), gain[None], mesh.edges, instants, variances,
+        observer, _sums(regression, inverse), gain[None], mesh.edges, rows, variances,
         mesh.edges[-1:],
     )
     return of_eta[-1], of_x[-1]
 
 
-def _sums(regression: LinearRegression, made: Array) -> ErrorsAt:
-    """Errors of Y to those of what is made (k, p) of h = ∫ψᵀY."""
+def _sums(
+    regression: LinearRegression, made: Array, weight: Callable[[Array], Array] | None = None
+) -> ErrorsAt:
+    """Errors of Y to those of what is made (k, p) of h = ∫ψᵀY, perhaps weighted at each time."""
     p = regression.p
 
     def of_h(t: Array, inside: Array) -> ErrorSystem:
         into = transpose(regression.psi(t, inside))
+        if weight is not None:
+            into = weight(inside)[:, None, None] * into
         return ErrorSystem(np.zeros((1, p, p)), into, made[None], np.zeros((1, *into.shape[1:])))
 
     return of_h
 
 
 def noise_level(
-    observer: ErrorsAt, regression: LinearRegression, instants: Array, outputs: Array,
+    observer: ErrorsAt, regression: LinearRegression, rows: Rows, outputs: Array,
     starts: Array | None = None,
 ) -> float:
     """σ of recorded outputs from the residual of least squares of a regression without resets.
 
-    With r = Y − ψ G⁻¹h, and P_h the covariance of h for σ = 1,
+    All N rows count alike there, however far apart they are: in a pause a hold rule makes errors
+    that are no noise. With G = Σψᵀψ, h = ΣψᵀY, r = Y − ψ G⁻¹h, and P_h the covariance of h for
+    σ = 1,
 
-        E ∫|r|² dt = σ² (∫ E|δY|² dt − tr(G⁻¹ P_h)):
+        E Σ|r|² = σ² (Σ E|δY|² − tr(G⁻¹ P_h)):
 
     the second term is what the fit of p parameters takes away, the noise being coloured by ζ.
     ``outputs`` are variances of each signal [u; y] relative to σ², (m + r,), and the other
     arguments are as of :func:`deviations`.
     """
-    mesh, rows, p = regression.mesh, regression.psi.values.shape[2], regression.p
-    final = regression.gram.final
-    values, vectors = np.linalg.eigh(final[:, :p])
-    known = values > _SINGULAR * values.max(initial=0.0)
-    root = np.where(known, 1.0 / np.sqrt(np.where(known, values, 1.0)), 0.0)[:, None] * vectors.T
+    mesh, k, p = regression.mesh, regression.psi.values.shape[2], regression.p
+    start, stop = mesh.edges[[0, -1]].tolist()
+    near = 1e-6 * float(np.diff(rows.t).min(initial=stop - start))
+    own = rows.t[(rows.t > start - near) & (rows.t < stop + (near if rows.lines else -near))]
+    if not len(own):
+        return np.nan
+    own = own.clip(start, stop)
+    root = regression.factor
+    if root is None:
+        both = np.concatenate([regression.psi(own), regression.Y(own)[:, :, None]], axis=2)
+        root = np.linalg.qr(both.reshape(-1, p + 1), mode="r") * np.sqrt((stop - start) / len(own))
+    _, sigma, Vt = np.linalg.svd(root[:, :p], full_matrices=False)
+    known = sigma > np.sqrt(_SINGULAR) * sigma.max(initial=0.0)
+    inverse = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)[:, None] * Vt
 
     def of_Y(t: Array, inside: Array) -> ErrorSystem:
         o = observer(t, inside)
-        C, D = o.C[:, :rows], o.D[:, :rows]
+        C, D = o.C[:, :k], o.D[:, :k]
         return ErrorSystem(
             o.A, o.B, np.concatenate([C, C], axis=1), np.concatenate([D, D], axis=1)
         )
 
-    t = np.linspace(mesh.edges[0], mesh.edges[-1], _TIMES)
+    ends = np.union1d(own, [start, stop])
+    density = (stop - start) / (np.diff(ends) * (len(ends) - 1))
+
+    def weight(t: Array) -> Array:
+        return np.asarray(density[np.searchsorted(ends, t, side="right").clip(1, len(density)) - 1])
+
+    t = own[np.unique(np.linspace(0, len(own) - 1, _TIMES).round().astype(np.intp))]
+    t = np.append(t, stop)
     of_fit, of_rows = deviations(
-        of_Y, _sums(regression, root), np.zeros((len(t), rows, p)), mesh.edges, instants, outputs,
-        t, starts,
+        of_Y, _sums(regression, inverse, weight), np.zeros((len(t), k, len(inverse))), mesh.edges,
+        rows, outputs, t, starts,
     )
-    duration = float(mesh.edges[-1] - mesh.edges[0])
-    whole = duration * float((of_rows**2).sum(axis=1).mean())
+    whole = (stop - start) * float((of_rows[:-1] ** 2).sum(axis=1).mean())
     left = whole - float((of_fit[-1] ** 2).sum())
-    eta = root.T @ (root @ final[:, p])
-    # The noise is taken at the instants, where it does not depend on what the hold rule assumes.
-    if regression.factor is not None:
-        square = regression.misfit(eta)
-    else:
-        residual = regression.Y(instants) - regression.psi(instants) @ eta
-        square = duration * float((residual**2).sum(axis=-1).mean())
-    more = (len(instants) + 1) * np.count_nonzero(outputs) > known.sum()  # numbers than estimates
+    eta = inverse.T @ (inverse @ (root[:, :p].T @ root[:, p]))
+    square = float(((root @ np.append(-eta, 1.0)) ** 2).sum())
+    more = len(own) * np.count_nonzero(outputs) > known.sum()  # numbers than estimates
     return float(np.sqrt(square / left)) if more and left > _LEFT * whole else np.nan
 
 
-def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, Array]:
-    """Elements between edges and groups, whether one is new at each one's start, its share.
+def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, IntArray]:
+    """Elements between edges and groups, whether a group begins with one, and which it is in.
 
-    Edges at samples within a group are left out: ψ bends there at most, as the errors do.
+    Edges at rows within a group are left out: ψ bends there at most, as the errors do.
     """
     instants = groups.starts
     near = 1e-9 * float(np.diff(edges).min())
@@ -280,12 +342,8 @@ def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, Array]:
     mesh = Mesh(np.union1d(edges[inner], own), radau_rule(_STAGES))
     parts = int(np.clip(np.ceil(_ELEMENTS / mesh.size), 1, _MOST_PARTS))
     mesh, _ = mesh.split(np.full(mesh.size, parts, dtype=np.intp))
-    at = np.searchsorted(mesh.edges, instants - near)
-    fresh = np.zeros(mesh.size + 1, dtype=bool)
-    fresh[at.clip(0, mesh.size)] = True
-    fresh[0] = True
-    group = np.searchsorted(instants - near, mesh.edges[:-1], side="right") - 1
-    return mesh, fresh[:-1], groups.shares[group.clip(0)]
+    group = np.searchsorted(instants - near, mesh.edges[:-1], side="right").clip(1) - 1
+    return mesh, np.diff(group, prepend=-1) > 0, group
 
 
 def _among(t: Array, times: Array, near: float) -> BoolArray:
@@ -361,32 +419,35 @@ def _joint(
 
 
 def _factors(
-    ends: Array, fresh: BoolArray, deviations: Array, L: Array | None, anew: BoolArray, zeta: int,
+    ends: Array, fresh: BoolArray, anew: BoolArray, deviations: Array, L: Array | None, zeta: int,
     wanted: IntArray,
 ) -> tuple[Array, Array]:
-    """L of [ζ; s; e] at the left ends of the elements ``wanted`` (W, d + m + r, ·), and at the end.
+    """L of [ζ; s; e] at the left ends of elements ``wanted`` (W, d + a (m + r), ·), and at the end.
 
-    The errors of several samples stand in L side by side, before it is made triangular again. An
-    element makes ``ends`` of it (K, d, d + m + r); another e (K, m + r) begins where ``fresh``, and
-    ζ is zero where ``anew``.
+    The errors of several rows stand in L side by side, before it is made triangular again. An
+    element makes ``ends`` of it (K, d, d + a (m + r)). Of the a errors that count, with
+    ``deviations`` (K, a, m + r), the first gives way to another one where ``fresh``, and all of
+    them do where ``anew``; ζ is zero there.
     """
-    size, signals = ends.shape[1], deviations.shape[1]
-    own = np.arange(signals)
-    width = used = size + _BESIDE * signals
-    L = np.zeros((size + signals, width)) if L is None else L
-    L = np.pad(L, ((0, 0), (0, width - L.shape[1])))
+    size, (alive, signals) = ends.shape[1], deviations.shape[1:]
+    own, whole = np.arange(signals), size + alive * signals
+    width = whole + _BESIDE * signals
+    L = np.zeros((whole, whole)) if L is None else L
+    used = L.shape[1]
+    L = np.pad(L, ((0, 0), (0, width - used)))
     out, told = np.empty((len(wanted), *L.shape)), 0
     asked = np.isin(np.arange(len(ends)), wanted).tolist()
     for k, end in enumerate(ends):
         if anew[k]:
             L[:zeta] = 0.0
-        if fresh[k]:  # another e, independent of those before
+        for block in range(0 if anew[k] else alive - fresh[k], alive):
             if used == width:
-                L[:size, :size] = np.asarray(np.linalg.qr(L[:size].T, mode="r")).T
-                L[:size, size:] = 0.0
-                used = size
-            L[size:] = 0.0
-            L[size + own, used + own] = deviations[k]
+                L[:, :whole] = np.asarray(np.linalg.qr(L.T, mode="r")).T
+                L[:, whole:] = 0.0
+                used = whole
+            L[size : whole - signals] = L[size + signals :]
+            L[whole - signals :] = 0.0
+            L[whole - signals + own, used + own] = deviations[k, block]
             used += signals
         if asked[k]:
             out[told], told = L, told + 1

@@ -25,6 +25,7 @@ from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.observers import Measurements, Observation, Observer, build
 from gpebo_cli.observers._base import AffineStateMap
 from gpebo_cli.observers.gpebo import Gpebo
+from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.constant import scales_of
 from gpebo_cli.reduction.form import InputDerivatives
@@ -63,7 +64,7 @@ def examine(settings: Settings, system: DescriptorSystem) -> Examination:
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
-        noise = signal_noise(settings.noise, levels, recording.cells)
+        noise = signal_noise(settings.noise, levels, recording.rows)
         seen = Measurements(recording.inputs, recording.outputs, noise, recording.derivatives)
         return Examination(()) if observer is None else _of_observer(
             observer, settings, system, seen, []
@@ -142,10 +143,10 @@ def _per_unit(
     plain = not regression.resets and regression.dynamics is None and observation.names is None
     if observation.errors is None or not plain or not isinstance(state_map, AffineStateMap):
         return {}
-    (start, stop), cells = seen.span, None if seen.noise is None else seen.noise.cells
-    instants = np.arange(start, stop, settings.noise.sample_time) if cells is None else cells[:-1]
+    (start, stop), rows = seen.span, None if seen.noise is None else seen.noise.rows
+    rows = rows or Rows(np.arange(start, stop, settings.noise.sample_time), lines=False)
     of_eta, of_x = of_least_squares(
-        observation.errors, regression, known, state_map.gain(np.array([stop]))[0], instants,
+        observation.errors, regression, known, state_map.gain(np.array([stop]))[0], rows,
         np.concatenate([np.zeros(system.m), np.ones(system.r)]),
     )
     found = dict(zip(system.states, of_x.tolist(), strict=True))

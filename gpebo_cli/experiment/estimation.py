@@ -83,7 +83,7 @@ def continuous(
     def observe(signals: Source | Signals) -> Observation:
         known = signals if isinstance(signals, Source) else source
         seen = Measurements(
-            signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.cells),
+            signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.rows),
             known.derivatives, known.t if known.recording else None,
         )
         return observer.observe(system, seen, settings.solver)

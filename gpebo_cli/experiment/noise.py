@@ -29,6 +29,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers import SignalNoise
+from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings
 from gpebo_cli.simulation.signals import Signals
@@ -84,15 +85,15 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
 
 
 def signal_noise(
-    settings: NoiseSettings, levels: NoiseLevels, cells: Array | None = None
+    settings: NoiseSettings, levels: NoiseLevels, rows: Rows | None = None
 ) -> SignalNoise:
     """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12.
 
-    A recording has samples of its own, whose errors are held in ``cells`` (N + 1,).
+    A recording has ``rows`` of its own.
     """
     outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
-    step = settings.sample_time if cells is None else float(np.diff(cells).mean())
-    return SignalNoise(levels.inputs, outputs, step, cells)
+    step = settings.sample_time if rows is None else float(np.diff(rows.t).mean())
+    return SignalNoise(levels.inputs, outputs, step, rows)
 
 
 @dataclass(frozen=True, eq=False)

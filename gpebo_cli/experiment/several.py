@@ -53,10 +53,10 @@ def joined_source(sources: Sequence[Source]) -> Source:
     return replace(
         sources[0], t=t, recording=recording, derivatives=None, pieces=tuple(sources),
         own_t=np.concatenate([each.t[own] for each, own in zip(sources, kept, strict=True)]),
-        cells=np.concatenate([
-            each.cells[own] + by for each, own, by in zip(sources, kept, shifts, strict=True)
-            if each.cells is not None
-        ]),
+        rows=sources[0].rows and sources[0].rows._replace(t=np.concatenate([
+            each.rows.t[own] + by for each, own, by in zip(sources, kept, shifts, strict=True)
+            if each.rows is not None
+        ])),
         inputs=_joined([each.inputs for each in sources], shifts),
         outputs=_joined([each.outputs for each in sources], shifts),
         states=_joined([each.states for each in sources], shifts),

@@ -18,6 +18,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Sampling, build, sampling
+from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
@@ -48,7 +49,7 @@ class Source:
     true: Signals | None = None  # of a simulation, without noise
     simulation: SimulationResult | None = None
     recording: RecordingResult | None = None
-    cells: Array | None = None  # (K + 1,) of a recording, see Recording.cells
+    rows: Rows | None = None  # of a recording
     samples: Array | None = None  # (N,) of one recording: the times of its rows
     pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
@@ -98,7 +99,7 @@ def recorded(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
         assumptions=tuple, verdict="", derivatives=recording.derivatives,
-        cells=recording.cells, samples=samples_t,
+        rows=recording.rows, samples=samples_t,
         recording=RecordingResult(
             **vars(recording.sampled(t)), file=table.header.source, sha256=table.sha256,
             rows=len(samples_t), hold=recording.hold,

@@ -18,8 +18,8 @@ from gpebo_cli.evidence.uncertainty import (
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers._base import Differentiable, Observation
+from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.estimator import Affine, Estimator
 from gpebo_cli.regression.linear import LinearRegression
@@ -45,13 +45,13 @@ def sampled_deviations(
     Levels that are zero are unknown but for a simulation. Without a source the samples are a
     stream, each of whose rows has errors of its own.
     """
-    recorded = source is None or source.cells is not None
+    recorded = source is None or source.rows is not None
     if levels.silent and not recorded:
         return None
     variances = _variances(noise, levels)
     if source is None:
         return SampledDeviations(variances, None, relative=levels.silent)
-    instants = _instants(source, noise)
+    instants = _rows(source, noise).t
     near = 1e-6 * float(np.diff(instants).min(initial=np.inf))
 
     def number(t: Array) -> Array:
@@ -72,23 +72,23 @@ def residual_ratio(
 
     One where the sensors' noise is all that the estimates leave; None: nobody can tell.
     """
-    if observation.errors is None or levels.silent or source.cells is None:
+    if observation.errors is None or levels.silent or source.rows is None:
         return None
     if observation.regression.resets or observation.regression.dynamics is not None:
         return None
     found = noise_level(
-        observation.errors, observation.regression, source.cells[:-1], _variances(noise, levels),
+        observation.errors, observation.regression, source.rows, _variances(noise, levels),
         observation.starts,
     )
     return None if np.isnan(found) else found
 
 
-def _instants(source: Source, noise: NoiseSettings) -> Array:
-    """Times (N,) from each of which to the next the errors of the signals are the same."""
-    if source.cells is not None:
-        return source.cells[:-1]
+def _rows(source: Source, noise: NoiseSettings) -> Rows:
+    """What the signals are samples of."""
+    if source.rows is not None:
+        return source.rows
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
-    return np.arange(start, stop, noise.sample_time)
+    return Rows(np.arange(start, stop, noise.sample_time), lines=False)
 
 
 def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
@@ -122,32 +122,32 @@ def standard_deviations(
         return _NOT_SAID
     if len(estimator.cases) > MOST_CASES:
         return _MANY.format(len(estimator.cases))
-    edges, instants = regression.mesh.edges, _instants(source, noise)
+    edges, rows = regression.mesh.edges, _rows(source, noise)
     variances = _variances(noise, levels)
     if levels.silent:
-        level = _level(errors, regression, instants, variances, observation.starts)
+        level = _level(errors, regression, rows, variances, observation.starts)
         if np.isnan(level):
             return _FEW
         variances *= level**2
     gains = state_map.gains(t, states)[..., columns]
     if regression.resets and isinstance(estimator, ResumableEstimator):
-        found = list(_over_resets(errors, estimator, regression, gains, instants, variances, t))
+        found = list(_over_resets(errors, estimator, regression, gains, rows, variances, t))
     else:
         found = [
-            deviations(errors, of_case, gain, edges, instants, variances, t, observation.starts)
+            deviations(errors, of_case, gain, edges, rows, variances, t, observation.starts)
             for of_case, gain in zip(estimator.errors(regression), gains, strict=True)
         ]
     return np.array([eta for eta, _ in found]), np.array([x for _, x in found])
 
 
 def _level(
-    errors: ErrorsAt, regression: LinearRegression, instants: Array, variances: Array,
+    errors: ErrorsAt, regression: LinearRegression, rows: Rows, variances: Array,
     starts: Array | None,
 ) -> float:
     """σ of a recording; with resets the mean square of what each segment says."""
     segments = regression.segments
     squares = [
-        noise_level(errors, own, _within(instants, own.mesh), variances, starts) ** 2
+        noise_level(errors, own, rows, variances, starts) ** 2
         for own in segments
     ]
     lengths = np.array([own.mesh.edges[-1] - own.mesh.edges[0] for own in segments])
@@ -156,16 +156,9 @@ def _level(
     return float(np.sqrt(np.nansum(weights * squares) / weights.sum())) if told.any() else np.nan
 
 
-def _within(instants: Array, mesh: Mesh) -> Array:
-    """Those from a mesh's start to before its end."""
-    near = 1e-6 * float(mesh.steps.min())
-    low, high = mesh.edges[[0, -1]] - near
-    return np.asarray(instants[(instants >= low) & (instants < high)])
-
-
 def _over_resets(
     errors: ErrorsAt, estimator: ResumableEstimator, regression: LinearRegression, gains: Array,
-    instants: Array, variances: Array, t: Array,
+    rows: Rows, variances: Array, t: Array,
 ) -> Iterator[tuple[Array, Array]]:
     """Deviations of every case, from segment to segment."""
     segments, resets = regression.segments, regression.resets
@@ -181,8 +174,8 @@ def _over_resets(
         reached = estimator.resume(segment, mesh.edges[-1:], known).reached
         for g, system in enumerate(systems):
             *of, L = propagated(
-                errors, system, gains[g][own], mesh.edges, each_alone(_within(instants, mesh)),
-                variances, t[own], factors[g],
+                errors, system, gains[g][own], mesh.edges, each_alone(rows), variances,
+                t[own], factors[g],
             )
             found[g].append((of[0], of[1]))
             if reset is not None:

@@ -23,6 +23,7 @@ from gpebo_cli.model.descriptor import (
 )
 from gpebo_cli.model.text import switching
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, aside
+from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps
 from gpebo_cli.regression.estimator import Estimator
@@ -51,7 +52,7 @@ class SignalNoise:
     inputs: Array  # (m,) standard deviation of every sample
     outputs: Array  # (r,)
     sample_time: float  # seconds, on the average
-    cells: Array | None = None  # (K + 1,) of a recording: between them errors are of one sample
+    rows: Rows | None = None  # of a recording
 
     @property
     def variances(self) -> Array:

@@ -232,20 +232,19 @@ class KalmanBucy:
         noise = signals.noise or SignalNoise(
             np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time
         )
-        cells, note = noise.cells, known.note
-        unknown = cells is not None and not noise.variances.any()
-        if cells is not None and unknown and evidence.errors is not None:
+        rows, note = noise.rows, known.note
+        unknown = rows is not None and not noise.variances.any()
+        if rows is not None and unknown and evidence.errors is not None:
             alike = np.concatenate([np.zeros(system.m), np.ones(system.r)])
-            level = noise_level(evidence.errors, evidence.regression, cells[:-1], alike)
+            level = noise_level(evidence.errors, evidence.regression, rows, alike)
             noise = replace(noise, outputs=np.full(system.r, np.nan_to_num(level)))
             note += f"; noise of the outputs taken from the residual, {level:.2g}" * (level > 0.0)
             unknown = not level > 0.0
 
         def steps(inside: Array) -> Array | float:
-            if cells is None:
+            if rows is None:
                 return 1.0
-            k = np.searchsorted(cells, inside, side="right").clip(1, len(cells) - 1)
-            return np.asarray((cells[k] - cells[k - 1]) / noise.sample_time)
+            return rows.intensities(inside) / noise.sample_time
 
         def reduced(t: Array, inside: Array) -> FilterModel:
             return filter_model(known.matrices(t, inside), known.measured(t, inside), known.form)

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,9 +23,26 @@ Held = Callable[[Array, Array], Array]
 _STAGES = (3, 4, 6, 9, 12, 16)  # candidates for the mesh of a recording
 _FIRST_ELEMENTS = 24  # at least this many, as for a simulation
 _PROBED = 64  # elements on which the plant's matrices are looked at
-_GAP = 5.0  # times the median step: a longer one is a pause
 _SAME = 1e-13  # slopes that differ by less than this share of the signal's size are the same
 _SMALLEST = 1e-9  # an edge nearer than this share of a step to a sample is that sample
+
+
+class Rows(NamedTuple):
+    """Where signals were sampled: each row has an error of its own."""
+
+    t: Array  # (N,) seconds, ascending
+    lines: bool  # errors between them are on straight lines; else they are held from each one on
+
+    def intensities(self, t: Array) -> Array:
+        """Of white noise that moves integrals as errors of variance 1 do, at times t (M,), in s.
+
+        What lines make of an error beside a time has a part in the steps on both sides.
+        """
+        step = np.diff(self.t)
+        if self.lines:
+            wide = np.pad(step, 1, mode="edge")
+            step = 0.25 * (wide[:-2] + 2.0 * step + wide[2:])
+        return np.asarray(step[np.searchsorted(self.t, t, side="right").clip(1, len(step)) - 1])
 
 
 def held(t: Array, values: Array, hold: str) -> Held:
@@ -73,8 +91,7 @@ def recording_mesh(
     """
     start, stop = span
     inner = (t > start) & (t < stop)
-    middles = np.setdiff1d(cells(t, hold, span), [*t, *span])
-    cuts = np.union1d(source.breakpoints(start, stop), middles)
+    cuts = source.breakpoints(start, stop)
     signal = held(t, values, hold)
     candidates = []
     for rule in map(radau_rule, _STAGES):
@@ -88,18 +105,6 @@ def recording_mesh(
         parts = _parts(source, signal, mesh, tol)
         candidates.append((mesh.size * (rule.stages + 1) * parts, mesh))
     return min(candidates, key=lambda candidate: candidate[0])[1]
-
-
-def cells(t: Array, hold: str, span: tuple[float, float]) -> Array:
-    """Times (C + 1,) of the span between which errors of samples at ``t`` (N,) are those of one.
-
-    What a straight line between two samples makes of their errors is as large as if each were held
-    for half of it. Where steps are alike that is the same as from one sample to the next.
-    """
-    t = np.unique(np.append(t[(t > span[0]) & (t < span[1])], span))
-    step = np.diff(t)
-    long = (step > _GAP * np.median(step)) & (hold != "zoh")
-    return np.union1d(t, t[:-1][long] + 0.5 * step[long])
 
 
 def bends(t: Array, values: Array, hold: str) -> BoolArray:

@@ -12,7 +12,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
 from gpebo_cli.model.text import FollowsSignals
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.recordings.hold import cells, held, recording_mesh
+from gpebo_cli.recordings.hold import Rows, held, recording_mesh
 from gpebo_cli.recordings.table import Samples, Table, read_table
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
@@ -37,9 +37,11 @@ class Recording:
         return InputDerivatives.of_signal(self.inputs) if self.hold == "cubic" else None
 
     @property
-    def cells(self) -> Array:
-        """Times (N + 1,) between which errors of the signals are those of one sample."""
-        return cells(self.table.samples.t, self.hold, self.span)
+    def rows(self) -> Rows:
+        """Those of the span, whose ends count as rows."""
+        t, (start, stop) = self.table.samples.t, self.span
+        inner = t[(t > start) & (t < stop)]
+        return Rows(np.concatenate([[start], inner, [stop]]), lines=self.hold != "zoh")
 
     def sampled(self, t: Array) -> Samples:
         """All signals at the times t (N,) of the span.
