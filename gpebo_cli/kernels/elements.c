@@ -330,7 +330,8 @@ static Outcome carried_errors(Call *call)
 #define MOST_STAGES 16 /* of a rule */
 #define MOST_ORDERS 48 /* of a series */
 #define AT_ONCE 8      /* columns: their sums are in registers, and their series in the cache */
-typedef double Columns[AT_ONCE];
+typedef double Columns[AT_ONCE], Nodes[MOST_STAGES]; /* zeros after the last stage */
+#define EACH_NODE _Pragma("omp simd") for (int n = 0; n < MOST_STAGES; n++)
 /* Not unrolled before they are vectorised: else sums are kept in memory, at twice the time. */
 #define EACH_COLUMN _Pragma("omp simd") for (int b = 0; b < AT_ONCE; b++)
 #define MAXIMUM(a, b) ((a) > (b) ? (a) : (b)) /* or b where a is no number */
@@ -402,21 +403,23 @@ EVERY_WIDTH static npy_intp expanded(const Part *q)
     return 0;
 }
 
-/* The sums of so many terms at some times, one `apart` from the other, rows one `next` to it. */
-EVERY_WIDTH static void summed(const Part *q, npy_intp count, const double *times, npy_intp some,
-                               double *out, npy_intp apart, npy_intp next)
+/* The sums of so many terms at some times, one `apart` from the other, rows one `next` to it; and
+   in the place of the first term at the last of all times. */
+EVERY_WIDTH static void summed(const Part *q, npy_intp count, const Nodes times, npy_intp some,
+                               npy_intp all, double *out, npy_intp apart, npy_intp next)
 {
-    for (npy_intp i = 0; i < q->d; i++)
-        for (npy_intp j = 0; j < some; j++) {
-            double power = 1.0;
-            Columns sum = {0.0};
-            for (npy_intp k = 0; k < count; k++, power *= times[j]) {
-                const double *x = q->terms[k * q->d + i];
-                EACH_COLUMN sum[b] += power * x[b];
-            }
-            for (npy_intp b = 0; b < q->columns; b++)
-                out[j * apart + i * next + b] = sum[b];
-        }
+    Nodes power[MOST_ORDERS];
+    for (npy_intp k = 0; k < count; k++)
+        EACH_NODE power[k][n] = k ? power[k - 1][n] * times[n] : 1.0;
+    for (npy_intp e = 0; e < q->d * q->columns; e++) {
+        double *x = q->terms[e / q->columns] + e % q->columns, *to = out + e / q->columns * next;
+        Nodes sum = {0.0};
+        for (npy_intp k = 0; k < count; k++)
+            EACH_NODE sum[n] += power[k][n] * x[k * q->d * AT_ONCE];
+        for (npy_intp j = 0; j < some; j++)
+            to[j * apart + e % q->columns] = sum[j];
+        *x = sum[all - 1];
+    }
 }
 
 /* All parts of element k from the left end in the terms: X at the nodes, and the right end in its
@@ -425,11 +428,11 @@ static int through_element(const Call *call, Part *q, npy_intp k, npy_intp part,
                            double *so_far, double *out)
 {
     const npy_intp s = SIZE(s), d = q->d, all = SIZE(c), parts = call->index[2][k];
-    const double *nodes = call->in[0], end = 1.0;
+    const double *nodes = call->in[0];
     int converged = 1;
     q->h = call->in[1][k] / (double)parts;
     for (npy_intp i = 0, node = 0, some = 0; i < parts; i++, node += some, some = 0) {
-        double times[MOST_STAGES];
+        Nodes times = {0.0};
         q->A = call->in[5] + part * call->step[5];
         q->decay = call->in[6] + part * call->step[6];
         q->f = call->in[7] + first + part++ * call->step[7];
@@ -439,8 +442,9 @@ static int through_element(const Call *call, Part *q, npy_intp k, npy_intp part,
         converged &= count > 0;
         for (; node + some < s && (i + 1 == parts || nodes[node + some] * parts <= i + 1); some++)
             times[some] = nodes[node + some] * parts - i;
-        summed(q, count, times, some, out + node * d * all, d * all, all);
-        summed(q, count, &end, 1, q->terms[0], 0, AT_ONCE);
+        const npy_intp known = some > 0 && times[some - 1] == 1.0 ? some : some + 1;
+        times[known - 1] = 1.0;
+        summed(q, count, times, some, known, out + node * d * all, d * all, all);
     }
     return converged;
 }
@@ -454,7 +458,8 @@ static Outcome series(Call *call)
     for (npy_intp k = 0; k < K; sum += parts[k++])
         if (parts[k] < 1)
             return refused("parts", parts[k]);
-    if (s > MOST_STAGES || SIZE(f) > all || (SIZE(P) != 1 && SIZE(P) != sum))
+    if (s < 1 || s > MOST_STAGES || call->in[0][s - 1] != 1.0 || SIZE(f) > all ||
+        (SIZE(P) != 1 && SIZE(P) != sum))
         return refused("stages, columns, or parts of all elements", SIZE(P));
     for (npy_intp i = 0; i <= d; i++)
         if (row[i] < (i ? row[i - 1] : 0) || row[i] > entries)
@@ -493,9 +498,6 @@ static Outcome series(Call *call)
     }
     return DONE;
 }
-
-#define EACH_NODE _Pragma("omp simd") for (int n = 0; n < MOST_STAGES; n++)
-typedef double Nodes[MOST_STAGES]; /* zeros after the last stage */
 
 /* D/h ⊗ I − A of an element: full blocks of s rows, transposed, and diagonal ones behind them. */
 typedef struct {
