@@ -45,22 +45,23 @@ def by_elimination(
 def _residual(
     Dh: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array, values: Array
 ) -> Array:
-    """What is left of each element's equations, relative to their terms (K,).
+    """What is left of each element's equations, relative to the largest of their terms (K,).
 
     No pivots are sought beyond the states' own unknowns: this says whether that did harm.
     """
     K, points = values.shape[:2]
-    X, there = values[:, 1:], np.diff(rows) > 0
-    terms = at_nodes(entries, K, points - 1)[..., None] * X[:, :, columns]
-    change, f = (X - values[:, :1]).reshape(K, points - 1, -1), at_nodes(f, K, points - 1)
-    left = np.matmul(Dh, change).reshape(X.shape)
-    size = np.matmul(np.abs(Dh), np.abs(change)).reshape(X.shape)
-    left[:, :, there] -= np.add.reduceat(terms, rows[:-1][there], axis=2)
-    size[:, :, there] += np.add.reduceat(np.abs(terms), rows[:-1][there], axis=2)
-    left[..., : f.shape[-1]] -= f
-    size[..., : f.shape[-1]] += np.abs(f)
-    size += np.abs(Dh).sum(axis=2)[..., None, None] * np.abs(values[:, :1])
-    return np.asarray((np.abs(left) / np.maximum(size, _SMALL)).max(axis=(1, 2, 3), initial=0.0))
+    values, there = values.swapaxes(2, 3), np.diff(rows) > 0  # states last: their sums are fast
+    X, f = values[:, 1:], at_nodes(f, K, points - 1).swapaxes(2, 3)
+    a, first = at_nodes(entries, K, points - 1), rows[:-1][there]
+    left = np.matmul(Dh, (X - values[:, :1]).reshape(K, points - 1, -1)).reshape(X.shape)
+    left[..., there] -= np.add.reduceat(a[:, :, None] * X[..., columns], first, axis=3)
+    left[:, :, : f.shape[2]] -= f
+    largest = np.abs(values).max(axis=1)
+    size = np.abs(Dh).sum(axis=2).max(axis=1)[:, None, None] * largest
+    terms = np.abs(a).max(axis=1)[:, None] * largest[..., columns]
+    size[..., there] += np.add.reduceat(terms, first, axis=2)
+    size[:, : f.shape[2]] += np.abs(f).max(axis=1)
+    return np.asarray((np.abs(left).max(axis=1) / np.maximum(size, _SMALL)).max(axis=(1, 2)))
 
 
 @lru_cache(maxsize=16)

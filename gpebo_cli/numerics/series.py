@@ -29,6 +29,7 @@ from gpebo_cli.numerics.collocation import (
 )
 from gpebo_cli.numerics.elimination import StiffError, by_elimination
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
+from gpebo_cli.numerics.linalg import largest_within
 from gpebo_cli.numerics.mesh import (
     SHARE,
     Looked,
@@ -67,8 +68,7 @@ class Sparse(NamedTuple):
 
     def sizes(self, mesh: Mesh) -> Array:
         """The largest of each entry in each element, (K or 1, e)."""
-        entries = at_points(self.entries, mesh.size, mesh.rule.stages)
-        return np.asarray(np.abs(entries).max(axis=1))
+        return largest_within(at_points(self.entries, mesh.size, mesh.rule.stages))
 
     def full(self) -> Array:
         """With every entry, (N or 1, d, d)."""
@@ -87,8 +87,8 @@ class Sparse(NamedTuple):
         of_row = np.repeat(np.arange(d), np.diff(self.rows))
         own = np.zeros((N, d))
         own[:, of_row[of_row == self.columns]] = self.entries[:, of_row == self.columns]
-        sizes = np.broadcast_to(units[:, None], (N, d, 1))
-        discs = own - np.abs(own) + self.product(np.abs(self.entries), sizes)[..., 0] / units
+        discs = own - np.abs(own)
+        discs += self.row_sums(np.abs(self.entries) * (units[self.columns] / units[of_row]))
         if discs.max(initial=0.0) <= enough:
             return float(discs.max(initial=0.0))
         some = np.linspace(0, N - 1, int(np.clip(_LOOKED_AT // d**3, 1, 32)), dtype=np.intp)
@@ -100,11 +100,13 @@ class Sparse(NamedTuple):
         share = len(self.columns) / max(x.shape[1], 1) ** 2
         if share > (_DENSE if len(entries) == 1 else 1.0) or x.shape[2] * share > _WORTH:
             return self._replace(entries=entries).full() @ x
-        terms = entries[:, :, None] * x[:, self.columns]
-        full = np.diff(self.rows) > 0
-        out = np.zeros_like(x)
+        return self.row_sums(entries[:, None] * x.swapaxes(1, 2)[..., self.columns]).swapaxes(1, 2)
+
+    def row_sums(self, terms: Array) -> Array:
+        """Sums (…, d) of terms (…, e), one of each entry, over the entries of rows."""
+        there, out = np.diff(self.rows) > 0, np.zeros((*terms.shape[:-1], len(self.rows) - 1))
         if len(self.columns):
-            out[:, full] = np.add.reduceat(terms, self.rows[:-1][full], axis=1)
+            out[..., there] = np.add.reduceat(terms, self.rows[:-1][there], axis=-1)
         return out
 
     def norms(self, entries: Array, units: Array) -> Array:

@@ -48,7 +48,7 @@ def known_resolved(
     system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients],
     looked_at: Callable[[Array], Coefficients], mesh: Mesh, c: Coefficients, beside: Array,
     solver: SolverSettings, cuts: Array, longest: float, *, bounded: bool,
-) -> tuple[Mesh, Coefficients]:
+) -> tuple[Mesh, Coefficients | None]:
     """The mesh on which nothing is overlooked and inputs are resolved, and the model there.
 
     It begins with a mesh and the model ``c`` there; ``evaluated`` gives it on others, ``looked_at``
@@ -72,7 +72,7 @@ def known_resolved(
     if mesh is not given or 2.0 * float(mesh.steps.min()) > longest:
         return mesh, c
     joined = _joined(system, mesh, c, cuts, _MARGIN * solver.tol, longest)
-    return (mesh, c) if joined.size == mesh.size else (joined, evaluated(joined))
+    return (mesh, c) if joined.size == mesh.size else (joined, None)
 
 
 def cut_where(

@@ -53,6 +53,7 @@ SMALL = 8  # states, up to which dense matrices are faster in any case
 _FULL = 50  # states, beyond which full constant plants are simulated here, too
 _ENTRIES = 4  # per row of E; with more of them E counts as full
 _LENGTH = 2.6  # h‖A‖ of an element: products of two solutions, too, are resolved to 1e-9 there
+_SOME = 5  # at every so many points it is seen how fast states move
 _ROUNDING = 32.0  # units in the last place by which a consistent state may miss one asked for
 _TINY = float(np.finfo(float).tiny)
 
@@ -99,37 +100,38 @@ class _Plant:
         )
         return self.found.values
 
-    def eliminate(self, mesh: Mesh) -> Explicit | ConstantForm:
-        """The explicit form from the entries at the points of a mesh (or UndecidedError)."""
+    def eliminate(self, mesh: Mesh, every: int = 1) -> Explicit | ConstantForm:
+        """The explicit form from the entries at every so many points of a mesh (UndecidedError)."""
         if self.at is not mesh:
             self.entries(mesh)
         while not self.eliminated:
-            f = forcing(self.found, self.system.n)
+            found = self.found if every == 1 else self.found.at_times(slice(None, None, every))
             try:
-                self.form = self._form(f)
+                self.form = self._form(found, forcing(found, self.system.n))
             except MoreOrdersError:
                 if self.order == self.most:
                     raise
                 self.order += 1
                 self.entries(mesh)
             else:
-                self.eliminated = True
+                self.eliminated = every == 1
+                break
         return self.form
 
-    def _form(self, f: Array) -> Explicit | ConstantForm:
-        n, (E, A) = self.system.n, (getattr(self.found.values, name) for name in "EA")
+    def _form(self, found: Entries, f: Array) -> Explicit | ConstantForm:
+        n, (E, A) = self.system.n, (getattr(found.values, name) for name in "EA")
         may_be_full = n > _FULL and E.shape[1] == A.shape[1] == 1
         if self.constant is None and not (may_be_full and E.shape[2] > _ENTRIES * n):
             try:
-                self.scaling = self.scaling or scaling_of(self.found, n)
-                return explicit_form(self.found, self.scaling, f)
+                self.scaling = self.scaling or scaling_of(found, n)
+                return explicit_form(found, self.scaling, f)
             except UndecidedError as error:
                 if isinstance(error, MoreOrdersError) or not may_be_full:
                     raise
         if self.constant is None:
             full = np.zeros((2, n, n))
             for matrix, name, values in zip(full, "EA", (E, A), strict=True):
-                matrix[self.found.places[name]] = values[0, 0]
+                matrix[found.places[name]] = values[0, 0]
             self.constant = constant_form(full[0], full[1], self.most - 1)
         return self.constant.along(f)
 
@@ -151,8 +153,8 @@ class _Plant:
         if len(M.entries) == 1:
             return np.zeros(mesh.size)
         of_row = np.repeat(np.arange(form.d), np.diff(M.rows))
-        rates = (M.entries * (units[M.columns] / units[of_row])).reshape(*mesh.points.shape, -1)
-        tail = unresolved(rates * mesh.steps[:, None, None], mesh.rule, 1.0)
+        scales = mesh.steps[:, None, None] * (units[M.columns] / units[of_row])
+        tail = unresolved(M.entries.reshape(*mesh.points.shape, -1) * scales, mesh.rule, 1.0)
         tail[0] *= 2.0**mesh.rule.stages  # what begins at zero is small in the first element
         return tail
 
@@ -190,24 +192,23 @@ def _simulated(
     plant: _Plant, mesh: Mesh, cuts: Array, solver: SolverSettings, *, bounded: bool
 ) -> Simulation | None:
     system, tol = plant.system, solver.tol
-    plant.entries(mesh)
-    form = plant.eliminate(mesh)
+    form = plant.eliminate(mesh, _SOME)
     if not form.d:
         return None  # there is nothing to integrate, and the derivative array has all states
     if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
         return None  # what jumps then is for the derivative array to say
     M, units = plant.matrix(), form.units
-    shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh), units).max(), _TINY)
+    shortest = longest = _LENGTH / max(M.norms(np.abs(M.entries), units).max(), _TINY)
     stiff = bool(np.ceil(mesh.steps / longest).sum() > series.MOST_ELEMENTS)
     if stiff:
         longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), _TINY)
 
     used = plant.found.places["u"][0]
     beside = _beside_inputs(plant.found, np.abs(system.initial_state))[used]
-    mesh, _ = known_resolved(
+    mesh = known_resolved(
         system, plant.entries, lambda t: entries(system.coefficients, t, 0).values, mesh,
         plant.found.values, beside, solver, cuts, np.inf, bounded=bounded,
-    )
+    )[0]
     parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
     if not parts.sum() <= solver.max_elements:
         return None

@@ -187,12 +187,12 @@ def _known_resolved(
     terms = _beside_inputs(c)
     if solver.name == "ivp":
         return mesh, c, terms
-    mesh, c = known_resolved(
+    mesh, known = known_resolved(
         system, evaluated, lambda t: system.coefficients.taylor(t, 0), mesh, c,
         terms(np.abs(system.initial_state)), solver, cuts,
         longest if structure.steady and structure.d > _QUICK else 0.0, bounded=bounded,
     )
-    return mesh, c, terms
+    return mesh, known or evaluated(mesh), terms
 
 
 def _growth_resolved(
