@@ -229,23 +229,6 @@ def test_a_kept_sampler_is_not_used_for_other_times():
     np.testing.assert_allclose(signal(t)[:, 0], np.sin([0.8, 1.2]), atol=1e-12)
 
 
-def test_elements_are_joined_where_one_polynomial_does_as_well():
-    rule = radau_rule(8)
-    mesh = initial_mesh(0.0, 16.0, [4.0], 16, rule)
-    smooth, narrow = np.sin(mesh.points), np.exp(-(((mesh.points - 10.3) / 0.2) ** 2))
-    one = np.array([1])
-    joined = mesh.joined(smooth[..., None], one, 1e-3, np.array([4.0]))
-    np.testing.assert_array_equal(joined.edges, [0, 4, 8, 12, 16])
-    signals = np.stack([smooth, narrow], axis=2)
-    both = mesh.joined(signals, np.array([1, 1]), 1e-3, np.array([4.0]))
-    assert {0.0, 4.0, 8.0, 10.0, 11.0, 16.0} <= set(both.edges)
-    assert both.size < mesh.size
-    jump = np.sign(mesh.points - 8.01)[..., None]
-    assert mesh.joined(jump, one, 1e-3, np.zeros(0)).size < 16
-    noise = np.random.default_rng(1).random((16, 9, 1))
-    assert mesh.joined(noise, one, 1e-3, np.zeros(0)) is mesh
-
-
 def test_long_elements_that_seem_to_grow_beyond_all_numbers_are_cut():
     """x' = 2 sin(t) x has the period of an element, whose map is 19 and not 1 before it is cut."""
     def coefficients(t, inside):

@@ -15,7 +15,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import MATRIX_NAMES
 from gpebo_cli.model.expressions import parse, record
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.numerics.mesh import _JOINED, Mesh, initial_mesh, joining
+from gpebo_cli.numerics.mesh import Mesh, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.simulation import known as at_known
 from gpebo_cli.simulation import simulate
@@ -245,30 +245,6 @@ def test_a_pulse_between_the_nodes_is_seen():
 
     assert overlooked(0.0) == [False, False, False]
     assert overlooked(0.1) == [False, True, False]
-
-
-def test_noise_is_not_joined_and_nothing_is_where_no_number_is():
-    mesh = initial_mesh(0.0, 1.0, [], 8, radau_rule(4))
-    noise = np.random.default_rng(0).normal(size=(8, 5, 1))
-    for value in (0.0, np.nan, np.inf):
-        values = np.where(noise > 1.0, value, noise)
-        with np.errstate(invalid="ignore"):
-            assert mesh.joined(values, np.array([1]), 1e-3, np.zeros(0)) is mesh
-
-
-def test_what_is_small_beside_its_kind_does_not_keep_elements_apart():
-    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(6))
-    values = np.stack([np.ones(mesh.points.shape), 1e-8 * np.sin(9 * mesh.points)], axis=2)
-    assert mesh.joined(values, np.array([2]), 1e-4, np.zeros(0)).size == 1
-    assert mesh.joined(values, np.array([1, 1]), 1e-4, np.zeros(0)) is mesh
-
-
-@pytest.mark.parametrize("count", _JOINED)
-def test_joining_there_and_back_is_what_changes(count):
-    rule = radau_rule(6)
-    there, back = joining(rule, count)
-    t = (np.arange(count)[:, None] + rule.points).ravel() / count
-    np.testing.assert_allclose(back @ (there @ t**6), t**6, atol=1e-12)
 
 
 def test_growth_and_jumps_leave_the_mesh_as_it_was():

@@ -131,10 +131,13 @@ class TextCoefficients:
         for k, (name, matrix) in enumerate(zip(MATRIX_NAMES, self.assembly.fixed, strict=True)):
             fixed, columns = np.flatnonzero(matrix), np.flatnonzero(targets[:, 0] == k)
             there = np.concatenate([fixed, targets[columns, 1]])
-            found = np.zeros((order + 1, len(t) if len(columns) else 1, len(there)))
-            found[0, :, : len(fixed)] = matrix.flat[fixed]
-            if len(columns):
-                found[:, :, len(fixed) :] = moving[:, :, columns]
+            found = moving[:, :1, :0]
+            if len(columns):  # in a row
+                found = moving[:, :, columns[0] : columns[-1] + 1]
+            if len(fixed):
+                own, found = found, np.zeros((order + 1, found.shape[1], len(there)))
+                found[0, :, : len(fixed)] = matrix.flat[fixed]
+                found[:, :, len(fixed) :] = own
             values[name] = found
             places[name] = np.unravel_index(there, matrix.shape)
         return Entries(Coefficients(**values), places)

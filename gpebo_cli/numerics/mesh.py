@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
-from itertools import pairwise
 from math import factorial, prod
 from typing import Any, NamedTuple
 
@@ -29,8 +28,6 @@ _FOOT = 1e-8  # of its final size: what a component was before may be that wrong
 _WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
 _MANY = 1 << 16  # numbers, from which on sampling them by element pays
 _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
-_JOINED = (8, 4, 2)  # as many elements become one
-_MANY_PIECES = 64  # between edges that stay; with more of them joining does not pay
 _EQUAL = 1e-11  # relative difference of lengths that is rounding
 _TINY = float(np.finfo(np.float64).tiny)
 _WINDOW = 1 << 12  # elements of a long mesh that are solved together
@@ -130,47 +127,6 @@ class Mesh:
         edges[-1] = self.edges[-1]
         return Mesh(edges, self.rule), np.where(own == 1, parent, -1)
 
-    def joined(
-        self, values: Array, counts: IntArray, tol: float, keep: Array, longest: float = np.inf
-    ) -> Mesh:
-        """Neighbours of equal length joined where a polynomial over all of them does as well.
-
-        Compared at all points of the short elements, so that nothing they have seen is lost. Of
-        point values (K, s + 1, c), of which so many as ``counts`` (kinds,) are of one kind, one
-        kind after the other, none may change by more than ``tol``, relative to the signal's own
-        size so far. The edges ``keep`` (B,) stay, and no element is joined to one that is longer
-        than ``longest``. Where nothing is joined, it is this mesh itself.
-        """
-        inner = set(np.searchsorted(self.edges, keep).tolist()) if len(keep) else set()
-        bounds = [0, *sorted(inner - {0, self.size}), self.size]
-        if len(bounds) > _MANY_PIECES + 1:
-            return self
-        rows = values.transpose(2, 0, 1)  # all times of one in a row: that is fast
-        # Sizes so far, floored as in signal_scale, and at a share of the final one: the foot of a
-        # pulse costs nothing.
-        size = np.maximum.accumulate(np.abs(rows).max(axis=2), axis=1)
-        size = np.maximum(size, _FOOT * size[:, -1:])
-        level = SHARE * np.maximum.reduceat(size, counts.cumsum() - counts, axis=0)
-        allowed = tol * np.maximum(size, np.maximum(level, _TINY).repeat(counts, axis=0))
-        stays = np.ones(self.size + 1, dtype=bool)
-        free = np.ones(self.size, dtype=bool)
-        for count in _JOINED:
-            first = np.concatenate(
-                [np.arange(a, b - count + 1, count) for a, b in pairwise(bounds)]
-            )
-            first = first[free[first] & (count * self.steps[first] <= longest)]
-            together = first[:, None] + np.arange(count)
-            there, back = joining(self.rule, count)
-            seen = rows[:, together].reshape(len(rows) * len(first), len(back))
-            change = np.abs(seen @ there.T @ back.T - seen).reshape(len(seen) * count, len(there))
-            change = change.max(axis=1).reshape(len(rows), *together.shape)
-            fits = (change <= allowed[:, together]).all(axis=2).all(axis=0)
-            stays[together[fits, 1:]] = False
-            free[together[fits]] = False
-            if not free.any():
-                break
-        return self if stays.all() else Mesh(self.edges[stays], self.rule)
-
     def sampler(self, t: Array, inside: Array | None = None) -> Sampler:
         """Interpolation from this mesh to the times ``t`` (N,).
 
@@ -183,21 +139,6 @@ class Mesh:
         return Sampler(*signals.interpolation(
             self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
         ))
-
-
-@lru_cache(maxsize=64)
-def joining(rule: RadauRule, count: int) -> tuple[Array, Array]:
-    """From point values of ``count`` equal elements to those of one over all of them, and back.
-
-    Shapes (s + 1, count (s + 1)) and (count (s + 1), s + 1), for the values one element after the
-    other: those of the joined element are read from the polynomials of the short ones.
-    """
-    short = Mesh(np.arange(count + 1) / count, rule)
-    joined = Mesh(np.array([0.0, 1.0]), rule)
-    size = count * len(rule.points)
-    unit = np.eye(size).reshape(count, len(rule.points), size)
-    there = short.sampler(joined.points.ravel(), joined.inside.ravel())(unit)
-    return there, joined.sampler(short.points.ravel()).weights
 
 
 @dataclass(frozen=True, eq=False)

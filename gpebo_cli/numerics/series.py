@@ -29,7 +29,7 @@ from gpebo_cli.numerics.collocation import (
 )
 from gpebo_cli.numerics.elimination import StiffError, by_elimination
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
-from gpebo_cli.numerics.linalg import largest_within
+from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import (
     SHARE,
     Looked,
@@ -234,14 +234,18 @@ class _Found(NamedTuple):
 def _series(
     weights: Array, mesh: Mesh, A: Sparse, f: Array, kicks: Array | None, start: Array, tol: float
 ) -> tuple[Array, Array]:
-    """Series in time over one element after the other, with weights (d,) of the states."""
+    """Series in time over one element after the other, with weights (d,) of the states.
+
+    With kicks only values at both ends of each element.
+    """
     size = np.maximum(np.abs(A.entries).max(axis=0), _TINY)
     terms, parts = _powers(A.entries, size, mesh, tol)
-    decay = (np.abs(terms) / size).max(axis=2, initial=0.0)
+    decay = _largest_shares(terms, size)
     decay = np.maximum.accumulate(decay[:, ::-1], axis=1)[:, ::-1]
     forced = _powers(f.reshape(len(f), -1), np.abs(f).max(axis=0).ravel(), mesh, tol, parts)[0]
+    nodes = mesh.rule.nodes if kicks is None else mesh.rule.nodes[-1:]
     return elements.series(
-        mesh.rule.nodes, mesh.steps, parts, A.rows, A.columns, terms.swapaxes(1, 2), decay,
+        nodes, mesh.steps, parts, A.rows, A.columns, terms.swapaxes(1, 2), decay,
         forced.reshape(*forced.shape[:2], *f.shape[1:]), kicks, start, weights, tol, SHARE,
     )
 
@@ -258,11 +262,11 @@ def _powers(
     if len(values) == 1 or not w:
         return values[:1, None], np.ones(mesh.size, dtype=np.intp) if parts is None else parts
     terms = rule.to_legendre @ values.reshape(mesh.size, rule.stages + 1, w)
-    counts = (np.abs(terms) > tol * size).any(axis=(0, 2))
-    terms = terms[:, : 1 + int(np.flatnonzero(counts).max(initial=0))]
+    counts = (largest_over_time(terms) > tol * size).any(axis=1)
+    terms = terms[:, : 1 + int(np.flatnonzero(counts).max(initial=0))].copy()
     degrees = np.arange(terms.shape[1])
     if parts is None:
-        sizes = (np.abs(_legendre_powers(len(degrees), 1) @ terms) / size).max(axis=2)[:, 1:]
+        sizes = _largest_shares(_legendre_powers(len(degrees), 1) @ terms, size)[:, 1:]
         rates = ((sizes * (sizes > tol)) ** (1.0 / degrees[1:])).max(axis=1, initial=0.0)
         parts = np.ceil(np.clip(_DECAY * rates, 1.0, _MOST_PARTS)).astype(np.intp)
     found, first = np.empty((parts.sum(), len(degrees), w)), parts.cumsum() - parts
@@ -270,6 +274,12 @@ def _powers(
         some, changed = parts == count, _legendre_powers(len(degrees), count)
         found[first[some, None] + np.arange(count)] = changed @ terms[some, None]
     return found, parts
+
+
+def _largest_shares(values: Array, size: Array) -> Array:
+    """Largest sizes (K, g) of values (K, g, w) in units of a size (w,)."""
+    shares = values / size
+    return np.asarray(np.abs(shares, out=shares).max(axis=2, initial=0.0))
 
 
 @lru_cache

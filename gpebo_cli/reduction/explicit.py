@@ -27,6 +27,7 @@ from gpebo_cli.reduction.derivative_array import Scaling, balance
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
 _SOUND = 0.1  # of the largest entry of its row, in units of the states
 _ROUNDING, _CLEAR = 1e-13, 1e-9  # of what an entry is the difference of: zero below, sure above
+_AT_ONCE = 64  # times or entries, of which there are two while they are copied
 _FILL = 40  # entries per equation; with more of them, a matrix is not sparse
 
 Row = dict[int, Array]
@@ -144,13 +145,25 @@ def _divided(values: Array, which: IntArray, factor: Array) -> Array:
     return out
 
 
+def _by_time(values: Array, which: IntArray, count: int) -> Array:
+    """Some of the values (e, orders, N or 1) themselves at ``count`` times, (count, w)."""
+    out, every = np.empty((count, len(which))), values.shape[2] == 1
+    for first in range(0, count, _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        out[some] = values[which, 0, slice(1) if every else some].T
+    return out
+
+
 class _Equations:
     """Rows of entries; one becomes a mapping where it is touched."""
 
     def __init__(self, values: Array, places: Places, known: Array, units: Array) -> None:
         n = len(units)
         order = np.lexsort(places[::-1])
-        self.values = np.take(np.moveaxis(values, 2, 0), order, axis=0)
+        self.values = np.empty((len(order), *values.shape[:2]))
+        for first in range(0, len(order), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            self.values[some] = np.moveaxis(values[:, :, order[some]], 2, 0)
         self.place = [place[order] for place in places]  # rows, and columns
         self.first = np.searchsorted(self.place[0], np.arange(n + 1))
         self.given = known  # (n, orders, N or 1)
@@ -208,8 +221,9 @@ class _Equations:
         order = np.argsort(i, kind="stable")
         place = np.empty(len(i), dtype=np.intp)  # of each entry in the end
         place[order] = np.arange(len(i))
-        entries = np.empty((count, len(i)))
-        entries[:, place[: plain.sum()]] = self.values[plain, 0].T
+        of_plain = np.zeros(len(i), dtype=np.intp)
+        of_plain[place[: plain.sum()]] = np.flatnonzero(plain)
+        entries = _by_time(self.values, of_plain, count)
         for k, (_, _, value) in zip(place[plain.sum() :].tolist(), touched, strict=True):
             entries[:, k] = value
         rows = np.searchsorted(i[order], np.arange(len(chosen) + 1))
@@ -219,7 +233,7 @@ class _Equations:
         """What is known in the rows ``chosen`` (d,), (N or 1, d)."""
         touched = [(p, self.known[i][0]) for p, i in enumerate(chosen.tolist()) if i in self.known]
         count = max([self.given.shape[2], *(len(value) for _, value in touched)])
-        f = np.array(np.broadcast_to(self.given[chosen, 0].T, (count, len(chosen))))
+        f = _by_time(self.given, chosen, count)
         for p, value in touched:
             f[:, p] = value
         return f

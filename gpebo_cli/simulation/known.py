@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import accumulate, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -16,21 +15,32 @@ from gpebo_cli.model.descriptor import (
     DescriptorSystem,
     IntArray,
 )
-from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, SHARE, Mesh, initial_mesh, unresolved
+from gpebo_cli.numerics.mesh import (
+    FIRST_ELEMENTS,
+    SHARE,
+    Kind,
+    Mesh,
+    initial_edges,
+    initial_mesh,
+    unresolved,
+    unresolved_kinds,
+)
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.settings import SolverSettings, TimeSettings
 
+_FEWEST = 6  # elements
+_USUAL = 1.5  # times the mean length: elements of a first mesh are up to so long, beside jumps
 _LOOKS = 40  # times within each first element at which known functions are looked at once more
 _MOST_LOOKS = 1 << 16
 _SURPRISE = 100.0  # times what the nodes let expect: then something stands between them
 _LOOK_ROUNDS = 8
 _NOTHING = 1e-12  # of what an input stands beside: less is rounding
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
-_MARGIN = 1e-3  # of the tolerance, to which known functions are resolved when joined: what is made
-# of them takes more degrees
+_MARGIN = 1e-3  # of the tolerance, to which known functions are resolved on few elements: what is
+# made of them takes more degrees
 Known = TypeVar("Known")
-SHORT = 4.0  # rate times length of joined elements; exp(t) is resolved to 1e-9 there
+SHORT = 4.0  # rate times length of elements that are few; exp(t) is resolved to 1e-9 there
 
 
 def first_mesh(
@@ -44,19 +54,44 @@ def first_mesh(
     return Mesh(edges, mesh.rule), cuts, bounded
 
 
+def few_elements(system: DescriptorSystem, mesh: Mesh, cuts: Array, longest: float) -> Mesh:
+    """Fewer elements than those of a first mesh, up to the ``longest`` (s), to begin with.
+
+    Nothing narrow hides in these, either, or it is the mesh itself; the cuts (B,) stay.
+    """
+    start, stop = mesh.edges[0], mesh.edges[-1]
+    if 0.5 * FIRST_ELEMENTS * longest < stop - start:
+        return mesh
+    few = max(_FEWEST, int(np.ceil((stop - start) / longest)))
+    edges, bounded = system.coefficients.resolved(initial_edges(start, stop, cuts, few))
+    coarse = Mesh(edges, mesh.rule)
+    return coarse if bounded and coarse.steps.max() <= longest else mesh
+
+
 def known_resolved(
     system: DescriptorSystem, evaluated: Callable[[Mesh], Coefficients],
     looked_at: Callable[[Array], Coefficients], mesh: Mesh, c: Coefficients, beside: Array,
-    solver: SolverSettings, cuts: Array, longest: float, *, bounded: bool,
-) -> tuple[Mesh, Coefficients | None]:
+    solver: SolverSettings, *, bounded: bool,
+) -> tuple[Mesh, Coefficients]:
     """The mesh on which nothing is overlooked and inputs are resolved, and the model there.
 
     It begins with a mesh and the model ``c`` there; ``evaluated`` gives it on others, ``looked_at``
     its values at any times. Inputs compare with sizes ``beside`` them (m,). ``bounded``: nothing
-    narrow hides between the nodes. Where no element has to be cut, they are joined as far as known
-    functions are resolved all the same, up to the ``longest`` (s); the cuts (B,) stay.
+    narrow hides between the nodes. Elements longer than those of a first mesh are cut down to such
+    until all known functions are resolved.
     """
-    given = mesh
+    usual = _USUAL * float(mesh.edges[-1] - mesh.edges[0]) / FIRST_ELEMENTS
+    while float(mesh.steps.max()) > usual:
+        kinds = _known_kinds(system, c, mesh)
+        if not kinds:
+            break
+        tail = unresolved_kinds(kinds, mesh.rule)
+        poor = (tail > _MARGIN * solver.tol) & (mesh.steps > usual)
+        if not poor.any():
+            break
+        parts = wanted_parts(tail, poor, _MARGIN * solver.tol, mesh.rule.stages)
+        mesh, _ = mesh.split(np.minimum(parts, np.ceil(mesh.steps / usual).astype(np.intp)))
+        c = evaluated(mesh)
     for _ in range(0 if bounded else _LOOK_ROUNDS):
         overlooked = _overlooked(system, c, looked_at, mesh, solver.tol, beside)
         if not overlooked.any():
@@ -64,15 +99,12 @@ def known_resolved(
         mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
         c = evaluated(mesh)
     if system.m and "u" not in system.coefficients.constant:
-        def tail(mesh: Mesh, c: Coefficients) -> Array:
+        def of_inputs(mesh: Mesh, c: Coefficients) -> Array:
             u = c.u[0].reshape(*mesh.points.shape, -1)
             return unresolved(u, mesh.rule, SHARE * beside)
 
-        mesh, c = cut_where(tail, evaluated, mesh, c, solver.tol, solver.max_elements)
-    if mesh is not given or 2.0 * float(mesh.steps.min()) > longest:
-        return mesh, c
-    joined = _joined(system, mesh, c, cuts, _MARGIN * solver.tol, longest)
-    return (mesh, c) if joined.size == mesh.size else (joined, None)
+        mesh, c = cut_where(of_inputs, evaluated, mesh, c, solver.tol, solver.max_elements)
+    return mesh, c
 
 
 def cut_where(
@@ -106,22 +138,6 @@ def least_beside(terms: Array, inputs: IntArray, m: int) -> Array:
     least = np.full(m, np.inf)
     np.minimum.at(least, inputs, terms)
     return np.where(np.isfinite(least), least, 0.0)
-
-
-def _joined(
-    system: DescriptorSystem, mesh: Mesh, c: Coefficients, cuts: Array, tol: float, longest: float
-) -> Mesh:
-    """Elements joined where known functions are resolved all the same.
-
-    The mesh is kept with the matrices of a text, as :func:`gpebo_cli.reduction.structure.analyse`
-    keeps what it finds.
-    """
-    kept: dict[object, Mesh] = getattr(system.coefficients, "kept", {})
-    asked = mesh.edges.tobytes(), mesh.rule, len(c.E), cuts.tobytes(), tol, longest
-    if asked not in kept:
-        values, counts = _known_kinds(system, c, mesh)
-        kept[asked] = mesh.joined(values, counts, tol, cuts, longest)
-    return kept[asked]
 
 
 def _overlooked(
@@ -161,30 +177,16 @@ def _overlooked(
     return found
 
 
-def _known_kinds(
-    system: DescriptorSystem, c: Coefficients, mesh: Mesh
-) -> tuple[Array, IntArray]:
-    """Every function of the model with its derivatives, (K, s + 1, c), and how many of each kind.
+def _known_kinds(system: DescriptorSystem, c: Coefficients, mesh: Mesh) -> list[Kind]:
+    """Every function of the model with its derivatives.
 
     Reciprocals of what E holds are among them: the state sees those, and they may be harder to
     resolve by far.
     """
     moving = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
-    orders, times = c.E.shape[:2]
-    parts = [getattr(c, name).reshape(orders, times, -1).swapaxes(1, 2) for name in moving]
-    if not any(part.shape[1] for part in parts):
-        return np.zeros((*mesh.points.shape, 0)), np.zeros(0, dtype=np.intp)
-    whole = np.concatenate(parts, axis=1)  # all times of a function in a row: that is fast
-    high, low = whole[0].max(axis=1), whole[0].min(axis=1)
-    moves = high > low
-    kinds = list(whole[:, moves])
-    ends = accumulate([part.shape[1] for part in parts], initial=0)
-    counts = [int(np.count_nonzero(moves[a:b])) for a, b in pairwise(ends)] * orders
-    if moving[0] == "E":
-        first = slice(parts[0].shape[1])
-        size = np.abs([high[first], low[first]])
-        away = (size.min(axis=0) > _NEAR_ZERO * size.max(axis=0)) & (high[first] * low[first] > 0.0)
-        kinds.append(1.0 / whole[0, first][moves[first] & away])
-        counts.append(len(kinds[-1]))
-    values = np.concatenate(kinds).reshape(-1, *mesh.points.shape).transpose(1, 2, 0)
-    return values, np.array([k for k in counts if k], dtype=np.intp)
+    kinds = [values for name in moving for values in getattr(c, name)]
+    if "E" in moving:
+        E = c.E[0].reshape(mesh.points.size, -1)
+        size = np.abs(E)
+        kinds.append(1.0 / E[:, size.min(axis=0) > _NEAR_ZERO * size.max(axis=0)])
+    return [(values.reshape(*mesh.points.shape, -1), 0.0) for values in kinds if values.size]

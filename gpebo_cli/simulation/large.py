@@ -16,6 +16,7 @@ from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution
 from gpebo_cli.numerics.errors import EPS, NOTHING, VALUE
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import (
     SHARE,
     Kind,
@@ -43,6 +44,7 @@ from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.known import (
     SHORT,
     cut_where,
+    few_elements,
     first_mesh,
     known_resolved,
     least_beside,
@@ -60,16 +62,18 @@ _TINY = float(np.finfo(float).tiny)
 
 def forcing(found: Entries, n: int) -> Array:
     """Taylor coefficients (orders, N, n) of f = B u + F θ + φ."""
-    f = _placed(found, "phi", n)
-    times = max(getattr(found.values, name).shape[1] for name in ("B", "F", "u", "theta", "phi"))
-    f = f.repeat(times // f.shape[1], axis=1)
+    values = found.values
+    times = max(getattr(values, name).shape[1] for name in ("B", "F", "u", "theta", "phi"))
+    f = np.zeros((n, len(values.phi), times))
+    for (i,), value in found.of("phi").items():
+        f[i] = value
     for matrix, vector in (("B", "u"), ("F", "theta")):
         known = found.of(vector)
         for (i, j), value in found.of(matrix).items():
             signal = known.get((j,))
             if signal is not None:
-                f[:, :, i] += product(value, signal)
-    return f
+                f[i] += product(value, signal)
+    return np.moveaxis(f, 0, 2)
 
 
 def _placed(found: Entries, name: str, size: int) -> Array:
@@ -94,6 +98,8 @@ class _Plant:
 
     def entries(self, mesh: Mesh) -> Coefficients:
         """Every entry at the points of a mesh."""
+        if self.eliminated:
+            del self.form  # two of them would be as much again
         self.at, self.eliminated = mesh, False
         self.found = entries(
             self.system.coefficients, mesh.points.ravel(), self.order, mesh.inside.ravel()
@@ -114,7 +120,11 @@ class _Plant:
                 self.order += 1
                 self.entries(mesh)
             else:
-                self.eliminated = every == 1
+                if every == 1:
+                    self.eliminated, values = True, self.found.values
+                    # Nothing else of A is needed now, nor of what others are parts of.
+                    values = values._replace(A=largest_over_time(values.A[0])[None, None])
+                    self.found = self.found._replace(values=Coefficients(*map(np.array, values)))
                 break
         return self.form
 
@@ -205,9 +215,13 @@ def _simulated(
 
     used = plant.found.places["u"][0]
     beside = _beside_inputs(plant.found, np.abs(system.initial_state))[used]
+    del form, M
+    if bounded:
+        mesh = few_elements(system, mesh, cuts, np.inf)
+        plant.entries(mesh)
     mesh = known_resolved(
         system, plant.entries, lambda t: entries(system.coefficients, t, 0).values, mesh,
-        plant.found.values, beside, solver, cuts, np.inf, bounded=bounded,
+        plant.found.values, beside, solver, bounded=bounded,
     )[0]
     parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
     if not parts.sum() <= solver.max_elements:

@@ -22,7 +22,7 @@ from gpebo_cli.reduction.strangeness_free import StrangenessFree, direct_part, s
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.simulation.known import SHORT, first_mesh, known_resolved, least_beside
+from gpebo_cli.simulation.known import SHORT, few_elements, first_mesh, known_resolved, least_beside
 from gpebo_cli.simulation.large import SMALL, large_simulation
 from gpebo_cli.simulation.linearised import Linearised, looked_along
 from gpebo_cli.simulation.newton import follow
@@ -32,7 +32,6 @@ _SHARES = np.linspace(0.0, 1.0, 9)  # of the horizon, where numbers may be too l
 _LOOKED_AT = 32  # times at which the mixing of states is looked at
 _MOST_ALIKE, _LOOKED_AT_FOR_GROWTH = 6000, 2000  # elements: more are cut only where it grows
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
-_QUICK = 2  # differential equations, up to which elements are not joined
 _TINY = float(np.finfo(float).tiny)
 _LOOKS = 4  # at what entries do along a solution that is found closer and closer
 _SAME = 1e3  # tolerances, by which a closer look moves nothing
@@ -172,10 +171,9 @@ def _known_resolved(
     """The mesh that the known functions ask for, all of them there, and :func:`_beside_inputs`.
 
     Elements are cut until the inputs are resolved, as far as cutting helps: evaluating an input
-    costs next to nothing beside solving for the state on elements that are too long. Where nothing
-    needs them that short they are joined again, but not where the state may grow or decay much
-    within one: an element that does not resolve growth may hide it.
-    And not where elements are solved sooner than it is seen that they can be joined.
+    costs next to nothing beside solving for the state on elements that are too long. Few of them
+    are the first, but not where the state may grow or decay much within one: an element that does
+    not resolve growth may hide it.
     """
     def evaluated(mesh: Mesh) -> Coefficients:
         return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
@@ -183,16 +181,18 @@ def _known_resolved(
     longest = SHORT / max(structure.rate, _TINY)
     if solver.name != "ivp" and mesh.steps.max() > longest:
         mesh = _growth_resolved(system, structure, mesh, solver)
+    elif solver.name != "ivp" and structure.steady and bounded:
+        mesh = few_elements(system, mesh, cuts, longest)
     c = evaluated(mesh)
     terms = _beside_inputs(c)
     if solver.name == "ivp":
         return mesh, c, terms
-    mesh, known = known_resolved(
-        system, evaluated, lambda t: system.coefficients.taylor(t, 0), mesh, c,
-        terms(np.abs(system.initial_state)), solver, cuts,
-        longest if structure.steady and structure.d > _QUICK else 0.0, bounded=bounded,
+    beside = terms(np.abs(system.initial_state))
+    mesh, c = known_resolved(
+        system, evaluated, lambda t: system.coefficients.taylor(t, 0), mesh, c, beside, solver,
+        bounded=bounded,
     )
-    return mesh, known or evaluated(mesh), terms
+    return mesh, c, terms
 
 
 def _growth_resolved(
