@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import Array, Prepare, Row, Solve, as_new, compare, decades, loosest
+from gpebo_cli import load_plant
 from gpebo_cli.experiment.pipeline import run_experiment
-from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 
 ROOT = Path(__file__).parent.parent
@@ -35,15 +34,6 @@ SCIPY = ("LSODA", "BDF", "Radau")
 OURS = decades(-4, -13)
 PEERS = decades(-7, -13)
 _GRID = 41  # samples of ours; the reference's times are among them
-
-
-@cache
-def plant(name: str = "circuit") -> DescriptorSystem:
-    """A shipped plant."""
-    import yaml
-
-    text = (ROOT / "conf" / "plant" / f"{name}.yaml").read_text("utf-8")
-    return plant_from_mapping(yaml.safe_load(text), f"{name}.yaml")
 
 
 @cache
@@ -81,9 +71,10 @@ def ours(tol: float, gammas: list[float] | None = None) -> Solve:
         solver=SolverSettings(tol=tol),
     )
     chosen = np.rint(_reference()[0] / HORIZON * (_GRID - 1)).astype(int)
+    system = load_plant("circuit")
 
     def solve() -> Array:
-        result = run_experiment(settings, as_new(plant()))
+        result = run_experiment(settings, as_new(system))
         if result.estimation is None:
             raise TypeError("drem estimates")
         states = result.simulation.states[chosen, 1:3]

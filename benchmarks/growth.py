@@ -33,7 +33,7 @@ def experiment(
     horizon: float = 20.0, gains: int = 1, samples: int = 2, name: str = "circuit"
 ) -> Callable[[], object]:
     """The numerical part of the experiment with a shipped plant."""
-    from benchmarks.circuit import plant
+    from gpebo_cli import load_plant
     from gpebo_cli.experiment.pipeline import run_experiment
     from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 
@@ -42,7 +42,7 @@ def experiment(
         plant={}, estimator={"name": "drem", "gamma": gamma},
         time=TimeSettings(horizon=horizon, samples=samples), solver=SolverSettings(tol=1e-9),
     )
-    system = plant(name)
+    system = load_plant(name)
 
     def run() -> object:
         estimation = run_experiment(settings, as_new(system)).estimation

@@ -11,12 +11,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import yaml
 
-from gpebo_cli.configs.locations import conf_folder
+from gpebo_cli import load_plant
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
@@ -40,8 +38,7 @@ def error_matrices(t: Array, inside: Array) -> tuple[Array, Array]:
 
     The plant is the shipped canonical one, its second output is y_ℓ.
     """
-    text = (Path(conf_folder()) / "plant" / "canonical.yaml").read_text(encoding="utf-8")
-    blocks = canonical_blocks(plant_from_mapping(yaml.safe_load(text)), t, inside)
+    blocks = canonical_blocks(load_plant("canonical"), t, inside)
     c, dc, N = blocks.C[:, 1, 2:4], blocks.dC[:, 1, 2:4], blocks.N
     L = diagonalising_gain(c, dc, N)
     M_w, _, _ = unknown_input_matrices(c, dc, N, np.zeros((len(t), 3)), L)
@@ -83,8 +80,7 @@ def errata_assumption7(path: Path) -> None:
 
 def sampled_orders(path: Path) -> None:
     """Draw how far the circuit's observer at samples is from the one in continuous time."""
-    text = (Path(conf_folder()) / "plant" / "circuit.yaml").read_text(encoding="utf-8")
-    plant = plant_from_mapping(yaml.safe_load(text))
+    plant = load_plant("circuit")
     time = TimeSettings(0.0, HORIZON, 20_001)
 
     def estimates(observer: dict[str, object]) -> tuple[Array, Array]:
@@ -110,8 +106,7 @@ def sampled_orders(path: Path) -> None:
 
 def unbounded(path: Path) -> None:
     """Draw the relative error of the state on the plant of docs/howto/unstable.md, by remedy."""
-    text = (Path(__file__).parent / "examples" / "plant" / "unbounded.yaml").read_text("utf-8")
-    system = plant_from_mapping(yaml.safe_load(text))
+    system = load_plant(Path(__file__).parent / "examples" / "plant" / "unbounded.yaml")
     curves = []
     for k, remedy in enumerate(("none", "output_injection", "reset", "current_coordinates")):
         result = run_experiment(

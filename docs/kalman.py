@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from gpebo_cli.configs.locations import conf_folder
+from gpebo_cli import load_plant
+from gpebo_cli.configs.files import shipped
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results.files import write_text
 from gpebo_cli.results.style import Curve, Panel, compose, line, save
 from gpebo_cli.settings import NoiseSettings, Settings
@@ -55,13 +54,6 @@ def methods(process: float) -> tuple[Method, ...]:
     )
 
 
-def shipped(name: str) -> dict[str, Any]:
-    """A plant that comes with gpebo."""
-    text = (Path(conf_folder()) / "plant" / f"{name}.yaml").read_text(encoding="utf-8")
-    plant: dict[str, Any] = yaml.safe_load(text)
-    return plant
-
-
 def run(system: DescriptorSystem, method: Method, level: float, seed: int) -> RunResult:
     """One run; ``level`` is the standard deviation of the outputs' noise."""
     noise = NoiseSettings(sample_time=SAMPLE_TIME, outputs=level, seed=seed)
@@ -83,12 +75,11 @@ def errors(result: RunResult) -> tuple[Array, Array]:
     return error, np.full(error.shape, np.nan) if stated is None else stated[0][:, chosen]
 
 
-def table(rows: list[tuple[str, dict[str, Any], float]]) -> str:
+def table(rows: list[tuple[str, DescriptorSystem, float]]) -> str:
     """Markdown: a row per plant and level of noise, RMS errors per method."""
     head: list[str] = []
     lines = []
-    for label, plant, process in rows:
-        system = plant_from_mapping(plant, "")
+    for label, system, process in rows:
         for level in (0.0, 0.05):
             cells = [label, f"{level:g}"]
             stated = np.nan
@@ -117,14 +108,14 @@ def over_time() -> str:
     level, spans = 0.05, ((2.0, 5.0), (15.0, 20.0))
     head = ["plant", "", *(f"{a:g} to {b:g} s" for a, b in spans)]
     lines = [head, ["---", "---", "---:", "---:"]]
-    circuit = plant_from_mapping(shipped("circuit"), "")
+    circuit = load_plant("circuit")
     for method in (methods(1e-4)[0], methods(1e-4)[2]):
         results = [run(circuit, method, level, seed) for seed in range(SEEDS)]
         t = results[0].simulation.t
         e1 = np.array([errors(result)[0][:, 0] for result in results])
         lines.append(["circuit", f"error of e1, {method.label}"])
         lines[-1] += [f"{_rms(e1[:, (t >= a) & (t <= b)]):.2g}" for a, b in spans]
-    window = plant_from_mapping(shipped("window"), "")
+    window = load_plant("window")
     result = run(window, methods(1e-3)[3], level, 0)
     stated, t = errors(result)[1], result.simulation.t
     for name, column in zip(window.states, stated.T, strict=True):
@@ -139,7 +130,7 @@ def _rms(values: Array) -> float:
 
 def picture(path: Path) -> None:
     """Errors on the oscillator that is seen for three seconds, without and with noise."""
-    system = plant_from_mapping(shipped("window"), "")
+    system = load_plant("window")
     panels = []
     for level in (0.0, 0.05):
         curves = []
@@ -158,15 +149,13 @@ def picture(path: Path) -> None:
 def main() -> None:
     """Write the picture, and the table into the page."""
     picture(DOCS / "img" / "kalman.png")
-    window = shipped("window")
-    compared = table(
-        [
-            ("circuit", shipped("circuit"), 1e-4),
-            ("descriptor", shipped("descriptor"), 1e-4),
-            ("window", window, 1e-3),
-            ("window, growing", {**window, "A": [[0, 1], [-1, 0.3]]}, 1e-3),
-        ]
-    )
+    growing = load_plant({**shipped("plant/window"), "A": [[0, 1], [-1, 0.3]]})
+    compared = table([
+        ("circuit", load_plant("circuit"), 1e-4),
+        ("descriptor", load_plant("descriptor"), 1e-4),
+        ("window", load_plant("window"), 1e-3),
+        ("window, growing", growing, 1e-3),
+    ])
     page = PAGE.read_text(encoding="utf-8")
     for name, text in (("table", compared), ("over time", over_time())):
         begin, end = BEGIN.format(name), END.format(name)

@@ -7,13 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from gpebo_cli.configs.locations import conf_folder
+from gpebo_cli import load_plant
+from gpebo_cli.configs.files import shipped
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results.figures import describe
 from gpebo_cli.results.files import make_folder, write_text
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line, save
@@ -55,8 +54,7 @@ MATRICES = (
 
 def plant(name: str, **changes: object) -> DescriptorSystem:
     """A shipped plant, with some of its keys replaced."""
-    text = (Path(conf_folder()) / "plant" / f"{name}.yaml").read_text(encoding="utf-8")
-    return plant_from_mapping({**yaml.safe_load(text), **changes}, f"{name}.yaml")
+    return load_plant({**shipped(f"plant/{name}"), **changes})
 
 
 def run(system: DescriptorSystem, estimator: Mapping[str, object], level: float) -> RunResult:
@@ -132,9 +130,7 @@ def level_figure(found: Mapping[str, Mapping[str, Array]], path: Path) -> None:
 
 def step_figure(path: Path) -> None:
     """The recipe theta_step: estimates of an unknown that steps; and with a reset at the step."""
-    recipe = yaml.safe_load(
-        (Path(conf_folder()) / "experiment" / "theta_step.yaml").read_text(encoding="utf-8")
-    )
+    recipe = shipped("experiment/theta_step")
     settings = Settings(
         plant={}, estimator={"name": "least_squares", **recipe["estimator"]},
         time=TimeSettings(horizon=float(recipe["time"]["horizon"])),

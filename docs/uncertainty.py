@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import yaml
 
-from gpebo_cli import estimators
-from gpebo_cli.configs.locations import conf_folder
+from gpebo_cli import estimators, load_plant
 from gpebo_cli.experiment import sources
 from gpebo_cli.experiment.noise import (
     draw_errors,
@@ -21,7 +19,6 @@ from gpebo_cli.experiment.noise import (
 from gpebo_cli.experiment.seeds import _columns
 from gpebo_cli.experiment.uncertainty import standard_deviations
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, build
 from gpebo_cli.regression.errors import respond
@@ -48,12 +45,6 @@ class Errors(NamedTuple):
     names: tuple[str, ...]
     errors: Array  # (M, p + n, seeds)
     predicted: Array  # (M, p + n)
-
-
-def plant(name: str) -> DescriptorSystem:
-    """A shipped plant."""
-    text = (Path(conf_folder()) / "plant" / f"{name}.yaml").read_text(encoding="utf-8")
-    return plant_from_mapping(yaml.safe_load(text), f"{name}.yaml")
 
 
 def errors_over_seeds(
@@ -120,7 +111,7 @@ def table() -> str:
     ]
     for name in PLANTS:
         for settings, found in zip(
-            ESTIMATORS, errors_over_seeds(plant(name), ESTIMATORS), strict=True
+            ESTIMATORS, errors_over_seeds(load_plant(name), ESTIMATORS), strict=True
         ):
             known = found.predicted > 1e-9
             within = np.abs(found.errors) <= 1.96 * found.predicted[..., None]

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from gpebo_cli.configs import files
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import Measurements
@@ -16,10 +17,7 @@ CONF = Path(__file__).parent.parent / "conf"
 
 def shipped(name: str, **changes: Any) -> DescriptorSystem:
     """A plant from ``conf/plant``, with some of its keys replaced."""
-    import yaml
-
-    mapping = yaml.safe_load((CONF / "plant" / f"{name}.yaml").read_text(encoding="utf-8"))
-    return plant_from_mapping({**mapping, **changes}, f"{name}.yaml")
+    return plant_from_mapping({**files.shipped(f"plant/{name}"), **changes}, f"{name}.yaml")
 
 
 def reference(name: str) -> dict[str, Any]:

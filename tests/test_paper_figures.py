@@ -387,7 +387,7 @@ def test_update_writes_what_check_reads(tmp_path: Path) -> None:
 def test_what_is_no_table_is_named(tmp_path: Path, content: str) -> None:
     path = tmp_path / "table.csv"
     path.write_text(content)
-    with pytest.raises(ConfigError, match=r"table\.csv is not a table of numbers"):
+    with pytest.raises(GpeboError, match=r"table\.csv(, line|:)"):
         list(differences(decaying(1.0), path))
 
 

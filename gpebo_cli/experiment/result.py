@@ -50,14 +50,23 @@ class StateChange:
     time: float
 
 
-@dataclass(frozen=True)
-class RecordingResult:
-    """Signals of a recording on the output grid, and which file they are from."""
+@dataclass(frozen=True, kw_only=True)
+class SignalsResult:
+    """Signals on the output grid, wherever they are from."""
 
     t: Array  # (N,)
     inputs: Array  # (N, m)
     outputs: Array  # (N, r)
     states: Array  # (N, n), NaN for a state that was not recorded
+    elements: int
+    measured_inputs: Array | None = None  # (N, m) what the observer saw; None: the same
+    measured_outputs: Array | None = None  # (N, r)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingResult(SignalsResult):
+    """Those of a recording, and which file they are from."""
+
     file: str
     sha256: str
     rows: int
@@ -65,19 +74,12 @@ class RecordingResult:
     first: float  # times of its first and last sample
     last: float
     known_states: tuple[str, ...]
-    elements: int
-    measured_inputs: None = None  # a recording is what was measured
-    measured_outputs: None = None
 
 
-@dataclass(frozen=True)
-class SimulationResult:
-    """The plant's signals on the output grid and how they were obtained."""
+@dataclass(frozen=True, kw_only=True)
+class SimulationResult(SignalsResult):
+    """Those of a simulated plant, and how they were obtained."""
 
-    t: Array  # (N,)
-    inputs: Array  # (N, m)
-    outputs: Array  # (N, r)
-    states: Array  # (N, n)
     index: int  # differentiation index: strangeness index + 1, or 0 for an explicit ODE
     strangeness_index: int
     differential: int  # d, number of differential equations
@@ -87,16 +89,9 @@ class SimulationResult:
     jumps: tuple[StateChange, ...]  # at jumps of the inputs inside the horizon
     impulses: tuple[tuple[float, str], ...]  # (time, state) where a jump puts a Dirac impulse
     error_estimate: float  # relative to each state's own size, the largest
-    elements: int
-    measured_inputs: Array | None = None  # (N, m) what the observer saw; None: the same
-    measured_outputs: Array | None = None  # (N, r)
     state_errors: Array | None = None  # (n,) the estimate for each state, relative to its own size
     linear_solves: float | None = None  # what Newton's method cost; None: the plant is linear
     bounded: bool = True  # known functions are, between the times at which they are evaluated
-
-
-SignalsResult = RecordingResult | SimulationResult
-"""Signals on the output grid, wherever they are from."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ line's width. A gain that is off by 2e-4 does not pass.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -28,9 +27,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import files
+from gpebo_cli.results.finished import read_columns
 from gpebo_cli.results.style import MAX_PANELS, Panel, drawn
 
 RELATIVE = 1e-3
@@ -103,20 +102,16 @@ def differences(panels: Sequence[Panel], reference: Path) -> Iterator[str]:
     Yields:
         One line per curve: which one, where it differs most and by how much.
     """
-    header, table = _read(reference)
     block = blocks(panels)[0]
-    ours = {column.name: column for column in block.columns}
-    if header[0] != block.name:
-        yield f"{header[0]} is now {block.name}"
-        return
-    for name in ours.keys() - set(header[1:]):
+    table = read_columns(reference, block.name)
+    x, ours = table.pop(block.name), {column.name: column for column in block.columns}
+    for name in ours.keys() - table.keys():
         yield f"{name}: there is no such curve in the reference"
-    x = table[:, 0]
     near = np.abs(block.x[:, None] - x).argmin(axis=0)
     if not np.allclose(block.x[near], x, rtol=1e-9, atol=1e-9 * float(np.ptp(block.x))):
-        yield f"{header[0]} does not have the values of the reference among its own"
+        yield f"{block.name} does not have the values of the reference among its own"
         return
-    for name, expected in zip(header[1:], table[:, 1:].T, strict=True):
+    for name, expected in table.items():
         column = ours.get(name)
         if column is None:
             yield f"{name}: there is no such curve any more"
@@ -142,17 +137,3 @@ def _difference(column: Column, rows: Array, reference: Array) -> tuple[int, str
         f"it is {values[k]:.6g}, the reference {reference[k]:.6g}; they differ by "
         f"{abs(values[k] - reference[k]):.2g}, {allowed[k]:.2g} is allowed"
     )
-
-
-def _read(path: Path) -> tuple[list[str], Array]:
-    try:
-        with open(path, encoding="utf-8", newline="") as stream:
-            header, *rows = csv.reader(stream)
-        table = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # no rows, rows of different lengths, or words in them
-        raise ConfigError(f"{path} is not a table of numbers, as --update writes them") from error
-    if table.ndim != 2 or table.shape[1] != len(header) or np.isnan(table[:, 0]).any():
-        raise ConfigError(f"{path} is not a table of numbers, as --update writes them")
-    return header, table
