@@ -17,7 +17,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from gpebo_cli.cli import usage
+from gpebo_cli.cli.app import COMMANDS
+from gpebo_cli.cli.usage import help_of
 
 sys.path.insert(0, str(Path(__file__).parent))
 import messages
@@ -75,9 +76,7 @@ def on_page_content(html: str, page: Page, **_: Any) -> str:
 def commands_page() -> str:
     """The help of every command, as it is printed."""
     texts = {
-        "gpebo": usage.HELP,
-        "gpebo run": usage.run_help(),
-        **{f"gpebo {command}": text for command, text in usage.HELP_OF.items()},
+        "gpebo": help_of(), **{f"gpebo {command}": help_of(command) for command in COMMANDS},
     }
     parts = [f"## {name}\n\n```text\n{text.rstrip()}\n```\n" for name, text in texts.items()]
     return "\n".join(["# Commands\n\nWhat `--help` prints.\n", *parts])

@@ -15,7 +15,7 @@ import pytest
 from examples import ROOT, environment
 
 from gpebo_cli.cli.app import COMMANDS
-from gpebo_cli.cli.completion import SCRIPTS, candidates
+from gpebo_cli.cli.completion import SHELLS, candidates
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.evidence.metrics import NAMES
 from gpebo_cli.observers.gpebo import Gpebo
@@ -88,7 +88,7 @@ def test_figures_list_topics_recipes_and_columns():
     assert names("figures", "figures.formats=[png,p") == ["figures.formats=[png,pdf"]
     assert names("compare", "--sort", "rms") == ["rms_error_states"]
     assert names("new", "p") == ["plant"]
-    assert names("completion", "") == [*SCRIPTS, "--help"]
+    assert names("completion", "") == [*SHELLS, "--help"]
     assert names("run", "--cfg", "j") == ["job"]
 
 

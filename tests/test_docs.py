@@ -16,8 +16,8 @@ from examples import ROOT, blocks, commands, gpebo, python, shell
 
 from gpebo_cli import __all__ as public
 from gpebo_cli import __version__, estimators
-from gpebo_cli.cli import usage
 from gpebo_cli.cli.app import COMMANDS
+from gpebo_cli.cli.usage import help_of
 
 README = ROOT / "README.md"
 sys.path.insert(0, str(ROOT / "docs"))
@@ -27,8 +27,8 @@ import tutorials  # noqa: E402
 
 NOTEBOOK = ROOT / "docs" / "first_run.ipynb"
 MADE = ("notebook.md", "commands.md", "messages.md")  # with the site
-HELP = {"": usage.HELP, **usage.HELP_OF, "run": usage.run_help()}
-del HELP["completion"]  # its words are for a shell's start-up file
+# That of completion is for a shell's start-up file.
+HELP = {"": help_of(), **{name: help_of(name) for name in (*COMMANDS[1:-1], "run")}}
 
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 
@@ -50,7 +50,7 @@ def test_every_example_in_help_runs(tmp_path):
 
 
 def test_help_names_every_command_and_group():
-    assert all(f"\n  {name} " in usage.HELP for name in COMMANDS)
+    assert all(f"\n  {name} " in HELP[""] for name in COMMANDS)
     for name, text in HELP.items():
         assert text.startswith(("usage: gpebo " + name, "gpebo: ")), name
         assert max(map(len, text.splitlines())) <= 100, name

@@ -104,9 +104,9 @@ def _was_interrupted(error: BaseException | None) -> bool:
 def _dispatch(words: list[str]) -> int:
     command, rest = (words[0], words[1:]) if words else ("--help", [])
     if command in ("--help", "-h", "help"):
-        from gpebo_cli.cli.usage import HELP
+        from gpebo_cli.cli.usage import help_of
 
-        sys.stdout.write(HELP)
+        sys.stdout.write(help_of())
         return 0
     if command in ("--version", "-V", "version"):
         from gpebo_cli._version import __version__
@@ -114,9 +114,9 @@ def _dispatch(words: list[str]) -> int:
         sys.stdout.write(f"gpebo {__version__}\n")
         return 0
     if command in COMMANDS and not {"--help", "-h"}.isdisjoint(rest):
-        from gpebo_cli.cli.usage import HELP_OF, run_help
+        from gpebo_cli.cli.usage import help_of
 
-        sys.stdout.write(run_help() if command == "run" else HELP_OF[command])
+        sys.stdout.write(help_of(command))
         return 0
     if command in COMMANDS:
         from importlib import import_module

@@ -16,7 +16,7 @@ from contextlib import suppress
 from gpebo_cli.cli.arguments import OPTIONS, VALUES
 from gpebo_cli.cli.listing import KINDS, described
 from gpebo_cli.cli.options import SHORT, VOLUME
-from gpebo_cli.cli.usage import HELP_OF
+from gpebo_cli.cli.usage import help_of
 from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder, default, outline
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.results.names import FIGURE_NAMES, FORMATS, METRICS
@@ -34,65 +34,21 @@ _FOLDER_OPTIONS = ("--config-dir", "-cd", "--output", "--check", "--update")
 _WITH_KEYS = tuple(group for group in DATA_GROUPS if group != "plant")
 _NOT_KEYS = ("name", "title", "reference", "defaults", "hydra")
 
-# Bash cuts words at "=" (COMP_WORDBREAKS) and replaces the last piece only, so what stands before
-# that piece is taken off each candidate.
-_BASH = """\
-# bash completion for gpebo; in ~/.bashrc:  eval "$(gpebo completion bash)"
-_gpebo() {
-    local line="${COMP_LINE:0:COMP_POINT}" cur="${COMP_WORDS[COMP_CWORD]}" word before reply
-    word="${line##*[[:space:]]}"
-    [[ $cur == [=:] ]] && cur=""
-    before="${word%"$cur"}"
-    COMPREPLY=()
-    while IFS=$'\\t' read -r reply _; do
-        case $reply in *=|*.|*\\[|*/) compopt -o nospace 2>/dev/null ;; esac
-        reply="${reply#"$before"}"
-        COMPREPLY+=("${reply// /\\\\ }")
-    done < <("${COMP_WORDS[0]}" __complete --line "$line" 2>/dev/null)
-}
-complete -F _gpebo gpebo
-"""
-
-_ZSH = """\
-#compdef gpebo
-# zsh completion for gpebo; in ~/.zshrc, after compinit:  eval "$(gpebo completion zsh)"
-_gpebo() {
-    local -a plain open shown_plain shown_open
-    local reply text
-    while IFS=$'\\t' read -r reply text; do
-        if [[ $reply == *(=|.|/|\\[) ]]; then
-            open+=("$reply"); shown_open+=("$reply${text:+  -- $text}")
-        else
-            plain+=("$reply"); shown_plain+=("$reply${text:+  -- $text}")
-        fi
-    done < <("${words[1]}" __complete "${(@Q)words[2,CURRENT]}" 2>/dev/null)
-    (( $#plain )) && compadd -l -d shown_plain -a plain
-    (( $#open )) && compadd -S '' -l -d shown_open -a open
-}
-compdef _gpebo gpebo
-"""
-
-_FISH = """\
-# fish completion for gpebo; in ~/.config/fish/config.fish:  gpebo completion fish | source
-function __gpebo
-    set -l words (commandline -opc) (commandline -ct)
-    $words[1] __complete $words[2..-1] 2>/dev/null
-end
-complete -c gpebo -f -a '(__gpebo)'
-"""
-
-SCRIPTS = {"bash": _BASH, "zsh": _ZSH, "fish": _FISH}
+SHELLS = ("bash", "zsh", "fish")
+"""The shells there are scripts for, in the folder ``shells``."""
 
 
 def main(words: list[str]) -> int:
     """Print the script of a shell; the exit code (ConfigError)."""
-    if len(words) != 1 or words[0] not in SCRIPTS:
+    if len(words) != 1 or words[0] not in SHELLS:
         given = shown(" ".join(words)) if words else "nothing"
         raise ConfigError(
-            f"gpebo completion needs one of {', '.join(SCRIPTS)}; got {given}"
-            + nearest(" ".join(words), SCRIPTS)
+            f"gpebo completion needs one of {', '.join(SHELLS)}; got {given}"
+            + nearest(" ".join(words), SHELLS)
         )
-    sys.stdout.write(SCRIPTS[words[0]])
+    path = os.path.join(os.path.dirname(__file__), "shells", f"gpebo.{words[0]}")
+    with open(path, encoding="utf-8") as stream:
+        sys.stdout.write(stream.read())
     return 0
 
 
@@ -140,17 +96,15 @@ def _in_place(before: Sequence[str], word: str, commands: Sequence[str]) -> Iter
         "figures": [*choices(conf_folder(), "experiment"), "figures.formats=", *VOLUME],
         "new": [] if before else ["plant", "estimator", "observer", "recipe", "recording"],
         "reproduce": [*choices(conf_folder(), "experiment/published"), *VOLUME],
-        "completion": SCRIPTS,
+        "completion": SHELLS,
         "compare": METRICS if last == "--sort" else (),
     }
-    return [*found.get(command, ()), *_options(command)]
+    return [*found.get(command, ()), *(_options(command) if command in commands else ())]
 
 
 def _options(command: str) -> list[str]:
     """The options that the help of a command names."""
-    if command not in HELP_OF:
-        return []
-    text = "" if command == "completion" else HELP_OF[command]  # that one names those of others
+    text = "" if command == "completion" else help_of(command)  # that one names those of others
     words = [word.strip("[],") for word in text.split()]
     return [*(word for word in words if word.startswith("--")), "--help"]
 
