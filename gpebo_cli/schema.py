@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import types
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -69,6 +70,19 @@ def shown(value: object) -> str:
     except (ValueError, RecursionError):  # an integer with too many digits, or a cycle
         return f"a {type(value).__name__} that cannot be shown"
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def plain(value: object) -> Any:
+    """``value`` with arrays, tuples, ranges and paths as the lists and texts of a YAML file."""
+    if hasattr(value, "toarray"):  # SciPy's sparse matrices
+        value = value.toarray()
+    if hasattr(value, "tolist"):  # NumPy's arrays and scalars
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [plain(inner) for inner in value]
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 def read(cls: type[T], mapping: object, where: str) -> T:

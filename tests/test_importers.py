@@ -390,12 +390,14 @@ def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"M": None}, "M is missing"), ({"K": [[1, 0]]}, "K has 1 rows; expected 2"),
-    ({"G": [[1, 2, 3]]}, "G[0] has 3 entries; expected 2"), ({"stiffness": 1}, "unknown key"),
+    ({"G": [[1, 2, 3]]}, "G[0] has 3 entries; expected 2"),
+    ({"stiffness": 1}, "stiffness: no such key"), ({"r": [1, 2]}, "r has 2 entries"),
     ({"measure": ["q3"]}, "did you mean"), ({"M": [[1, True], [0, 1]]}, "M[0][1]"),
     ({"positions": ["a"]}, "positions has 1 names and M has 2 rows"),
-    ({"measure": "q1"}, "expected a list of names"), ({"inputs": ["u"]}, "inputs maps names to"),
-    ({"K": 3}, "K must be a list of rows"), ({"K": [1, 2]}, "K[0] must be a list"),
-    ({"M": [[0] * 1001]}, "M has more than"), ({"units": "m"}, "units maps names to texts"),
+    ({"measure": "q1"}, "measure: expected a list"),
+    ({"inputs": ["u"]}, "inputs: expected a mapping of names"),
+    ({"K": 3}, "K: expected a list"), ({"K": [1, 2]}, "K[0]: expected a list"),
+    ({"M": [[0]] * 1001}, "M has 1001 rows"), ({"units": "m"}, "units: expected a mapping"),
 ])
 def test_mistakes_in_mechanics(change, message):
     with pytest.raises(ConfigError) as error:

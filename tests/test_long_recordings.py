@@ -10,7 +10,7 @@ import pytest
 from gpebo_cli import run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
-from gpebo_cli.experiment.accuracy import _varies_slowly
+from gpebo_cli.experiment.fit import _varies_slowly
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory

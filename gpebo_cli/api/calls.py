@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 import numpy as np
 
 from gpebo_cli import observers
-from gpebo_cli.api.choice import choose, plain, primary
+from gpebo_cli.api.choice import choose, primary
 from gpebo_cli.api.result import Result
 from gpebo_cli.configs import configuration
 from gpebo_cli.configs.files import is_file
@@ -24,7 +24,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.recordings.drive import located
 from gpebo_cli.regression.text import system_from_mapping
-from gpebo_cli.schema import nearest, shown, unknown
+from gpebo_cli.schema import nearest, plain, shown, unknown
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
 
 if TYPE_CHECKING:

@@ -7,17 +7,15 @@ is written in one place.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
-
-import numpy as np
 
 from gpebo_cli.configs import files, locations
 from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.registry import installed
-from gpebo_cli.schema import nearest, shown
+from gpebo_cli.schema import nearest, plain, shown
 
 _WHOLE = ("plant", "regression")  # a mapping or a file of these is all of it
 
@@ -58,19 +56,6 @@ def choose(
         )
         raise ConfigError(f"{group}: expected {wanted}, got {shown(given)}")
     return _named(group, given, config_dir)
-
-
-def plain(value: object) -> Any:
-    """``value`` with arrays, tuples, ranges and paths as the lists and texts of a YAML file."""
-    if hasattr(value, "toarray"):  # SciPy's sparse matrices
-        return value.toarray().tolist()
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return [plain(inner) for inner in value]
-    return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 def _as_path(given: object) -> str | None:

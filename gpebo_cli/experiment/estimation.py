@@ -20,9 +20,10 @@ from gpebo_cli.evidence.excitation import (
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import Metrics
-from gpebo_cli.experiment import accuracy
+from gpebo_cli.experiment import accuracy, doubts
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
+from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.memory import check_samples
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
@@ -127,7 +128,7 @@ def continuous(
                 settings, observation, estimator, source, levels, known, estimation
             )
         note += _no_deviations(why)
-    fit = accuracy.fit_of(observation, estimation, system, source) if source.recording else None
+    fit = fit_of(observation, estimation, system, source) if source.recording else None
     if fit is not None and settings.uncertainty and not levels.silent:
         fit = replace(fit, ratio=residual_ratio(observation, source, settings.noise, levels))
     noise = None
@@ -177,7 +178,7 @@ def _with_deviations(
     regression, final = observation.regression, estimation.explaining
     if regression.resets or final is None or not _one_fit(observation):
         return estimation.with_deviations(std), ""
-    told, why = accuracy.finished(
+    told, why = doubts.finished(
         std, "", regression.root, final, estimation.requirement, columns
     )
     return estimation.with_deviations(told), why
@@ -261,11 +262,11 @@ def at_samples(
         ), online.parameters, system)
     chosen = kept_samples(1, len(t), settings.time.samples)
     kept = chosen[kept_samples(len(by.cases), len(chosen), settings.output.max_rows)]
-    still = accuracy.still(parameters, by.requirement, online.natural_sizes)
+    still = doubts.still(parameters, by.requirement, online.natural_sizes)
     told = np.concatenate([parameters, states], axis=2)[:, kept]
     std, gains = made.at(kept, ~np.isnan(told) & ~still[:, None, None])
     nobody = settings.uncertainty and parameters.size and std is None
-    std, why = accuracy.finished(
+    std, why = doubts.finished(
         std, none_at_samples(len(by.cases)) if nobody else "", online.root,
         made.parameters[:, -1], by.requirement, columns,
     )
@@ -396,7 +397,7 @@ def _estimate(
             settings, system, observation, explaining, kept, np.concatenate(sizes), known, seen,
             columns, requirement,
         )) if about_own and _one_fit(observation) else ({}, ()),
-        still=accuracy.still(parameters, requirement, natural),
+        still=doubts.still(parameters, requirement, natural),
     )
     return estimator, result, accuracy.metrics_of(numbers, observation.parameters, system)
 
@@ -415,7 +416,7 @@ def _doubts(
     def states(t: Array) -> Callable[[Array], Array]:
         return lambda eta: state_map.at(t)(eta[:, None].repeat(len(t), axis=1))
 
-    return accuracy.doubts(
+    return doubts.of_estimates(
         regression.root, final, states(t), states(t[-1:]),
         [*regression.parameters, *system.states], sizes, known, seen, columns, requirement,
     )

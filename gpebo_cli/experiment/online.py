@@ -16,7 +16,7 @@ from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.evidence.excitation import WELL, Excitation
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
 from gpebo_cli.evidence.uncertainty import SampledDeviations
-from gpebo_cli.experiment.accuracy import doubts
+from gpebo_cli.experiment import doubts as doubted
 from gpebo_cli.experiment.result import Fit
 from gpebo_cli.experiment.uncertainty import MOST_CASES
 from gpebo_cli.findings import Assumption, Requirement
@@ -261,7 +261,7 @@ class Online:
     ) -> tuple[Mapping[str, float], tuple[str, ...]]:
         """How far ``final`` estimates (G, p) may be off, and warnings of that; None: the newest."""
         _, known, _ = self._newest
-        return doubts(
+        return doubted.of_estimates(
             self.root, self._final if final is None else final, self.last_states, self.last_states,
             [*self.parameters, *self._system.states],
             np.append(self.natural_sizes, self.largest) if sizes is None else sizes,

@@ -7,69 +7,89 @@ full row rank the index is 3, without constraints 0.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import Entry, PlantDraft
-from gpebo_cli.schema import check_keys, per_name, shown
+from gpebo_cli.schema import per_name, plain, read
 
-KEYS = (
-    "title", "reference", "parameters", "positions", "inputs", "unknowns", "M", "D", "K", "G", "B",
-    "F", "r", "measure", "initial_positions", "initial_velocities", "units",
-)
-"""Keys of a mechanical model; only M is required."""
+Matrix = list[list[Entry]]
 MAX_POSITIONS = 1_000
+
+
+@dataclass(frozen=True)
+class Model:
+    """The keys of a mechanical model with k positions, c constraints, m inputs and q unknowns.
+
+    Entries are numbers, or expressions of t and of the parameters; matrices are lists of rows.
+    """
+
+    M: Matrix  # (k, k)
+    D: Matrix = field(default_factory=list)  # (k, k)
+    K: Matrix = field(default_factory=list)  # (k, k)
+    G: Matrix = field(default_factory=list)  # (c, k)
+    B: Matrix = field(default_factory=list)  # (k, m)
+    F: Matrix = field(default_factory=list)  # (k, q)
+    r: list[Entry] = field(default_factory=list)  # (c,)
+    positions: list[str] = field(default_factory=list)  # (k,) by default q1, …
+    inputs: Mapping[str, Entry] = field(default_factory=dict)
+    unknowns: Mapping[str, Entry] = field(default_factory=dict)
+    parameters: Mapping[str, Entry] = field(default_factory=dict)
+    measure: list[str] = field(default_factory=list)  # positions, velocities and forces
+    initial_positions: object = field(default_factory=dict)  # by position, in order, or one for all
+    initial_velocities: object = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    title: str = ""
+    reference: str = ""
 
 
 def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> PlantDraft:
     """The plant of a mechanical model.
 
     Args:
-        model: KEYS with matrices as lists of rows, entries numbers or expressions of t and of the
-            parameters: ``M``, ``D``, ``K`` (k × k), ``G`` (c × k), ``B`` (k × m), ``F`` (k × q),
-            ``r`` (c), names ``positions`` (default q1, …), ``inputs`` and ``unknowns`` (name to
-            value), ``measure`` (names of positions, velocities and forces).
+        model: keys and values as :class:`Model` has them, of which only M is required; arrays and
+            SciPy's sparse matrices stand for lists of rows.
         name: of the plant; velocities are v_<position>, forces of constraints lambda1, ….
         source: the file, for messages.
 
     Raises:
         ConfigError: an unknown key, or a size that does not fit; says both numbers.
     """
-    where = f"{source or name}: "
-    check_keys(model, KEYS, source or name)
-    M = _matrix(model, "M", None, None, where)
-    k = len(M)
-    if k == 0:
-        raise ConfigError(f"{where}M is missing; it has a row and a column for each position")
-    M, D, K = (_matrix(model, key, k, k, where) for key in "MDK")
-    G = _matrix(model, "G", None, k, where)
-    inputs, unknowns = (_named(model, key, where) for key in ("inputs", "unknowns"))
-    B = _matrix(model, "B", k, len(inputs), where)
-    F = _matrix(model, "F", k, len(unknowns), where)
-    given = model.get("positions")
-    positions = [f"q{i + 1}" for i in range(k)] if given is None else _list(given, where)
+    where = source or name
+    given = read(Model, plain({k: v for k, v in model.items() if v is not None}), where)
+    k, c = len(given.M), len(given.G)
+    if not (0 < k <= MAX_POSITIONS and c <= MAX_POSITIONS):
+        raise ConfigError(f"{where}: M has {k} rows and G {c}; 1 to {MAX_POSITIONS} are read")
+    sizes = {"M": (k, k), "D": (k, k), "K": (k, k), "G": (c, k), "B": (k, len(given.inputs)),
+             "F": (k, len(given.unknowns))}
+    M, D, K, G, B, F = (
+        _sized(getattr(given, key), *size, f"{where}: {key}") for key, size in sizes.items()
+    )
+    positions = given.positions or [f"q{i + 1}" for i in range(k)]
     if len(positions) != k:
-        raise ConfigError(f"{where}positions has {len(positions)} names and M has {k} rows")
+        raise ConfigError(f"{where}: positions has {len(positions)} names and M has {k} rows")
+    if len(given.r) not in (0, c):
+        raise ConfigError(f"{where}: r has {len(given.r)} entries, and there are {c} constraints")
     velocities = [f"v_{position}" for position in positions]
-    forces = [f"lambda{i + 1}" for i in range(len(G))]
+    forces = [f"lambda{i + 1}" for i in range(c)]
 
     draft = PlantDraft(
-        name, str(model.get("title") or f"mechanism {name}"),
-        str(model.get("reference") or source),
+        name, given.title or f"mechanism {name}", given.reference or source,
         comments=["M q'' + D q' + K q = G' lambda + B u + F theta,  G q = r"],
-        parameters=_named(model, "parameters", where),
+        parameters=dict(given.parameters),
     )
-    units = {label: str(unit) for label, unit in _mapping(model, "units", where, "texts").items()}
-    start = [
-        *_start(model, "initial_positions", positions, where),
-        *_start(model, "initial_velocities", positions, where), *[0.0] * len(forces),
-    ]
-    for state, first in zip([*positions, *velocities, *forces], start, strict=True):
-        draft.states[state] = (first, units.get(state, ""))
-    for group, values in ((draft.inputs, inputs), (draft.unknowns, unknowns)):
-        group.update({label: (value, units.get(label, "")) for label, value in values.items()})
+    start = [0.0] * (2 * k + c)
+    for first, key in enumerate(("initial_positions", "initial_velocities")):
+        start[first * k : (first + 1) * k] = per_name(
+            getattr(given, key), positions, "position", f"{where}: {key}", "finite", absent=0.0
+        ).tolist()
+    for state, value in zip([*positions, *velocities, *forces], start, strict=True):
+        draft.states[state] = (value, given.units.get(state, ""))
+    for group, values in ((draft.inputs, given.inputs), (draft.unknowns, given.unknowns)):
+        group.update({
+            label: (value, given.units.get(label, "")) for label, value in values.items()
+        })
 
     for position, velocity in zip(positions, velocities, strict=True):
         row = draft.equation(f"{position}' = {velocity}")
@@ -77,7 +97,7 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
         draft.add("A", row, velocity, 1.0)
     terms = (
         ("E", M, velocities, 1), ("A", D, velocities, -1), ("A", K, positions, -1),
-        ("B", B, list(inputs), 1), ("F", F, list(unknowns), 1),
+        ("B", B, list(given.inputs), 1), ("F", F, list(given.unknowns), 1),
         ("A", [[line[i] for line in G] for i in range(k)], forces, 1),
     )
     for i in range(k):
@@ -85,9 +105,14 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
         for matrix, rows, columns, sign in terms:
             for entry, column in zip(rows[i], columns, strict=True):
                 _put(draft, matrix, row, column, entry, sign)
-    _constraints(draft, G, _right_hand_side(model, len(G), where), positions)
-    measured = model.get("measure")
-    draft.measure([] if measured is None else _list(measured, where), where)
+    for j in range(c):  # 0 = G q − r; an r that is not zero is an input
+        row = draft.equation(f"constraint {j + 1}: G q = r")
+        for entry, column in zip(G[j], positions, strict=True):
+            _put(draft, "A", row, column, entry, 1)
+        if given.r and given.r[j] != 0:
+            draft.inputs[f"r{j + 1}"] = (given.r[j], "")
+            draft.add("B", row, f"r{j + 1}", -1.0)
+    draft.measure(given.measure, f"{where}: ")
     return draft
 
 
@@ -137,19 +162,6 @@ def linearise(
     }
 
 
-def _constraints(
-    draft: PlantDraft, G: list[list[Entry]], r: list[Entry], positions: Sequence[str]
-) -> None:
-    """Rows 0 = G q − r; an r that is not zero is an input."""
-    for j in range(len(G)):
-        row = draft.equation(f"constraint {j + 1}: G q = r")
-        for entry, column in zip(G[j], positions, strict=True):
-            _put(draft, "A", row, column, entry, 1)
-        if r[j] != 0:
-            draft.inputs[f"r{j + 1}"] = (r[j], "")
-            draft.add("B", row, f"r{j + 1}", -1.0)
-
-
 def _put(draft: PlantDraft, matrix: str, row: int, column: str, entry: Entry, sign: int) -> None:
     if isinstance(entry, str):
         draft.add(matrix, row, column, entry if sign > 0 else f"-({entry})")
@@ -157,74 +169,13 @@ def _put(draft: PlantDraft, matrix: str, row: int, column: str, entry: Entry, si
         draft.add(matrix, row, column, sign * entry)
 
 
-def _list(value: object, where: str) -> list[str]:
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise ConfigError(f"{where}expected a list of names, got {shown(value)}")
-    return [str(item) for item in value]
-
-
-def _named(model: Mapping[str, object], key: str, where: str) -> dict[str, Entry]:
-    given = _mapping(model, key, where)
-    return {label: _entry(item, f"{where}{key}.{label}") for label, item in given.items()}
-
-
-def _mapping(
-    model: Mapping[str, object], key: str, where: str, to: str = "values"
-) -> dict[str, object]:
-    value = model.get(key) or {}
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}{key} maps names to {to}, got {shown(value)}")
-    return {str(label): item for label, item in value.items()}
-
-
-def _entry(value: object, where: str) -> Entry:
-    if isinstance(value, bool) or not isinstance(value, int | float | str | np.number):
-        raise ConfigError(f"{where}: expected a number or an expression, got {shown(value)}")
-    return value if isinstance(value, str) else float(value)
-
-
-def _matrix(
-    model: Mapping[str, object], key: str, rows: int | None, columns: int | None, where: str
-) -> list[list[Entry]]:
-    """A matrix as rows of entries; absent: zeros of the size asked for, or no rows."""
-    value = model.get(key)
-    if value is None:
-        return [[0.0] * (columns or 0) for _ in range(rows or 0)]
-    if hasattr(value, "toarray"):
-        value = value.toarray()
-    if isinstance(value, np.ndarray):
-        value = np.atleast_2d(value).tolist()
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise ConfigError(f"{where}{key} must be a list of rows, got {shown(value)}")
-    if max([len(value), *(len(row) for row in value if isinstance(row, Sequence))]) > MAX_POSITIONS:
-        raise ConfigError(f"{where}{key} has more than {MAX_POSITIONS} rows or columns")
-    out = []
-    for i, row in enumerate(value):
-        if not isinstance(row, Sequence) or isinstance(row, str):
-            raise ConfigError(f"{where}{key}[{i}] must be a list, got {shown(row)}")
-        if columns is not None and len(row) != columns:
-            raise ConfigError(f"{where}{key}[{i}] has {len(row)} entries; expected {columns}")
-        out.append([_entry(item, f"{where}{key}[{i}][{j}]") for j, item in enumerate(row)])
-    if rows is not None and len(out) != rows:
-        raise ConfigError(f"{where}{key} has {len(out)} rows; expected {rows}")
-    return out
-
-
-def _right_hand_side(model: Mapping[str, object], count: int, where: str) -> list[Entry]:
-    value = model.get("r")
-    if value is None:
-        return [0.0] * count
-    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
-        raise ConfigError(f"{where}r is a list with an entry for each of the {count} constraints")
-    return [_entry(item, f"{where}r[{j}]") for j, item in enumerate(value)]
-
-
-def _start(
-    model: Mapping[str, object], key: str, positions: Sequence[str], where: str
-) -> list[float]:
-    value = model.get(key)
-    if value is None:
-        return [0.0] * len(positions)
-    value = list(value) if isinstance(value, np.ndarray) else value
-    found = per_name(value, positions, "position", f"{where}{key}", "finite", absent=0.0)
-    return [float(number) for number in found]
+def _sized(matrix: Matrix, rows: int, columns: int, where: str) -> Matrix:
+    """A matrix of the size that is asked for; zeros where there is none."""
+    if not matrix:
+        return [[0.0] * columns for _ in range(rows)]
+    if len(matrix) != rows:
+        raise ConfigError(f"{where} has {len(matrix)} rows; expected {rows}")
+    for i, row in enumerate(matrix):
+        if len(row) != columns:
+            raise ConfigError(f"{where}[{i}] has {len(row)} entries; expected {columns}")
+    return matrix

@@ -1,0 +1,133 @@
+"""What the final estimates explain of a recording, and what their residual looks like."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gpebo_cli.experiment.result import EstimationResult, Fit
+from gpebo_cli.experiment.sources import Source
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.observers import Observation
+
+_LAGS = 20  # of the residual's autocorrelation
+_SLOW = 8  # one in so many of a residual's cosines is slow
+_RARE = 0.005  # chance of each sum below which they are not those of white noise
+_SILENT = 1e-9  # of an output: a residual below that is rounding
+_FAR = 7.0  # deviations of most samples: what is farther away is no noise of theirs
+_ROUNDING = 0.35  # steps: rounding alone leaves 0.29
+_ROUNDED = 0.95  # share of an output's changes that are whole steps, if it is rounded to these
+
+
+def fit_of(
+    observation: Observation, estimation: EstimationResult, system: DescriptorSystem,
+    source: Source,
+) -> Fit | None:
+    """Root mean squares over time of Y − ψη̂ with the final estimates, and of Y; the fitted ŷ."""
+    regression = observation.regression
+    final = estimation.explaining
+    if final is None or estimation.names != regression.parameters:
+        return None
+    duration = float(regression.mesh.edges[-1] - regression.mesh.edges[0])
+
+    def rms(eta: Array) -> float:
+        return float(np.sqrt(regression.misfit(eta) / duration))
+
+    fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)))
+    if regression.resets or regression.dynamics is not None:
+        return fit
+    return _explained(
+        fit, final[fit.best], observation, system, source,
+        every=regression.factor is None and not source.pieces,
+    )
+
+
+def _varies_slowly(residual: Array) -> bool:
+    """Whether a residual (N, r) has more in its slowest cosines than white noise.
+
+    In its slowest 4, 8, 16, …: what is small and slow hides from single lags.
+    """
+    from scipy.fft import dct  # as long to import as a small run takes
+    from scipy.special import fdtrc
+
+    spectrum = dct(residual, axis=0, norm="ortho")[1:] ** 2
+    (count, outputs), slow = spectrum.shape, len(spectrum) // _SLOW
+    some = 2 ** np.arange(2, slow.bit_length())
+    sums = (spectrum / spectrum[slow:].mean(axis=0)).sum(axis=1).cumsum()[some - 1]
+    chances = fdtrc(some * outputs, (count - slow) * outputs, sums / (some * outputs))
+    return bool(chances.min(initial=1.0) < _RARE)
+
+
+def _step(y: Array) -> float:
+    """What an output (N,) is rounded to; 0.0 where most changes are no multiples of one step."""
+    change = np.abs(np.diff(y))
+    change = change[change > _SILENT * np.abs(y).max()]
+    step = float(np.median(change)) if len(change) else 0.0
+    whole = np.abs(change - step * np.rint(change / step)) < _SILENT**0.5 * step if step else change
+    return step if len(change) and whole.mean() >= _ROUNDED else 0.0
+
+
+def _explained(
+    fit: Fit, eta: Array, observation: Observation, system: DescriptorSystem, source: Source, *,
+    every: bool,
+) -> Fit:
+    """With ŷ of the final estimates η̂ (p,), and how white y − ŷ is.
+
+    ŷ is C x̂ + D u + H θ̂ of a plant, and ψη̂ of a regression whose Y is measured. Whiteness is
+    looked at at ``every`` sample, or at the output times if x̂ is known there only.
+    """
+    t, recording, state_map = source.t, source.recording, observation.state_map
+    if recording is None or len(state_map.times):
+        return fit
+
+    def outputs(t: Array, own_t: Array, u: Array, y: Array) -> Array:
+        if system.regression is not None:
+            return np.asarray(observation.regression.psi(t) @ eta)[:, : system.r]
+        x = state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
+        c = system.coefficients.taylor(own_t, 0, signals=np.hstack([u, y])[None])
+        terms = (c.C, x), (c.D, u), (c.H, np.tile(eta[: system.q], (len(t), 1)))
+        return np.asarray(sum(
+            np.matmul(matrix[0], signal[..., None])[..., 0] for matrix, signal in terms
+        ))
+
+    u, y = recording.inputs, recording.outputs
+    fitted = outputs(t, t if source.own_t is None else source.own_t, u, y)
+    fit = replace(fit, outputs=fitted)
+    samples = t if source.samples is None else source.samples
+    samples = samples[(samples >= t[0]) & (samples <= t[-1])]
+    if every:
+        u, y = source.inputs(samples), source.outputs(samples)
+        t, fitted = samples, outputs(samples, samples, u, y)
+    # Two samples apart: between samples the signals are interpolated and no noise is white.
+    apart = 2.0 * (recording.last - recording.first) / max(recording.rows - 1, 1)
+    step = float(t[-1] - t[0]) / (len(t) - 1)
+    stride = 1 if t is samples else max(1, int(np.ceil(apart / step)))
+    residual = (y - fitted)[::stride]
+    residual = residual - residual.mean(axis=0)
+    power = (residual**2).sum(axis=0)
+    # What an output is used up for leaves rounding, which is no noise.
+    count, seen = len(residual), power > _SILENT**2 * (y[::stride] ** 2).sum(axis=0)
+    lags = range(1, min(_LAGS, count // 4) + 1)
+    if not seen.any() or not lags:
+        return fit
+    correlation = np.array([
+        ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
+    ])
+    names = frozenset[str]().union(*system.coefficients.signals.values())
+    typical = np.median(np.abs(residual), axis=0) / 0.6745  # σ of normal noise, whatever few do
+    far = (np.abs(residual) > _FAR * typical) & seen & (typical > 0.0)
+    return replace(
+        fit, far=[
+            (name, int(own.sum()), float(t[::stride][np.argmax(own)]))
+            for name, own in zip(system.outputs, far.T, strict=True) if own.any()
+        ],
+        rounded=[
+            (name, step) for name, step, own in zip(
+                system.outputs, map(_step, y.T), np.sqrt(power / count), strict=True
+            ) if own < _ROUNDING * step
+        ],
+        correlation=correlation, slow=_varies_slowly(residual[:, seen]), lag=stride * step,
+        in_matrices=tuple(name for name in system.outputs if name in names),
+        band=1.96 / np.sqrt(count * seen.sum()),
+    )
