@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from benchmarks.problems import Problem
 from gpebo_cli.configs import files
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
@@ -27,18 +28,8 @@ def reference(name: str) -> dict[str, Any]:
 
 def problem(path: Path) -> tuple[dict[str, Any], DescriptorSystem]:
     """A published problem: its description and the plant."""
-    data = json.loads(path.read_text(encoding="utf-8"))
-    n, m, r = len(data["E"]), len(data["u"]), len(data["C"])
-    states = [f"x{i + 1}" for i in range(n)]
-    mapping = {
-        "name": data["name"],
-        "states": states,
-        "inputs": {f"u{i + 1}": data["u"][i] for i in range(m)},
-        "outputs": [f"y{i + 1}" for i in range(r)],
-        **{key: data[key] for key in "EABC"},
-        "initial_state": data["x0"],
-    }
-    return data, plant_from_mapping(mapping, path.name)
+    found = Problem(path.stem, json.loads(path.read_text(encoding="utf-8")))
+    return found.data, plant_from_mapping(found.mapping, path.name)
 
 
 def seen(signals):

@@ -48,7 +48,8 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
     """The plant of a mechanical model.
 
     Args:
-        model: keys and values as :class:`Model` has them, of which only M is required; arrays and
+        model: M and, where there are any, ``D``, ``K``, ``G``, ``B``, ``F``, ``r``, ``positions``,
+            ``inputs``, ``unknowns``, ``measure`` and so on, as :class:`Model` has them; arrays and
             SciPy's sparse matrices stand for lists of rows.
         name: of the plant; velocities are v_<position>, forces of constraints lambda1, ….
         source: the file, for messages.
