@@ -351,6 +351,8 @@ def test_the_series_resistance_of_a_battery_is_seen_in_its_output():
         ("1 + abs(y)/2", lambda t: np.where(t < 2 * np.log(1.5), 2 - 3 * np.exp(-t / 2),
                                             2 * np.exp((t - 2 * np.log(1.5)) / 2) - 2)),
         ("2 - sign(y)", lambda t: np.where(t < 1 / 3, 3 * t - 1, t - 1 / 3)),
+        # Flows between tanks whose levels pass each other: no derivative there.
+        ("1 + sign(t - 1)*sqrt(abs(t - 1)) - sign(y)*sqrt(abs(y))", lambda t: t - 1),
     ],
 )  # fmt: skip
 def test_outputs_may_pass_kinks_and_jumps_of_the_right_side(right_side, solution):

@@ -34,14 +34,16 @@ static inline Interval product(Interval a, Interval b)
     return widened(lesser(lesser(p, q), lesser(r, s)), greater(greater(p, q), greater(r, s)));
 }
 
-static inline double nearest_to_zero(Interval a) { return greater(greater(a.low, -a.high), 0.0); }
-
-static inline double largest(Interval a) { return greater(fabs(a.low), fabs(a.high)); }
+static inline Interval absolute(Interval a)
+{
+    const double nearest = greater(greater(a.low, -a.high), 0.0);
+    return (Interval){nearest, greater(fabs(a.low), fabs(a.high))};
+}
 
 static inline Interval square(Interval a)
 {
-    const double x = nearest_to_zero(a), y = largest(a);
-    return widened(x * x, y * y);
+    a = absolute(a);
+    return widened(a.low * a.low, a.high * a.high);
 }
 
 static inline Interval quotient(Interval a, Interval b)
@@ -54,8 +56,7 @@ static inline Interval quotient(Interval a, Interval b)
 static Interval raised(Interval a, double r)
 {
     if (r == floor(r) && r > 0.0) {
-        if (fmod(r, 2.0) == 0.0)
-            return widened(pow(nearest_to_zero(a), r), pow(largest(a), r));
+        a = fmod(r, 2.0) == 0.0 ? absolute(a) : a;
         return widened(pow(a.low, r), pow(a.high, r));
     }
     if (r > 0.0)
@@ -63,7 +64,7 @@ static Interval raised(Interval a, double r)
     return a.low > 0.0 ? widened(pow(a.high, r), pow(a.low, r)) : anything;
 }
 
-static double slack_of(Interval a) { return 4e-16 * largest(a) + 1e-15; }
+static double slack_of(Interval a) { return 4e-16 * absolute(a).high + 1e-15; }
 
 /* Whether a crest of sin(x + to) at `at`, or one that rounding might have moved, is inside. */
 static int crest(Interval a, double slack, double at)
@@ -118,7 +119,7 @@ static inline Interval image(npy_intp what, Interval a, Interval b, int same_row
     case COS: return wave(a, cos(a.low), cos(a.high), HALF_PI);
     case TAN: return tangent(a);
     case SINH: return rising(sinh, a, -INFINITY, INFINITY);
-    case COSH: return widened(cosh(nearest_to_zero(a)), cosh(largest(a)));
+    case COSH: return rising(cosh, absolute(a), 0.0, INFINITY);
     case TANH: return rising(tanh, a, -INFINITY, INFINITY);
     case ASIN: return rising(asin, a, -1.0, 1.0);
     case ACOS:
@@ -128,6 +129,7 @@ static inline Interval image(npy_intp what, Interval a, Interval b, int same_row
     case ACOSH: return rising(acosh, a, 1.0, INFINITY);
     case ATANH: return rising(atanh, a, -1.0, 1.0);
     case ERF: return rising(erf, a, -INFINITY, INFINITY);
+    case ABSOLUTE: return absolute(a);
     default: return (Interval){signum(a.low), signum(a.high)};
     }
 }
@@ -142,13 +144,11 @@ static void run_cell(const Call *call, Interval *row, char *number)
         const npy_intp left = operation->left, right = operation->right;
         const Interval a = left < 0 ? (Interval){constant[~left], constant[~left]} : row[left];
         const Interval b = right < 0 ? (Interval){constant[~right], constant[~right]} : row[right];
-        Interval found = image(operation->what, a, b, left == right && left >= 0);
+        const Interval found = image(operation->what, a, b, left == right && left >= 0);
         const double middle = found.low + 0.5 * (found.high - found.low);
         const int one = (left < 0 || number[left]) && (right < 0 || number[right]);
-        if (one && isfinite(middle))
-            found.low = found.high = middle;
         number[operation->result] = one && isfinite(middle);
-        row[operation->result] = found;
+        row[operation->result] = one && isfinite(middle) ? (Interval){middle, middle} : found;
     }
 }
 

@@ -83,6 +83,7 @@ EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, np
     case ACOSH: UNARY(acosh(x[i])); break;
     case ATANH: UNARY(atanh(x[i])); break;
     case ERF: UNARY(erf(x[i])); break;
+    case ABSOLUTE: UNARY(fabs(x[i])); break;
     default: UNARY(x[i] > 0.0 ? 1.0 : x[i] < 0.0 ? -1.0 : x[i] == 0.0 ? 0.0 : x[i]);
     }
 }

@@ -9,7 +9,7 @@
 /* In the order of _OPERATIONS in expressions/program.py. */
 enum { ADD, SUBTRACT, MULTIPLY, DIVIDE, POWER, GREATER_EQUAL, BINARY_OPERATIONS };
 enum { NEGATIVE = BINARY_OPERATIONS, SQRT, EXP, LOG, SIN, COS, TAN, SINH, COSH, TANH, ASIN };
-enum { ACOS = ASIN + 1, ATAN, ASINH, ACOSH, ATANH, ERF, SIGN, OPERATIONS };
+enum { ACOS = ASIN + 1, ATAN, ASINH, ACOSH, ATANH, ERF, ABSOLUTE, SIGN, OPERATIONS };
 
 /* One operation: what, the row of its result, its operands; see `operand`. */
 typedef struct {

@@ -76,7 +76,7 @@ def jump(
     """
     mu, n = structure.mu, system.n
     now = np.array([t])
-    after = system.coefficients.taylor(now, max(mu, 1), now + width)
+    after = system.coefficients.taylor(now, mu, now + width)
     reduced = strangeness_free_form(system, structure, now, now + width)
     levels = mu + 1
     blocks = np.zeros((levels, n, levels, n))

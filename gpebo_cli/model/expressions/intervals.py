@@ -43,7 +43,7 @@ class Interval(NDArrayOperatorsMixin):
         """All values that a function can have."""
         with np.errstate(all="ignore"):
             low, high = _image(ufunc, *inputs)
-            if ufunc.__name__ in ("negative", "sign", "greater_equal"):
+            if ufunc.__name__ in ("negative", "absolute", "sign", "greater_equal"):
                 return Interval(low, high)
             slack = _WIDER * np.abs(low) + _TINY, _WIDER * np.abs(high) + _TINY
             return Interval(low - slack[0], high + slack[1])
@@ -137,6 +137,7 @@ _OTHERS: dict[str, _Rule] = {
     "divide": _divide,
     "negative": lambda _, low, high, *__: (-high, -low),
     "power": _power,
+    "absolute": lambda ufunc, low, high, *_: _even(ufunc, low, high),
     "cosh": lambda ufunc, low, high, *_: _even(ufunc, low, high),
     "sin": lambda ufunc, low, high, *_: _wave(ufunc, low, high, 0.0),
     "cos": lambda ufunc, low, high, *_: _wave(ufunc, low, high, _HALF_PI),

@@ -168,8 +168,9 @@ def switched(name: str, decided: Coefficient, arguments: list[Jet], order: int) 
     sign = np.sign(decided)
     if name == "sign":
         return [sign]
-    if name == "abs":
-        return multiply([sign], arguments[0], order)
+    if name == "abs":  # at its zero rounding has any sign: a root of it would not be a number
+        value = arguments[0]
+        return [np.absolute(value[0]), *multiply([sign], value, order)[1:]]
     weight = 0.5 + (0.5 if name == "max" else -0.5) * sign
     a, b, _ = arguments
     return add(multiply([weight], a, order), multiply([1.0 - weight], b, order), order)

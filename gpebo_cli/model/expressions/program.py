@@ -22,7 +22,7 @@ _OPERATIONS = {
     for code, name in enumerate((
         "add", "subtract", "multiply", "divide", "power", "greater_equal", "negative", "sqrt",
         "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "arcsin", "arccos", "arctan",
-        "arcsinh", "arccosh", "arctanh", "erf", "sign",
+        "arcsinh", "arccosh", "arctanh", "erf", "absolute", "sign",
     ))
 }  # fmt: skip
 _GIVEN = 2  # rows that are always given: the times, and those at which jumps are decided
