@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from plants import reference, seen, shipped
+from scipy.linalg import expm
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.experiment.pipeline import run_experiment
@@ -71,6 +72,10 @@ def test_algebraic_zb_is_exact_once_za_is():
 
 def test_zb3_is_not_invented():
     result = run(shipped("canonical"), samples=11)
+    found = {a.name: a.evidence for a in result.assumptions}
+    assert found["Assumption 4"]["smallest"] == pytest.approx(0.7, rel=1e-3)  # of N21
+    of_c = [found["Assumption 6"][name] for name in ("smallest_c1", "smallest_c2")]
+    assert of_c == pytest.approx([0.7, 1.5], rel=1e-3)
     assert np.isnan(result.estimation.states[..., 4]).all()
     assert np.isfinite(result.metrics.final_error_states).all()
 
@@ -131,20 +136,25 @@ def test_any_gain_gives_the_same_limit(L_w):
     assert np.abs(error).max() < 10 * decays.evidence["transition_norm"] + 1e-9
 
 
-def test_remark_4_gain_for_constant_coefficients():
+@pytest.mark.parametrize("N32", [-0.75, 0])
+def test_remark_4_gain_for_constant_coefficients(N32):
     """a1 c1/c2 > 0 and constant: Remark 4's L_w gives a stable M_w, and all evidence is closed."""
-    mapping = {"N21": 1, "N31": 0.5, "N32": 1.5, "c1": 1, "c2": 2}
+    mapping = {"N21": 1, "N31": 0.5, "N32": N32, "c1": 1, "c2": 2}
     A = np.diag([0.05, -0.5, 1.0, 1.0, 1.0]).tolist()
     C = [[0, 0, 0, 0, 0], [1, 1, 0, 0, 0], [0.5, 0, "c1", "c2", 0]]
     system = shipped("canonical", parameters=mapping, A=A, C=C, outputs=["none", "y1", "y2"])
     result = run(system, L_w="remark4")
     found = {a.name: a for a in result.assumptions}
     assert found["Assumption 3"].evidence["outputs"] == "y1"
+    assert found["Assumption 4"].holds == (N32 != 0)
+    assert found["Assumption 4"].evidence == {"smallest": abs(N32)}
     assert found["Growth of Φ"].evidence["rate"] == pytest.approx(0.05)
     seven = found["Assumption 7"]
     assert seven.holds
     assert seven.evidence["integral_M11"] == pytest.approx(-0.5 * 20)
     assert seven.evidence["integral_M22"] == pytest.approx(-2.5 * 20)
+    decay = np.linalg.norm(expm([[-10, 0], [-20, -50]]), 2)
+    assert seven.evidence["transition_norm"] == pytest.approx(decay, rel=1e-5)
     error = result.estimation.states[0, -1, 2:4] - result.simulation.states[-1, 2:4]
     assert np.abs(error).max() < 1e-3
 
@@ -178,7 +188,8 @@ def test_matrices_against_their_definition():
         ({"C": [[1, 0, 0, 0, 0], [0.5, 0, 0, "c2", 0]]}, {}, ModelError, "Assumption 6 fails"),
         *(
             ({"C": [[1, 0, 0, 0, 0], [0.5, 0, *row]]}, {}, ModelError, "Assumption 6 fails: no")
-            for row in (["c1", "c2", "sin(t)"], ["c1", "cos(t)", 0], ["cos(t)", "c2", 0])
+            for row in (["c1", "c2", "sin(t)"], ["c1", "cos(t)", 0], ["cos(t)", "c2", 0],
+                        [1e-10, "c2", 0])
         ),
         (
             {"A": (np.diag([-1.0, -2, 1, 1, 1]) + 0.2 * np.eye(5, k=-2)).tolist()}, {},
@@ -187,6 +198,7 @@ def test_matrices_against_their_definition():
         ({}, {"output": "y1"}, ModelError, "Assumption 6 fails: output y1"),
         ({}, {"output": "y9"}, ConfigError, "'y9' is not an output"),
         ({}, {"L_w": ["t", "x"]}, ConfigError, r"observer.L_w\[1\]"),
+        ({}, {"L_w": ["t"]}, ConfigError, r"observer.L_w: got \['t'\]; accepted: diagonal"),
         ({}, {"L_w": "ab"}, ConfigError, "observer.L_w: got 'ab'; accepted: diagonal"),
         ({}, {"r0": [1.0]}, ConfigError, "two finite numbers"),
     ],

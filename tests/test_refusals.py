@@ -19,6 +19,8 @@ from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.importers.matrices import from_control
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers.reduced.invariant import invariant_observer
+from gpebo_cli.recordings.guess import guess
+from gpebo_cli.regression.text import regression_from_mapping
 from gpebo_cli.results.files import remove_files
 from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 
@@ -73,6 +75,18 @@ def canonical(**changes):
         ),
         ({"noise": {"name": "none", "outputs": 0.1}}, "noise.outputs: noise=none has no noise"),
         ({"data": ROWS.assign(V=[True, False, True])}, "data, column V: bool is not numbers"),
+        (
+            {"plant": {**HIDDEN, "inputs": {"u": 0}, "outputs": [], "C": []}},
+            "the observer needs outputs and C; without",
+        ),
+        (
+            {"observer": {"name": "gpebo", "remedy": "reset", "unknown_initial": ["il"]}},
+            "observer.unknown_initial: with this remedy the parameters are about later states",
+        ),
+        (
+            {"noise": {"name": "gaussian", "outputs": 0.1, "sample_time": 1e-3, "seeds": 101}},
+            "noise.seeds = 101: with noise.sample_time = 0.001 s they have 2.02e+06 samples",
+        ),
     ],
 )
 def test_of_runs(settings, message):
@@ -95,6 +109,14 @@ def test_of_runs(settings, message):
         ({"A": [[" ", 1], [1, 0]]}, "A[0][0] = ' ': it is empty; write a number"),
         ({"A": [["t" + " " * 10**6 + "t", 1], [1, 0]]}, "it has 1000002 characters, more than"),
         ({"A": [["d(d(abs(sin(t))))", 1], [1, 0]]}, "d(.) of something that jumps"),
+        *(({"A": [[text, 1], [1, 0]]}, f"A[0][0] = {text!r}: {reason}") for text, reason in (
+            ("0**(-1)", "it divides by zero"), ("1/0", "it divides by zero"),
+            ("log(-1)", "a function in it is undefined at its argument"),
+            ("1e308*10", "a number in it is too large"), ("1e400", "a number in it is not finite"),
+            ("t // 2", "the operator FloorDiv has no meaning here"),
+        )),
+        ({"A": [["1" + "0" * 400, 1], [1, 0]]}, "a number in it is too large"),
+        ({"A": [["-" * 201 + "t", 1], [1, 0]]}, "it is nested more than 200 deep"),
         ({"A": [["step(3)", 1], [1, 0]]}, "the argument of step does not depend on t"),
         ({"A": [["sin(t, t)", 1], [1, 0]]}, "sin takes one argument, not 2"),
         ({"A": [["max(t)", 1], [1, 0]]}, "max takes two arguments, not 1"),
@@ -103,6 +125,8 @@ def test_of_runs(settings, message):
         ({"A": [[1, 1]]}, "A has 1 row but"),
         ({"A": [[1], [1]]}, "A has 1 column but"),
         ({"A": {"a,b": 1, "a": {"b": 2}}}, "A has the entry a,b twice"),
+        ({"A": {"a": 3}}, "A has 'a': '3'; write entries as 'row,column': value ("),
+        ({"A": {"a,q": 3}}, "A: column 'q' is no state, and no number from 0 to 1; "),
         ({"A": np.eye(3)}, "A is 3 × 3, and"),
         ({"states": None}, "states is missing"),
         ({"initial_state": 3}, "must map states to numbers or list 2 numbers, not '3'"),
@@ -190,9 +214,14 @@ def test_of_several_recordings_with_an_observer_of_later_states(tmp_path):
         run("circuit", data={"name": "csv", "file": files}, observer=observer)
 
 
-def test_of_a_state_space_model_that_would_need_derivatives():
-    system = plant_from_mapping({**HIDDEN, "inputs": {"u": "sin(t)"}})
-    with pytest.raises(ConfigError, match="needs derivatives of inputs"):
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"inputs": {"u": "sin(t)"}}, "needs derivatives of inputs"),
+    ({"A": [["sin(t)", 1], [1, 0]]}, "not time-invariant: A depends on time or on signals, and a"),
+    ({"phi": [1, 0]}, "not time-invariant: phi is not zero, and a state-space model"),
+])
+def test_of_state_space_models(changes, message):
+    system = plant_from_mapping({**HIDDEN, **changes})
+    with pytest.raises(ConfigError, match=message):
         invariant_observer(system, SolverSettings(), "strangeness_free", None, 0.0)
 
 
@@ -264,6 +293,12 @@ def test_of_calls_from_python(tmp_path):
          "plant p: the model is in discrete time (dt = 0.1), and"),
         (lambda: from_control(SimpleNamespace(B=np.eye(1)), "p"), ConfigError,
          "plant p: SimpleNamespace has no A; give a state-space model"),
+        (lambda: regression_from_mapping(3, "r.yaml"), ConfigError,
+         "regression (r.yaml) must be a mapping with the keys "),
+        (lambda: regression_from_mapping({"name": "r", "signals": 3}), ConfigError,
+         "regression r: signals must map names to expressions"),
+        (lambda: guess("a.mat", shipped("circuit")), ConfigError,
+         "a.mat: there is nothing to guess in tables with types; data.file=a.mat reads it"),
         (lambda: remove_files([tmp_path]), GpeboError, f"cannot remove {tmp_path}: "),
     ):
         with pytest.raises(error) as caught:
