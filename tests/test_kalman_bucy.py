@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from examples import gpebo
 from plants import seen, shipped
-from test_cli import FAST, folders, gpebo
+from test_cli import FAST, folders
 from test_observer import ROTATING
 
 from gpebo_cli import run as api_run

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import seen, shipped
@@ -505,20 +503,12 @@ def test_a_reset_that_keeps_nothing_follows_a_step_of_an_unknown(name):
     assert relative_error(kept)[-1] > 100 * relative_error(followed)[-1]
 
 
-def command(*words, cwd):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        [sys.executable, "-m", "gpebo_cli", *words], cwd=cwd, env=environment, timeout=120,
-        capture_output=True, text=True, check=False,
-    )
-
-
 def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
     words = [
         "run", "--config-dir", str(EXAMPLES), "plant=unbounded", "time.horizon=40", "figures=none",
         "estimator=least_squares", "observer.form=given", "hydra.run.dir=out",
     ]
-    done = command(*words, cwd=tmp_path)
+    done = gpebo(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (line,) = done.stderr.splitlines()
     assert line.startswith("gpebo: warning: Φ has grown to ")
@@ -526,7 +516,7 @@ def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
     assert warning in done.stdout.splitlines()[-1]
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert summary["warnings"] == [warning]
-    done = command(*words, "observer.remedy=reset", cwd=tmp_path)
+    done = gpebo(*words, "observer.remedy=reset", cwd=tmp_path)
     assert done.returncode == 0
     assert not done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
@@ -543,7 +533,7 @@ def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
     ],
 )
 def test_command_refuses_in_one_line(words, message, tmp_path):
-    done = command("run", "plant=circuit", "figures=none", *words, cwd=tmp_path)
+    done = gpebo("run", "plant=circuit", "figures=none", *words, cwd=tmp_path)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("gpebo: error: ")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import shipped
@@ -375,7 +374,7 @@ RECIPES = {
 @pytest.mark.parametrize("name", RECIPES)
 def test_recipes_run_from_the_command_line(name, tmp_path):
     words = ["run", f"experiment={name}", f"hydra.run.dir={tmp_path}", "time.horizon=0.5"]
-    subprocess.run([sys.executable, "-m", "gpebo_cli", *words], check=True, capture_output=True)
+    assert gpebo(*words, cwd=tmp_path).returncode == 0
     summary = json.loads((tmp_path / "summary.json").read_text("utf-8"))
     assert summary["plant"] == RECIPES[name]
     assert (tmp_path / "figures" / "states.png").exists()
