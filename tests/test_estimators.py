@@ -16,8 +16,7 @@ from gpebo_cli import estimators
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
-from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
-from gpebo_cli.estimators._scalar import scalar_law, scalar_path
+from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_law, scalar_path
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved

@@ -7,12 +7,11 @@ with an underscore may change.
 """
 
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, axis, combinations, gain
-from gpebo_cli.estimators._extension import kreisselmeier, lion, low_pass
 from gpebo_cli.estimators._information import Information, information
 from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reached
 from gpebo_cli.estimators._recursive import InformationRoot, KreisselmeierFilter, ScalarLaw
 from gpebo_cli.estimators._registry import GROUP, able, build, names, settings_of
-from gpebo_cli.estimators._scalar import mix
+from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, mix
 from gpebo_cli.estimators._segments import estimate, raised, tuned, tuned_for
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import product
 from math import prod
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,8 @@ from gpebo_cli.regression.estimator import Estimates, ResumableEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import Known
 from gpebo_cli.schema import LARGEST, Accepted, number, per_name
+
+Part = TypeVar("Part", bound="GainEstimator")
 
 _LOGSPACE = re.compile(r"logspace\(\s*([^,()]+),\s*([^,()]+),\s*([^,()]+)\)")
 _LARGEST = 1e300  # of gains, which make up for the units of the regression
@@ -144,6 +146,10 @@ class GainEstimator(ABC):
     def start(self, parameters: Sequence[str]) -> Array:
         """η̂ at the start, shape (p,)."""
         return per_name(self.initial, parameters, "parameter", "estimator.initial", "finite")
+
+    def part(self, kind: type[Part]) -> Part:
+        """Another estimator with these settings, as far as it has them, that this one rests on."""
+        return kind(**{own.name: getattr(self, own.name) for own in fields(kind)})
 
     @abstractmethod
     def estimate(self, regression: LinearRegression, t: Array) -> Estimates:

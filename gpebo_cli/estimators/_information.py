@@ -18,8 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from gpebo_cli.errors import SolverError, check_memory
-from gpebo_cli.estimators._extension import low_pass
-from gpebo_cli.estimators._scalar import SINGULAR
+from gpebo_cli.estimators._scalar import SINGULAR, low_pass
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory

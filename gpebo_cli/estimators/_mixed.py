@@ -9,15 +9,13 @@ from functools import cached_property, partial
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
-from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._recursive import (
     KreisselmeierFilter,
     Mixed,
     ScalarLaw,
-    inverse_sampled,
     mix_sampled,
 )
-from gpebo_cli.estimators._scalar import ScalarPath, mix, scalar_law
+from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
 from gpebo_cli.model.descriptor import Array
@@ -62,25 +60,41 @@ class FilteredEstimator(ResumableEstimator):
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
         """δ𝒴 behind the filters, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂), of every case."""
-        names, p = regression.parameters, regression.p
-        rates = filter_rates(self.rates, names)
-        extended = self.extend(regression, rates, known[0].values if known else None)
+        rates, mixed = self.behind(regression, known)
 
         def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
-            omega = extended(t, inside)[..., :p]
-            delta, adjugate, _ = determinant_and_adjugate_action(omega)
-            into = rates[:, None] * self.seen(regression.psi(t, inside))
-            return scalar_errors(rates, into, delta, adjugate, gain)
+            return scalar_errors(rates, *mixed(t, inside), gain)
 
-        return tuple(partial(at, gain) for gain in self.gains("gamma", names))
+        return tuple(partial(at, gain) for gain in self.gains("gamma", regression.parameters))
+
+    def behind(
+        self, regression: LinearRegression, known: Known = ()
+    ) -> tuple[Array, Callable[[Array, Array], tuple[Array, Array, Array]]]:
+        """Rates (p,) of the filters behind Y; what they take of it (N, p, rows), Δ and adj(Ω).
+
+        The latter at times (N,) and where jumps are decided.
+        """
+        p, rates = regression.p, filter_rates(self.rates, regression.parameters)
+        extended = self.extend(regression, rates, known[0].values if known else None)
+
+        def at(t: Array, inside: Array) -> tuple[Array, Array, Array]:
+            delta, adjugate, _ = determinant_and_adjugate_action(extended(t, inside)[..., :p])
+            return rates[:, None] * self.seen(regression.psi(t, inside)), delta, adjugate
+
+        return rates, at
 
     def at_samples(self, rates: Array) -> KreisselmeierFilter:
         """The filters in discrete time, with rates of shape (p,)."""
         return KreisselmeierFilter(rates)
 
+    def mixing(self, parameters: Sequence[str]) -> Mixing:
+        """The filters at samples, and mixing; one group."""
+        filters = self.at_samples(filter_rates(self.rates, parameters))
+        return lambda regression: mix_sampled(filters.update(regression), filters.errors)
+
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
-        return RecursiveMixed(self, parameters, sampled_mixing(self, parameters), mu=mu)
+        return RecursiveMixed(self, parameters, self.mixing(parameters), mu=mu)
 
     def seen(self, psi: Array) -> Array:
         """What the filters of 𝒴 take of Y: ψᵀ (N, p, rows) of ψ (N, rows, p)."""
@@ -142,16 +156,6 @@ def finite_time(mu: float) -> tuple[str, float, str]:
 
 
 Mixing = Callable[[SampledRegression], Mixed]  # an extension, and Δ and η̄ at K samples
-
-
-def sampled_mixing(settings: FilteredEstimator, parameters: Sequence[str]) -> Mixing:
-    """The filters of an estimator at samples, and mixing; one group."""
-    return partial(_mixed, settings.at_samples(filter_rates(settings.rates, parameters)))
-
-
-def _mixed(filters: KreisselmeierFilter, regression: SampledRegression) -> Mixed:
-    extended = filters.update(regression)
-    return Mixed(*mix_sampled(extended), lambda: ([filters.errors()], [inverse_sampled(extended)]))
 
 
 class RecursiveMixed:

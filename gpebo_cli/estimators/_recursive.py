@@ -234,21 +234,23 @@ class KreisselmeierFilter:
         return Filter(decay * np.eye(len(self._rates)), old, new)
 
 
-def inverse_sampled(extended: Array) -> Array:
-    """Ω⁻¹ (K, p, p) of [Ω | 𝒴] (K, p, p + 1), zero where it is rounding."""
+def mix_sampled(extended: Array, behind: Callable[[], Filter], left: Array | float = 1.0) -> Mixed:
+    """Of one group, from [Ω | 𝒴] (K, p, p + 1), 𝒴 being what filters ``behind`` have, or ``left``.
+
+    That is a matrix (K or 1, p, s) times what they have.
+    """
     omega = extended[..., :-1]
-    return _solved(omega, np.broadcast_to(np.eye(omega.shape[-1]), omega.shape))[1]
 
+    def solved(rhs: Array) -> tuple[Array, Array, BoolArray]:
+        """Δ (K,), Ω⁻¹b (K, p, c), zero where that is rounding, and where it is not (K,)."""
+        delta, action, reciprocal = determinant_and_adjugate_action(omega, rhs)
+        usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))
+        zero, where = np.zeros_like(action), usable[:, None, None]
+        return delta, np.divide(action, delta[:, None, None], out=zero, where=where), usable
 
-def mix_sampled(extended: Array) -> tuple[Array, Array, BoolArray]:
-    """Δ (K, 1), η̄ (K, 1, p) and where it is usable (K, 1), from [Ω | 𝒴] (K, p, p + 1)."""
-    delta, quotient, usable = _solved(extended[..., :-1], extended[..., -1:])
-    return delta[:, None], quotient[:, None, :, 0], usable[:, None]
+    def errors() -> tuple[list[Filter], list[Array]]:
+        inverse = solved(np.broadcast_to(np.eye(omega.shape[-1]), omega.shape))[1]
+        return [behind()], [inverse if isinstance(left, float) else inverse @ left]
 
-
-def _solved(omega: Array, rhs: Array) -> tuple[Array, Array, BoolArray]:
-    """det(Ω) (K,), Ω⁻¹b (K, p, c), zero where that is rounding, and where it is not (K,)."""
-    delta, action, reciprocal = determinant_and_adjugate_action(omega, rhs)
-    usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))
-    zero, where = np.zeros_like(action), usable[:, None, None]
-    return delta, np.divide(action, delta[:, None, None], out=zero, where=where), usable
+    delta, quotient, usable = solved(extended[..., -1:])
+    return Mixed(delta[:, None], quotient[:, None, :, 0], usable[:, None], errors)

@@ -1,11 +1,11 @@
-"""Mixing, and the scalar law of DREM, η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i), for any number of gains.
+"""DREM: extension of the regressor, mixing, and the law η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i) for any gains.
 
-From Ω η = 𝒴 mixing makes one scalar equation for each parameter, 𝐘 = Δ η. In the variable I = ∫Δ²
-and with η̄ = 𝐘/Δ the law is dη̂/dI = γ (η̄ − η̂). Without noise η̄ is constant and the law has the
-closed form η̂ = η̄ + e^{−γI} (η̂(0) − η̄): exact at any gain, one exponential per gain and time. With
-noise or forgetting η̄ varies, and where Δ changes sign it has poles that the law itself does not
-have. Then the law itself is integrated, by the same L-stable collocation as everything else, all
-gains as one batch.
+The extension makes a square system Ω η = 𝒴 of Y = ψη, and mixing one scalar equation for each
+parameter, 𝐘 = Δ η. In the variable I = ∫Δ² and with η̄ = 𝐘/Δ the law is dη̂/dI = γ (η̄ − η̂). Without
+noise η̄ is constant and the law has the closed form η̂ = η̄ + e^{−γI} (η̂(0) − η̄): exact at any gain,
+one exponential per gain and time. With noise or forgetting η̄ varies, and where Δ changes sign it
+has poles that the law itself does not have. Then the law itself is integrated, by the same L-stable
+collocation as everything else, all gains as one batch.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.refinement import wanted_parts
+from gpebo_cli.regression.linear import LinearRegression, with_realisations
 
 # (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p), and σ_min/σ_max of Ω (N,)
 MixedSignals = Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -38,6 +39,52 @@ _LANES = 1 << 22  # numbers in one batch of gains
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not needed
 # there, because its weight in every law is ∫Δ².
 SINGULAR = 1e-14
+_FILTERED, _CUTS = 1e-11, 30  # tail of what a filter follows, and rounds of cuts for it
+
+
+def kreisselmeier(
+    regression: LinearRegression, rates: Array, start: Array | None = None
+) -> Trajectory:
+    """[Ω | 𝒴] of shape (p, p + c) with Ω' = −Λ(Ω − ψᵀψ), 𝒴' = −Λ(𝒴 − ψᵀY), from ``start``.
+
+    Λ = diag(``rates``): one filter λ_i/(p + λ_i) per row, as in the paper (Section V); all rates
+    equal is the classical extension. Since Λ multiplies rows, Ω η = 𝒴 holds for any rates.
+    """
+    return low_pass(regression.outer, rates[:, None], start)
+
+
+def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Trajectory:
+    """``signal.low_pass(rate)`` on a mesh fine enough for the filter's own transient.
+
+    λ in 1/s is (p,) or whatever broadcasts against the signal. It starts at 0 or ``start``.
+    """
+    edges = signal.mesh.edges
+    smallest = 1e-13 * max(1.0, abs(float(edges[0])), abs(float(edges[-1])))
+    fastest = float(np.max(rate))
+    for _ in range(_CUTS):
+        filtered, mesh = signal.low_pass(rate, start), signal.mesh
+        # Where elements are short beside the filter, the signal is what is not resolved.
+        poor = (mesh.steps * fastest > 0.5) & (mesh.steps > smallest)
+        if poor.any():
+            flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
+            poor &= unresolved(flat, mesh.rule) > _FILTERED
+        if not poor.any():
+            break
+        signal = mesh.split(np.where(poor, 4, 1))[0].along(signal)
+    return filtered
+
+
+def lion(regression: LinearRegression, rates: Array, start: Array | None = None) -> Trajectory:
+    """[Ω | 𝒴] of shape (p, p + c), row i being λ_i/(p + λ_i) of one row of [ψ | Y].
+
+    Row i takes row i mod r of the regression: with one output every row is a filtered copy of the
+    same ψ, and rates must differ for Ω to be invertible.
+    """
+    psi = regression.psi.values
+    both = np.concatenate([psi, with_realisations(psi, regression.Y.values)], axis=-1)
+    rows = np.arange(regression.p) % both.shape[2]
+    signal = Trajectory(regression.mesh, both[:, :, rows])
+    return low_pass(signal, rates[:, None], start)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,20 +24,12 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
-from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import (
-    MixedEstimates,
-    RecursiveMixed,
-    filter_rates,
-    sampled_mixing,
-    scalar_errors,
-)
+from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
 from gpebo_cli.estimators._recursive import Mixed, Steps
-from gpebo_cli.estimators._scalar import ScalarPath, filled, mix, scalar_path
+from gpebo_cli.estimators._scalar import ScalarPath, filled, scalar_path
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
@@ -63,14 +55,9 @@ class Exciting(GainEstimator):
     kappa: float = field(default=1e10, metadata={"positive": True})
     rates: object = field(default=None, metadata={"key": "lambda"})
 
-    @property
-    def linear(self) -> Drem:
-        """The estimator whose Δ and 𝐘 the new regressor is made of."""
-        return Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
-
     def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
         """Extend, mix, rotate, and keep what the closed form needs at the times t (M,)."""
-        inner = self.linear.resume(regression, t, ())
+        inner = self.part(Drem).resume(regression, t, ())
         (path,) = inner.groups
         columns, turning = 1 + path.quotient.shape[-1], self._turning(path)
 
@@ -120,28 +107,25 @@ class Exciting(GainEstimator):
 
         Then δη̂' = γΦ_21 (δe_2 − Φ_21 δη̂).
         """
-        names, p, end = regression.parameters, regression.p, regression.mesh.edges[-1:]
-        rates = filter_rates(self.rates, names)
-        extended = kreisselmeier(regression, rates)
-        turning = self._turning(mix(extended, end))
+        p, end, linear = regression.p, regression.mesh.edges[-1:], self.part(Drem)
+        rates, mixed = linear.behind(regression)
+        turning = self._turning(linear.resume(regression, end, ()).groups[0])
         (law,) = self.estimate(regression, end).groups
         first, second = np.arange(p, 2 * p), np.arange(2 * p, 3 * p)
 
         def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
-            omega = extended(t, inside)[..., :p]
-            delta, adjugate, _ = determinant_and_adjugate_action(omega)
+            seen, delta, adjugate = mixed(t, inside)
             turn = (turning(t, inside) * delta)[:, None]
             filters = np.zeros((len(t), 3 * p, 3 * p))
             filters[:, :p, :p] = np.diag(rates)
             filters[:, first, second] = turn * delta[:, None]
             filters[:, second, first] = -filters[:, first, second]
             filters[:, second, :p] = -turn[..., None] * adjugate
-            into = np.zeros((len(t), 3 * p, regression.psi.values.shape[2]))
-            into[:, :p] = rates[:, None] * transpose(regression.psi(t, inside))
+            into = np.pad(seen, ((0, 0), (0, 2 * p), (0, 0)))
             e_2 = np.eye(3 * p)[None, 2 * p :]
             return scalar_errors(filters, into, law.signals(t, inside)[0], e_2, gain)
 
-        return tuple(partial(at, gain) for gain in self.gains("gamma", names))
+        return tuple(partial(at, gain) for gain in self.gains("gamma", regression.parameters))
 
 
 class Rotation:
@@ -151,7 +135,7 @@ class Rotation:
     """
 
     def __init__(self, settings: Exciting, parameters: Sequence[str]) -> None:
-        self._mixing, self._steps = sampled_mixing(settings.linear, parameters), Steps()
+        self._mixing, self._steps = settings.part(Drem).mixing(parameters), Steps()
         self._kappa = settings.kappa
         self._energy, self._turned = 0.0, np.zeros(len(parameters), complex)  # ∫Δ², c e^{−iφ}
         self._inverse: Array | None = None

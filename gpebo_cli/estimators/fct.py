@@ -47,12 +47,7 @@ class FiniteTime(ResumableEstimator):
     @property
     def inner(self) -> Drem | LsDrem:
         """The asymptotic estimator that is corrected."""
-        if self.extension == "kreisselmeier":
-            return Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
-        return LsDrem(
-            gamma=self.gamma, alpha=self.alpha, f0=self.f0, beta=self.beta, bound=self.bound,
-            initial=self.initial,
-        )
+        return self.part(Drem) if self.extension == "kreisselmeier" else self.part(LsDrem)
 
     def axes(self) -> dict[str, Sequence[float]]:
         """The cases of the inner estimator (ConfigError: ``mu`` is not between 0 and 1)."""

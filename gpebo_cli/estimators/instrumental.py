@@ -20,21 +20,50 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, gain
-from gpebo_cli.estimators._extension import averaged, lagged
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     RecursiveMixed,
     mixed_estimates,
     scalar_errors,
 )
-from gpebo_cli.estimators._recursive import Mixed, inverse_sampled, mix_sampled
+from gpebo_cli.estimators._recursive import Mixed, mix_sampled
 from gpebo_cli.estimators._scalar import mix
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
-from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.linear import LinearRegression, with_realisations
 from gpebo_cli.regression.samples import Filter, Past, SampledRegression, delayed
+
+
+def lagged(regression: LinearRegression, delay: float, t: Array, inside: Array) -> Array:
+    """[ψ(t) ; ψ(t − d)]ᵀ (N, 2p, rows) at times t (N,), d in seconds, zero before the start."""
+    start = regression.mesh.edges[0]
+    before = regression.psi(np.maximum(t - delay, start), inside - delay)
+    before[inside - delay < start] = 0.0
+    return np.swapaxes(np.concatenate([regression.psi(t, inside), before], axis=-1), -1, -2)
+
+
+def averaged(regression: LinearRegression, delay: float, settle: float) -> Trajectory:
+    """Means of [ψ(t) ; ψ(t − d)]ᵀ [ψ | Y], shape (2p, p + c): Z' = (product − Z)/(T₀ + t), Z = 0.
+
+    What a disturbance of Y has in common with a factor stays in the mean of that row; the rest
+    vanishes as the mean is taken over longer and longer times. The mesh has edges where the delayed
+    ψ has; d and T₀ are in seconds.
+    """
+    edges = regression.mesh.edges
+    later = edges[edges + delay < edges[-1]] + delay
+    after = np.searchsorted(edges, later)
+    apart = np.minimum(edges[after] - later, later - edges[after - 1])
+    cuts = np.union1d(edges, later[apart > 1e-12 * (edges[-1] - edges[0])])
+    mesh = Mesh(cuts, regression.mesh.rule)
+    t, inside = mesh.points.ravel(), mesh.inside.ravel()
+    psi, Y = regression.psi(t, inside), regression.Y(t, inside)
+    both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
+    product = lagged(regression, delay, t, inside) @ both
+    whole = mesh.trajectory(product).integral()
+    span = (settle + mesh.points - edges[0])[..., None, None]
+    return Trajectory(mesh, whole.values / span)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,14 +151,12 @@ class SampledMeans:
         self._sums, self._span = sums[-1], float(spans[-1, 0, 0])
         means = sums / spans[1:]
         left = self._settings.left(means, self._names)
-        extended = left @ means
 
-        def behind() -> tuple[Sequence[Filter], Sequence[Array]]:
+        def behind() -> Filter:
             keep = spans[:-1] * np.eye(2 * p)
-            own = (each / spans[1:] for each in (keep, old * seen[:-1], new * seen[1:]))
-            return [Filter(*own)], [inverse_sampled(extended) @ left]
+            return Filter(*(x / spans[1:] for x in (keep, old * seen[:-1], new * seen[1:])))
 
-        return Mixed(*mix_sampled(extended), behind)
+        return mix_sampled(left @ means, behind, left)
 
 
 ESTIMATOR = Instrumental

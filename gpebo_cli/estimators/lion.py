@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.estimators._extension import lion
 from gpebo_cli.estimators._mixed import FilteredEstimator
 from gpebo_cli.estimators._recursive import KreisselmeierFilter
+from gpebo_cli.estimators._scalar import lion
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Trajectory

@@ -57,9 +57,7 @@ class LsDrem(ResumableEstimator):
     @property
     def least_squares(self) -> LeastSquares:
         """The part that extends the regressor."""
-        return LeastSquares(
-            alpha=self.alpha, f0=self.f0, beta=self.beta, bound=self.bound, initial=self.initial
-        )
+        return self.part(LeastSquares)
 
     def axes(self) -> dict[str, Sequence[float]]:
         """α, f₀, β and γ, checked as the least-squares part checks them."""

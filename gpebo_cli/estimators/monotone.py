@@ -20,15 +20,13 @@ from scipy.integrate import solve_ivp
 
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators._base import GainEstimator, filtered_errors, gain
-from gpebo_cli.estimators._extension import kreisselmeier
-from gpebo_cli.estimators._mixed import energy_requirement, filter_rates, sampled_mixing
+from gpebo_cli.estimators._mixed import energy_requirement
 from gpebo_cli.estimators._recursive import Steps
-from gpebo_cli.estimators._scalar import ScalarPath, mix
+from gpebo_cli.estimators._scalar import ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
@@ -65,9 +63,9 @@ class Monotone(GainEstimator):
 
     def estimate(self, regression: LinearRegression, t: Array) -> MonotoneEstimates:
         """Verify T, extend and mix, for the times t (M,)."""
-        extended = kreisselmeier(regression, filter_rates(self.rates, regression.parameters))
+        (path,) = Drem(rates=self.rates).resume(regression, t, ()).groups
         return MonotoneEstimates(
-            *self.law(regression.parametrisation), mix(extended, np.asarray(t), regression.floor),
+            *self.law(regression.parametrisation), path,
             self.gains("gamma", regression.parameters)[:, 0], regression.realisations,
         )
 
@@ -98,18 +96,14 @@ class Monotone(GainEstimator):
 
     def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
         """δ𝒴' = −Λ(δ𝒴 − ψᵀδY), δθ̂' = γΔT(adj(Ω) δ𝒴 − Δ∇S δθ̂), δη̂ = ∇S δθ̂, of every case."""
-        k, names = regression.p, regression.parameters
-        rates = filter_rates(self.rates, names)
-        extended = kreisselmeier(regression, rates)
+        rates, mixed = Drem(rates=self.rates).behind(regression)
         made = self.estimate(regression, regression.mesh.edges[-1:])
         S, T = made.S, made.T
 
         def at(gamma: float, path: Theta, t: Array, inside: Array) -> ErrorSystem:
-            omega = extended(t, inside)[..., :k]
-            delta, adjugate, _ = determinant_and_adjugate_action(omega)
+            into, delta, adjugate = mixed(t, inside)
             slope, weighted = S.jacobian(path(t)[:, 0]), gamma * delta[:, None, None] * T
             law = delta[:, None, None] * (weighted @ slope)
-            into = rates[:, None] * transpose(regression.psi(t, inside))
             return filtered_errors(rates, into, law, weighted @ adjugate, slope)
 
         gains = made.gains.tolist()
@@ -181,7 +175,7 @@ class RecursiveMonotone:
 
     def __init__(self, settings: Monotone, parameters: Sequence[str]) -> None:
         self._settings = settings
-        self._mixing = sampled_mixing(Drem(rates=settings.rates), parameters)
+        self._mixing = Drem(rates=settings.rates).mixing(parameters)
         self._steps = Steps()
         self._gains = settings.gains("gamma", parameters)[:, 0]
         self._theta: Array | None = None  # (g, q)

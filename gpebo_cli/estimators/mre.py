@@ -13,9 +13,9 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
-from gpebo_cli.estimators._extension import kreisselmeier
 from gpebo_cli.estimators._mixed import reached
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, over_steps
+from gpebo_cli.estimators._scalar import kreisselmeier
 from gpebo_cli.estimators._vector import (
     VectorEstimates,
     VectorLaw,

@@ -17,7 +17,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement, sampled_mixing
+from gpebo_cli.estimators._mixed import MixedEstimates, energy_requirement
 from gpebo_cli.estimators._recursive import Steps
 from gpebo_cli.estimators._scalar import SINGULAR, ScalarPath
 from gpebo_cli.estimators.drem import Drem
@@ -63,11 +63,6 @@ class Power(ResumableEstimator):
             )
         return super().axes()
 
-    @property
-    def linear(self) -> Drem:
-        """The estimator with the same errors and a linear law."""
-        return Drem(gamma=self.gamma, rates=self.rates, initial=self.initial)
-
     def recursive(self, parameters: Sequence[str]) -> RecursivePower:
         """The finite-time law at samples.
 
@@ -81,7 +76,7 @@ class Power(ResumableEstimator):
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> PowerEstimates:
         """Extend and mix as ``drem``, for the times t (M,)."""
-        inner = self.linear.resume(regression, t, known)
+        inner = self.part(Drem).resume(regression, t, known)
         own = {"alpha": self.alpha, "beta": self.beta, "gamma2": self.gamma2}
         return PowerEstimates(**{**vars(inner), **own})
 
@@ -117,7 +112,7 @@ class RecursivePower:
     """
 
     def __init__(self, settings: Power, parameters: Sequence[str]) -> None:
-        self._mixing, self._steps = sampled_mixing(settings.linear, parameters), Steps()
+        self._mixing, self._steps = settings.part(Drem).mixing(parameters), Steps()
         self._alpha, self._gains = settings.alpha, settings.gains("gamma", parameters)
         self._start = settings.start(parameters)
         self._eta = np.broadcast_to(self._start, (len(self._gains), len(self._start)))
