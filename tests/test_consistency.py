@@ -16,9 +16,9 @@ from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state
-from gpebo_cli.reduction.derivative_array import balance, forcing
+from gpebo_cli.reduction.scaling import balance
 from gpebo_cli.reduction.stages import in_stages
-from gpebo_cli.reduction.strangeness_free import strangeness_free_form
+from gpebo_cli.reduction.strangeness_free import forcing, strangeness_free_form
 from gpebo_cli.reduction.structure import _probe_times, analyse
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.ivp import consistent_start

@@ -25,8 +25,8 @@ from gpebo_cli.observers.canonical import (
     unknown_input_matrices,
 )
 from gpebo_cli.observers.reduced.matrices import observer_matrices
-from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 

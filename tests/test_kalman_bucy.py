@@ -28,8 +28,8 @@ from gpebo_cli.observers import SignalNoise, observe
 from gpebo_cli.observers._riccati import run_filter
 from gpebo_cli.observers.kalman_bucy import NoiseModel, filter_model
 from gpebo_cli.observers.reduced.matrices import observer_matrices
-from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.results.figures import describe
 from gpebo_cli.results.report import estimate_table
 from gpebo_cli.settings import (

@@ -16,7 +16,7 @@ from gpebo_cli import kernels
 from gpebo_cli.numerics.elimination import steps_of
 from gpebo_cli.numerics.linalg import affine_scan, largest
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.reduction.derivative_array import forcing
+from gpebo_cli.reduction.strangeness_free import forcing
 
 needs_kernels = pytest.mark.skipif(
     kernels.kind() == "numpy" and os.environ.get("GPEBO_KERNELS") != "compiled",

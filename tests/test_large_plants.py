@@ -21,7 +21,7 @@ from gpebo_cli.numerics.mesh import SHARE, initial_mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced import extension
-from gpebo_cli.reduction import derivative_array
+from gpebo_cli.reduction import scaling
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import large, simulate
 
@@ -538,10 +538,10 @@ def test_units_of_many_states_are_those_that_singular_values_give(monkeypatch):
         }, "units").mapping())
         found = []
         for kept in (40, 0):
-            derivative_array._balancing.cache_clear()
-            monkeypatch.setattr(derivative_array, "_KEPT", kept)
+            scaling._balancing.cache_clear()
+            monkeypatch.setattr(scaling, "_KEPT", kept)
             c = system.coefficients.taylor(np.zeros(1), 2)
-            found.append(derivative_array.units_at(c))
+            found.append(scaling.units_at(c))
         for dense, sparse in zip(*found, strict=True):
             np.testing.assert_array_equal(sparse, dense)
         assert len(set(found[0].states)) > 1

@@ -15,7 +15,7 @@ from gpebo_cli.numerics.linalg import (
     inverse_or_none,
     largest_over_time,
 )
-from gpebo_cli.reduction.derivative_array import _first_of_each_part
+from gpebo_cli.reduction.scaling import _first_of_each_part
 
 
 def adjugate(omega: np.ndarray) -> np.ndarray:

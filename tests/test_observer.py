@@ -11,8 +11,8 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
-from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 

@@ -20,8 +20,8 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
-from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.settings import (
     NoiseSettings,
     Settings,

@@ -11,7 +11,6 @@ from examples import gpebo
 
 from gpebo_cli import ConfigError, SolverError, check, run
 from gpebo_cli.regression.text import regression_from_mapping
-from gpebo_cli.regression.text_at_samples import advance
 
 SINE = {"name": "sine", "unknowns": {"a": 2.0, "b": -1.0}, "signals": {"s": "sin(t)"}}
 
@@ -111,10 +110,10 @@ def test_samples_may_come_in_any_pieces(hold):
     t = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, 80))
     s = np.sin(3 * t)[:, None]
     Y = np.cos(t)[:, None]
-    _, whole, scale = advance(text, hold, None, t, s, Y)
+    _, whole, scale = text.advance(hold, None, t, s, Y)
     state, rows = None, []
     for part in (slice(0, 1), slice(1, 2), slice(2, 30), slice(30, 31), slice(31, 80)):
-        state, piece, upto = advance(text, hold, state, t[part], s[part], Y[part])
+        state, piece, upto = text.advance(hold, state, t[part], s[part], Y[part])
         rows.append(piece.rows[1:])
         np.testing.assert_allclose(upto, scale[part], rtol=1e-12)
     np.testing.assert_allclose(np.concatenate(rows), whole.rows[1:], rtol=1e-12, atol=1e-14)

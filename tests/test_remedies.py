@@ -20,7 +20,7 @@ from test_observer import ROTATING
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, SolverError
-from gpebo_cli.evidence.excitation import segment_level
+from gpebo_cli.evidence.excitation import window_level
 from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
@@ -290,7 +290,7 @@ def test_windows_of_excitation_run_through_resets():
     G = (plain.gram(t[whole]) - plain.gram(t[whole] - 3.0))[..., :3]
     inverse = before[(t[whole, None] > edges[list(at)]).sum(axis=1)]
     expected = np.linalg.eigvalsh(np.swapaxes(inverse, 1, 2) @ G @ inverse)[:, 0]
-    level = segment_level(cut, t, 3.0)
+    level = window_level([segment.outer for segment in cut.segments], t, 3.0, cut.resets)
     assert np.isnan(level[~whole]).all()
     np.testing.assert_allclose(level[whole], expected, rtol=1e-9)
     final = before[3].T @ plain.gram.final[:, :3] @ before[3]

@@ -19,7 +19,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest, symmetric_eigenvalues
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
@@ -116,7 +116,9 @@ def assess(
         t_c=partial(_t_c, later, settings.rho, tol),
         lambda_min=lambda: float(eigenvalues(t[-1:])[0, 0]) if later.p else 0.0,
         known=partial(known, later, t), gram_eigenvalues=partial(eigenvalues, t),
-        pe_level=partial(segment_level, later, t, window),
+        pe_level=lambda: window_level(
+            [segment.outer for segment in later.segments], t, window, later.resets
+        ),
     )
 
 
@@ -206,49 +208,29 @@ def _first_time(
         level[-1] = max(level[-1], 0.0)
 
 
-def segment_level(regression: LinearRegression, t: Array, window: float) -> Array:
-    """:func:`window_level` at the times t (M,) where parameters may be replaced inside a window.
-
-    What was seen before a reset counts for the parameters after it: T⁻ᵀ G T⁻¹, as in
-    ``ExtensionState.after``.
-    """
-    p = regression.p
-    if not regression.resets:
-        return window_level(regression.outer, t, window)
-    level = np.full(len(t), np.nan)
-    start = t - window
-    whole = np.flatnonzero(start >= regression.mesh.edges[0] - 1e-12 * max(1.0, window))
-    gram = np.zeros((len(whole), p, p + 1))
-    before: LinearRegression | None = None
-    for segment, reset in zip(regression.segments, (None, *regression.resets), strict=True):
-        if before is not None and reset is not None:
-            size = largest(before.gram.final)
-            for i in np.flatnonzero((start[whole] < reset.time) & (t[whole] > reset.time)):
-                gram[i] = ExtensionState(gram[i], size).after(reset).values
-        low, high = segment.mesh.edges[[0, -1]]
-        a, b = np.clip(start[whole], low, high), np.clip(t[whole], low, high)
-        here = np.flatnonzero(b > a)
-        gram[here] += between(segment.outer, a[here], b[here])
-        before = segment
-    level[whole] = np.maximum(symmetric_eigenvalues(gram)[:, 0], 0.0)
-    return level
-
-
-def window_level(outer: Trajectory, t: Array, window: float) -> Array:
+def window_level(
+    pieces: Sequence[Trajectory], t: Array, window: float, resets: Sequence[Reset] = ()
+) -> Array:
     """λ_min of ∫_{t−T}^{t} ψᵀψ at the times t (M,); NaN before the first whole one.
 
     Whole elements are summed afresh for every window T, in seconds. The difference G(t) − G(t − T)
-    was rejected: once a regressor has died out, it is the rounding of two large numbers. Of
-    ``outer``, ψᵀψ (p, p), further columns are not looked at.
+    was rejected: once a regressor has died out, it is the rounding of two large numbers. ``pieces``
+    are [ψᵀψ | ·] (p, p + c) from one reset to the next. What was seen before a reset counts for the
+    parameters after it: T⁻ᵀ G T⁻¹, as in ``ExtensionState.after``.
     """
-    mesh = outer.mesh
-    level = np.full(len(t), np.nan)
-    start = t - window
-    whole = (start >= mesh.edges[0] - 1e-12 * max(1.0, window)).nonzero()[0]
-    if len(whole) == 0:
-        return level
-    sums = between(outer, np.maximum(start[whole], mesh.edges[0]), t[whole])
-    level[whole] = np.maximum(symmetric_eigenvalues(sums).min(axis=1, initial=np.inf), 0.0)
+    level, start, slack = np.full(len(t), np.nan), t - window, 1e-12 * max(1.0, window)
+    whole = (start >= pieces[0].mesh.edges[0] - slack).nonzero()[0]
+    gram = np.zeros((len(whole), *pieces[0].values.shape[2:]))
+    for k, outer in enumerate(pieces):
+        low, high = outer.mesh.edges[[0, -1]]
+        if k:
+            size = largest(pieces[k - 1].integral().final)
+            for i in np.flatnonzero((start[whole] < low) & (t[whole] > low)):
+                gram[i] = ExtensionState(gram[i], size).after(resets[k - 1]).values
+        a, b = np.clip(start[whole], low, high), np.clip(t[whole], low, high)
+        here = np.flatnonzero(b > a)
+        gram[here] += between(outer, a[here], b[here])
+    level[whole] = np.maximum(symmetric_eigenvalues(gram).min(axis=1, initial=np.inf), 0.0)
     return level
 
 
@@ -292,7 +274,7 @@ def persistent(outer: Trajectory, gain: float) -> Requirement:
     mesh = outer.mesh
     length = float(mesh.edges[-1] - mesh.edges[0]) / WINDOWS
     t = np.linspace(mesh.edges[0], mesh.edges[-1], 10 * WINDOWS + 1)
-    level = float(np.nanmin(window_level(outer, t, length)))
+    level = float(np.nanmin(window_level([outer], t, length)))
     needed = DECAY / WINDOWS
     return Requirement(
         name="PE",

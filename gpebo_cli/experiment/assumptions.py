@@ -27,8 +27,8 @@ from gpebo_cli.observers._base import AffineStateMap
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.recordings.load import load
-from gpebo_cli.reduction.constant import scales_of
 from gpebo_cli.reduction.form import InputDerivatives
+from gpebo_cli.reduction.scaling import scales_of
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Simulation

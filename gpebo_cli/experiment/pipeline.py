@@ -30,6 +30,7 @@ from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdic
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
+from gpebo_cli.regression.text import TextRegression
 from gpebo_cli.settings import Settings
 
 
@@ -95,7 +96,8 @@ def run_experiment(
     check_seeds(settings.noise, levels, settings.time.horizon)
     memory.check(settings, system, levels, 0 if estimator is None else len(estimator.cases))
     if isinstance(estimator, estimators.Fitting):
-        estimator.law(getattr(system.regression, "parametrisation", None))
+        given = system.regression
+        estimator.law(given.parametrisation if isinstance(given, TextRegression) else None)
     stage = _Clock(progress, settings.solver.max_seconds)
     recorded, samples = settings.data.name == "csv", sampling(observer)
     with stage("read" if recorded else "simulate"):

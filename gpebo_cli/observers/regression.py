@@ -25,8 +25,7 @@ from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.parametrisation import Parametrisation
-from gpebo_cli.regression.text import TextRegression
-from gpebo_cli.regression.text_at_samples import TextState, advance
+from gpebo_cli.regression.text import TextRegression, TextState
 from gpebo_cli.settings import SolverSettings
 
 
@@ -118,7 +117,7 @@ class GivenAtSamples:
         self, state: TextState | None, t: Array, u: Array, y: Array
     ) -> tuple[TextState, SampledBlock]:
         """Regression at the samples t (K,) of u (K, m), and y (K, rows) where the text has no Y."""
-        state, regression, scale = advance(self.text, self.hold, state, t, u, y)
+        state, regression, scale = self.text.advance(self.hold, state, t, u, y)
         count, S = len(t), self.text.parametrisation
         none = np.zeros((count, self.text.system.n, len(self.parameters)))
         errors = None

@@ -26,7 +26,7 @@ def consistent_state(form: StrangenessFree, x0: Array, weights: Array) -> Array:
     """The consistent x nearest to x0 in its differential part, shape (n,).
 
     Minimises ‖W E (x − x0)‖ subject to A2 x + f2 = 0 at the first time of ``form``, where the
-    weights W (n,) make the rows of E comparable, see :class:`.derivative_array.Scaling`. Unique,
+    weights W (n,) make the rows of E comparable, see :class:`.scaling.Scaling`. Unique,
     because E has full column rank on the kernel of A2; NaN where numbers are so large or so small
     that it has not. A state that satisfies the constraints to rounding is returned as it is.
     """

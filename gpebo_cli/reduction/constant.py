@@ -16,9 +16,9 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.reduction.explicit import MoreOrdersError, UndecidedError
+from gpebo_cli.reduction.scaling import scales_of
 
 _ROUNDING, _CLEAR = 1e-12, 1e-5  # relative singular values: zero below, sure above
-_SCALED = 16  # rounds in which rows and columns are brought to the size one
 _TINY = float(np.finfo(float).tiny)
 
 
@@ -34,7 +34,7 @@ class ConstantForm:
     through: Array  # (d, n)
     mu: int
     pivot: float  # the smallest singular value that counts, relative
-    weights: Array  # (n,) see ``derivative_array.Scaling``
+    weights: Array  # (n,) see ``scaling.Scaling``
     offset: Array  # (N, n)
     f: Array  # (N, d)
     # Sizes of the terms of the offset (n,)
@@ -171,23 +171,3 @@ def _constraints(e: Array, a: Array, max_mu: int) -> tuple[list[tuple[Array, lis
             for p, q in zip([*known, None], [nothing, *of_f], strict=True)
         ]
     raise UndecidedError
-
-
-def scales_of(E: Array, A: Array) -> tuple[Array, Array, float]:
-    """Scales of rows and columns (n,) and of time by which E/τ and A (n, n) are of the size one.
-
-    By largest entries: means of logarithms, as in ``derivative_array.balance``, count the smallest
-    ones as much, and of full matrices those are rounding (the driven cavity is then undecided).
-    They are powers of two, so that scaling commits no rounding error.
-    """
-    E, A = np.abs(E), np.abs(A)
-    r, c, time = np.zeros(len(E)), np.zeros(len(E)), 0.0
-    for _ in range(_SCALED):
-        e, a = (X * np.exp2(r[:, None] + c) for X in (E * np.exp2(-time), A))
-        there = (e.max(axis=1) > 0.0) & (a.max(axis=1) > 0.0)
-        if there.any():
-            time += float(np.median(np.log2(e.max(axis=1)[there] / a.max(axis=1)[there])))
-        both = np.maximum(e, a)
-        size = [np.log2(np.where(x > 0.0, x, 1.0)) for x in (both.max(axis=1), both.max(axis=0))]
-        r, c = r - 0.5 * size[0], c - 0.5 * size[1]
-    return np.exp2(np.rint(r)), np.exp2(np.rint(c)), float(np.exp2(np.rint(time)))

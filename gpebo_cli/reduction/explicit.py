@@ -22,7 +22,7 @@ import numpy as np
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.model.entries import Entries, Places
 from gpebo_cli.model.expressions import jets
-from gpebo_cli.reduction.derivative_array import Scaling, balance
+from gpebo_cli.reduction.scaling import Scaling, balance
 
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
 _SOUND = 0.1  # of the largest entry of its row, in units of the states
@@ -56,7 +56,7 @@ class Explicit:
     mu: int
     state_units: Array  # (n,)
     pivot: float  # the smallest one at any time, relative to its row
-    weights: Array  # (n,) see ``derivative_array.Scaling``
+    weights: Array  # (n,) see ``scaling.Scaling``
     known: float = 0.0  # sizes of what is known in the states
     loss: float = 1.0  # by how much elimination may have made rounding grow
 

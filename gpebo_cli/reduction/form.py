@@ -29,7 +29,7 @@ from gpebo_cli.model.functions import FunctionCoefficients
 from gpebo_cli.model.matrix import listed
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.reduction.derivative_array import Units, units_at
+from gpebo_cli.reduction.scaling import Units, units_at
 from gpebo_cli.reduction.strangeness_free import reduced
 from gpebo_cli.reduction.structure import Structure, analyse
 

@@ -18,12 +18,21 @@ from gpebo_cli.kernels.structure_numpy import (
 )
 from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem, distinct
 from gpebo_cli.numerics.linalg import inverse_or_none, transpose
-from gpebo_cli.reduction.derivative_array import forcing, who
 from gpebo_cli.reduction.stages import UnclearError, in_stages
-from gpebo_cli.reduction.structure import RESIDUAL, Structure, unclear_ranks
+from gpebo_cli.reduction.structure import RESIDUAL, Structure, unclear_ranks, who
 
 MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
 _LOOKS = 32  # times at which the sensitivity to rounding is looked at
+
+
+def forcing(c: Coefficients) -> Array:
+    """Taylor coefficients of f = B u + F θ + φ, shape (K + 1, N, n)."""
+    f = c.phi.copy()
+    for k in range(len(f)):
+        for i in range(k + 1):
+            f[k] += np.matmul(c.F[i], c.theta[k - i][..., None])[..., 0]
+            f[k] += np.matmul(c.B[i], c.u[k - i][..., None])[..., 0]
+    return f
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from gpebo_cli.model.descriptor import (
 from gpebo_cli.model.expressions import halved
 from gpebo_cli.numerics.linalg import inverse_or_none, transpose
 from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, initial_edges
-from gpebo_cli.reduction.derivative_array import Scaling, balance, who
+from gpebo_cli.reduction.scaling import Scaling, balance
 from gpebo_cli.reduction.stages import Stages, UnclearError, in_stages
 
 RESIDUAL = 1e-13  # rows that should vanish after elimination, relative to the array
@@ -97,6 +97,11 @@ def without_equations() -> Structure:
         smallest_singular_value=np.inf, time_invariant=True,
         reference=Pivots(0, none, none, np.zeros((0, 0))), steady=True, dynamics=None,
     )
+
+
+def who(system: DescriptorSystem) -> str:
+    """The plant, as messages name it."""
+    return f"plant {system.name}" + (f" ({system.source})" if system.source else "")
 
 
 def growth_rates(E1: Array, A1: Array, basis: Array | None) -> Array:

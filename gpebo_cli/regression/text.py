@@ -7,15 +7,15 @@ Besides the language of plants there are the operators that regressions are buil
     integral(x)   ∫ x from the start
     delay(x, d)   x(t − d), zero before the start
 
-which may be nested. They are exact on the mesh: filters and integrals by the mesh's own rule, and
-elements end where a delayed signal jumps or has a kink.
+which may be nested. Elements of a mesh end where a delayed signal jumps or has a kink. From one
+sample to the next signals are what the hold makes of them, and what is kept does not grow.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -44,7 +44,9 @@ from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.recordings.drive import driven, tables
 from gpebo_cli.reduction.structure import without_equations
 from gpebo_cli.regression.linear import LinearRegression, outer_products
+from gpebo_cli.regression.operators import Operator, OperatorState
 from gpebo_cli.regression.parametrisation import Parametrisation, read_box
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import check_keys, number, shown
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.signals import Signals, Simulation
@@ -61,27 +63,15 @@ _MAX_DELAYED = 10_000  # edges that delays may ask for
 
 
 @dataclass(frozen=True, eq=False)
-class Operator:
-    """One operator of the text; its value is a further signal."""
+class TextState:
+    """Where a recursion stands, after a sample at ``t``."""
 
-    name: str  # lp, hp, integral or delay
-    argument: Tape  # of one output
-    number: float  # λ in 1/s or d in s; 0 for integral
-
-    def __call__(self, x: Trajectory) -> Array:
-        """The operator's values at the points of the mesh, (K, s + 1)."""
-        if self.name == "integral":
-            return x.integral().values
-        if self.name == "lp":
-            return x.low_pass(self.number).values
-        if self.name == "hp":
-            return np.asarray(self.number * (x.values - x.low_pass(self.number).values))
-        start = x.mesh.edges[0]
-        t, inside = (times.ravel() - self.number for times in (x.mesh.points, x.mesh.inside))
-        since = inside > start
-        out = np.zeros(len(t))
-        out[since] = x(np.maximum(t[since], start), inside[since])
-        return out.reshape(x.values.shape)
+    t: float
+    operators: tuple[OperatorState, ...]
+    row: Array  # (rows, p + 1) [ψ | Y]
+    scale: Array  # (p,) largest entry of each column of ψ so far
+    growth: None = field(default=None, init=False)  # there is no Φ
+    error_estimate: float = field(default=0.0, init=False)  # nothing is approximated but the hold
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +106,11 @@ class TextRegression:
         """
 
         def evaluated(mesh: Mesh) -> tuple[tuple[Array, Array], list[tuple[Array, float]]]:
-            columns = self._signals(signals, mesh)
-            psi = self._at(self.psi, mesh, columns).reshape(*mesh.points.shape, self.rows, -1)
-            if self.Y is not None:
-                right = self._at(self.Y, mesh, columns)
-            else:
+            columns, psi, right = self._on_mesh(signals, mesh)
+            if right is None:
                 assert Y is not None  # noqa: S101  a source gives it
                 right = Y(mesh.points.ravel(), mesh.inside.ravel())
+            psi = psi.reshape(*mesh.points.shape, self.rows, -1)
             right = right.reshape(*mesh.points.shape, self.rows)
             kinds = [*columns[0].T, psi, right, outer_products(psi, right)]
             return (psi, right), [(kind.reshape(*mesh.points.shape, -1), 0.0) for kind in kinds]
@@ -155,27 +143,69 @@ class TextRegression:
                         f"the horizon; at most {_MAX_DELAYED} are followed"
                     )
         mesh = Mesh(np.union1d(mesh.edges, cuts), mesh.rule)
-        known = mesh.trajectory(self._signals(signals, mesh)[0])
+        known = mesh.trajectory(self._on_mesh(signals, mesh)[0][0])
         edges = mesh.edges
         for tape in self.tapes:
             followers = tape.following(range(known.values.shape[2]))
             edges, _ = resolved_along(tape, followers, known.cells, edges)
         return Mesh(edges, mesh.rule)
 
-    def _signals(self, signals: Trajectory, mesh: Mesh) -> Array:
-        """The signals and all operators at the points of a mesh, (1, K (s + 1), m + operators)."""
-        m = self.system.m
-        columns = np.zeros((1, mesh.points.size, m + len(self.operators)))
-        columns[0, :, :m] = signals(mesh.points.ravel(), mesh.inside.ravel())
-        for k, operator in enumerate(self.operators):
-            x = self._at(operator.argument, mesh, columns).reshape(mesh.points.shape)
-            columns[0, :, m + k] = operator(Trajectory(mesh, x)).ravel()
-        return columns
+    def _on_mesh(self, signals: Trajectory, mesh: Mesh) -> tuple[Array, Array, Array | None]:
+        """:meth:`_evaluated` at the points of a mesh, K (s + 1) of them."""
+        t, inside = mesh.points.ravel(), mesh.inside.ravel()
+        return self._evaluated(
+            t, inside, signals(t, inside),
+            lambda _, operator, x: operator(mesh.trajectory(x)).ravel(),
+        )
 
-    @staticmethod
-    def _at(tape: Tape, mesh: Mesh, columns: Array) -> Array:
-        """Outputs of a tape at the points of a mesh, (K (s + 1), outputs)."""
-        return np.asarray(tape.taylor(mesh.points.ravel(), 0, mesh.inside.ravel(), columns)[0])
+    def _evaluated(
+        self, t: Array, inside: Array, signals: Array,
+        operate: Callable[[int, Operator, Array], Array],
+    ) -> tuple[Array, Array, Array | None]:
+        """Signals and operators (1, N, m + operators), ψ (N, rows, p), and Y (N, rows) of a text.
+
+        At the times t (N,), from signals (N, m); ``operate`` makes the values of an operator, of
+        this number, of those of its argument (N,).
+        """
+        count, m = signals.shape
+        columns = np.zeros((1, count, m + len(self.operators)))
+        columns[0, :, :m] = signals
+        for k, operator in enumerate(self.operators):
+            x = operator.argument.taylor(t, 0, inside, columns)[0][:, 0]
+            columns[0, :, m + k] = operate(k, operator, x)
+        psi = self.psi.taylor(t, 0, inside, columns)[0].reshape(count, self.rows, -1)
+        Y = None if self.Y is None else np.asarray(self.Y.taylor(t, 0, inside, columns)[0])
+        return columns, psi, Y
+
+    def advance(
+        self, hold: str, state: TextState | None, t: Array, signals: Array, Y: Array
+    ) -> tuple[TextState, SampledRegression, Array]:
+        """Carry the operators over the samples at the times t (K,), ascending, after ``state.t``.
+
+        The state is None before the first sample; signals are (K, m), and Y (K, rows), which is not
+        looked at where the text has one. What comes is where it stands, the regression at the
+        samples, and the scale of ψ's columns (K, p) so far.
+        """
+        reached: list[OperatorState] = []
+
+        def operate(k: int, operator: Operator, x: Array) -> Array:
+            known = OperatorState(t[:1], x[:1]) if state is None else state.operators[k]
+            values, after = operator.carried(hold, known, t, x)
+            reached.append(after)
+            return values
+
+        _, psi, right = self._evaluated(t, t, signals, operate)
+        right = Y if right is None else right
+        rows = np.concatenate([psi, right.reshape(len(t), self.rows, 1)], axis=2)
+        scale = np.maximum.accumulate(np.abs(psi).max(axis=1, initial=0.0), axis=0)
+        if state is not None:
+            scale = np.maximum(scale, state.scale)
+        last, row = (t[0], rows[0]) if state is None else (state.t, state.row)
+        regression = SampledRegression(
+            t, np.diff(t, prepend=last), np.concatenate([row[None], rows]), hold,
+            self.parametrisation,
+        )
+        return TextState(float(t[-1]), tuple(reached), rows[-1], scale[-1]), regression, scale
 
 
 class _Operators:

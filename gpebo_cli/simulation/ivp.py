@@ -20,7 +20,7 @@ from gpebo_cli.numerics.collocation import LinearSolution, at_points, unresolved
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearProblem
-from gpebo_cli.reduction.derivative_array import forcing
+from gpebo_cli.reduction.strangeness_free import forcing
 from gpebo_cli.reduction.structure import Structure
 
 _MAX_ROUNDS = 12

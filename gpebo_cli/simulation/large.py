@@ -30,7 +30,6 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction.consistency import Jump
 from gpebo_cli.reduction.constant import ConstantForm, constant_form
-from gpebo_cli.reduction.derivative_array import Scaling
 from gpebo_cli.reduction.explicit import (
     Explicit,
     MoreOrdersError,
@@ -39,6 +38,7 @@ from gpebo_cli.reduction.explicit import (
     product,
     scaling_of,
 )
+from gpebo_cli.reduction.scaling import Scaling
 from gpebo_cli.reduction.structure import Structure, analyse, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.known import (

@@ -43,8 +43,8 @@ from gpebo_cli.observers.reduced.regression import (
     term_sizes,
 )
 from gpebo_cli.observers.reduced.split import comparable, initial_basis, units_along
-from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
+from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import SolverSettings
 from gpebo_cli.simulation import ivp

@@ -32,8 +32,8 @@ from gpebo_cli.observers.reduced.split import (
     units_along,
     within_frame,
 )
-from gpebo_cli.reduction.derivative_array import Units
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
+from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.regression.errors import ErrorSystem
 
 _LACKING = 1e-8  # of the largest singular value of what constraints say of w: it is rounding

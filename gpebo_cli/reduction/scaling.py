@@ -1,7 +1,4 @@
-"""Scalings under which the ranks of a model are judged, units in which an observer sees it, and f.
-
-What is scaled are the derivative arrays of :mod:`gpebo_cli.kernels.structure_numpy`.
-"""
+"""Scalings under which the ranks of a model are judged, and units in which an observer sees it."""
 
 from __future__ import annotations
 
@@ -26,6 +23,7 @@ from gpebo_cli.numerics.linalg import largest_over_time
 _KEPT = 64  # states, up to which what the pattern of E and A alone decides is kept
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 _ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
+_SCALED = 16  # rounds in which rows and columns are brought to the size one
 _OPEN = 1e-11  # added to squares of terms: directions that they leave open come to nothing
 _FULL = 400  # factors, up to which their equations are solved as full ones
 _BESIDE_TIES = 0.1234  # decades: where factors are rounded, halves and thirds are not at an edge
@@ -63,16 +61,6 @@ class Units(NamedTuple):
     def plain(cls, system: DescriptorSystem) -> Units:
         """Everything as it was written."""
         return cls(*map(np.ones, (system.n, system.n, system.r, system.q)))
-
-
-def forcing(c: Coefficients) -> Array:
-    """Taylor coefficients of f = B u + F θ + φ, shape (K + 1, N, n)."""
-    f = c.phi.copy()
-    for k in range(len(f)):
-        for i in range(k + 1):
-            f[k] += np.matmul(c.F[i], c.theta[k - i][..., None])[..., 0]
-            f[k] += np.matmul(c.B[i], c.u[k - i][..., None])[..., 0]
-    return f
 
 
 def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
@@ -230,6 +218,21 @@ def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:
         place = nearer
 
 
-def who(system: DescriptorSystem) -> str:
-    """The plant, as messages name it."""
-    return f"plant {system.name}" + (f" ({system.source})" if system.source else "")
+def scales_of(E: Array, A: Array) -> tuple[Array, Array, float]:
+    """Scales of rows and columns (n,) and of time by which E/τ and A (n, n) are of the size one.
+
+    By largest entries: means of logarithms, as in :func:`balance`, count the smallest
+    ones as much, and of full matrices those are rounding (the driven cavity is then undecided).
+    They are powers of two, so that scaling commits no rounding error.
+    """
+    E, A = np.abs(E), np.abs(A)
+    r, c, time = np.zeros(len(E)), np.zeros(len(E)), 0.0
+    for _ in range(_SCALED):
+        e, a = (X * np.exp2(r[:, None] + c) for X in (E * np.exp2(-time), A))
+        there = (e.max(axis=1) > 0.0) & (a.max(axis=1) > 0.0)
+        if there.any():
+            time += float(np.median(np.log2(e.max(axis=1)[there] / a.max(axis=1)[there])))
+        both = np.maximum(e, a)
+        size = [np.log2(np.where(x > 0.0, x, 1.0)) for x in (both.max(axis=1), both.max(axis=0))]
+        r, c = r - 0.5 * size[0], c - 0.5 * size[1]
+    return np.exp2(np.rint(r)), np.exp2(np.rint(c)), float(np.exp2(np.rint(time)))
