@@ -17,7 +17,8 @@ from gpebo_cli.evidence.knowledge import Knowledge, knowledge
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.observers import Measurements, build
-from gpebo_cli.observers.reduced.extension import extend, reduced_system
+from gpebo_cli.observers.reduced.extension import extend
+from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
 from gpebo_cli.settings import Settings
@@ -95,7 +96,7 @@ class _Rows:
             signals.inputs, signals.outputs,
             derivatives=InputDerivatives.of_plant(system, np.ones(system.m, dtype=bool)),
         ), settings.solver, form="strangeness_free")
-        extension = extend(reduced, reduced.mesh, reduced.start())
+        extension = extend(reduced, reduced.mesh, reduced.start)
         mesh, final = extension.mesh, extension.assembled
         # ψ of an output that is a state is its gain, here of a state as large as the outputs are.
         sizes = largest_over_time(signals.states.values, 2)

@@ -16,8 +16,8 @@ from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.observers._base import AffineStateMap, Measurements, Observation, Sampling
 from gpebo_cli.observers.reduced.condensed import condensed, thinned
-from gpebo_cli.observers.reduced.extension import reduced_system
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
+from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
 from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain

@@ -46,9 +46,9 @@ from gpebo_cli.observers._base import (
 )
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
-from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
 from gpebo_cli.observers.reduced.split import Split
+from gpebo_cli.observers.reduced.system import ReducedSystem, reduced_system
 from gpebo_cli.observers.remedies.current_coordinates import CurrentState
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.reduction.form import EquationForm

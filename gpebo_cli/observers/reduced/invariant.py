@@ -16,7 +16,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import ByName
-from gpebo_cli.observers.reduced.extension import choose_form
+from gpebo_cli.observers.reduced.system import choose_form
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import SolverSettings
 

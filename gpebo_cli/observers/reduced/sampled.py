@@ -25,7 +25,6 @@ from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import ByName, InitialError, SampledBlock, largest_entry
-from gpebo_cli.observers.reduced.extension import begin_at, choose_form, measured, needed, start_at
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import (
     VANISHING,
@@ -33,7 +32,14 @@ from gpebo_cli.observers.reduced.regression import (
     resolve,
     term_sizes,
 )
-from gpebo_cli.observers.reduced.split import comparable, split_in_frame, units_along
+from gpebo_cli.observers.reduced.split import comparable, split_in_frame
+from gpebo_cli.observers.reduced.system import (
+    Formulation,
+    begin_at,
+    choose_form,
+    measured,
+    start_at,
+)
 from gpebo_cli.recordings.hold import edges, held
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives
 from gpebo_cli.regression.errors import ErrorSteps
@@ -61,44 +67,25 @@ class SampledState:
 
 
 @dataclass(frozen=True, eq=False)
-class SampledObserver:
+class SampledObserver(Formulation):
     """A plant's observer in discrete time; immutable, see :class:`SampledState`."""
 
-    form: EquationForm
-    solver: SolverSettings
     hold: str
-    regression: str  # projected or paper
-    like: ObserverMatrices  # those at the first sample, whose basis is kept
-    start: Array  # (k, 1 + q + n_a)
-    initial_dual: Array  # (n_a, n) V1⁺P
-    xi_a0: Array  # (n_a,)
-    parameters: tuple[str, ...]
-    note: str  # which form of the equations is used, where that was not said, and why
     errors: bool = False  # whether blocks say what errors of u and y do
 
     def responding(self, noisy: BoolArray) -> SampledObserver:
         """The same with ``errors``, unless noise of [u; y] (m + r,) is in matrices or slopes."""
         return replace(self, errors=not self.form.noise_enters(noisy))
 
-    @property
-    def system(self) -> DescriptorSystem:
-        """The plant."""
-        return self.form.system
-
-    @property
-    def units(self) -> Array:
-        """Of the coordinates in which the extension is integrated, (k,)."""
-        return units_along(self.like.split.basis, self.form.units.states)
-
     def assumptions(self, reached: SampledState) -> tuple[Assumption, ...]:
         """What the observer needed so far, with its evidence."""
         evidence = {"smallest_singular_value_at_least": reached.injectivity}
-        return needed(self.form, self.note, self.like.split.rank, evidence)
+        return self.needed(self.first.split.rank, evidence)
 
     def truth(self, extension: Array) -> InitialError:
         """What the parameters are, from [ξ_a | ξ_b | Φ] (K, k, 1 + p) at the times to be asked."""
         return InitialError(
-            self.initial_dual, self.xi_a0, self.like.split.dual, lambda _t: extension, self.units
+            self.begin.dual, self.xi_a0, self.first.split.dual, lambda _t: extension, self.units
         )
 
     def advance(
@@ -152,10 +139,10 @@ class SampledObserver:
     ) -> tuple[ObserverMatrices, Array]:
         """The matrices at the times t (N,), and [v; y] (N, · + r, 1) from [u; y] (N, m + r)."""
         o = observer_matrices(
-            self.form, t, inside, self.solver.rank_tol, self.like,
+            self.form, t, inside, self.solver.rank_tol, self.first,
             signals=signals if self.form.follows_signals else None,
         )
-        rank = self.like.split.rank
+        rank = self.first.split.rank
         if o.split.rank != rank:
             raise ModelError(
                 f"plant {self.system.name}: the rank of E changes from {rank} to {o.split.rank} "
@@ -169,7 +156,7 @@ class SampledObserver:
         error: float,
     ) -> tuple[SampledState, SampledBlock]:
         """Regression and state map from [ξ_a | ξ_b | Φ], z (K, k, ·), and what errors become."""
-        system, basis = self.system, self.like.split.basis
+        system, basis = self.system, self.basis
         o, driving = self._matrices(t, t, signals)
         equations = o.equations(driving)
         assembled = regression_signals(z, system.q, basis, equations)
@@ -225,12 +212,8 @@ def sampled_observer(
         first = replace(first, split=split, on_basis=first.algebraic)
     u, y = np.split(sample[None], [system.m], axis=1)
     begin = start_at(used, first, measured(used, t, t, u, y))
-    xi = begin_at(xi_a0, system, used.units.states, first, begin)
-    return SampledObserver(
-        form=used, solver=solver, hold=hold, regression=regression, like=first,
-        start=begin.extension(first.split.dual, begin.offset + begin.basis @ xi),
-        initial_dual=begin.dual, xi_a0=xi, parameters=(*system.unknowns, *begin.names), note=note,
-    )
+    xi = begin_at(xi_a0, used, first, begin)
+    return SampledObserver(used, solver, first, begin, xi, regression, note, hold)
 
 
 def _kernel_is_fixed(

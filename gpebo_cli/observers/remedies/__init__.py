@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from gpebo_cli.observers._base import Observation
-from gpebo_cli.observers.reduced.extension import ReducedSystem
+from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.observers.remedies.current_coordinates import CurrentCoordinates
 from gpebo_cli.observers.remedies.noise_free import NoiseFree
 from gpebo_cli.observers.remedies.output_injection import OutputInjection

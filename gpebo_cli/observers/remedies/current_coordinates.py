@@ -21,9 +21,9 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._base import AffineStateMap, Observation
-from gpebo_cli.observers.reduced.extension import ReducedSystem, assumptions
 from gpebo_cli.observers.reduced.matrices import weakest
 from gpebo_cli.observers.reduced.regression import Assembled, regression_signals
+from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
 
@@ -101,7 +101,7 @@ class CurrentCoordinates:
             ),
             truth=CurrentState(reduced),
             error_estimate=error,
-            assumptions=assumptions(reduced, (smallest, float(mesh.points.ravel()[where]))),
+            assumptions=reduced.assumptions((smallest, float(mesh.points.ravel()[where]))),
             growth=None,
             note=reduced.note,
         )

@@ -24,7 +24,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers._base import AffineStateMap, Observation
-from gpebo_cli.observers.reduced.extension import ReducedSystem, reduced_system
+from gpebo_cli.observers.reduced.system import ReducedSystem, reduced_system
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.simulation.linearised import Linearised
 

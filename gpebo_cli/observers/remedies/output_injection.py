@@ -32,9 +32,9 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers._base import Observation
 from gpebo_cli.observers._riccati import StateSpace, run_filter
-from gpebo_cli.observers.reduced.extension import ReducedSystem
 from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices
 from gpebo_cli.observers.reduced.split import units_along
+from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.observers.remedies.plain import Plain
 
 _TOLERANCE = 1e-6  # of S

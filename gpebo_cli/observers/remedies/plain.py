@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpebo_cli.observers._base import AffineStateMap, InitialError, Observation, Truth
-from gpebo_cli.observers.reduced.extension import Extension, ReducedSystem, assumptions, extend
+from gpebo_cli.observers.reduced.extension import Extension, extend
+from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.regression.errors import respond
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import Reset
@@ -19,7 +20,7 @@ class Plain:
 
     def observe(self, reduced: ReducedSystem) -> Observation:
         """The regression, and the state from its parameters; perhaps with output injection."""
-        extension = extend(reduced, reduced.mesh, reduced.start())
+        extension = extend(reduced, reduced.mesh, reduced.start)
         if reduced.lost is not None:
             for signal in (extension.assembled.offset, extension.assembled.gain):
                 signal[:, reduced.lost] = np.nan
@@ -53,7 +54,7 @@ def observation(
     return Observation(
         regression=LinearRegression(
             Y=mesh.trajectory(final.Y[:, some]), psi=mesh.trajectory(final.psi[:, some]),
-            parameters=(*reduced.system.unknowns, *reduced.begin.names),
+            parameters=reduced.parameters,
             scale=extension.scale, resets=resets,
         ),
         state_map=AffineStateMap(
@@ -61,7 +62,7 @@ def observation(
         ),
         truth=truth,
         error_estimate=extension.error_estimate,
-        assumptions=assumptions(reduced, extension.weakest),
+        assumptions=reduced.assumptions(extension.weakest),
         growth=growth,
         growth_rate=logarithm / (stop - start),
         errors=errors,

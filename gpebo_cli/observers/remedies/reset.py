@@ -28,8 +28,9 @@ from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import InitialError, Observation, log_norm
-from gpebo_cli.observers.reduced.extension import Extension, ReducedSystem, Start, extend, joined
+from gpebo_cli.observers.reduced.extension import Extension, extend, joined
 from gpebo_cli.observers.reduced.split import comparable
+from gpebo_cli.observers.reduced.system import ReducedSystem, Start
 from gpebo_cli.observers.remedies.plain import observation
 from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.resets import ExtensionState, Reset
@@ -61,7 +62,7 @@ class Resets:
         """One regression over all segments, with the maps from each to the next."""
         mesh, times = _with_edges(reduced.mesh, reset_times(reduced, self))
         cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
-        p = reduced.system.q + len(reduced.begin.names)
+        p = len(reduced.parameters)
         begin, xi_a, dual = reduced.begin, reduced.xi_a, reduced.first.split.dual
         later: list[tuple[float, Array, Array]] = []
         extensions: list[Extension] = []
