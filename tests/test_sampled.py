@@ -331,6 +331,20 @@ def test_the_scalar_law_is_stable_for_any_gain_and_any_sample_time(hold, gain):
     )
 
 
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_the_scalar_law_in_parts_is_that_of_the_whole(hold):
+    block, usable = regression(K=40, p=2, hold=hold), np.arange(40)[:, None] != 19
+    delta, quotient = RNG.normal(size=(40, 1)), RNG.normal(size=(40, 1, 2))
+    whole, own = (ScalarLaw(np.ones(2), np.array([[0.1]]), 1, 0.5) for _ in range(2))
+    expected = whole.update(block, delta, quotient, usable).parameters
+    made = [own.update(
+        replace(block, t=block.t[k : k + 10], steps=block.steps[k : k + 10],
+                rows=block.rows[k : k + 11]),
+        *(each[k : k + 10] for each in (delta, quotient, usable)),
+    ).parameters for k in range(0, 40, 10)]
+    np.testing.assert_allclose(np.concatenate(made, axis=1), expected, rtol=1e-12)
+
+
 def test_a_quotient_that_is_rounding_moves_nothing():
     block = regression(K=3, p=1)
     law = ScalarLaw(np.array([5.0]), np.array([[1e10]]), 1)
