@@ -167,12 +167,13 @@ def test_a_narrow_pulse_along_an_output_is_seen(width):
     assert found["q"][-1] == pytest.approx(np.exp(-1e4 * width * np.sqrt(np.pi)), rel=1e-6)
 
 
-@pytest.mark.parametrize(("what", "least"), [
-    ("gpebo_cli.model.expressions.bounds._MOST_ALONG", 2),
-    ("gpebo_cli.simulation.simulate._LOOKS", 1),
+@pytest.mark.parametrize("least", [
+    {"model.expressions.bounds._MOST_ALONG": 2, "model.expressions.bounds._FOR_EACH": 0},
+    {"simulation.simulate._LOOKS": 1},
 ])
-def test_a_pulse_along_an_output_that_is_not_followed_far_enough_is_said(what, least, monkeypatch):
-    monkeypatch.setattr(what, least)
+def test_a_pulse_along_an_output_that_is_not_followed_far_enough_is_said(least, monkeypatch):
+    for name, value in least.items():
+        monkeypatch.setattr(f"gpebo_cli.{name}", value)
     told = run({
         "name": "slit", "states": ["p", "q"], "inputs": {"u": 0.1}, "outputs": ["y"],
         "E": [[1, 0], [0, 1]], "A": [[0, 0], [0, "-1000*exp(-((y - 0.46371)/1e-5)**2)"]],

@@ -171,7 +171,7 @@ def test_a_rate_that_is_wrong_by_a_twentieth_is_noticed_and_the_right_one_is_not
     assert "is not white" in said[1]
 
 
-def test_what_is_made_of_a_recording_is_forecast(monkeypatch):
+def test_what_is_made_of_a_recording_is_forecast(monkeypatch, tmp_path):
     """A plant that follows what is measured keeps every sample, and a machine must not swap."""
     t = np.linspace(0.0, 40.0, 2001)
     data = {"t": t, "current": 2.0 + np.sin(t), "v": 3.7 - 0.03 * np.sin(t)}
@@ -180,6 +180,15 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch):
                        r"time.horizon=20.8 fits, and .* \(data.file=- < FILE\)$"):
         run("battery", data=data)
     run("battery", data=data, time={"horizon": 20.5})
+    # The filter holds more, and so do several files together.
+    with pytest.raises(ConfigError, match=r"time\.horizon=2.98 fits"):
+        run("battery", data=data, observer="kalman_bucy", time={"horizon": 20.5})
+    table = np.column_stack([data["t"], data["current"], data["v"]])[:1026]
+    files = [str(tmp_path / name) for name in ("a.csv", "b.csv")]
+    for file in files:
+        np.savetxt(file, table, delimiter=",", header="t,current,v", comments="")
+    with pytest.raises(ConfigError, match="1025 samples would take some"):
+        run("battery", data={"file": files})
 
 
 def test_an_estimator_without_its_map_is_refused_before_a_file_is_read():

@@ -853,3 +853,29 @@ def test_a_recorded_state_that_ends_at_zero_is_judged_by_its_size_over_time():
     assert result.estimation.requirement.holds
     assert 1e-5 < abs(result.estimation.parameters[0, -1, 0] - 0.5) < 1e-3
     assert result.warnings == ()
+
+
+@pytest.mark.parametrize(("gain", "bounded"), [
+    ("exp(-((u - 0.5)/1e-3)**2)", True), ("exp(-(sin(1e4*u)/1e-4)**2)", False),
+])
+def test_a_recording_says_whether_what_follows_its_signals_is_bounded(gain, bounded, monkeypatch):
+    """In more elements than the fewest cells, too; where there is no end of pulses, it is said."""
+    monkeypatch.setattr("gpebo_cli.model.expressions.bounds._MOST_ALONG", 16)
+    t = np.linspace(0.0, 6.0, 61)
+    plant = {
+        "name": "follower", "states": ["x"], "inputs": {"u": 0}, "unknowns": {"a": 1},
+        "outputs": ["y"], "E": [[1]], "A": [[-1]], "F": [[gain]], "C": [[1]],
+        "initial_state": {"x": 1},
+    }
+    found = run(plant, data={"t": t, "u": np.sin(t), "y": np.exp(-t)}, estimator="least_squares")
+    assert found.details.recording.bounded == bounded
+    assert ("nothing bounds what functions that change so often" in found.verdict) != bounded
+
+
+@pytest.mark.parametrize(("hold", "told"), [("zoh", True), ("linear", False)])
+def test_pauses_through_which_samples_are_held_are_said(hold, told, tmp_path):
+    t = np.concatenate([np.arange(0.0, 2.0, 0.1), np.arange(5.0, 7.0, 0.1)])
+    table = np.column_stack([t, np.sin(t), np.cos(t)])
+    np.savetxt(tmp_path / "r.csv", table, delimiter=",", header="t,u,y", comments="")
+    said = run("descriptor", data={"file": str(tmp_path / "r.csv"), "hold": hold}).verdict
+    assert ("through 1 pause of up to 3.1 s the last sample is held" in said) == told

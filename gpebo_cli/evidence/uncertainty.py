@@ -24,7 +24,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.recordings.hold import Rows
+from gpebo_cli.recordings.hold import PAUSE, Rows
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
@@ -37,7 +37,6 @@ _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
 _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
 _GROUPS = 2000  # of samples, by which many of them are replaced at first
-_PAUSE = 5.0  # times the median step: rows on both sides of a longer one are alone
 _PER_ELAPSED = 64  # groups at least, since the start, at first
 _AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
 _BESIDE = 8  # errors that stand beside each other in a factor
@@ -112,7 +111,7 @@ def _grouped(rows: Rows, end: float, t: Array, starts: Array, most: int, per: in
         return np.searchsorted(instants, times + near, side="right").clip(1) - 1
 
     steps = np.diff(instants, append=max(end, instants[-1]))
-    pauses = np.flatnonzero(steps > _PAUSE * np.median(steps))
+    pauses = np.flatnonzero(steps > PAUSE * np.median(steps))
     fresh = at(starts)
     bounds = np.unique(np.concatenate([
         [0, count - 1, count], at(t), fresh, pauses, (pauses + 1).clip(max=count)

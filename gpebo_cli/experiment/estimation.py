@@ -86,6 +86,7 @@ def continuous(
         seen = Measurements(
             signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.rows),
             known.derivatives, known.t if known.recording else None,
+            sum(each.inputs.mesh.points.size for each in source.pieces if each is not known),
         )
         return observer.observe(system, seen, settings.solver)
 

@@ -107,7 +107,8 @@ def run_experiment(
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
         source = several.joined_source([read(one, system, levels, samples) for one in each])
-    unbounded, of_source = functions_note(system, source.simulation), source.assumptions
+    unbounded = functions_note(system, source.simulation or source.recording)
+    of_source = source.assumptions
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
         excitation=None, estimation=None, metrics=None, timings=stage.seconds,
@@ -131,6 +132,7 @@ def run_experiment(
         found.unknown, found.left_out, estimation.active,
     )
     notes = found.note + simulation_note(source.simulation, settings.solver.tol) + unbounded
+    notes += source.recording.note if source.recording else ""
     return replace(
         result, regression=found.regression, excitation=excitation, estimation=estimation,
         metrics=found.metrics, noise=found.noise, fit=found.fit, estimable=found.estimable,

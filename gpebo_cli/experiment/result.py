@@ -74,6 +74,8 @@ class RecordingResult(SignalsResult):
     first: float  # times of its first and last sample
     last: float
     known_states: tuple[str, ...]
+    bounded: bool  # known functions are, between the times at which they are evaluated
+    note: str = ""  # what the last line of a run has to say of it, from "; " on
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,6 +49,8 @@ def joined_source(sources: Sequence[Source]) -> Source:
             name for name in recordings[0].known_states if all(name in each for each in known)
         ),
         elements=sum(each.elements for each in recordings),
+        bounded=all(each.bounded for each in recordings),
+        note="".join(each.note for each in recordings),
     )
     return replace(
         sources[0], t=t, recording=recording, derivatives=None, pieces=tuple(sources),

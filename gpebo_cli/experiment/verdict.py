@@ -9,10 +9,11 @@ import numpy as np
 
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
-from gpebo_cli.experiment.result import ActiveBound, Fit, SimulationResult
+from gpebo_cli.experiment.result import ActiveBound, Fit, RecordingResult, SimulationResult
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
+from gpebo_cli.recordings.hold import PAUSE, Rows
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model
@@ -128,7 +129,22 @@ def simulation_note(simulated: SimulationResult | None, tol: float) -> str:
     return told
 
 
-def functions_note(system: DescriptorSystem, simulated: SimulationResult | None) -> str:
+def pauses_note(rows: Rows) -> str:
+    """What the last line of a run has to say of pauses in which rows are held, from "; " on."""
+    steps = np.diff(rows.t)
+    long = steps[steps > PAUSE * np.median(steps)]
+    if rows.lines or not len(long):
+        return ""
+    return (
+        f"; through {len(long)} pause{'s' * (len(long) > 1)} of up to {long.max():.3g} s the last "
+        "sample is held (data.hold=zoh), which biases estimates if the plant moves meanwhile: take "
+        "data.hold=linear, or a file for each part (data.file=[…])"
+    )
+
+
+def functions_note(
+    system: DescriptorSystem, simulated: SimulationResult | RecordingResult | None
+) -> str:
     """What the last line of a run has to say of functions without bounds, from "; " on."""
     source = system.coefficients
     if isinstance(source, FunctionCoefficients) and source.functions:

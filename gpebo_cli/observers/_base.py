@@ -69,6 +69,7 @@ class Measurements:
     noise: SignalNoise | None = None  # for an observer that weighs by it; None: there is none
     derivatives: InputDerivatives | None = None  # of the inputs; None: they are not known
     wanted: Array | None = None  # (N,) times that results are for; None: all
+    beside: int = 0  # points of the meshes of other recordings, whose results are kept as well
 
     @property
     def mesh(self) -> Mesh:
@@ -92,16 +93,19 @@ class Measurements:
             there = aside(t, inside)
         return np.concatenate([self.inputs(there, inside), self.outputs(there, inside)], axis=1)
 
-    def check_memory(self, system: DescriptorSystem) -> None:
-        """Refuse a recording whose samples make more than memory holds (ConfigError)."""
+    def check_memory(self, system: DescriptorSystem, times: float = 1.0) -> None:
+        """Refuse a recording whose samples make more than memory holds (ConfigError).
+
+        An observer may hold so many ``times`` what a regression and a state map take.
+        """
         if self.wanted is None:
             return
         start, stop = self.span
         p = system.q + differential_order(system, start)
-        each = _HELD * (p + 1) * (system.n + p + system.m + system.r)
+        each = times * _HELD * (p + 1) * (system.n + p + system.m + system.r)
         check_memory(
             f"what is made of each of the recording's {self.mesh.size} samples",
-            each * self.mesh.points.size,
+            each * (self.mesh.points.size + self.beside),
             lambda share: f"time.horizon={share * (stop - start):.3g} fits, and observer=gpebo "
             "takes any number of rows as a stream (data.file=- < FILE)",
         )

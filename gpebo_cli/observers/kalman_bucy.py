@@ -61,6 +61,7 @@ _LEVEL = 1e-8  # of M's largest eigenvalue over all windows, in units of P(0)⁻
 _ROUNDING = 8.0 * float(np.finfo(float).eps)  # of the terms of a sum
 _INITIAL_VARIANCE = 10.0  # of what observer.P0 leaves out
 _NOTHING = 1e-28  # of the square of the largest row: rounding
+_HELD = 7.0  # times what a regression takes: pairs of 2 n by n + 1, and what they follow; measured
 _EXACT = 1e-4  # of the variance that would regularise it: what noise leaves below is exact
 
 
@@ -224,6 +225,7 @@ class KalmanBucy:
 
         ConfigError: settings that do not fit the plant.
         """
+        signals.check_memory(system, _HELD)
         known = reduced_system(
             system, signals, solver, xi_a0=self.xi_a0, form=self.form
         )

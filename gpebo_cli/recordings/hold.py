@@ -17,6 +17,8 @@ from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource
 from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 
+PAUSE = 5.0  # times the median step: a longer one
+
 # (times (N,), where it is decided which samples they are between (N,)) -> values (N, c)
 Held = Callable[[Array, Array], Array]
 

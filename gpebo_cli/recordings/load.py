@@ -30,6 +30,7 @@ class Recording:
     inputs: Trajectory  # (m,)
     outputs: Trajectory  # (r,)
     states: Trajectory  # (n,), NaN for a state that was not recorded
+    bounded: bool  # known functions are, between the times at which they are evaluated
 
     @property
     def derivatives(self) -> InputDerivatives | None:
@@ -76,9 +77,10 @@ def load(
     mesh = recording_mesh(samples.t, values, data.hold, span, system.coefficients, tol)
     both = mesh.along(held(samples.t, values, data.hold))
     # What is narrow between samples: functions of time, then those of signals.
-    edges, _ = system.coefficients.of_time.resolved(mesh.edges)
+    edges, bounded = system.coefficients.of_time.resolved(mesh.edges)
     if isinstance(system.coefficients, FollowsSignals):
-        edges, _ = system.coefficients.along(both.cells, range(m + system.r), edges)
+        edges, also = system.coefficients.along(both.cells, range(m + system.r), edges)
+        bounded = bounded and also
     if len(edges) > len(mesh.edges):
         mesh = Mesh(edges, mesh.rule)
         both = mesh.along(both)
@@ -89,6 +91,7 @@ def load(
         inputs=Trajectory(mesh, both.values[..., :m]),
         outputs=Trajectory(mesh, both.values[..., m:]),
         states=_states(samples, span, smooth=data.hold == "cubic"),
+        bounded=bounded,
     )
 
 

@@ -128,7 +128,8 @@ def _recording(recording: RecordingResult | None) -> dict[str, Any] | None:
     if recording is None:
         return None
     names = ("file", "sha256", "rows", "hold", "first", "last", "known_states", "elements")
-    return {name: getattr(recording, name) for name in names}
+    own = {name: getattr(recording, name) for name in names}
+    return {**own, "bounded_between_nodes": recording.bounded}
 
 
 def _fit(fit: Fit | None) -> dict[str, Any] | None:

@@ -32,7 +32,8 @@ _MOST_VALUES = 1 << 20  # of all expressions in all cells, where these are more
 _AT_ONCE = 1 << 14  # cells whose bounds are held at the same time
 # No narrower than a signal; kinks and jumps are edges.
 _POLYNOMIAL = {"add", "subtract", "multiply", "negative", "signal", "abs", "sign", "min", "max"}
-_MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds
+_MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds, and
+_FOR_EACH = 2  # cells for each element of those, if these are more
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one
 _ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
 _MOST_SWITCHED = 1 << 16
@@ -128,10 +129,8 @@ def resolved_along(
     """
     if all(tape.instructions[place].operation in _POLYNOMIAL for place in followers):
         return edges, True
-    if len(edges) > _MOST_ALONG:
-        return edges, False
     followed = tape.of([place for place in tape.outputs if place in followers])
-    return resolved(Bounds(followed, signals), edges, _MOST_ALONG)
+    return resolved(Bounds(followed, signals), edges, max(_MOST_ALONG, _FOR_EACH * len(edges)))
 
 
 def _coarser(low: Array, depth: IntArray, edges: Array) -> Array:
