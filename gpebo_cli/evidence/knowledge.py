@@ -126,8 +126,8 @@ class Knowledge:
             whole = np.maximum.accumulate(whole)[-len(last) :, None]
             last = np.where(own[-len(last) :] <= _NOISE * whole, 0.0, last)
         scaled = last / self.sizes[:, None, :]
-        size = np.linalg.norm(scaled, axis=2)
-        return np.asarray(np.linalg.norm(scaled @ kernel, axis=2) <= slack[:, None] * size)
+        left, size = (np.einsum("mnp,mnp->mn", x, x) for x in (scaled @ kernel, scaled))
+        return np.asarray(np.sqrt(left) <= slack[:, None] * np.sqrt(size))
 
     def resolved(self, h: Array, offset: Array, gain: Array, growth: float | None) -> BoolArray:
         """Of which states (n,) x = offset + gain η something is left beside errors, at the end.

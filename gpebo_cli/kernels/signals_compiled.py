@@ -17,6 +17,6 @@ sample = _compiled.sample
 def largest(values: Array) -> Array:
     """In C for few columns."""
     if values.shape[0] > 1 and values.shape[2] > _WIDE:
-        return np.asarray(np.abs(values).max(axis=1))
+        return np.asarray(np.maximum(values.max(axis=1), -values.min(axis=1)))
     found: Array = _compiled.largest(values)
     return found

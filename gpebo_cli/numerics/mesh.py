@@ -350,9 +350,11 @@ def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:
 def predicted_tail(last: Array, rule: RadauRule, scale: Array) -> Array:
     """:func:`legendre_tail` (K, c) from the sizes of the last coefficients (K, up to 4, c)."""
     size = np.broadcast_to(scale, last[:, 0].shape)[:, None]
-    used = last[:, -len(rule.to_next) :]
-    predicted = np.minimum(used / size, 1.0) ** rule.to_next[:, None]
-    return np.asarray(size[:, 0] * predicted.max(axis=1))
+    shares = np.minimum(last[:, -len(rule.to_next) :] / size, 1.0)
+    with np.errstate(divide="ignore"):
+        powers = np.log(shares, out=shares)  # one exponential is a fourth of as many powers
+    powers *= rule.to_next[:, None]
+    return np.asarray(size[:, 0] * np.exp(powers.max(axis=1)))
 
 
 def signal_scale(values: Array) -> Array:
