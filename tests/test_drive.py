@@ -134,6 +134,19 @@ def test_kinks_that_a_table_passes_are_edges_of_elements(tmp_path, hold):
     assert result["x"][-1] == pytest.approx(0.5 + area, abs=1e-12)
 
 
+@pytest.mark.parametrize("argument", [
+    "(u - 0.7)*(u - 0.7001)", "abs(u - 0.70005) - 5e-5", "exp(-1) - exp(-((u - 0.70005)/5e-5)**2)"
+])
+def test_a_table_may_pass_a_jump_and_come_back_at_once(tmp_path, argument):
+    """x' = sign(.), −1 for 0.7 < u < 0.7001 only."""
+    plant = {**PLANT, "A": [[0]], "phi": [f"sign({argument})"], "B": None,
+             "inputs": {"u": {"file": table(tmp_path)}}}
+    slopes = np.diff(U) / np.diff(T)
+    inside = sum(1e-4 / abs(slope) for slope, ends in zip(slopes, pairwise(U), strict=True)
+                 if min(ends) < 0.7 < max(ends))
+    assert signals(plant)["x"][-1] == pytest.approx(3.5 - 2 * inside, abs=1e-8)
+
+
 @pytest.mark.parametrize("width", [1e-2, 1e-4])
 @pytest.mark.parametrize("extra", [{}, {"v": "sin(t)"}])
 def test_what_is_narrow_in_a_table_is_found(tmp_path, width, extra):

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 
 from gpebo_cli import check, run
-from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
@@ -160,6 +160,19 @@ def observed(plant, horizon=10.0, noisy=(), **settings):
     truth = found.truth(t, system.theta_at(t), signals.states)[-1]
     x = found.state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
     return found, eta - truth, float(np.abs(x - signals.states(t)).max())
+
+
+@pytest.mark.parametrize("when", [0.7, 1.2345678])
+def test_assumption_1_may_fail_at_a_time_that_is_met_when_elements_are_cut(when):
+    plant = {
+        "name": "passing", "states": ["w", "a", "b"], "outputs": ["y"], "inputs": {"u": "sin(t)"},
+        "E": [[1, 0, 0], [0, 0, 1], [0, 0, 0]], "A": [[-1, 1, 0.5], [0, 1, 0], [0, 0, 1]],
+        "B": [[0], [0], [-1]], "C": [[1, f"t - {when}", 0]], "initial_state": [1, 0, 0],
+    }
+    with pytest.raises((ModelError, SolverError)):
+        observed(plant, form="given")
+    _, error, of_states = observed(plant)
+    assert max(np.abs(error).max(), of_states) < 1e-9
 
 
 CONSTRAINED = [CAPACITORS, PENDULUM, TANKS, FOUR_BAR, CRANE, LC_LOOP]

@@ -419,6 +419,34 @@ def test_elements_end_where_an_output_passes_a_jump(tol, algebraic):
     assert found.cases[0]["final_error_states"] < 1e-8
 
 
+def time_between(low, high, until=10.0):
+    """For how long low < sin t < high."""
+    crossed = [2 * np.pi * k + turn for k in range(-1, 3) for turn in (0.0, np.pi)]
+    phases = np.arcsin(np.clip([low, high], -1.0, 1.0))
+    ends = [sorted(turn + phases * (-1) ** k) for k, turn in enumerate(crossed)]
+    return sum(np.diff(np.clip(each, 0.0, until))[0] for each in ends)
+
+
+@pytest.mark.parametrize(("argument", "inside"), [
+    ("y - 0.999999", [(0.999999, 1.0)]),  # comes and goes between two times of a mesh
+    ("(0.31 - y)*(y - 0.3101)", [(0.31, 0.3101)]),
+    ("exp(-((y - 0.3)/1e-4)**2) - exp(-1)", [(0.2999, 0.3001)]),
+    ("sin(30*y)", [(2 * k * np.pi / 30, (2 * k + 1) * np.pi / 30) for k in range(-5, 5)]),
+])
+def test_an_output_may_pass_a_jump_and_come_back_at_once(argument, inside):
+    """x' = sign(.) along y = sin t: all of it was missed, with an estimate of 1e-13."""
+    system = plant_from_mapping({
+        "name": "twice", "states": ["s", "x"], "outputs": ["y"], "E": [[1, 0], [0, 1]],
+        "A": [[0, 0], [0, 0]], "phi": ["cos(t)", f"sign({argument})"], "C": [[1, 0]],
+        "initial_state": [0, 0],
+    })
+    found = simulate(system, TimeSettings(horizon=10.0), SolverSettings(tol=1e-9))
+    truth = 2 * sum(time_between(*each) for each in inside) - 10.0
+    error = abs(found.signals.states.final[1] - truth)
+    assert error < 1e-9 + 100 * 10 * found.state_errors[1]
+    assert found.state_errors[1] < 1e-8
+
+
 def test_an_unknown_friction_is_estimated_from_a_speed_that_changes_its_sign():
     plant = {
         "name": "friction", "states": ["p", "v"], "inputs": {"u": "2*sin(t)"},

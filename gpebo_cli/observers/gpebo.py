@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError, GpeboError, SolverError
+from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.observers._base import AffineStateMap, Measurements, Observation, Sampling
@@ -98,13 +98,14 @@ class Gpebo:
         arguments = system, signals, solver
         if self.form != "auto" or self.regression == "paper" or not isinstance(self.remedy, Plain):
             return self._on(self.form, *arguments)
-        found: Observation | SolverError
+        found: Observation | ModelError | SolverError
         known = everything = (True, system.q + system.n)
 
         def few(elements: int) -> SolverSettings:
             return replace(solver, max_elements=min(solver.max_elements, max(_TRIED, elements)))
 
-        # No mesh resolves Assumption 1 failing at one time, or the other form's large rounding.
+        # No mesh resolves Assumption 1 failing at one time, or the other form's large rounding; or
+        # it is only when elements are cut that such a time is met.
         try:
             found = self._on("auto", system, signals, few(100 * signals.mesh.size))
             if not found.note and not _same_on_both_forms(found, system, signals):
@@ -112,7 +113,7 @@ class Gpebo:
             why = "which determines more than the equations as given"
             if not known[0]:
                 why = "which tells with more digits what the equations as given tell, or more"
-        except SolverError as error:
+        except (ModelError, SolverError) as error:
             found, known, limits = error, (False, -1), solver
             why = "for as given its signals are not resolved"
         if known < everything and signals.mesh.size < _LONG:
@@ -124,7 +125,7 @@ class Gpebo:
                     return other
             except GpeboError:  # the form does not exist, or not for these signals
                 pass
-        return self._on("auto", *arguments) if isinstance(found, SolverError) else found
+        return found if isinstance(found, Observation) else self._on("auto", *arguments)
 
     def _on(
         self, form: str, system: DescriptorSystem, signals: Measurements, solver: SolverSettings,

@@ -157,15 +157,20 @@ class Driven:
         found = np.union1d(self.given.breakpoints(start, stop), inner)
         if not self._switches.outputs or not start < stop:
             return found
-        edges = np.concatenate([[start], found, [stop]])
-        t = (edges[:-1, None] + np.diff(edges)[:, None] * _LOOKS).ravel()
-        new = switched(self._switches, t, lambda t: self._known(t, 0, t)[1])
-        return with_others(edges, new)[1:-1]
+        edges, _ = self._along_tables(np.concatenate([[start], found, [stop]]))
+        t = edges[:-1, None] + np.diff(edges)[:, None] * _LOOKS
+        t = aside(t, t.mean(axis=1, keepdims=True)).ravel()  # each in its own piece
+        new = switched(self._switches, t, lambda t, order: self._known(t, order, t)[1])
+        return with_others(np.array([start, *found, stop]), new)[1:-1]
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
         """As of the text, from edges (K + 1,), and of what follows tables: they are polynomials."""
         edges, sure = self.given.resolved(edges)
+        edges, also = self._along_tables(edges)
+        return edges, sure and also
 
+    def _along_tables(self, edges: Array) -> tuple[Array, bool]:
+        """:meth:`resolved` for what follows tables, from edges (K + 1,)."""
         def cells(low: Array, high: Array) -> list[list[Interval] | None]:
             half = 0.5 * (high - low)
             jets = {
@@ -174,8 +179,7 @@ class Driven:
             }
             return [jets.get(k) for k in range(self.given.m)]
 
-        edges, also = self.given.along(cells, self.tables, edges)
-        return edges, sure and also
+        return self.given.along(cells, self.tables, edges)
 
     @cached_property
     def _switches(self) -> Tape:

@@ -84,9 +84,8 @@ class Linearised:
         mesh = self.guess.mesh
         if self._switching is None or mesh.size == 1:
             return np.zeros(0)
-        found = switched(self._switching, mesh.points.ravel(), lambda t: self._along(t, 0, t)[2])
-        # A guess that switches more often than its elements can show slides along a jump.
-        return found if len(found) <= mesh.size else np.zeros(0)
+        t = mesh.points.ravel()
+        return switched(self._switching, t, lambda t, order: self._along(t, order, t)[2])
 
     @cached_property
     def _switching(self) -> Tape | None:
@@ -136,10 +135,10 @@ class Linearised:
         return c._replace(A=c.A + GC, F=c.F + GH, phi=phi, u=known.u)
 
     def _sides(self, t: Array, along: Array) -> Array:
-        """On which side of each jump or kink [u; y] (order + 1, N, m + r) is, (N, number)."""
+        """Side of each jump or kink (N, number) where [u; y] (order + 1, N, m + r) is; 0: on it."""
         if self._switching is None:
             return np.zeros((len(t), 0))
-        return np.asarray(self._switching.taylor(t, 0, None, along[:1])[0] >= 0.0)
+        return np.asarray(np.sign(self._switching.taylor(t, 0, None, along[:1])[0]))
 
     def _along(
         self, t: Array, order: int, inside: Array | None, signals: Array | None = None

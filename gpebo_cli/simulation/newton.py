@@ -134,8 +134,8 @@ def _window(
         moved = values - found.mesh.along(guess).values
         change = float((np.abs(moved).max(axis=(0, 1)) / signal_scale(values)).max())
         # Each change is about the square of the one before times a constant.
-        growth = max(1.0, change / before**2) if np.isfinite(before) and before > 0 else np.inf
-        expected = min(change, _SAFETY * growth * change**2)
+        growth = max(1.0, change / before / before) if 0.0 < before < np.inf else np.inf
+        expected = min(change, _SAFETY * growth * change * change)
         if full and expected <= solver.tol:
             return found, count, work, expected
         if not np.isfinite(change) or (count > 2 and change > _SHRINKS * before):

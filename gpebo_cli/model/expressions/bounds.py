@@ -129,7 +129,8 @@ def resolved_along(
     """
     if all(tape.instructions[place].operation in _POLYNOMIAL for place in followers):
         return edges, True
-    followed = tape.of([place for place in tape.outputs if place in followers])
+    places = [*tape.outputs, *(switch.argument for switch in tape.switches)]
+    followed = tape.of([place for place in places if place in followers])
     return resolved(Bounds(followed, signals), edges, max(_MOST_ALONG, _FOR_EACH * len(edges)))
 
 
@@ -282,25 +283,38 @@ def _bisected(arguments: Tape, cells: Array) -> Array:
     return np.asarray(found[between | at_low | at_high])
 
 
-def switched(arguments: Tape, t: Array, signals: Callable[[Array], Array]) -> Array:
+def switched(arguments: Tape, t: Array, signals: Callable[[Array, int], Array]) -> Array:
     """Times (number,) between those of t (N,), ascending, where an argument changes its sign.
 
-    ``signals`` gives [u; y] (1, M, m + r) at any times (M,). Changes of sign that are rounding
-    of an argument are left out.
+    ``signals`` gives Taylor coefficients of [u; y] (order + 1, M, m + r) at any times (M,). Between
+    two times at which an argument has one sign, it may change twice: where it turns around is
+    looked at, too. Changes of sign that are rounding of an argument are left out.
     """
-    def at(t: Array) -> Array:
-        return np.asarray(arguments.taylor(t, 0, None, signals(t))[0])
+    def at(t: Array, order: int) -> Array:
+        return np.asarray(arguments.taylor(t, order, None, signals(t, order)))
 
-    found = at(t)
-    k, j = np.nonzero((found[1:] >= 0.0) != (found[:-1] >= 0.0))
-    size = np.maximum(np.abs(found[k, j]), np.abs(found[k + 1, j]))
-    told = size > _ROUNDING * np.abs(found).max(axis=0, initial=0.0)[j]
-    k, j = k[told], j[told]
-    if not 0 < len(k) <= _MOST_SWITCHED:
-        return np.zeros(0)
+    value, slope = at(t, 1)
+    above, least = value >= 0.0, _ROUNDING * np.abs(value).max(axis=0, initial=0.0)
+    with np.errstate(over="ignore"):
+        falls = np.where(above, slope, -slope) < 0.0
+    low, j = np.nonzero((above[1:] == above[:-1]) & falls[:-1] & ~falls[1:])
     index = np.arange(len(j))
-    before = found[k, j] >= 0.0
-    return np.unique(halved(lambda t: at(t)[index, j] >= 0.0, before, t[k], t[k + 1]))
+    side = np.where(above[low, j], 1.0, -1.0)
+    turns = halved(
+        lambda t: side * at(t, 1)[1][index, j] < 0.0, falls[low, j], t[low], t[low + 1]
+    )
+    beyond = side * at(turns, 0)[0][index, j] < -least[j]
+    low, j, turns = low[beyond], j[beyond], turns[beyond]
+    k, i = np.nonzero(above[1:] != above[:-1])
+    told = np.maximum(np.abs(value[k, i]), np.abs(value[k + 1, i])) > least[i]
+    k, i = k[told], i[told]
+    left = np.concatenate([t[k], t[low], turns])
+    right = np.concatenate([t[k + 1], turns, t[low + 1]])
+    which, index = np.concatenate([i, j, j]), np.arange(len(left))
+    if not 0 < len(left) <= _MOST_SWITCHED:
+        return np.zeros(0)
+    before = np.concatenate([above[k, i], above[low, j], ~above[low, j]])
+    return np.unique(halved(lambda t: at(t, 0)[0][index, which] >= 0.0, before, left, right))
 
 
 def halved(sign: Callable[[Array], Array], before: Array, low: Array, high: Array) -> Array:
