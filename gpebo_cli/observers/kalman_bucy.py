@@ -187,6 +187,8 @@ class NoiseModel:
         """
         Zt = transpose(s.rows)
         SDt, V, _ = self.measured(s, steps)
+        c = Zt @ s.c
+        c[np.abs(c) <= _ROUNDING * (np.abs(Zt) @ np.sqrt(s.terms))] = 0.0
         signals = self.signals * np.reshape(steps, (-1, 1, 1))
         Q = (s.from_noise * signals) @ transpose(s.from_noise)
         if self.process.any():
@@ -194,7 +196,7 @@ class NoiseModel:
             inside = _inside(q, split, s.projector)
             Q = Q + (inside * self.process) @ transpose(inside)
         return StateSpace(
-            A=s.A, b=s.b[:, :, None], c=Zt @ s.c, z=-(Zt @ s.g_y[:, :, None]), Q=Q,
+            A=s.A, b=s.b[:, :, None], c=c, z=-(Zt @ s.g_y[:, :, None]), Q=Q,
             N=s.from_noise @ SDt, V=V,
         )
 
