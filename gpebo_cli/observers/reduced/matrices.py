@@ -351,6 +351,8 @@ def _eliminate_in_part(
             "observer.form=strangeness_free"
         )
     inverse = kernel @ (transpose(Vt[:, :rank]) / sigma[:, None, :rank])
+    # A state of which nothing is told must not look as if a little of it was.
+    inverse = units[:, None] * without_rounding(inverse / units[:, None])
     smallest = sigma[:, :rank].min(axis=1, initial=np.inf) / size
     return U[:, :, :rank], inverse, smallest
 

@@ -57,8 +57,10 @@ def untouched(
         kernel = np.hstack([frame.kernel, given_up])
         _, sigma, Vt = np.linalg.svd(algebraic @ kernel)
         ranks = (sigma > rank_tol * size[:, None]).sum(axis=1)
-        weakest = sigma[:, max(ranks[0] - 1, 0)]
-        if (ranks != ranks[0]).any() or weakest.min() < _DIP * weakest.max():
+        if (ranks != ranks[0]).any():
+            return None
+        weakest = sigma[:, : ranks[0]].min(axis=1, initial=np.inf)
+        if weakest.min() < _DIP * weakest.max():
             return None
         left = replace(frame, remaining=Remaining(kept, dual, given_up, int(ranks[0])))
         free = kernel @ transpose(Vt[:, ranks[0] :])
