@@ -9,9 +9,10 @@ from plants import CONF
 from random_systems import HORIZON, random_system
 from units import drawn, in_units
 
-from gpebo_cli import run
+from gpebo_cli import estimators, run
 from gpebo_cli.evidence.excitation import WELL
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.regression.linear import LinearRegression
 
 SHIPPED = sorted(
     path.relative_to(CONF / "plant").as_posix().removesuffix(".yaml")
@@ -98,6 +99,40 @@ def test_evidence_is_the_same_in_any_units(name, decades):
                     for run in (one, other))
     assert known == again
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+
+
+@pytest.mark.parametrize("seed", [102, 123])
+def test_what_no_sample_tells_is_unknown_in_any_units(seed):
+    """Kernels of E turn: ψ of a parameter that acts on nothing measured is rounding of z."""
+    content = random_system(seed)[0]
+    units = drawn(np.random.default_rng(7 * seed + 1001), plant_from_mapping(content), decades=True)
+    one, other = (
+        run(made, time={"horizon": HORIZON * unit, "samples": 11}, estimator="least_squares",
+            observer={"name": "gpebo", "sample_time": 0.1 * unit}).details
+        for made, unit in ((content, 1.0), (in_units(content, units), float(units.time)))
+    )
+    assert one.excitation.is_ie == other.excitation.is_ie
+    known, again = ({name for name, since in run.estimable.items() if since is not None}
+                    for run in (one, other))
+    assert known == again
+
+
+@pytest.mark.parametrize("name", ["least_squares", "ls_drem"])
+def test_least_squares_keeps_its_digits_in_any_units(name):
+    """G, in these units, has eigenvalues from 1e-22 to 100, and 1e-5 of its largest in others."""
+    unit = np.array([1e-11, 1e-8, 1.0, 10.0])
+    truth = np.array([1.0, 2.0, -1.0, 3.0])
+
+    def psi(t):
+        return np.stack([1 + 0 * t, np.cos(t), np.sin(t), t], axis=-1)[..., None, :] * unit
+
+    regression = LinearRegression.from_functions(
+        psi, lambda t: psi(t) @ (truth / unit), list("abcd"), 2.0
+    )
+    more = {"gamma": 1e3} if name == "ls_drem" else {}
+    estimator = estimators.build({"name": name, "f0": 1e-200, **more})
+    found = estimator.estimate(regression, np.array([0.0, 2.0])).parameters(slice(None))[0, -1]
+    assert found * unit == pytest.approx(truth, rel=1e-9)
 
 
 def ladder(ampere):

@@ -20,6 +20,7 @@ import numpy as np
 from gpebo_cli.errors import SolverError, check_memory
 from gpebo_cli.estimators._scalar import SINGULAR, low_pass
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression
@@ -29,6 +30,7 @@ _PICARD_ROUNDS = 200
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
+CLEAR = 1e-8  # λ_min/λ_max, from which on the units that are given cost no digits worth a word
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +72,25 @@ class InformationAt:
         """The smallest eigenvalue of G_z at the last time."""
         return max(float(np.linalg.eigvalsh(self.values[-1, :, : self.values.shape[1]])[0]), 0.0)
 
-    def solution(self, alpha: float, f0: float, start: Array) -> Array | None:
-        """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z), shape (M, p, c); None where that is singular.
+    def solution(self, alpha: float, f0: float, start: Array) -> Array:
+        """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z), shape (M, p, c).
 
-        The spectrum, which many gains share, is not needed for it.
+        The spectrum, which many gains share, is not needed for it. It is solved in units in which
+        F⁻¹ has ones on its diagonal; directions in which F⁻¹ is rounding stay where they start.
         """
         p = len(start)
         weight = (self.memory * f0)[:, None, None]
-        right = weight * start[:, None] + alpha * self.values[..., p:]
         left = alpha * self.values[..., :p]
-        np.einsum("mii->mi", left)[:] += weight[..., 0]
+        right = alpha * self.values[..., p:] - left @ start[:, None]
+        diagonal = np.einsum("mii->mi", left)
+        diagonal += weight[..., 0]
+        unit = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))[..., None]
+        left, right = unit * left * transpose(unit), unit * right
         try:
-            return np.asarray(np.linalg.solve(left, right))
+            moved = np.linalg.solve(left, right)
         except np.linalg.LinAlgError:
-            return None
+            moved = np.linalg.pinv(left, p * EPS, hermitian=True) @ right
+        return np.asarray(start[:, None] + unit * moved)
 
     def quotient(self) -> tuple[Array, Array]:
         """G_z⁻¹ h_z (M, p, c), and to how many digits, λ_min/λ_max (M,).

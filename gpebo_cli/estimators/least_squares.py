@@ -12,6 +12,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._information import (
+    CLEAR,
     Information,
     InformationAt,
     Spectrum,
@@ -205,8 +206,8 @@ class LeastSquaresEstimates(Unmixed):
         eta = []
         for case, at, own in zip(chosen, known, starts, strict=True):
             gains = case["alpha"], case["f0"], own
-            solved = at.solution(*gains) if few else None
-            eta.append(solution(at.spectrum, *gains) if solved is None else solved)
+            alone = few or at.spectrum.digits[-1] < CLEAR
+            eta.append(at.solution(*gains) if alone else solution(at.spectrum, *gains))
         found = np.array(eta)
         return found.reshape(*found.shape[:3], *self.realisations)
 

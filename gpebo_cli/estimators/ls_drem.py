@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._information import Information, Spectrum, check_held
+from gpebo_cli.estimators._information import CLEAR, Information, Spectrum, check_held
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     RecursiveMixed,
@@ -142,7 +142,7 @@ def mix_least_squares(
     digits, delta = np.empty(shape), np.empty(shape)
     rows, columns = info.gram.values.shape[-2:]
     quotient = np.empty((*shape, rows * (columns - rows)))
-    # If no digit is left in the units that are given, each parameter's own size is the unit.
+    # If few digits are left in the units that are given, each parameter's own size is the unit.
     for in_own_units in (False, True):
         for first in range(0, mesh.size, _AT_ONCE):  # all spectra at once would take much memory
             part = slice(first, first + _AT_ONCE)
@@ -153,7 +153,7 @@ def mix_least_squares(
             quotient[part] = found.reshape(*points.shape, -1)
             delta[part] = np.prod(_shares(at.spectrum, alpha, f0), axis=1).reshape(points.shape)
         usable = digits > SINGULAR
-        if usable.any():
+        if digits.max() > CLEAR:
             break
     return scalar_path(mesh, signals, delta, digits, filled(quotient, usable), t, floor)
 

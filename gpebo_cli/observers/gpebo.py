@@ -30,6 +30,7 @@ _CLEAR = 1e4  # times what is rounding: an eigenvalue of N that tells with some 
 _SOUND = 1e-8  # relative singular values that are surely not zero
 _TRIED = 2_000  # elements for the equations as given, before the other form is tried
 _LONG = 10_000  # elements of a run that is not observed twice unasked: it takes gigabytes
+_AHEAD = 50  # samples by which it is judged whether a plant's kernels turn; in streams a second
 _NOTE = "; observer on the strangeness-free form, {}"
 
 
@@ -154,6 +155,7 @@ class Gpebo:
         return sampled_observer(
             system, solver, hold, start, sample, derivatives,
             xi_a0=self.xi_a0, weights=self.weights, regression=self.regression, form=self.form,
+            ahead=1.0 if self.sample_time is None else _AHEAD * self.sample_time,
         )
 
     def _refuse_what_needs_the_past(self) -> None:

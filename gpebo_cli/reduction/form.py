@@ -33,7 +33,7 @@ from gpebo_cli.reduction.scaling import Units, units_at
 from gpebo_cli.reduction.strangeness_free import reduced
 from gpebo_cli.reduction.structure import Structure, analyse
 
-_AHEAD = np.linspace(0.0, 1.0, 17)  # seconds
+_AHEAD = np.linspace(0.0, 1.0, 17)  # of what of the plant is looked at before its samples come
 _SEEN = 2  # derivatives at the start by which an entry that is zero there is known
 _MOVED = 1e-8  # of hidden constraints: what derivatives of an output may change by rounding
 _ABSENT = 1e-10  # of the largest coefficient of an input: a derivative with less is not there
@@ -270,9 +270,9 @@ class _Along:
 
 def strangeness_free(
     given: EquationForm, t: Array, inside: Array, signals: Array | None, *, max_mu: int,
-    rank_tol: float,
+    rank_tol: float, ahead: float = 1.0,
 ) -> EquationForm:
-    """The strangeness-free form, for a horizon that the times t (N,) span.
+    """The strangeness-free form, for a horizon that the times t (N,) span, or ``ahead`` seconds.
 
     By these times is judged which derivatives of inputs there are. ``signals`` are [u; y] there (N,
     m + r), for matrices that follow them (ConfigError: a derivative is needed of an input, or of an
@@ -281,7 +281,7 @@ def strangeness_free(
     system, inputs = given.system, given.inputs
     source = system.coefficients
     if len(t) == 1:  # of samples that are still to come nothing is known but the plant
-        t = inside = t + _AHEAD
+        t = inside = t + ahead * _AHEAD
         signals = None if signals is None else np.repeat(signals, len(t), axis=0)
     known = system
     if system.depends_on_outputs and signals is not None:

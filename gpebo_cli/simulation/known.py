@@ -35,6 +35,7 @@ _LOOKS = 40  # times within each first element at which known functions are look
 _MOST_LOOKS = 1 << 16
 _SURPRISE = 100.0  # times what the nodes let expect: then something stands between them
 _LOOK_ROUNDS = 8
+_CUTS = 3  # without effect, after which what is left of a signal may be rounding
 _NOTHING = 1e-12  # of what an input stands beside: less is rounding
 _NEAR_ZERO = 1e-2  # reciprocals of what comes nearer to zero, relatively, resolve nothing
 _MARGIN = 1e-3  # of the tolerance, to which known functions are resolved on few elements: what is
@@ -117,14 +118,16 @@ def cut_where(
     be too many elements. The result is the mesh, and what is known on it.
     """
     before: Array | float = np.inf
+    missed: Array | float = 0.0  # cuts in a row without effect
     while True:
         tail = tail_of(mesh, known)
-        poor = (tail > tol) & ((tail < 0.25 * before) | (tail > 1e-6))
+        missed = np.where(tail < 0.25 * before, 0.0, missed + 1.0)
+        poor = (tail > tol) & (missed < np.where(tail > 1e-6, _CUTS, 1))
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
         if not poor.any() or too_short.any() or parts.sum() > max_elements:
             return mesh, known
-        before = np.repeat(tail, parts)
+        before, missed = tail.repeat(parts), missed.repeat(parts)
         mesh, _ = mesh.split(parts)
         known = evaluated(mesh)
 

@@ -47,7 +47,7 @@ from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import SolverSettings
 
 _STAGES = 4  # per sample, order 7: beyond what any hold is good for
-_PROBED = np.linspace(0.0, 1.0, 17)  # seconds: what turns, does so by more than rounding in them
+_PROBED = np.linspace(0.0, 1.0, 17)  # of the time ahead: what turns, does so by more than rounding
 TOLERANCE = 1e-10  # where samples are far apart, steps are cut until this is reached
 
 
@@ -164,6 +164,11 @@ class SampledObserver(Formulation):
         growth = largest_entry(Phi[1:])
         smallest = float(o.injectivity.min())
         of_gain, scale = term_sizes(z, system.q, basis, equations)
+        if basis.shape[1] > o.split.rank:
+            # What the kernel of E, which turns, leaves of z holds but for errors of z's own size.
+            own = (np.abs(z[:, :, 1:]) / self.units[:, None]).max(axis=1, initial=0.0)[:, None]
+            carried = np.abs(equations.on_basis) @ (self.units[:, None] * own)
+            scale = np.maximum(scale, carried.max(axis=1, initial=0.0))
         if before is not None:
             growth, scale[0] = max(growth, before.growth), np.maximum(scale[0], before.scale)
             smallest = min(smallest, before.injectivity)
@@ -198,15 +203,18 @@ def sampled_observer(
     system: DescriptorSystem, solver: SolverSettings, hold: str, start: float, sample: Array,
     derivatives: InputDerivatives | None, *,
     xi_a0: Mapping[str, float] | list[float] | None, weights: ByName | None, regression: str,
-    form: str,
+    form: str, ahead: float,
 ) -> SampledObserver:
     """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start`` seconds.
 
-    Settings are those of the observer; auto is as given where Assumption 1 holds at the start.
+    Settings are those of the observer; auto is as given where Assumption 1 holds at the start. What
+    the plant does is judged by the seconds ``ahead``.
     """
     t = np.array([start])
-    used, first, note = choose_form(system, t, t, sample[None], derivatives, solver, form, weights)
-    if not _kernel_is_fixed(used, first, t + _PROBED, sample, solver.rank_tol):
+    used, first, note = choose_form(
+        system, t, t, sample[None], derivatives, solver, form, weights, ahead=ahead
+    )
+    if not _kernel_is_fixed(used, first, t + ahead * _PROBED, sample, solver.rank_tol):
         eye = np.eye(system.n)
         split = replace(first.split, basis=eye, dual=eye, frame=None)
         first = replace(first, split=split, on_basis=first.algebraic)

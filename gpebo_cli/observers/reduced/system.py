@@ -200,14 +200,16 @@ def choose_form(
     system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
     derivatives: InputDerivatives | None, solver: SolverSettings, form: str,
     weights: ByName | None, units: Units | None = None, *, piecewise: bool = False,
+    ahead: float = 1.0,
 ) -> tuple[EquationForm, ObserverMatrices, str]:
     """The form of the equations, its matrices at the times t (N,), and why it is this one.
 
     The first time is that of the start. A plant whose matrices follow signals needs [u; y]
-    (N, m + r) there, and hidden constraints the derivatives of inputs, as far as they are known.
-    ``units`` are those in which everything counts; None: of the plant at the start. ``piecewise``
-    the matrices are looked at piece by piece, and those of the first times do, unless E moves
-    (ConfigError: no outputs, wrong weights, a derivative of an input that is not known).
+    (N, m + r) there, and hidden constraints the derivatives of inputs, as far as they are known;
+    of a single time the structure is judged by the plant over the seconds ``ahead``. ``units`` are
+    those in which everything counts; None: of the plant at the start. ``piecewise`` the matrices
+    are looked at piece by piece, and those of the first times do, unless E moves (ConfigError: no
+    outputs, wrong weights, a derivative of an input that is not known).
     """
     if system.r == 0:
         raise ConfigError(
@@ -240,7 +242,7 @@ def choose_form(
             note = f"; observer on the strangeness-free form, for as given {_reason(error)}"
     hidden = strangeness_free(
         given, t, inside, signals,
-        max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol,
+        max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol, ahead=ahead,
     )
     for j in hidden.interpolated:
         name = system.inputs[j]
