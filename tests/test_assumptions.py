@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from examples import gpebo
 from plants import shipped
 
 from gpebo_cli import run
@@ -23,14 +21,6 @@ ROOT = Path(__file__).parent.parent
 def found(system, **observer):
     settings = Settings(plant={}, estimator={}, observer={"name": "gpebo", **observer})
     return {a.name: a for a in examine(settings, system).assumptions}
-
-
-def command(*words, cwd):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        [sys.executable, "-m", "gpebo_cli", *words], cwd=cwd, env=environment, timeout=120,
-        capture_output=True, text=True, check=False,
-    )
 
 
 def test_the_circuit_satisfies_everything():
@@ -116,15 +106,15 @@ def test_growth_of_the_fundamental_matrix_is_reported():
         (["plant=canonical", "observer.form=given"], 1, "Assumption 1 failed"),
     ],
 )
-def test_command(words, code, last, tmp_path):
-    done = command("check", *words, cwd=tmp_path)
+def test_gpebo(words, code, last, tmp_path):
+    done = gpebo("check", *words, cwd=tmp_path)
     assert done.returncode == code
     assert done.stdout.splitlines()[-1] == last
     assert not any(tmp_path.iterdir())  # a check leaves nothing behind
 
 
 def test_command_as_json(tmp_path):
-    done = command("check", "plant=canonical", "observer=canonical", "--json", cwd=tmp_path)
+    done = gpebo("check", "plant=canonical", "observer=canonical", "--json", cwd=tmp_path)
     assert done.returncode == 0
     answer = json.loads(done.stdout)
     assert answer["holds"] is True
@@ -132,7 +122,7 @@ def test_command_as_json(tmp_path):
 
 
 def test_command_with_a_wrong_word(tmp_path):
-    done = command("check", "plant=circut", cwd=tmp_path)
+    done = gpebo("check", "plant=circut", cwd=tmp_path)
     assert done.returncode == 2
     assert "did you mean circuit" in done.stderr
 

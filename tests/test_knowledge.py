@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import shipped
 from random_systems import largest_error, random_system, run_system
-from test_cli import gpebo
 
 from gpebo_cli import run
 from gpebo_cli.evidence.knowledge import knowledge

@@ -7,9 +7,10 @@ import json
 
 import numpy as np
 import pytest
+from examples import gpebo
 from plants import shipped
 from scipy.integrate import solve_ivp
-from test_cli import folders, gpebo
+from test_cli import folders
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import build

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from examples import gpebo
 from plants import seen, shipped
 from regressions import ETA, regression, three
 from scipy.integrate import trapezoid
-from test_cli import folders, gpebo
+from test_cli import folders
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import build
