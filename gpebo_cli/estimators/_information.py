@@ -80,12 +80,15 @@ class InformationAt:
         """
         p = len(start)
         weight = (self.memory * f0)[:, None, None]
-        left = alpha * self.values[..., :p]
-        right = alpha * self.values[..., p:] - left @ start[:, None]
+        left, right = alpha * self.values[..., :p], alpha * self.values[..., p:]
+        if start.any():
+            right -= left @ start[:, None]
         diagonal = np.einsum("mii->mi", left)
         diagonal += weight[..., 0]
         unit = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))[..., None]
-        left, right = unit * left * transpose(unit), unit * right
+        left *= unit
+        left *= transpose(unit)
+        right *= unit
         try:
             moved = np.linalg.solve(left, right)
         except np.linalg.LinAlgError:

@@ -18,9 +18,7 @@ so T need not be smooth in time.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -50,12 +48,9 @@ _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the 
 _AMPLIFIED = 1e3  # times the tolerance: errors beyond that are looked at once more
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
 _MODEST = 1e100  # values up to here may be multiplied with each other
-# GNU's C library gives freed memory back to the system, page by page, and takes as much again a
-# moment later: up to a fifth of an experiment's time. It may keep 256 MB, for arrays up to 64 MB.
-with suppress(AttributeError, OSError, TypeError):  # other libraries have no such function
-    _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-    ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1 << 26)
-    ctypes.CDLL(None).mallopt(_M_TRIM_THRESHOLD, 1 << 28)
+# The C library gives freed memory back to the system, page by page, and takes as much again a
+# moment later, unless it has seen a larger array come and go. This one is never written to.
+np.empty(_CHUNK // 4)
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,13 +56,12 @@ def first_mesh(
 
 
 def few_elements(system: DescriptorSystem, mesh: Mesh, cuts: Array, longest: float) -> Mesh:
-    """Fewer elements than those of a first mesh, up to the ``longest`` (s), to begin with.
+    """Fewer elements than those of a first mesh, equal parts of which last up to ``longest`` (s).
 
     Nothing narrow hides in these, either, or it is the mesh itself; the cuts (B,) stay.
     """
     start, stop = mesh.edges[0], mesh.edges[-1]
-    if 0.5 * FIRST_ELEMENTS * longest < stop - start:
-        return mesh
+    longest *= max(1.0, np.ceil((stop - start) / longest / FIRST_ELEMENTS))
     few = max(_FEWEST, int(np.ceil((stop - start) / longest)))
     edges, bounded = system.coefficients.resolved(initial_edges(start, stop, cuts, few))
     coarse = Mesh(edges, mesh.rule)

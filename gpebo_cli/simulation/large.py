@@ -217,7 +217,7 @@ def _simulated(
     beside = _beside_inputs(plant.found, np.abs(system.initial_state))[used]
     del form, M
     if bounded:
-        mesh = few_elements(system, mesh, cuts, np.inf)
+        mesh = few_elements(system, mesh, cuts, longest)
         plant.entries(mesh)
     mesh = known_resolved(
         system, plant.entries, lambda t: entries(system.coefficients, t, 0).values, mesh,
@@ -228,6 +228,7 @@ def _simulated(
         return None
     if parts.max() > 1.0:
         mesh = mesh.split(parts.astype(np.intp))[0]
+    if 2.0 * float(mesh.steps[0]) > longest:
         # What begins at zero is small in the first element, and is to be resolved there, too.
         mesh = Mesh(np.insert(mesh.edges, 1, mesh.edges[:2].mean()), mesh.rule)
     if stiff:  # what decays at once is not looked for by one round of cuts after the other

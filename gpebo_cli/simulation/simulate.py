@@ -179,9 +179,10 @@ def _known_resolved(
         return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
 
     longest = SHORT / max(structure.rate, _TINY)
-    if solver.name != "ivp" and mesh.steps.max() > longest:
+    first = float(mesh.steps.max())
+    if solver.name != "ivp" and first > longest:
         mesh = _growth_resolved(system, structure, mesh, solver)
-    elif solver.name != "ivp" and structure.steady and bounded:
+    elif solver.name != "ivp" and structure.steady and bounded and 2.0 * first <= longest:
         mesh = few_elements(system, mesh, cuts, longest)
     c = evaluated(mesh)
     terms = _beside_inputs(c)
