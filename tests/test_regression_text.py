@@ -58,6 +58,21 @@ def test_a_delay_moves_jumps_exactly():
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(("along", "of_time"), [
+    ("integral(sign(u))", "integral(sign(sin(t)))"),
+    ("integral(sign((u - 0.3)*(u - 0.3001)))", "integral(sign((sin(t) - 0.3)*(sin(t) - 0.3001)))"),
+    ("lp(sign(lp(u, 2)), 5)", "lp(sign(4*sin(t) - 2*cos(t) + 2*exp(-2*t)), 5)"),
+    ("integral(delay(sign(u - 0.5), 1))", "integral(sign(sin(t - 1) - 0.5)*step(t - 1))"),
+    ("sign(u - 0.2) + sign(delay(u, 1) - 0.2)",
+     "sign(sin(t) - 0.2) + sign(sin(t - 1)*step(t - 1) - 0.2)"),
+    ("integral(sign(lp(u, 2)*lp(u, 2)*lp(u, 2)))",
+     "integral(sign(4*sin(t) - 2*cos(t) + 2*exp(-2*t)))"),
+])
+def test_what_signals_switch_is_as_exact_as_what_time_does(along, of_time):
+    found, expected = values(along, u="sin(t)"), values(of_time, u="sin(t)")  # each on its own mesh
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
 def test_delays_that_make_too_many_corners_are_refused():
     text = "w"
     for k in range(14):  # 2^14 sums of these

@@ -7,7 +7,7 @@ Besides the language of plants there are the operators that regressions are buil
     integral(x)   ∫ x from the start
     delay(x, d)   x(t − d), zero before the start
 
-which may be nested. Elements of a mesh end where a delayed signal jumps or has a kink. From one
+which may be nested. Elements of a mesh end where a text or a delay jumps or has a kink. From one
 sample to the next signals are what the hold makes of them, and what is kept does not grow.
 """
 
@@ -32,13 +32,14 @@ from gpebo_cli.model.expressions import (
     record,
     resolved,
     resolved_along,
+    switched,
 )
 from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.syntax import signal
 from gpebo_cli.model.expressions.tape import UNKNOWN
 from gpebo_cli.model.plant import plant_from_mapping, read_parameters
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, aside, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.recordings.drive import driven, tables
@@ -60,6 +61,9 @@ KEYS = (
 
 _FIRST_ELEMENTS = 16
 _MAX_DELAYED = 10_000  # edges that delays may ask for
+_LOOKS = 3  # at where signals pass jumps
+_APART = 1e-13  # of a time: an edge nearer than that is there already
+_JUMPED = 1e-6  # of its size: what changes by more beside an end of an element jumps there
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +130,31 @@ class TextRegression:
         return regression, error
 
     def _mesh(self, signals: Trajectory) -> Mesh:
-        """The signals' mesh with an edge wherever a delayed signal jumps or has a kink."""
+        """The signals' mesh with an edge wherever something jumps or has a kink, or did before."""
         mesh = signals.mesh
         start, stop = float(mesh.edges[0]), float(mesh.edges[-1])
         jumps, size = signals.values[1:, 0] - signals.values[:-1, -1], signals.values
         jumped = (np.abs(jumps) > 1e-9 * largest_over_time(size, 2)).any(axis=1)
         found = [self.system.coefficients.breakpoints(start, stop), mesh.edges[1:-1][jumped]]
         cuts = np.concatenate(found + [breakpoints(tape, start, stop) for tape in self.tapes])
+        for _ in range(_LOOKS):  # integrals of what jumps are known where elements end there
+            fine = Mesh(np.union1d(mesh.edges, self._delayed(cuts, start, stop)), mesh.rule)
+            known = fine.trajectory(self._on_mesh(signals, fine)[0][0])
+            edges = fine.edges
+            for tape in self.tapes:
+                followers = tape.following(range(known.values.shape[2]))
+                edges, _ = resolved_along(tape, followers, known.cells, edges)
+            passed = self._passed(known, edges)
+            k = fine.edges.searchsorted(passed)
+            gap = np.minimum(fine.edges[k] - passed, passed - fine.edges[k - 1])
+            passed = passed[gap > _APART * np.abs(passed)]
+            if not len(passed):
+                break
+            cuts = np.union1d(cuts, passed)
+        return Mesh(edges, mesh.rule)
+
+    def _delayed(self, cuts: Array, start: float, stop: float) -> Array:
+        """Cuts (C,) and when they come out of delays, (number,) seconds (ConfigError: too many)."""
         for operator in self.operators:
             if operator.name == "delay":
                 later = np.concatenate([[start], cuts]) + operator.number
@@ -142,40 +164,54 @@ class TextRegression:
                         f"regression {self.system.name}: its delays make {len(cuts)} corners in "
                         f"the horizon; at most {_MAX_DELAYED} are followed"
                     )
-        mesh = Mesh(np.union1d(mesh.edges, cuts), mesh.rule)
-        known = mesh.trajectory(self._on_mesh(signals, mesh)[0][0])
-        edges = mesh.edges
-        for tape in self.tapes:
-            followers = tape.following(range(known.values.shape[2]))
-            edges, _ = resolved_along(tape, followers, known.cells, edges)
-        return Mesh(edges, mesh.rule)
+        return cuts
+
+    def _passed(self, known: Trajectory, edges: Array) -> Array:
+        """Times (number,) at which operators and recorded signals pass a jump or kink of a text."""
+        mesh = Mesh(edges, known.mesh.rule)
+        t, found = aside(mesh.points, mesh.inside).ravel(), [np.zeros(0)]
+        for tape in self.tapes:  # breakpoints are there of what is of time alone
+            places = {switch.argument for switch in tape.switches} - tape.of_time
+            if places:
+                arguments = tape.of(sorted(places))
+                found.append(switched(arguments, t, lambda t, order: known.taylor(t, order, t)))
+        return np.unique(np.concatenate(found))
 
     def _on_mesh(self, signals: Trajectory, mesh: Mesh) -> tuple[Array, Array, Array | None]:
         """:meth:`_evaluated` at the points of a mesh, K (s + 1) of them."""
         t, inside = mesh.points.ravel(), mesh.inside.ravel()
+
+        def outputs(tape: Tape, columns: Array) -> Array:
+            found = np.asarray(tape.taylor(t, 0, inside, columns)[0])
+            if tape.switches:  # at an end of an element, what jumps there is as it is within
+                within = mesh.trajectory(columns[0])(aside(t, inside), inside)[None]
+                other = np.asarray(tape.taylor(t, 0, inside, within)[0])
+                jumped = np.abs(other - found) > _JUMPED * np.abs(found).max(axis=0, initial=0.0)
+                found = np.where(jumped, other, found)
+            return found
+
         return self._evaluated(
-            t, inside, signals(t, inside),
+            signals(t, inside), outputs,
             lambda _, operator, x: operator(mesh.trajectory(x)).ravel(),
         )
 
     def _evaluated(
-        self, t: Array, inside: Array, signals: Array,
+        self, signals: Array, outputs: Callable[[Tape, Array], Array],
         operate: Callable[[int, Operator, Array], Array],
     ) -> tuple[Array, Array, Array | None]:
         """Signals and operators (1, N, m + operators), ψ (N, rows, p), and Y (N, rows) of a text.
 
-        At the times t (N,), from signals (N, m); ``operate`` makes the values of an operator, of
-        this number, of those of its argument (N,).
+        From signals (N, m); ``outputs`` makes those of a tape (N, outputs) of the first of these,
+        ``operate`` the values of an operator, of this number, of those of its argument (N,).
         """
         count, m = signals.shape
         columns = np.zeros((1, count, m + len(self.operators)))
         columns[0, :, :m] = signals
         for k, operator in enumerate(self.operators):
-            x = operator.argument.taylor(t, 0, inside, columns)[0][:, 0]
+            x = outputs(operator.argument, columns)[:, 0]
             columns[0, :, m + k] = operate(k, operator, x)
-        psi = self.psi.taylor(t, 0, inside, columns)[0].reshape(count, self.rows, -1)
-        Y = None if self.Y is None else np.asarray(self.Y.taylor(t, 0, inside, columns)[0])
-        return columns, psi, Y
+        psi = outputs(self.psi, columns).reshape(count, self.rows, -1)
+        return columns, psi, None if self.Y is None else outputs(self.Y, columns)
 
     def advance(
         self, hold: str, state: TextState | None, t: Array, signals: Array, Y: Array
@@ -194,7 +230,10 @@ class TextRegression:
             reached.append(after)
             return values
 
-        _, psi, right = self._evaluated(t, t, signals, operate)
+        def outputs(tape: Tape, columns: Array) -> Array:
+            return np.asarray(tape.taylor(t, 0, t, columns)[0])
+
+        _, psi, right = self._evaluated(signals, outputs, operate)
         right = Y if right is None else right
         rows = np.concatenate([psi, right.reshape(len(t), self.rows, 1)], axis=2)
         scale = np.maximum.accumulate(np.abs(psi).max(axis=1, initial=0.0), axis=0)
