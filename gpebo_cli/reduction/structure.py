@@ -163,6 +163,10 @@ def _analysed(
             staged = _in_stages(system, t, max_mu, rank_tol, levels.least)
             if staged is not None:
                 return staged
+            # The right μ is followed by others that find the same number of constraints.
+            more = system.coefficients.taylor(t, mu + 1)
+            if _judged(t, more, mu + 1, scaling, rank_tol, invariant).a != levels.a:
+                raise unclear_ranks(system, t, UnclearError(0, rounding=True))
         lines = partial(
             _lines, mu=mu, scaling=scaling, rank_tol=rank_tol, a=levels.a,
             reference=levels.reference,
