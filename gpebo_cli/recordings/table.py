@@ -431,9 +431,9 @@ def _from_frame(
         )
     t = values[~np.isnan(values[:, 0]), 0]
     for row in np.flatnonzero(np.diff(t) <= 0)[:1]:
+        before, after = t[row : row + 2].tolist()
         raise ConfigError(
-            f"{source}, column {header.names[0]}: {t[row + 1]!r} follows {t[row]!r}; times must "
-            "increase"
+            f"{source}, column {header.names[0]}: {after!r} follows {before!r}; times must increase"
         )
     return _table(header, data, values, system, sha256, first_line=0)
 
