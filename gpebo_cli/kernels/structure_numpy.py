@@ -251,8 +251,12 @@ def in_own_states(
     some = slice(0, None, every) if len(inverse) > 1 else slice(None)
     amplification = (np.abs(inverse[some, :, d:]) @ size).max(axis=0)
     amplification[:, :-1] /= columns
+    E1, A2 = W1 @ E, A2 / columns
+    T, of_f2 = inverse[:, :, :d] / time, inverse[:, :, d:]  # the scaled E is E/τ
+    offset = -(of_f2 @ f2)
+    # Of components beside which others are large the inverse leaves rounding of these.
+    offset -= T @ (E1 @ offset) + of_f2 @ (A2 @ offset + f2)
     return (
-        W1 @ E, W1 @ A, np.matmul(W1, f[:, :, None])[:, :, 0], A2 / columns, f2[:, :, 0],
-        inverse[:, :, :d] / time,  # the scaled E is E/τ
-        -(inverse[:, :, d:] @ f2)[:, :, 0], amplification,
+        E1, W1 @ A, np.matmul(W1, f[:, :, None])[:, :, 0], A2, f2[:, :, 0], T, offset[:, :, 0],
+        amplification,
     )
