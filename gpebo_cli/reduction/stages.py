@@ -96,7 +96,7 @@ def in_stages(
             X[k] -= sum(X[k - j] @ P[j] for j in range(1, k + 1))
         A_z, f_z = (below - taylor_product(X, above) for above, below in parts[1:])
         Uz, size, _ = np.linalg.svd(A_z[0], full_matrices=False)
-        # Beside its terms, which may cancel.
+        # It is compared with its terms, because they may cancel.
         require(size[:, -1] > _CLEAR * _EPS * np.linalg.norm(abs(W2) @ abs(A[0]), axis=(1, 2)))
         Wz = transpose(Uz / size[:, None, :])
         A_z, f_z = Wz @ A_z, Wz @ f_z
