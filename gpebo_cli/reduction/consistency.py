@@ -7,13 +7,15 @@ by the equation itself, in the sense of distributions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from math import comb, factorial
 
 import numpy as np
 
 from gpebo_cli.errors import ModelError
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.reduction.strangeness_free import StrangenessFree, strangeness_free_form
 from gpebo_cli.reduction.structure import Structure
 
@@ -58,10 +60,12 @@ class Jump:
     impulses: Array  # (μ, n) coefficients of δ, δ', … in x
 
 
-def jump(
-    system: DescriptorSystem, structure: Structure, t: float, width: float, before: Array
-) -> Jump:
-    """The state just after time t, given the limit from the left.
+def jumps(
+    system: DescriptorSystem, structure: Structure, times: Array, widths: Array
+) -> Callable[[int, Array], Jump]:
+    """The jump k at times[k] (N,), a function of k and of the state's limit from the left (n,).
+
+    ``widths`` (N,) tell how far beside the times the sides of a jump are looked at.
 
     With x = x_regular + Σ_k w_{k+1} δ^(k) and a step w_0 = x(t+) − x(t−), the coefficient of
     δ^(j) in E x' = A x + f (f jumps but has no impulse) gives, j = 0 … μ,
@@ -74,25 +78,41 @@ def jump(
     where the state has an impulse, so that their product means nothing, or no state after the jump
     satisfies the equations).
     """
-    mu, n = structure.mu, system.n
-    now = np.array([t])
-    after = system.coefficients.taylor(now, mu, now + width)
-    reduced = strangeness_free_form(system, structure, now, now + width)
+    if structure.a == 0:  # without constraints the state follows no jump
+        return lambda _, before: Jump(before, np.zeros((structure.mu, system.n)))
+    beside = times + widths
+    after = system.coefficients.taylor(times, structure.mu, beside)
+    left = system.coefficients.taylor(times, 0, times - widths)
+    form = strangeness_free_form(system, structure, times, beside, after)
+    every = {
+        name: np.broadcast_to(part, (len(times), *part.shape[1:]))
+        for name, part in {"E1": form.E1, "A2": form.A2, "basis": form.basis}.items()
+        if part is not None
+    }
+    return partial(_jump, system, structure, times, (left, after), replace(form, **every))
+
+
+def _jump(
+    system: DescriptorSystem, structure: Structure, times: Array,
+    sides: tuple[Coefficients, Coefficients], form: StrangenessFree, k: int, before: Array,
+) -> Jump:
+    """:func:`jumps` at times[k], with what is known of both sides at all of the times."""
+    mu, n, t, after, A2 = structure.mu, system.n, float(times[k]), sides[1], form.A2[k]
     levels = mu + 1
     blocks = np.zeros((levels, n, levels, n))
     for j in range(levels):
-        for k in range(j, levels):
-            sign = (-1.0) ** (k - j) * comb(k, k - j) * factorial(k - j)
-            blocks[j, :, k] += sign * after.E[k - j, 0]
-            if k + 1 < levels:
-                blocks[j, :, k + 1] -= sign * after.A[k - j, 0]
+        for i in range(j, levels):
+            sign = (-1.0) ** (i - j) * comb(i, i - j) * factorial(i - j)
+            blocks[j, :, i] += sign * after.E[i - j, k]
+            if i + 1 < levels:
+                blocks[j, :, i + 1] -= sign * after.A[i - j, k]
     constraints = np.zeros((structure.a, levels, n))
-    constraints[:, 0] = reduced.A2[0]
+    constraints[:, 0] = A2
     system_matrix = np.concatenate(
         [blocks.reshape(levels * n, levels * n), constraints.reshape(structure.a, levels * n)]
     )
     right = np.zeros(len(system_matrix))
-    right[levels * n :] = -(reduced.f2[0] + reduced.A2[0] @ before)
+    right[levels * n :] = -(form.f2[k] + A2 @ before)
     # Rows by their own size: an equation in microfarads weighs as much as one in ohms.
     size = np.abs(system_matrix).max(axis=1)
     size[size == 0] = 1.0
@@ -108,30 +128,21 @@ def jump(
     w = w.reshape(levels, n)
     significant = np.abs(w[1:]) > _IMPULSE * scale
     impulses = np.where(significant, w[1:], 0.0)
-    _refuse_ambiguous_products(system, t, width, w[0], impulses, scale)
-    state = before + w[0]
-    if reduced.basis is not None and reduced.offset is not None:
-        # On the constraints to the last digit: a component that they make zero is zero.
-        state = reduced.basis[0] @ (reduced.E1[0] @ state) + reduced.offset[0]
-    return Jump(state, impulses)
-
-
-def _refuse_ambiguous_products(
-    system: DescriptorSystem, t: float, width: float, step: Array, impulses: Array, scale: float
-) -> None:
-    """E or A may jump only where it is not multiplied by an impulse."""
-    now = np.array([t])
-    left = system.coefficients.taylor(now, 0, now - width)
-    right = system.coefficients.taylor(now, 0, now + width)
-    for name, change, factors in (
-        ("E", right.E[0, 0] - left.E[0, 0], [step, *impulses]),
-        ("A", right.A[0, 0] - left.A[0, 0], list(impulses)),
+    # E or A may jump only where it is not multiplied by an impulse.
+    for name, (before_it, after_it), factors in (
+        ("E", [side.E[0, k] for side in sides], [w[0], *impulses]),
+        ("A", [side.A[0, k] for side in sides], [*impulses]),
     ):
-        for factor in factors:
-            product = np.abs(change @ factor)
-            if product.max(initial=0.0) > 1e-9 * scale * max(1.0, float(np.abs(change).max())):
-                raise ModelError(
-                    f"plant {system.name}: {name} jumps at t = {t:.6g} where the state has an "
-                    "impulse or a jump of its own, and their product is undefined; take the "
-                    "conserved quantity (charge, momentum) as the state"
-                )
+        change = after_it - before_it
+        most = max((np.abs(change @ factor).max() for factor in factors), default=0.0)
+        if most > 1e-9 * scale * max(1.0, float(np.abs(change).max())):
+            raise ModelError(
+                f"plant {system.name}: {name} jumps at t = {t:.6g} where the state has an "
+                "impulse or a jump of its own, and their product is undefined; take the "
+                "conserved quantity (charge, momentum) as the state"
+            )
+    state = before + w[0]
+    if form.basis is not None and form.offset is not None:
+        # On the constraints to the last digit: a component that they make zero is zero.
+        state = form.basis[k] @ (form.E1[k] @ state) + form.offset[k]
+    return Jump(state, impulses)

@@ -17,7 +17,7 @@ from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
-from gpebo_cli.reduction.consistency import Jump, consistent_state, jump
+from gpebo_cli.reduction.consistency import Jump, consistent_state, jumps
 from gpebo_cli.reduction.strangeness_free import StrangenessFree, direct_part, strangeness_free_form
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -114,9 +114,7 @@ def _simulate_linear(
         )
 
     happened: dict[float, tuple[Array, Jump]] = {}
-    restarts = {
-        cut: _restart(system, structure, cut, mesh.edges, happened) for cut in map(float, cuts)
-    }
+    restarts = _restarts(system, structure, cuts, mesh.edges, happened)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         return _equations(strangeness_free_form(system, structure, t, inside))
@@ -261,19 +259,22 @@ def _equations(reduced: StrangenessFree) -> LinearEquation:
     return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints)
 
 
-def _restart(
-    system: DescriptorSystem, structure: Structure, t: float, edges: Array,
+def _restarts(
+    system: DescriptorSystem, structure: Structure, cuts: Array, edges: Array,
     happened: dict[float, tuple[Array, Jump]],
-) -> Callable[[Array], Array]:
-    k = int(np.searchsorted(edges, t))
-    width = 1e-3 * float(min(edges[k + 1] - edges[k], edges[k] - edges[k - 1]))  # where to look
+) -> dict[float, Callable[[Array], Array]]:
+    """What is done to the states (n, 1) at each of the cuts; the jumps are kept in ``happened``."""
+    if not len(cuts):
+        return {}
+    k, steps = np.searchsorted(edges, cuts), np.diff(edges)
+    at = jumps(system, structure, cuts, 1e-3 * np.minimum(steps[k], steps[k - 1]))
 
-    def restart(before: Array) -> Array:
-        what = jump(system, structure, t, width, before[:, 0])
+    def restart(k: int, t: float, before: Array) -> Array:
+        what = at(k, before[:, 0])
         happened[t] = (before[:, 0].copy(), what)
         return what.after[:, None]
 
-    return restart
+    return {t: partial(restart, k, t) for k, t in enumerate(cuts.tolist())}
 
 
 def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
