@@ -83,24 +83,28 @@ class Knowledge:
 
     @cached_property
     def independent(self) -> IntArray:
-        """Parameters that can be estimated together at the last time, the determined ones included.
+        """Parameters that can be estimated together, the determined ones included.
 
         The others, set to zero, change nothing that is determined: along the kernel of N the
-        regression is the same.
+        regression is the same. Of the times those count at which most of them can be told apart:
+        data say no less later, but beside what grows their Gram matrix shows it no longer.
         """
         if self.parameters[-1].all():
             return np.arange(self.parameters.shape[1])
-        V, spectrum, level = self.vectors[-1], self.eigenvalues[-1], self.level[-1]
-        normalised = (V * np.maximum(spectrum, 0.0)) @ V.T
-        first = np.flatnonzero(self.parameters[-1]).tolist()
-        rest, chosen = np.flatnonzero(~self.parameters[-1]).tolist(), list[int]()
+        clear = self.clarity >= 1.0
+        rank, least = clear.sum(axis=1), np.where(clear, self.eigenvalues, np.inf).min(axis=1)
+        m = int(np.argmax(np.where(rank == rank.max(), least, -1.0)))
+        known, level = self.parameters[m], self.level[m]
+        normalised = (self.vectors[m] * np.maximum(self.eigenvalues[m], 0.0)) @ self.vectors[m].T
+        first = np.flatnonzero(known | self.parameters[-1]).tolist()
+        rest, chosen = [j for j in range(len(known)) if j not in first], list[int]()
         left = normalised.copy()  # what those that are chosen do not explain of the others
         while first or rest:
             # Of those that may stand for one another the one with the most to say comes first.
             j = max(first or rest, key=left.diagonal().__getitem__)
             (first or rest).remove(j)
             more = [*chosen, j]
-            if not self.parameters[-1, j]:  # no eigenvalue is above what is left of a column
+            if not known[j]:  # no eigenvalue is above what is left of a column
                 if not left[j, j] >= 0.5 * level[j]:
                     continue
                 if np.linalg.eigvalsh(normalised[np.ix_(more, more)])[0] < level[more].max():

@@ -105,6 +105,8 @@ def continuous(
         excitation = assess(regression, t, settings.excitation, settings.solver.tol)
     with stage("estimate") as pace:
         known, seen_at = excitation.final, visible(observation, t, system.states)
+        if not known.parameters.all():
+            known = excitation.known
         seen, names = seen_at(known), (regression.parameters, system.states)
         told = dict(zip(system.states, seen[-1], strict=True))
         told |= dict(zip(regression.parameters, known.parameters[-1], strict=True))
