@@ -17,6 +17,8 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+import processes
+
 ROOT = Path(__file__).parents[1]
 
 _SERVER = """
@@ -75,7 +77,7 @@ def _bin_folder() -> str:
     address = str(Path(folder.name, "socket"))
     server = subprocess.Popen(
         [sys.executable, "-c", _SERVER, address], stdout=subprocess.PIPE, stdin=subprocess.DEVNULL,
-        env={**_clean(), "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "OPENBLAS_NUM_THREADS": "1"},
+        env=processes.environment(OPENBLAS_NUM_THREADS="1"),
     )
     assert server.stdout is not None
     assert server.stdout.readline() == b"ready\n"
@@ -93,16 +95,10 @@ def _bin_folder() -> str:
     return folder.name
 
 
-def _clean() -> dict[str, str]:
-    return {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
-
-
 def environment() -> dict[str, str]:
     """An environment in which ``gpebo`` and ``import gpebo_cli`` are this checkout's."""
-    return {
-        **_clean(), "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "OPENBLAS_NUM_THREADS": "1",
-        "PATH": f"{_bin_folder()}{os.pathsep}{os.environ['PATH']}",
-    }
+    path = f"{_bin_folder()}{os.pathsep}{os.environ['PATH']}"
+    return processes.environment(OPENBLAS_NUM_THREADS="1", PATH=path)
 
 
 def gpebo(*words: object, cwd: Path, text: str = "") -> subprocess.CompletedProcess[str]:
@@ -111,6 +107,15 @@ def gpebo(*words: object, cwd: Path, text: str = "") -> subprocess.CompletedProc
         ["gpebo", *map(str, words)], cwd=cwd, env=environment(), capture_output=True, text=True,
         check=False, timeout=300, input=text,
     )
+
+
+def assert_repeats(folder: Path, *names: str) -> None:
+    """The run in a folder, once more from its configuration, gives the same bytes."""
+    words = ("--config-dir", folder, "--config-name", "config", "hydra.run.dir=again")
+    done = gpebo("run", *words, cwd=folder.parent)
+    assert done.returncode == 0, done.stderr
+    for name in names:
+        assert (folder / name).read_bytes() == (folder.parent / "again" / name).read_bytes(), name
 
 
 def shell(script: str, folder: Path) -> str:

@@ -163,7 +163,7 @@ def run_import(r, folder):
     yield name, text
     made = gpebo("new", "plant", "mine", "--from", name, cwd=folder)
     yield from judged(made)
-    if made.code == 0:
+    if made.returncode == 0:
         words = ["--config-dir", ".", "plant=mine", "time.horizon=1e-3", *_SHORT]
         yield from judged(gpebo("run", *words, cwd=folder))
 
@@ -250,17 +250,17 @@ def run_recording(r, folder):
 
 def judged(done):
     """What is wrong with what a command printed, if anything."""
-    if done.code not in (0, 1, 2):
-        yield f"exit code {done.code}"
-    if done.code:
-        lines = [line for line in done.err.splitlines(keepends=True) if "warning: " not in line]
+    if done.returncode not in (0, 1, 2):
+        yield f"exit code {done.returncode}"
+    if done.returncode:
+        lines = [line for line in done.stderr.splitlines(keepends=True) if "warning: " not in line]
         errors = [line for line in lines if line.startswith("gpebo: error: ")]
-        if len(errors) != len(lines) and "Traceback" in done.err:
-            yield done.err
+        if len(errors) != len(lines) and "Traceback" in done.stderr:
+            yield done.stderr
         if errors:
             yield from one_line(errors[-1])
-        elif "FAILS" not in done.out:
-            yield f"exit code {done.code} without a reason: {done.err!r}"
+        elif "FAILS" not in done.stdout:
+            yield f"exit code {done.returncode} without a reason: {done.stderr!r}"
 
 
 def one_line(text):

@@ -6,18 +6,9 @@ import contextlib
 import io
 import os
 import sys
-from dataclasses import dataclass
+from subprocess import CompletedProcess
 
 from gpebo_cli.cli.app import main
-
-
-@dataclass(frozen=True)
-class Done:
-    """What a command printed, and its exit code."""
-
-    code: int
-    out: str
-    err: str
 
 
 @contextlib.contextmanager
@@ -30,7 +21,7 @@ def inside(folder):
         os.chdir(before)
 
 
-def gpebo(*words, cwd) -> Done:
+def gpebo(*words, cwd) -> CompletedProcess[str]:
     out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     err = io.StringIO()
     arguments = sys.argv
@@ -41,4 +32,4 @@ def gpebo(*words, cwd) -> Done:
     finally:
         sys.argv = arguments
     out.seek(0)
-    return Done(code, out.read(), err.getvalue())
+    return CompletedProcess(words, code, out.read(), err.getvalue())

@@ -121,12 +121,6 @@ def test_command_as_json(tmp_path):
     assert {"name", "statement", "holds", "evidence"} == set(answer["assumptions"][0])
 
 
-def test_command_with_a_wrong_word(tmp_path):
-    done = gpebo("check", "plant=circut", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "did you mean circuit" in done.stderr
-
-
 def test_nothing_to_estimate_is_exciting_and_gives_the_states():
     """Hidden constraints alone determine the state: x = 0, v = −u (strangeness-free, d = 0)."""
     names = found(lti(A=[[-1, 1], [1, 0]]))

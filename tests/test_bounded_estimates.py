@@ -7,11 +7,12 @@ import json
 import clarabel
 import numpy as np
 import pytest
+from processes import refused
 from scipy import sparse
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from gpebo_cli import ConfigError, run
+from gpebo_cli import run
 
 TANK = {
     "name": "tank", "states": ["h1", "h2"], "inputs": {"V": "sin(t)"}, "unknowns": {"leak": -0.05},
@@ -135,6 +136,5 @@ def test_estimates_respect_bounds_at_all_times_whatever_the_estimator(tmp_path):
     ({"bounds": BOUNDS, "remedy": "reset"}, "accepted remedies"),
 ])
 def test_bounds_that_cannot_be(changes, part):
-    with pytest.raises(ConfigError) as error:
+    with refused(part):
         run(TANK, observer=changes, time={"horizon": HORIZON, "samples": 5})
-    assert part in str(error.value)

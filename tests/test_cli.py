@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import examples
+import inprocess
 import pytest
 import yaml
+from processes import (
+    ROOT,
+    assert_refused,
+    begin,
+    environment,
+    process,
+    python,
+    rows_of,
+    wait_for,
+)
 
-from tests import inprocess
-
-ROOT = Path(__file__).parents[1]
 FAST = ["figures=none", "time.samples=51"]
 
 MINE = """\
@@ -33,20 +39,9 @@ initial_state: {x: 1}
 """
 
 
-def environment(**more):
-    inherited = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
-    return {**inherited, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", **more}
-
-
 def gpebo(*words, cwd, **more):
     """A process of its own where its environment is another one."""
-    if not more:
-        return examples.gpebo(*words, cwd=cwd)
-    command = [sys.executable, "-m", "gpebo_cli", *map(str, words)]
-    return subprocess.run(
-        command, cwd=cwd, env=environment(**more), capture_output=True, text=True,
-        check=False, timeout=120, stdin=subprocess.DEVNULL,
-    )
+    return process(*words, cwd=cwd, **more) if more else examples.gpebo(*words, cwd=cwd)
 
 
 def folders(cwd, kind="runs"):
@@ -95,44 +90,23 @@ def test_run_help_names_the_real_defaults(tmp_path):
         assert line.split("=", 1)[1].split()[0] == chosen[group]
 
 
-@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["list"], ["--version"]])
-def test_help_imports_nothing_heavy(tmp_path, words):
+HEAVY = ("numpy", "hydra", "omegaconf", "yaml", "argparse", "pathlib", "re", "dataclasses")
+
+
+@pytest.mark.parametrize(("words", "heavy"), [
+    *((["-S", "--", *words], HEAVY)  # without site-packages, whose own .pth files import things
+      for words in (["--help"], ["run", "--help"], ["list"], ["--version"])),
+    (["--", "run", "--cfg", "job"], ["numpy"]),
+    (["--", "run", *FAST], ["pandas", "sympy", "matplotlib"]),
+])
+def test_nothing_heavy_is_imported_for_nothing(tmp_path, words, heavy):
     script = (
         "import sys; sys.argv = ['gpebo', *sys.argv[1:]]; from gpebo_cli.cli.app import main; "
-        "main(); heavy = {'numpy', 'hydra', 'omegaconf', 'yaml', 'argparse', 'pathlib', 're', "
-        "'dataclasses'} & set(sys.modules); sys.exit(f'imported {heavy}' if heavy else 0)"
-    )
-    # -S: what site-packages' own .pth files import is not ours to answer for
-    done = subprocess.run(
-        [sys.executable, "-S", "-c", script, *words], env=environment(), cwd=tmp_path,
-        capture_output=True, text=True, check=False,
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def test_composing_imports_no_numbers(tmp_path):
-    script = (
-        "import sys; sys.argv = ['gpebo', 'run', '--cfg', 'job']; "
-        "from gpebo_cli.cli.app import main; main(); sys.exit('numpy' in sys.modules)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=environment(), cwd=tmp_path,
-        capture_output=True, text=True, check=False,
-    )
-    assert done.returncode == 0
-
-
-def test_a_run_without_figures_imports_neither_tables_nor_drawing(tmp_path):
-    script = (
-        "import sys; sys.argv = ['gpebo', 'run', *sys.argv[1:]]; "
-        "from gpebo_cli.cli.app import main; main(); "
-        "heavy = {'pandas', 'sympy', 'matplotlib'} & set(sys.modules); "
+        f"main(); heavy = {{*{heavy}}} & set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script, *FAST], env=environment(), cwd=tmp_path,
-        capture_output=True, text=True, check=False,
-    )
+    split = words.index("--")
+    done = python(*words[:split], "-c", script, *words[split + 1 :], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
 
 
@@ -237,6 +211,7 @@ WRONG = [
     (["run", "--config-name", "gpbo"], "did you mean gpebo?"),
     (["run", "tank"], "see gpebo run --help"),
     (["run", "circuit"], "did you mean plant=circuit?"),
+    (["check", "plant=circut"], "did you mean circuit?"),
     (["check", "drem"], "did you mean estimator=drem?"),
     (["run", "--plant=circuit"], "plant is written without dashes, as in plant=circuit"),
     (["run", "gamma=3"], "did you mean estimator.gamma?"),
@@ -253,29 +228,20 @@ WRONG = [
 
 @pytest.mark.parametrize(("words", "expected"), WRONG)
 def test_wrong_usage_is_one_line_and_exit_code_2(tmp_path, words, expected):
-    done = gpebo(*words, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith("gpebo: error: ")
-    assert done.stderr.count("\n") == 1
-    assert expected in done.stderr
+    assert_refused(gpebo(*words, cwd=tmp_path), expected)
     assert folders(tmp_path) == [], "a run that never began leaves no folder"
 
 
 def test_a_plant_in_this_folder_is_told_from_one_that_is_nowhere(tmp_path, mine):
     done = gpebo("run", "plant=mine", *FAST, cwd=mine)
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "yours, plant/mine.yaml, is found with --config-dir ." in done.stderr
-    done = gpebo("run", "mine", *FAST, cwd=mine)
-    assert "did you mean plant=mine?" in done.stderr
+    assert_refused(done, "yours, plant/mine.yaml, is found with --config-dir .")
+    assert_refused(gpebo("run", "mine", *FAST, cwd=mine), "did you mean plant=mine?")
 
 
 def test_a_failed_run_is_exit_code_1(tmp_path):
     (tmp_path / "taken").touch()
     done = gpebo("run", "hydra.run.dir=taken", *FAST, cwd=tmp_path)
-    assert done.returncode == 1
-    assert done.stderr.startswith("gpebo: error: cannot create the folder ")
-    assert done.stderr.endswith("taken: File exists\n")
+    assert_refused(done, "cannot create the folder ", "taken: File exists\n", code=1)
 
 
 def test_a_traceback_when_it_is_asked_for(tmp_path):
@@ -291,10 +257,7 @@ def test_an_unexpected_error_is_one_line_too(tmp_path):
         "def broken(words): raise RuntimeError('first\\nsecond')\n"
         "app._dispatch = broken; sys.exit(app.main())"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=environment(), cwd=tmp_path, capture_output=True,
-        text=True, check=False,
-    )
+    done = python("-c", script, cwd=tmp_path)
     assert done.returncode == 1
     assert done.stderr == (
         "gpebo: error: internal error: RuntimeError: first second "
@@ -305,16 +268,11 @@ def test_an_unexpected_error_is_one_line_too(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_an_interruption_is_exit_code_130_and_one_line(tmp_path):
     words = ["run", "estimator.gamma=logspace(0,12,200000)", "output.max_rows=400000"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "gpebo_cli", *words], cwd=tmp_path, env=environment(),
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:
-        deadline = time.monotonic() + 60
-        while not folders(tmp_path) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=60)
-    assert process.returncode == 130
+    with begin(*words, cwd=tmp_path) as running:
+        wait_for(tmp_path, "outputs/runs/*")
+        running.send_signal(signal.SIGINT)
+        _, error = running.communicate(timeout=60)
+    assert running.returncode == 130
     assert error == "gpebo: error: interrupted\n"
 
 
@@ -391,24 +349,20 @@ def test_many_cases_are_a_short_table(tmp_path):
     assert "… 88 more in cases.csv" in done.stdout
 
 
-def test_a_gain_may_be_logspace_without_quotes(tmp_path):
-    done = gpebo("run", "estimator.gamma=logspace(8, 10, 3)", *FAST, cwd=tmp_path)
+@pytest.mark.parametrize(("word", "gains"), [
+    ("estimator.gamma=logspace(8, 10, 3)", [1e8, 1e9, 1e10]),
+    ("experiment=paper_circuit", [1e8, 1e10]),
+])
+def test_a_gain_may_be_logspace_without_quotes_or_of_a_recipe(tmp_path, word, gains):
+    done = gpebo("run", word, *FAST, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    with (folders(tmp_path)[0] / "cases.csv").open() as stream:
-        assert [float(row["gamma"]) for row in csv.DictReader(stream)] == [1e8, 1e9, 1e10]
+    assert [float(row["gamma"]) for row in rows_of(folders(tmp_path)[0] / "cases.csv")] == gains
 
 
 def test_simulate_only(tmp_path):
     done = gpebo("run", "observer=none", *FAST, cwd=tmp_path)
     assert done.returncode == 0
     assert done.stdout.splitlines()[-1].startswith("simulated: index 2")
-
-
-def test_an_experiment_chooses_gains(tmp_path):
-    done = gpebo("run", "experiment=paper_circuit", *FAST, cwd=tmp_path)
-    assert done.returncode == 0
-    with (folders(tmp_path)[0] / "cases.csv").open() as stream:
-        assert [float(row["gamma"]) for row in csv.DictReader(stream)] == [1e8, 1e10]
 
 
 def test_a_plant_of_ones_own(tmp_path, mine):
@@ -420,8 +374,7 @@ def test_a_plant_of_ones_own(tmp_path, mine):
 def test_an_error_in_a_plant_names_its_file(tmp_path, mine):
     (mine / "plant" / "bad.yaml").write_text(MINE.replace("A: [[-1]]", "A: [[-z]]"))
     done = gpebo("run", "--config-dir", mine, "plant=bad", *FAST, cwd=tmp_path)
-    assert done.returncode == 2
-    assert "plant/bad.yaml" in done.stderr
+    assert_refused(done, "plant/bad.yaml")
 
 
 def test_a_saved_configuration_repeats_the_run_in_a_new_folder(tmp_path, mine):
@@ -445,8 +398,7 @@ def test_a_saved_configuration_repeats_the_run_in_a_new_folder(tmp_path, mine):
     group = gpebo(
         "run", "--config-dir", first, "--config-name", "config", "plant=circuit", cwd=tmp_path
     )
-    assert group.returncode == 2
-    assert "has plant written out" in group.stderr
+    assert_refused(group, "has plant written out")
 
 
 def test_cfg_prints_the_configuration_and_runs_nothing(tmp_path):
@@ -469,8 +421,8 @@ def test_cfg_prints_the_configuration_and_runs_nothing(tmp_path):
 def test_what_hydra_cannot_read_is_text(word, value, tmp_path):
     key = word.partition("=")[0]
     done = inprocess.gpebo("run", "--cfg", "job", "data=csv", word, cwd=tmp_path)
-    assert not done.err
-    found = yaml.safe_load(done.out)
+    assert not done.stderr
+    found = yaml.safe_load(done.stdout)
     for part in key.split("."):
         found = found[part]
     assert found == value
@@ -491,24 +443,12 @@ def test_the_flag_of_a_sweep_may_stand_anywhere(tmp_path, words):
     done = gpebo("run", *words, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     (sweep,) = folders(tmp_path, "sweeps")
-    with (sweep / "results.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
+    rows = rows_of(sweep / "results.csv")
     assert [float(row["estimator.gamma"]) for row in rows] == [1e6, 1e8]
     assert [row["status"] for row in rows] == ["done", "done"]
     slow, fast = (float(row["seconds_to_1pct_parameters"]) for row in rows)
     assert fast < slow
     assert not list(sweep.glob("*/figures"))
-
-
-def test_a_sweep_may_be_stored_in_a_recipe(tmp_path):
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "gains.yaml").write_text(
-        "# @package _global_\n"
-        "hydra: {mode: MULTIRUN, sweeper: {params: {estimator.gamma: '1e6,1e8'}}}\n"
-    )
-    done = gpebo("run", "--config-dir", ".", "experiment=gains", *FAST, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.splitlines()[-1] == "2 jobs, 2 done, 0 failed"
 
 
 def test_a_failed_job_is_recorded_and_the_next_one_runs(tmp_path):
@@ -517,8 +457,7 @@ def test_a_failed_job_is_recorded_and_the_next_one_runs(tmp_path):
     assert done.stderr.count("\n") == 1
     assert "1 of 2 jobs failed: job 0: estimator.gamma" in done.stderr
     (sweep,) = folders(tmp_path, "sweeps")
-    with (sweep / "results.csv").open() as stream:
-        failed, *cases = csv.DictReader(stream)
+    failed, *cases = rows_of(sweep / "results.csv")
     assert failed["status"] == "failed"
     assert "estimator.gamma" in failed["error"]
     assert [(row["job"], row["case"], float(row["gamma"])) for row in cases] == [
@@ -528,26 +467,6 @@ def test_a_failed_job_is_recorded_and_the_next_one_runs(tmp_path):
     assert record["status"] == "failed"
     assert record["overrides"]["estimator.gamma"] == "-1"
     assert (sweep / "1" / "summary.json").is_file()
-
-
-@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
-def test_an_interrupted_sweep_keeps_what_is_done(tmp_path):
-    words = ["run", "-m", f"time.horizon=1,{','.join(str(1000 + k) for k in range(20))}", *FAST]
-    with subprocess.Popen(
-        [sys.executable, "-m", "gpebo_cli", *words], cwd=tmp_path, env=environment(),
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:
-        deadline = time.monotonic() + 60
-        pattern = "outputs/sweeps/*/0/result.json"
-        while not list(tmp_path.glob(pattern)) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert error == "gpebo: error: interrupted\n"
-    (sweep,) = folders(tmp_path, "sweeps")
-    with (sweep / "results.csv").open() as stream:
-        assert next(csv.DictReader(stream))["status"] == "done"
 
 
 # Files of one's own ---------------------------------------------------------------------------
@@ -562,8 +481,7 @@ def test_half_written_neighbours_do_no_harm(tmp_path, mine):
 def test_a_file_that_would_be_ignored_is_refused(tmp_path, mine):
     (mine / "plant" / "circuit.yaml").write_text(MINE)
     done = gpebo("run", "--config-dir", mine, "plant=circuit", *FAST, cwd=tmp_path)
-    assert done.returncode == 2
-    assert "would be ignored; rename it" in done.stderr
+    assert_refused(done, "would be ignored; rename it")
 
 
 def test_a_plant_may_have_a_number_for_a_name(tmp_path):

@@ -7,12 +7,12 @@ import pty
 import select
 import shutil
 import subprocess
-import sys
 import time
 from typing import get_args, get_type_hints
 
 import pytest
-from examples import ROOT, environment
+from examples import ROOT, environment, gpebo
+from processes import assert_refused, python
 
 from gpebo_cli.cli.app import COMMANDS
 from gpebo_cli.cli.completion import SHELLS, candidates
@@ -124,9 +124,7 @@ def test_answering_loads_no_numbers(here):
         "heavy = {'numpy', 'hydra', 'omegaconf', 'yaml', 'pandas'} & set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
-    done = subprocess.run(
-        [sys.executable, "-S", "-c", script], capture_output=True, text=True, check=False
-    )
+    done = python("-S", "-c", script)
     assert done.returncode == 0, done.stderr
     assert "plant=circuit" in done.stdout
 
@@ -241,8 +239,4 @@ def test_fish(here):
 
 def test_an_unknown_shell_is_refused(here):
     for words, expected in ((["bsh"], "did you mean bash?"), ([], "needs one of bash, zsh, fish")):
-        done = subprocess.run(
-            ["gpebo", "completion", *words], capture_output=True, text=True, check=False
-        )
-        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-        assert expected in done.stderr
+        assert_refused(gpebo("completion", *words, cwd=here), expected)

@@ -42,6 +42,7 @@ def observation(system, **settings):
 def test_circuit_regressor_is_identically_zero_as_printed():
     printed = observation(shipped("circuit"), regression="paper").regression
     assert np.abs(printed.psi(T)).max() < 1e-12
+    assert np.abs(printed.Y(T)).max() < 1e-10
     corrected = observation(shipped("circuit")).regression
     assert np.linalg.eigvalsh(corrected.gram.final[:, :3])[0] > 0.5
 

@@ -652,23 +652,6 @@ def test_every_estimator_has_a_config():
     assert estimators.names() == sorted(path.stem for path in (CONF / "estimator").glob("*.yaml"))
 
 
-def test_class_defaults_are_those_of_the_files():
-    """An estimator made in Python is the one that the command line makes."""
-    import yaml
-    from plants import CONF
-
-    for path in (CONF / "estimator").glob("*.yaml"):
-        text = yaml.safe_load(path.read_text())
-        made = estimators.build({k: v for k, v in text.items() if k not in ("title", "reference")})
-        assert made.cases == type(made)().cases, path.stem
-
-
-def test_one_wrong_gain_of_many_is_found():
-    gains = [*map(float, range(1, 9)), float("nan")]
-    with pytest.raises(ConfigError, match="positive number, got nan"):
-        estimators.build({"name": "drem", "gamma": gains})
-
-
 def test_estimates_do_not_depend_on_the_elements_of_the_regression():
     """Where a gain is fast beside them they are cut, also where η̄ moves."""
     few, many = (

@@ -16,6 +16,7 @@ import pytest
 import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import refused
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
@@ -409,10 +410,8 @@ def test_hostile_text_is_refused_quickly_in_one_line(name: str) -> None:
     ids=lambda value: shorten(type(value).__name__),
 )  # fmt: skip
 def test_values_that_are_no_expressions_are_refused(value: object) -> None:
-    with pytest.raises(ConfigError) as caught:
+    with refused(begins=WHERE):
         parse(value, {}, WHERE)
-    assert str(caught.value).startswith(WHERE)
-    assert len(str(caught.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -437,9 +436,8 @@ def test_values_that_are_no_expressions_are_refused(value: object) -> None:
     ],
 )
 def test_messages_say_what_would_be_accepted(text: str, says: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+    with refused(says):
         parse(text, {"C1": read("t")}, WHERE, {"V": "an input"})
-    assert says in str(caught.value)
 
 
 def test_a_boolean_is_explained() -> None:

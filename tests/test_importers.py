@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 import sympy as sp
 import yaml
-from examples import blocks, gpebo, python
+from examples import assert_repeats, blocks, gpebo, python
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from processes import assert_refused, refused
 from scipy import sparse
 from scipy.integrate import solve_ivp
 from scipy.io import loadmat, mmwrite, savemat
@@ -288,10 +289,8 @@ def test_what_continues_and_what_is_a_comment():
     ("\n".join(f"R{k} a 0 1" for k in range(5001)), "more than 5000 elements"),
 ])
 def test_mistakes_in_netlists(lines, message):
-    with pytest.raises(ConfigError) as error:
+    with refused(message):
         from_netlist(f"title\n{lines}\n", "bad")
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("measure", "unknown", "message"), [
@@ -400,9 +399,8 @@ def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     ({"M": [[0]] * 1001}, "M has 1001 rows"), ({"units": "m"}, "units: expected a mapping"),
 ])
 def test_mistakes_in_mechanics(change, message):
-    with pytest.raises(ConfigError) as error:
+    with refused(message):
         from_mechanics({**SLIDER_CRANK, **change}, "rod", "rod.yaml")
-    assert message in str(error.value)
 
 
 MARKET = "%%MatrixMarket matrix array real general\n1 1\n-1\n"
@@ -562,11 +560,9 @@ def test_from_a_file_on_the_command_line(tmp_path):
     done = gpebo("check", "--config-dir", ".", "plant=mine", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     done = gpebo(*words[:2], "other", "--measure", "v(a)", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "--measure is for a plant from a file" in done.stderr
+    assert_refused(done, "--measure is for a plant from a file")
     done = gpebo(*words[:2], "other", "--from", "nothing.cir", cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr == "gpebo: error: nothing.cir cannot be read: No such file or directory\n"
+    assert_refused(done, "error: nothing.cir cannot be read: No such file or directory\n")
     assert not (tmp_path / "plant" / "other.yaml").exists()
 
 
@@ -589,10 +585,7 @@ def test_a_large_plant_has_its_matrices_in_a_file_beside_it(tmp_path, monkeypatc
     expected = run(plant_of(text), **short).to_pandas()
     assert result.to_pandas().equals(expected)
     result.save("a", figures=False)
-    words = ("--config-dir", "a", "--config-name", "config", "hydra.run.dir=b")
-    done = gpebo("run", *words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert Path("b/signals.csv").read_bytes() == Path("a/signals.csv").read_bytes()
+    assert_repeats(tmp_path / "a", "signals.csv")
 
 
 def archive(path, **arrays):
@@ -627,10 +620,8 @@ def test_mistakes_in_archives(content, message, tmp_path):
         os.mkfifo(path)
     plant = {"name": "p", "states": ["x1", "x2"], "E": [[1, 0], [0, 1]], "initial_state": [1, 0]}
     (folder / "p.yaml").write_text(yaml.safe_dump({**plant, "matrices": "m.npz"}))
-    with pytest.raises(ConfigError) as error:
+    with refused(message):
         load_plant(folder / "p.yaml")
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_files_that_claim_or_unpack_to_too_much(tmp_path, monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import replace
 from typing import Any
@@ -10,8 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from examples import gpebo
+from examples import assert_repeats, gpebo
 from plants import seen, shipped
+from processes import rows_of
 from test_cli import FAST, folders
 from test_observer import ROTATING
 
@@ -276,20 +276,12 @@ def test_command_line(tmp_path):
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["estimator"] == {"name": "kalman_bucy"}
     assert summary["estimator_requirement"]["name"] == "uniform observability"
-    with (folder / "estimates.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = rows_of(folder / "estimates.csv")
     assert float(rows[0]["theta1_std"]) == pytest.approx(2.0)
     assert float(rows[0]["w_x1_std"]) == pytest.approx(10**0.5)
     assert float(rows[-1]["w_x1_true"]) == pytest.approx(float(rows[-1]["w_x1_hat"]), abs=1e-6)
     assert {"x3_std", "theta2_hat", "x1_hat"} <= rows[0].keys()
-    again = gpebo(
-        "run", "--config-dir", folder, "--config-name", "config", "hydra.run.dir=again",
-        cwd=tmp_path,
-    )
-    assert again.returncode == 0, again.stderr
-    assert (tmp_path / "again" / "estimates.csv").read_bytes() == (
-        folder / "estimates.csv"
-    ).read_bytes()
+    assert_repeats(folder, "estimates.csv")
     compared = gpebo("compare", folder, cwd=tmp_path)
     assert compared.returncode == 0, compared.stderr
     assert "kalman_bucy" in compared.stdout

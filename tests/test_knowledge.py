@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import shipped
+from processes import assert_refused, rows_of
 from random_systems import largest_error, random_system, run_system
 
 from gpebo_cli import run
@@ -170,7 +170,7 @@ def test_a_run_goes_on_without_what_is_not_determined(half_seen):
             assert told["value"] is None
         else:
             assert told["value"] == pytest.approx(told["true"], rel=1e-9)
-    rows = list(csv.DictReader((half_seen / "out" / "cases.csv").read_text().splitlines()))
+    rows = rows_of(half_seen / "out" / "cases.csv")
     times = {name: rows[0][f"seconds_to_1pct_{name}"] for name in SEEN | UNSEEN}
     assert {name for name, time in times.items() if time} == SEEN
 
@@ -241,8 +241,7 @@ def test_the_next_sensors_make_deviations_fall_as_runs_with_them_say(plant_name,
 
 def test_only_all_sensors_can_be_asked_for(half_seen):
     done = gpebo("check", "plant=circuit", "sensors=il", cwd=half_seen)
-    assert done.returncode == 2
-    assert "sensors=il: the only choice is sensors=all" in done.stderr
+    assert_refused(done, "sensors=il: the only choice is sensors=all")
 
 
 def recorded(folder, plant=None, noise=0.01):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from regressions import adjugate
 
 from gpebo_cli.numerics.linalg import (
     affine_scan,
@@ -16,17 +17,6 @@ from gpebo_cli.numerics.linalg import (
     largest_over_time,
 )
 from gpebo_cli.reduction.scaling import _first_of_each_part
-
-
-def adjugate(omega: np.ndarray) -> np.ndarray:
-    """By cofactors, the definition."""
-    p = len(omega)
-    out = np.empty((p, p))
-    for i in range(p):
-        for j in range(p):
-            minor = np.delete(np.delete(omega, i, axis=0), j, axis=1)
-            out[j, i] = (-1) ** (i + j) * (np.linalg.det(minor) if p > 1 else 1.0)
-    return out
 
 
 @settings(max_examples=60, deadline=None)

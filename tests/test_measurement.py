@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from examples import gpebo
 from plants import shipped
+from processes import assert_refused
 from scipy.integrate import solve_ivp
 from test_cli import folders
 
@@ -297,11 +298,7 @@ def test_wrong_settings_are_refused_before_anything_is_run(noise, message):
     (["noise=gauss"], "did you mean gaussian?"),
 ])
 def test_wrong_settings_are_one_line_and_exit_2(tmp_path, words, message):
-    done = gpebo("run", "figures=none", *words, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    assert_refused(gpebo("run", "figures=none", *words, cwd=tmp_path), message)
     assert folders(tmp_path) == []
 
 

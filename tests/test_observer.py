@@ -92,12 +92,6 @@ def test_kept_row_of_the_circuit_is_the_source_equation():
     np.testing.assert_allclose(np.abs(Y[:, 0]), np.abs(u + xi_a1), atol=1e-9)
 
 
-def test_literal_regressor_of_the_circuit_is_identically_zero():
-    _, observation, _ = run(shipped("circuit"), regression="paper")
-    assert np.abs(observation.regression.psi(T)).max() < 1e-12
-    assert np.abs(observation.regression.Y(T)).max() < 1e-10
-
-
 def test_literal_regressor_is_lossless_where_A22_is_invertible():
     _, ours, truth = run(shipped("descriptor"))
     _, paper, _ = run(shipped("descriptor"), regression="paper")

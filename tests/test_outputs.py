@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import errno
 import json
 import os
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from factories import STATES, make_result, with_figures, without_observer
+from processes import read_table, refused
 
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
@@ -30,12 +30,6 @@ MADE_BY = Provenance({"gpebo": "0.1.0"}, GitState("c0ffee", False))
 def write(result: RunResult, folder: Path, figures: bool | list[str] = False) -> Path:
     write_run(with_figures(result, figures), folder, "plant: circuit\n", MADE_BY)
     return folder
-
-
-def read_table(path: Path) -> tuple[list[str], np.ndarray[Any, np.dtype[np.float64]]]:
-    with open(path, newline="") as stream:
-        header, *rows = csv.reader(stream)
-    return header, np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -286,11 +280,8 @@ def test_a_full_disk_leaves_nothing_half_written(
         replaced(source, target)
 
     monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(GpeboError) as caught:
+    with refused(str(tmp_path / name), "No space left", by=GpeboError):
         write(make_result(samples=11), tmp_path)
-    assert str(tmp_path / name) in str(caught.value)
-    assert "No space left" in str(caught.value)
-    assert "\n" not in str(caught.value)
     assert name not in os.listdir(tmp_path)
     assert not [found for found in os.listdir(tmp_path) if found.endswith(".tmp")]
     # summary.json is what tells a finished folder.

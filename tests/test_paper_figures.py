@@ -16,6 +16,7 @@ import pytest
 import yaml
 from factories import make_result
 from PIL import Image
+from processes import read_table
 
 from gpebo_cli.cli import app, figures
 from gpebo_cli.configs import configuration
@@ -52,12 +53,6 @@ def stems(folder: Path, suffix: str) -> set[str]:
     return {path.stem for path in folder.glob(f"*.{suffix}")}
 
 
-def read(path: Path) -> tuple[list[str], np.ndarray[Any, np.dtype[np.float64]]]:
-    with open(path, encoding="utf-8", newline="") as stream:
-        header, *rows = csv.reader(stream)
-    return header, np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
-
-
 # What is written
 
 
@@ -83,7 +78,7 @@ def test_a_table_beside_every_picture(written: Path) -> None:
 
 
 def test_the_paper_s_gain_is_the_faster_one(written: Path) -> None:
-    header, table = read(written / "paper_circuit" / "fig7_state_error_a.csv")
+    header, table = read_table(written / "paper_circuit" / "fig7_state_error_a.csv")
     slow, fast = (header.index(f"error of e1 (V): γ = {gain}") for gain in ("10⁸", "10¹⁰"))
     at_6s = int(np.flatnonzero(np.isclose(table[:, 0], 6.0))[0])
     assert table[at_6s, fast] < 1e-10
@@ -91,25 +86,25 @@ def test_the_paper_s_gain_is_the_faster_one(written: Path) -> None:
 
 
 def test_states_that_are_not_seen_are_not_drawn(written: Path) -> None:
-    header, _ = read(written / "paper_canonical" / "fig8_state_error_b.csv")
+    header, _ = read_table(written / "paper_canonical" / "fig8_state_error_b.csv")
     assert {name.partition(":")[0] for name in header[1:]} == {"error of zb1", "error of zb2"}
 
 
 def test_the_literal_regressor_is_zero_and_the_page_says_what_follows(written: Path) -> None:
-    _, table = read(written / "literal_regressor" / "fig2_regressor.csv")
+    _, table = read_table(written / "literal_regressor" / "fig2_regressor.csv")
     assert not table[:, 1:].any()
     assert "NOT interval-exciting" in (written / "index.html").read_text(encoding="utf-8")
 
 
 def test_times_shrink_with_the_gain(written: Path) -> None:
-    header, table = read(written / "gain_sweep" / "fig_gains.csv")
+    header, table = read_table(written / "gain_sweep" / "fig_gains.csv")
     assert header[0] == "gamma"
     np.testing.assert_allclose(table[:, 0], np.logspace(6, 12, 25))
     assert np.all(np.diff(table[:, header.index("time to 1 % (s): states")]) < 0)
 
 
 def test_estimators_are_overlaid(written: Path) -> None:
-    header, _ = read(written / "estimators_compared" / "fig_estimators.csv")
+    header, _ = read_table(written / "estimators_compared" / "fig_estimators.csv")
     names = {name.partition(": ")[2] for name in header[1:]}
     assert names == {"gradient", "least_squares", "mre", "drem", "lion", "ls_drem", "fct"}
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from processes import refused
 from regressions import adjugate, integrate
 from scipy.optimize import least_squares
 
@@ -118,9 +119,8 @@ def test_deviations_of_the_unknowns_follow_from_those_of_the_parameters():
     ({"Y": ["a*u"]}, "a is an unknown and cannot be used here"),
 ])
 def test_mistakes(change, message):
-    with pytest.raises(ConfigError) as error:
+    with refused(message):
         regression_from_mapping({**TEXT, **change})
-    assert message in str(error.value)
 
 
 def test_at_samples_the_fit_is_that_of_the_sums_so_far():

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from examples import gpebo
 from plants import seen, shipped
+from processes import rows_of
 from regressions import ETA, regression, three
 from scipy.integrate import trapezoid
 from test_cli import folders
@@ -262,8 +262,7 @@ def test_noise_csv(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     assert "over 20 seeds" in done.stdout
     [folder] = folders(tmp_path)
-    with (folder / "noise.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
+    rows = rows_of(folder / "noise.csv")
     assert [row["parameter"] for row in rows] == 2 * ["theta1", "theta2", "e0_x1", "e0_x2"]
     assert [row["gamma"] for row in rows] == 4 * ["1"] + 4 * ["10"]
     for row in rows:

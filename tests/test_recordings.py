@@ -15,11 +15,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from examples import assert_repeats, gpebo
 from hypothesis import given
 from hypothesis import strategies as st
 from plants import shipped
+from processes import assert_refused, refused
 from scipy.io import savemat
-from test_cli import gpebo
 
 from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError
@@ -239,13 +240,8 @@ def test_a_mistake_in_a_file_is_named_with_its_place(tmp_path, mistake):
     text, parts = BAD[mistake]
     path = tmp_path / "bad.csv"
     path.write_text(text)
-    with pytest.raises(ConfigError) as caught:
+    with refused(str(path), *parts):
         read_table(DataSettings("csv", str(path)), shipped("circuit"))
-    message = str(caught.value)
-    assert str(path) in message
-    assert "\n" not in message
-    for part in parts:
-        assert part in message
 
 
 @pytest.mark.parametrize("mistake", [m for m in BAD if "line" in BAD[m][1][0]])
@@ -484,9 +480,8 @@ def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
 def test_what_is_wrong_with_a_data_frame(change, part):
     good = {"t": [0.0, 0.5, 1.0], "V": [1.0, 2.0, 4.0], "y": [3.0, 5.0, 6.0]}
     frame = pd.DataFrame(good | change)
-    with pytest.raises(ConfigError) as caught:
+    with refused(part):
         read_table(DataSettings("csv", frame=frame), shipped("circuit"))
-    assert part in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -503,9 +498,8 @@ def test_what_is_wrong_with_a_data_frame(change, part):
 def test_settings_that_do_not_fit_the_file(tmp_path, settings, part):
     path = tmp_path / "r.csv"
     path.write_text(GOOD)
-    with pytest.raises(ConfigError) as caught:
+    with refused(part):
         read_table(DataSettings("csv", str(path), **settings), shipped("circuit"))
-    assert part in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["/dev/zero", "pipe"])
@@ -546,10 +540,8 @@ def test_a_byte_order_mark_quotes_and_other_columns_do_no_harm(tmp_path):
 def test_a_span_that_is_not_recorded(tmp_path, time, parts):
     path = tmp_path / "r.csv"
     path.write_text(GOOD)
-    with pytest.raises(ConfigError) as caught:
+    with refused(*parts):
         load(shipped("circuit"), DataSettings("csv", str(path)), time, 1e-12)
-    for part in parts:
-        assert part in str(caught.value)
 
 
 def test_measured_columns_are_what_the_observer_sees(tmp_path):
@@ -588,13 +580,7 @@ def test_a_recording_from_the_command_line(tmp_path):
     assert summary["fit"]["rms_residual"][0] < 1e-3 * summary["fit"]["rms_Y"]
     header = (tmp_path / "out" / "signals.csv").read_text().partition("\n")[0]
     assert header == "t,u,y"
-    again = gpebo(
-        "run", "--config-dir", "out", "--config-name", "config", "hydra.run.dir=again", cwd=tmp_path
-    )
-    assert again.returncode == 0, again.stderr
-    assert (tmp_path / "again" / "estimates.csv").read_bytes() == (
-        tmp_path / "out" / "estimates.csv"
-    ).read_bytes()
+    assert_repeats(tmp_path / "out", "estimates.csv")
     compared = gpebo("compare", "out", "again", "--no-figures", cwd=tmp_path)
     assert compared.returncode == 0, compared.stderr
     checked = gpebo("check", *words, cwd=tmp_path)
@@ -615,12 +601,7 @@ def test_a_recording_from_the_command_line(tmp_path):
 )
 def test_what_is_wrong_with_a_recording_is_one_line(tmp_path, words, part):
     (tmp_path / "bad.csv").write_text(BAD["a missing sample"][0])
-    done = gpebo("run", *words, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith("gpebo: error: ")
-    assert done.stderr.count("\n") == 1
-    assert part in done.stderr
+    assert_refused(gpebo("run", *words, cwd=tmp_path), part)
 
 
 def test_a_data_frame_from_python(tmp_path):
@@ -705,8 +686,7 @@ def test_what_is_guessed_runs_as_it_stands(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["recording"]["last"] == 20.0
     again = gpebo("new", "recording", "lab 1.csv", "--plant", "circuit", cwd=tmp_path)
-    assert again.returncode == 2
-    assert "exists already" in again.stderr
+    assert_refused(again, "exists already")
 
 
 @pytest.mark.parametrize(
@@ -722,9 +702,7 @@ def test_what_is_guessed_runs_as_it_stands(tmp_path):
 def test_what_cannot_be_looked_at_is_one_line(tmp_path, words, part):
     (tmp_path / "lab.csv").write_text(GOOD)
     (tmp_path / "one.csv").write_text("a\n1\n2\n")
-    done = gpebo("new", "recording", *words, cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert part in done.stderr
+    assert_refused(gpebo("new", "recording", *words, cwd=tmp_path), part)
 
 
 def test_signals_that_are_not_found_are_said(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import refused
 from scipy.integrate import solve_ivp
 
 from gpebo_cli import ConfigError, estimators
@@ -127,9 +128,8 @@ GOOD = {"name": "r", "unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": ["
     ({"signals": {"u": "sin("}}, "regression r: signals.u"),
 ])
 def test_mistakes(change, message):
-    with pytest.raises(ConfigError) as error:
+    with refused(message):
         regression_from_mapping({**GOOD, **change})
-    assert message in str(error.value)
 
 
 def test_an_expression_without_a_value_is_named_with_its_time():

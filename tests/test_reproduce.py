@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import yaml
 from examples import ROOT, gpebo
+from processes import assert_refused
 
 from gpebo_cli import ConfigError
 from gpebo_cli.cli import reproduce
@@ -67,9 +68,7 @@ def test_a_number_that_is_off_is_an_exit_code(tmp_path, monkeypatch, capsys):
     out = capsys.readouterr().out
     assert "OFF by 0.1" in out
     assert out.endswith("1 recipes, 1 numbers, 1 off\n")
-    done = gpebo("reproduce", "geldaa", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "did you mean gelda?" in done.stderr
+    assert_refused(gpebo("reproduce", "geldaa", cwd=tmp_path), "did you mean gelda?")
 
 
 def test_a_quantity_that_is_none_names_those_there_are():

@@ -5,16 +5,15 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from examples import gpebo
 from plants import shipped
+from processes import assert_refused, begin, process, python
 from scipy.integrate import solve_ivp
-from test_cli import environment, gpebo
 from test_observer import ROTATING
 
 from gpebo_cli import estimators
@@ -511,7 +510,7 @@ def test_a_stream_has_one_case():
 
 # Streams as processes -------------------------------------------------------------------------
 
-COMMAND = [sys.executable, "-m", "gpebo_cli", "run", "data.file=-", "estimator=ls_drem"]
+COMMAND = ["run", "data.file=-", "estimator=ls_drem"]
 
 
 @pytest.fixture(scope="module")
@@ -522,15 +521,8 @@ def rows():
     return ["t,V,y\n", *(",".join(map(repr, row)) + "\n" for row in table)]
 
 
-def started(cwd, words=(), **more):
-    return subprocess.Popen(
-        [*COMMAND, *words], cwd=cwd, env=environment(**more), text=True, bufsize=1,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )
-
-
 def test_every_row_is_answered_before_the_next_one_is_there(tmp_path, rows):
-    with started(tmp_path) as process:
+    with begin(*COMMAND, cwd=tmp_path) as process:
         process.stdin.write(rows[0] + rows[1])
         process.stdin.flush()
         header = process.stdout.readline().strip().split(",")
@@ -557,10 +549,7 @@ def test_every_row_is_answered_before_the_next_one_is_there(tmp_path, rows):
 
 
 def test_a_stream_gives_what_a_run_at_samples_gives(tmp_path, rows):
-    done = subprocess.run(
-        COMMAND, cwd=tmp_path, env=environment(), input="".join(rows), text=True,
-        capture_output=True, check=False,
-    )
+    done = process(*COMMAND, cwd=tmp_path, text="".join(rows))
     assert done.returncode == 0, done.stderr
     assert "interval-exciting" in done.stderr
     assert "parameters well determined at the end" in done.stderr
@@ -576,12 +565,8 @@ def test_a_stream_gives_what_a_run_at_samples_gives(tmp_path, rows):
 
 def test_a_bad_row_ends_a_stream_after_the_rows_before_it(tmp_path, rows):
     text = "".join(rows[:8]) + "0.5,,1\n" + rows[60]
-    done = subprocess.run(
-        COMMAND, cwd=tmp_path, env=environment(), input=text, text=True, capture_output=True,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
+    done = process(*COMMAND, cwd=tmp_path, text=text)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "standard input, line 9, column V" in done.stderr
     assert len(done.stdout.splitlines()) == 8
 
@@ -591,16 +576,11 @@ def test_a_bad_row_ends_a_stream_after_the_rows_before_it(tmp_path, rows):
     [("", "is empty"), ("t,V,y\n", "no rows"), ("t,V\n", "no column y"), ("t;V;y\n", "semicolons")],
 )
 def test_a_stream_that_is_none(tmp_path, text, part):
-    done = subprocess.run(
-        COMMAND, cwd=tmp_path, env=environment(), input=text, text=True, capture_output=True,
-        check=False,
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert part in done.stderr
+    assert_refused(process(*COMMAND, cwd=tmp_path, text=text), part)
 
 
 def test_interrupting_a_stream_leaves_whole_rows(tmp_path, rows):
-    with started(tmp_path) as process:
+    with begin(*COMMAND, cwd=tmp_path) as process:
         process.stdin.write("".join(rows[:20]))
         process.stdin.flush()
         for _ in range(20):
@@ -612,7 +592,7 @@ def test_interrupting_a_stream_leaves_whole_rows(tmp_path, rows):
 
 
 def test_a_reader_that_has_seen_enough_ends_a_stream_quietly(tmp_path, rows):
-    with started(tmp_path) as process:
+    with begin(*COMMAND, cwd=tmp_path) as process:
         process.stdin.write("".join(rows[:5]))
         process.stdin.flush()
         process.stdout.readline()
@@ -644,10 +624,7 @@ def test_the_memory_of_a_stream_does_not_grow(tmp_path):
         t = 0.01 * np.arange(count)
         table = np.column_stack([t, np.sin(t), np.cos(2 * t)]).tolist()
         text = "t,V,y\n" + "".join(f"{a!r},{b!r},{c!r}\n" for a, b, c in table)
-        done = subprocess.run(
-            [sys.executable, "-W", "ignore", "-c", script], cwd=tmp_path, env=environment(),
-            input=text, text=True, capture_output=True, check=False,
-        )
+        done = python("-W", "ignore", "-c", script, cwd=tmp_path, text=text)
         assert done.returncode == 0, done.stderr
         assert done.stdout.count("\n") == count + 1
         peak.append(int(done.stderr.splitlines()[-1]))

@@ -7,10 +7,11 @@ import re
 import numpy as np
 import pytest
 from plants import reference, shipped
+from processes import refused
 from scipy.integrate import solve_ivp
 from scipy.special import beta
 
-from gpebo_cli import ConfigError, GpeboError, run
+from gpebo_cli import GpeboError, run
 from gpebo_cli.errors import ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction import structure
@@ -104,17 +105,7 @@ def test_an_explicit_ode_has_index_zero():
     assert result.signals.states(np.array([2.0]))[0, 0] == pytest.approx(0.5, abs=1e-12)
 
 
-def test_a_rank_drop_of_E_that_the_model_tolerates_is_no_error():
-    """E = diag(1, t) loses rank at t = 0.37…, a singular point; E = diag(1, 0) does not care."""
-    singular = plant(
-        states=["a", "b"], E=[[1, 0], [0, "t - 0.3712"]], A=[[-1, 0], [0, -1]],
-        initial_state=[1, 1],
-    )
-    with pytest.raises(ModelError, match=r"t = 0\.3712"):
-        simulate(singular, TimeSettings(horizon=1.0), SOLVER)
-
-
-@pytest.mark.parametrize("where", [0.5001, 0.50003, 0.7, 0.123456])
+@pytest.mark.parametrize("where", [0.3712, 0.5001, 0.50003, 0.7, 0.123456])
 def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
     """A probe next to the zero may lie lower than all times of the first closer look."""
     singular = plant(
@@ -462,9 +453,8 @@ def test_numbers_whose_products_overflow_are_named(said):
         "outputs": ["y"], "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, -2]], "B": [[1], [0]],
         "F": [[1], [0]], "C": [[1, 1]], "initial_state": {"x": 1, "z": 0.5}, **HUGE[said],
     }
-    with pytest.raises(ConfigError) as caught:
+    with refused(said):
         run(plant, time={"horizon": 2.0})
-    assert said in str(caught.value)
 
 
 @pytest.mark.parametrize(("said", "settings"), [
