@@ -329,7 +329,7 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
             for wrong in (value.astype(complex), value[None], value.tolist()):
                 with pytest.raises(TypeError, match=f"argument {place} must be"):
                     compiled(*arguments[:place], wrong, *arguments[place + 1 :])
-    with pytest.raises(TypeError, match="too few"):
+    with pytest.raises(TypeError, match="expected"):
         compiled(*arguments[:-1])
     with pytest.raises(TypeError, match=r"expected|real|integer"):
         compiled(*arguments, "x")

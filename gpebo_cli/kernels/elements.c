@@ -147,8 +147,7 @@ static int solve_group(const Equation *q, const npy_intp *members, npy_intp coun
     const npy_intp m = q->s * q->d, n = q->n, columns = q->columns, sides = n + count * columns;
     const npy_intp length = row_length(m, sides);
     for (npy_intp i = 0; i < m; i++)
-        for (npy_intp j = m + sides; j < length; j++)
-            W[i * length + j] = 0.0;
+        memset(W + i * length + m + sides, 0, (length - m - sides) * sizeof(double));
     lengthen(q, members[0]);
     assemble(q, members[0], W, length);
     for (npy_intp k = 0; k < count; k++) {
@@ -169,16 +168,14 @@ static Outcome element_maps(Call *call)
 {
     const npy_intp K = SIZE(K), s = SIZE(s), d = SIZE(d), n = SIZE(n), columns = SIZE(c);
     const npy_intp groups = SIZE(g), m = s * d, *group = call->index[7];
-    Moving at_points[5];
-    for (int i = 0; i < 5; i++)
-        at_points[i] = (Moving){call->in[2 + i], call->step[2 + i]};
     Equation q = {.s = s, .d = d, .n = n, .columns = columns, .D = call->in[0], .h = call->in[1]};
-    q.E = at_points[0], q.A = at_points[1], q.f = at_points[2];
-    q.T = at_points[3], q.p = at_points[4];
+    Moving *to[] = {&q.E, &q.A, &q.f, &q.T, &q.p};
+    for (int i = 0; i < 5; i++)
+        *to[i] = (Moving){call->in[2 + i], call->step[2 + i]};
     if ((q.T.from == NULL) != (q.p.from == NULL) || (q.T.from == NULL && d != n) ||
         (q.T.from != NULL && q.E.from == NULL))
         return refused("constraints without an offset or E, or rows", d);
-    npy_intp *members = scratch_indices(call, K + groups), most = 1;
+    npy_intp *members = (npy_intp *)scratch(call, K + groups), most = 1;
     if (members == NULL)
         return ERROR;
     if (SIZE(P) != 1 && SIZE(P) != K * (s + 1))
@@ -334,39 +331,64 @@ typedef double Columns[AT_ONCE], Nodes[MOST_STAGES]; /* zeros after the last sta
 #define EACH_NODE _Pragma("omp simd") for (int n = 0; n < MOST_STAGES; n++)
 /* Not unrolled before they are vectorised: else sums are kept in memory, at twice the time. */
 #define EACH_COLUMN _Pragma("omp simd") for (int b = 0; b < AT_ONCE; b++)
+#define EACH_OF_WIDTH _Pragma("omp simd") for (int b = 0; b < width; b++)
 #define MAXIMUM(a, b) ((a) > (b) ? (a) : (b)) /* or b where a is no number */
 
 /* X' = A X + f in a part of an element, d rows and some of the columns. */
 typedef struct {
     npy_intp d, columns, forced, stride;  /* forced columns of them, of f's rows of `stride` */
     npy_intp degrees, orders;             /* how many powers of the time A and f have */
+    npy_intp width, below, later;         /* of a row of terms, and to the row below, later terms */
     const npy_intp *row, *column;         /* of the entries of A */
     const double *A, *f, *decay, *weight; /* (e, degrees), (orders, d, stride), (degrees,), (d,) */
-    double h, tol, share, *size, *change; /* these two in units, (d,) and zeros */
-    Columns *terms;                       /* (MOST_ORDERS, d); the first is the left end */
+    double h, tol, share, *size, *change; /* these two in units, (d,) */
+    double *terms;                        /* the first ones are the left end */
 } Part;
 
-/* The largest size in a row. */
-INLINE double largest_size(const double *row)
+/* The largest size of some numbers. */
+INLINE double largest_size(const double *x, npy_intp count)
 {
-    Columns size;
-    EACH_COLUMN size[b] = fabs(row[b]);
-    for (int width = AT_ONCE / 2; width; width /= 2)
-        for (int b = 0; b < width; b++)
-            size[b] = MAXIMUM(size[b + width], size[b]);
-    return size[0];
+    double size = 0.0;
+    _Pragma("omp simd reduction(max:size)") for (npy_intp b = 0; b < count; b++) size =
+        MAXIMUM(fabs(x[b]), size);
+    return size;
 }
 
 /* The largest change of the rows, relative to each row's size so far or a share of all. */
 INLINE double largest_change(const Part *q)
 {
-    Columns all = {0.0}, found = {0.0};
-    for (npy_intp i = 0; i < q->d; i += AT_ONCE)
-        EACH_COLUMN all[b] = MAXIMUM(q->size[i + b], all[b]);
-    const double least = larger(q->share * largest_size(all), DBL_MIN);
-    for (npy_intp i = 0; i < q->d; i += AT_ONCE)
-        EACH_COLUMN found[b] = MAXIMUM(q->change[i + b] / MAXIMUM(q->size[i + b], least), found[b]);
-    return largest_size(found);
+    const double least = larger(q->share * largest_size(q->size, q->d), DBL_MIN);
+    double found = 0.0;
+    _Pragma("omp simd reduction(max:found)") for (npy_intp i = 0; i < q->d; i++) found =
+        MAXIMUM(q->change[i] / MAXIMUM(q->size[i], least), found);
+    return found;
+}
+
+/* The next term of all rows from so many of the last ones; constant widths make it fast. */
+INLINE void next_term(const Part *q, npy_intp k, npy_intp known, const int width)
+{
+    const npy_intp d = q->d, later = q->later;
+    const double *last = q->terms + k * later, factor = q->h / (double)(k + 1);
+    for (npy_intp i = 0; i < d; i++) {
+        Columns sum = {0.0}, more = {0.0}; /* one alone would wait for each product */
+        double *next = q->terms + (k + 1) * later + i * q->below;
+        for (npy_intp b = 0; k < q->orders && b < q->forced; b++)
+            sum[b] = q->f[(k * d + i) * q->stride + b];
+        for (npy_intp e = q->row[i]; e < q->row[i + 1]; e++) {
+            const double *x = last + q->column[e] * q->below, *A = q->A + e * q->degrees;
+            npy_intp j = 0;
+            for (; j + 2 <= known; j += 2, x -= 2 * later) {
+                const double one = A[j], other = A[j + 1], *y = x - later;
+                EACH_OF_WIDTH sum[b] += one * x[b];
+                EACH_OF_WIDTH more[b] += other * y[b];
+            }
+            if (j < known)
+                EACH_OF_WIDTH sum[b] += A[j] * x[b];
+        }
+        EACH_OF_WIDTH next[b] = factor * (sum[b] + more[b]);
+        q->change[i] = q->weight[i] * largest_size(next, width);
+        q->size[i] = MAXIMUM(q->change[i], q->size[i]);
+    }
 }
 
 /* How many terms (k + 1) X_{k+1} = h (Σ A_j X_{k−j} + f_k) until none to follow counts, or 0. */
@@ -374,26 +396,12 @@ EVERY_WIDTH static npy_intp expanded(const Part *q)
 {
     double size[MOST_ORDERS] = {1.0};
     for (npy_intp k = 0; k + 1 < MOST_ORDERS && size[k] <= DBL_MAX; k++) {
-        const npy_intp d = q->d, known = k < q->degrees ? k + 1 : q->degrees;
-        const Columns *last = (const Columns *)q->terms + k * d;
+        const npy_intp known = k < q->degrees ? k + 1 : q->degrees;
         double bound = k + 1 < q->orders ? INFINITY : 0.0;
-        for (npy_intp i = 0; i < d; i++) {
-            Columns sum = {0.0};
-            double *next = q->terms[(k + 1) * d + i];
-            for (npy_intp b = 0; k < q->orders && b < q->forced; b++)
-                sum[b] = q->f[(k * d + i) * q->stride + b];
-            for (npy_intp e = q->row[i]; e < q->row[i + 1]; e++) {
-                const Columns *x = last + q->column[e];
-                const double *A = q->A + e * q->degrees;
-                for (npy_intp j = 0; j < known; j++, x -= d) {
-                    const double a = A[j];
-                    EACH_COLUMN sum[b] += a * (*x)[b];
-                }
-            }
-            EACH_COLUMN next[b] = q->h / (double)(k + 1) * sum[b];
-            q->change[i] = q->weight[i] * largest_size(next);
-            q->size[i] = MAXIMUM(q->change[i], q->size[i]);
-        }
+        if (q->width == 1)
+            next_term(q, k, known, 1);
+        else
+            next_term(q, k, known, AT_ONCE);
         size[k + 1] = largest_change(q);
         for (npy_intp j = 0; j < q->degrees && j <= k + 1; j++)
             bound = larger(q->decay[j] * size[k + 1 - j], bound);
@@ -403,22 +411,37 @@ EVERY_WIDTH static npy_intp expanded(const Part *q)
     return 0;
 }
 
+/* Puts up to AT_ONCE of so many numbers somewhere, all of them in one step. */
+INLINE void put(double *to, const double *from, npy_intp count)
+{
+    if (count >= AT_ONCE)
+        memcpy(to, from, sizeof(Columns));
+    else
+        memcpy(to, from, count * sizeof(double));
+}
+
 /* The sums of so many terms at some times, one `apart` from the other, rows one `next` to it; and
    in the place of the first term at the last of all times. */
 EVERY_WIDTH static void summed(const Part *q, npy_intp count, const Nodes times, npy_intp some,
                                npy_intp all, double *out, npy_intp apart, npy_intp next)
 {
     Nodes power[MOST_ORDERS];
+    const npy_intp rows = q->width == 1 ? AT_ONCE : 1; /* in a vector */
     for (npy_intp k = 0; k < count; k++)
         EACH_NODE power[k][n] = k ? power[k - 1][n] * times[n] : 1.0;
-    for (npy_intp e = 0; e < q->d * q->columns; e++) {
-        double *x = q->terms[e / q->columns] + e % q->columns, *to = out + e / q->columns * next;
-        Nodes sum = {0.0};
-        for (npy_intp k = 0; k < count; k++)
-            EACH_NODE sum[n] += power[k][n] * x[k * q->d * AT_ONCE];
-        for (npy_intp j = 0; j < some; j++)
-            to[j * apart + e % q->columns] = sum[j];
-        *x = sum[all - 1];
+    for (npy_intp i = 0; i < q->d; i += rows) {
+        const npy_intp left = rows > 1 ? q->d - i : q->columns;
+        for (npy_intp j = 0; j < all; j += 4) {
+            Columns sum[4] = {{0.0}};
+            double *x = q->terms + i * q->below;
+            for (npy_intp k = 0; k < count; k++)
+                for (int m = 0; m < 4; m++)
+                    EACH_COLUMN sum[m][b] += power[k][j + m] * x[k * q->later + b];
+            for (int m = 0; m < 4 && j + m < some; m++)
+                put(out + (j + m) * apart + i * next, sum[m], left);
+            if (j + 4 >= all)
+                put(x, sum[all - 1 - j], left);
+        }
     }
 }
 
@@ -436,8 +459,10 @@ static int through_element(const Call *call, Part *q, npy_intp k, npy_intp part,
         q->A = call->in[5] + part * call->step[5];
         q->decay = call->in[6] + part * call->step[6];
         q->f = call->in[7] + first + part++ * call->step[7];
-        for (npy_intp r = 0; r < d; r++)
-            q->size[r] = so_far[r] = larger(q->weight[r] * largest_size(q->terms[r]), so_far[r]);
+        for (npy_intp r = 0; r < d; r++) {
+            const double size = q->weight[r] * largest_size(q->terms + r * q->below, q->width);
+            q->size[r] = so_far[r] = larger(size, so_far[r]);
+        }
         const npy_intp count = expanded(q);
         converged &= count > 0;
         for (; node + some < s && (i + 1 == parts || nodes[node + some] * parts <= i + 1); some++)
@@ -467,33 +492,35 @@ static Outcome series(Call *call)
     for (npy_intp e = 0; e < entries; e++)
         if (column[e] < 0 || column[e] >= d)
             return refused("a column", column[e]);
-    const npy_intp rows = (d / AT_ONCE + 1) * AT_ONCE;
-    double *size = scratch(call, MOST_ORDERS * AT_ONCE * d + 3 * rows), *so_far = size + rows;
-    if (size == NULL)
+    const npy_intp width = all > 1 ? AT_ONCE : 1, length = width * MOST_ORDERS * d;
+    Part q = {.d = d, .stride = SIZE(f), .degrees = SIZE(g), .orders = SIZE(u), .row = row};
+    q.width = width, q.below = all > 1 ? AT_ONCE * MOST_ORDERS : 1, q.later = all > 1 ? AT_ONCE : d;
+    q.column = column, q.weight = call->in[10], q.tol = call->number[11];
+    q.share = call->number[12], q.size = scratch(call, length + 3 * d + 2 * AT_ONCE);
+    if (q.size == NULL)
         return ERROR;
-    Columns *terms = (Columns *)(so_far + 2 * rows);
-    memset(size, 0, 3 * rows * sizeof(double));
+    double *so_far = q.size + d;
+    q.change = so_far + d;
+    q.terms = q.change + d; /* in whole lines of the cache; vectors reach beyond the last */
+    q.terms += (64 - (uintptr_t)q.terms % 64) % 64 / sizeof(double);
     for (npy_intp k = 0; k < K; k++)
         call->out[1][k] = call->number[11];
     for (npy_intp first = 0; first < all; first += AT_ONCE) {
         const npy_intp c = all - first < AT_ONCE ? all - first : AT_ONCE, left = SIZE(f) - first;
-        Part q = {.d = d, .columns = c, .stride = SIZE(f), .row = row, .column = column};
-        q.forced = left < 0 ? 0 : left < c ? left : c, q.tol = call->number[11];
-        q.degrees = SIZE(g), q.orders = SIZE(u), q.weight = call->in[10], q.terms = terms;
-        q.share = call->number[12], q.size = size, q.change = so_far + rows;
+        q.columns = c, q.forced = left < 0 ? 0 : left < c ? left : c;
         memset(so_far, 0, d * sizeof(double));
-        memset(terms, 0, d * sizeof(Columns));
+        memset(q.terms, 0, length * sizeof(double));
         for (npy_intp i = 0; i < d; i++)
-            memcpy(terms[i], call->in[9] + i * all + first, c * sizeof(double));
+            memcpy(q.terms + i * q.below, call->in[9] + i * all + first, c * sizeof(double));
         for (npy_intp k = 0, part = 0; k < K; part += parts[k++]) {
             double *out = call->out[0] + k * (s + 1) * d * all + first;
             for (npy_intp i = 0; i < d; i++)
-                memcpy(out + i * all, terms[i], c * sizeof(double));
+                put(out + i * all, q.terms + i * q.below, c);
             if (!through_element(call, &q, k, part, first, so_far, out + d * all))
                 call->out[1][k] = INFINITY;
             for (npy_intp i = 0; i < d && call->in[8] != NULL; i++)
                 for (npy_intp b = 0; b < c; b++)
-                    terms[i][b] += call->in[8][(k * d + i) * all + first + b];
+                    q.terms[i * q.below + b] += call->in[8][(k * d + i) * all + first + b];
         }
     }
     return DONE;

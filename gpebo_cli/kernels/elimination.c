@@ -54,18 +54,20 @@ static inline int factor_panel(double *W, npy_intp m, npy_intp length, npy_intp 
            (width < 4 || eliminate_column(W, m, length, k, 3));
 }
 
+/* row −= factor other, from column j on. */
+static inline void subtract(double *restrict row, double factor, const double *restrict other,
+                            npy_intp j, npy_intp length)
+{
+    for (; j < length; j++)
+        row[j] -= factor * other[j];
+}
+
 /* The rows of the panel at k, right of it: each minus what those above take away. */
 static inline void finish_rows(double *W, npy_intp length, npy_intp k, npy_intp width)
 {
-    for (npy_intp c = k + 1; c < k + width; c++) {
-        double *restrict row = W + c * length;
-        for (npy_intp e = k; e < c; e++) {
-            const double factor = row[e];
-            const double *restrict above = W + e * length;
-            for (npy_intp j = k + PANEL; j < length; j++)
-                row[j] -= factor * above[j];
-        }
-    }
+    for (npy_intp c = k + 1; c < k + width; c++)
+        for (npy_intp e = k; e < c; e++)
+            subtract(W + c * length, W[c * length + e], W + e * length, k + PANEL, length);
 }
 
 /* Rows one and two minus what the rows u of the panel at k take away, from column `next` on. */
@@ -89,13 +91,8 @@ static inline void take_all_away(double *W, npy_intp first, npy_intp last, npy_i
     for (; i + 1 < last; i += 2)
         take_away(W + i * length, W + (i + 1) * length, W + k * length, length, k, next);
     for (; i < last; i++)
-        for (npy_intp e = k; e < k + PANEL; e++) {
-            double *restrict row = W + i * length;
-            const double factor = row[e];
-            const double *restrict u = W + e * length;
-            for (npy_intp j = next; j < length; j++)
-                row[j] -= factor * u[j];
-        }
+        for (npy_intp e = k; e < k + PANEL; e++)
+            subtract(W + i * length, W[i * length + e], W + e * length, next, length);
 }
 
 /* Rows k … k + width − 1 of X where U X = B and the rows below are solved and taken away. */
@@ -103,12 +100,8 @@ static inline void solve_panel(double *W, npy_intp m, npy_intp length, npy_intp 
 {
     for (npy_intp i = k + width - 1; i >= k; i--) {
         double *restrict row = W + i * length;
-        for (npy_intp e = i + 1; e < k + width; e++) {
-            const double factor = row[e];
-            const double *restrict later = W + e * length;
-            for (npy_intp j = m; j < length; j++)
-                row[j] -= factor * later[j];
-        }
+        for (npy_intp e = i + 1; e < k + width; e++)
+            subtract(row, row[e], W + e * length, m, length);
         const double pivot = row[i];
         for (npy_intp j = m; j < length; j++)
             row[j] /= pivot;

@@ -129,13 +129,9 @@ static PyObject *repeated(PyArrayObject *once, npy_intp times)
     strides[1] = 0;
     PyObject *view = PyArray_NewFromDescr(&PyArray_Type, PyArray_DescrFromType(NPY_DOUBLE), axes,
                                           shape, strides, PyArray_DATA(once), 0, NULL);
-    if (view == NULL)
-        return NULL;
-    Py_INCREF((PyObject *)once);
-    if (PyArray_SetBaseObject((PyArrayObject *)view, (PyObject *)once) < 0) {
-        Py_DECREF(view);
-        return NULL;
-    }
+    if (view != NULL &&
+        PyArray_SetBaseObject((PyArrayObject *)view, Py_NewRef((PyObject *)once)) < 0)
+        Py_CLEAR(view);
     return view;
 }
 

@@ -20,13 +20,6 @@ double *scratch(Call *call, npy_intp numbers)
     return memory == NULL ? NULL : PyArray_DATA((PyArrayObject *)memory);
 }
 
-npy_intp *scratch_indices(Call *call, npy_intp numbers)
-{
-    npy_intp length = numbers > 0 ? numbers : 1;
-    PyObject *memory = keep(call, PyArray_SimpleNew(1, &length, NPY_INTP));
-    return memory == NULL ? NULL : PyArray_DATA((PyArrayObject *)memory);
-}
-
 Outcome refused(const char *what, npy_intp value)
 {
     PyErr_Format(PyExc_ValueError, "%s: %zd will not do", what, (Py_ssize_t)value);
@@ -203,22 +196,15 @@ static int read_arguments(Call *call, const char *takes, PyObject *const *given,
     int place = 0;
     for (const char *word = takes; *word; word = after(word)) {
         if (*word == '*') {
-            if (count > MOST_ARGUMENTS || count <= place) {
-                PyErr_Format(PyExc_TypeError, "%zd arguments", count);
+            const int fit = count > place && count <= MOST_ARGUMENTS;
+            if (fit && !any_arrays(call, place, given))
                 return 0;
-            }
-            if (!any_arrays(call, place, given))
-                return 0;
-            place = (int)count;
+            place = fit ? (int)count : place + 1;
             continue;
         }
         if (word[0] && word[1] == '=')
             break;
-        if (place >= count) {
-            PyErr_Format(PyExc_TypeError, "%zd arguments are too few", count);
-            return 0;
-        }
-        if (!one_argument(call, place, given[place], word))
+        if (place < count && !one_argument(call, place, given[place], word))
             return 0;
         place++;
     }

@@ -76,9 +76,8 @@ typedef struct {
 
 #define SIZE(letter) (call->size[(int)#letter[0]])
 
-/* Memory that lives as long as the call; NULL with an exception. */
+/* Memory for so many numbers or indices that lives as long as the call; NULL with an exception. */
 double *scratch(Call *call, npy_intp numbers);
-npy_intp *scratch_indices(Call *call, npy_intp numbers);
 
 /* A ValueError about the arguments of a kernel. */
 Outcome refused(const char *what, npy_intp value);

@@ -345,13 +345,11 @@ static Outcome eliminated(Call *call)
     f.B = series(call, 6, n * p), f.F = series(call, 7, n * q);
     f.u = series(call, 8, p), f.theta = series(call, 9, q);
     const npy_intp wide = el.rank > n ? el.rank : n;
-    f.matrix = (Lane *)scratch(call, LANES * (m.orders * (n * widest + widest + n) +
-                                              (el.a + wide) * (n + 1)));
-    if (f.matrix == NULL)
+    const npy_intp sizes[] = {m.orders * n * widest, m.orders * widest, m.orders * n,
+                              (el.a + wide) * (n + 1)};
+    Lane *room, **parts[] = {&f.matrix, &f.vector, &f.g, &room};
+    if (!lanes_scratch(call, sizes, parts, LENGTH(sizes)))
         return ERROR;
-    f.vector = f.matrix + m.orders * n * widest;
-    f.g = f.vector + m.orders * widest;
-    Lane *room = f.g + m.orders * n;
     for (npy_intp first = 0; first < m.times; first += LANES) {
         const npy_intp used = m.times - first < LANES ? m.times - first : LANES;
         if (!equations(&m, &el, &f, first, used, SIZE(M), call->number[15], call->number[16],

@@ -57,7 +57,7 @@ static int prepare(Call *call, const Model *m, Look *look)
 {
     const npy_intp n = m->n, size = m->size, many = size * size;
     double *memory = scratch(call, 2 * n * size + 5 * many + size + 3 * n * n);
-    look->order = memory ? scratch_indices(call, size) : NULL;
+    look->order = memory ? (npy_intp *)scratch(call, size) : NULL;
     if (look->order == NULL)
         return 0;
     double **parts[] = {&look->e,       &look->a,      &look->M,  &look->W,
