@@ -102,13 +102,9 @@ EVERY_WIDTH static void drive(const Equation *q, npy_intp k, double *W, npy_intp
                 continue;
             }
             combine(right, f, at(q->A, point) + a * n, n, at(q->p, point), columns, columns);
-            if (q->E.from != NULL) {
-                combine(q->taken, NULL, at(q->E, point) + a * n, n, slope, columns, columns);
-                slope = q->taken;
-            }
+            combine(q->taken, NULL, at(q->E, point) + a * n, n, slope, columns, columns);
             for (npy_intp c = 0; c < columns; c++)
-                right[c] -= slope[c];
-            slope = q->slope + i * size;
+                right[c] -= q->taken[c];
         }
     }
 }
@@ -146,8 +142,6 @@ static int solve_group(const Equation *q, const npy_intp *members, npy_intp coun
 {
     const npy_intp m = q->s * q->d, n = q->n, columns = q->columns, sides = n + count * columns;
     const npy_intp length = row_length(m, sides);
-    for (npy_intp i = 0; i < m; i++)
-        memset(W + i * length + m + sides, 0, (length - m - sides) * sizeof(double));
     lengthen(q, members[0]);
     assemble(q, members[0], W, length);
     for (npy_intp k = 0; k < count; k++) {
