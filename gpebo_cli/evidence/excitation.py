@@ -105,21 +105,23 @@ def assess(
     # What is looked at later must not keep what is known of this regression by now.
     later = replace(regression)
 
-    def known(regression: LinearRegression, at: Array) -> Knowledge:
-        return knowledge(regression.gram(at), *_beside(regression, at, tol))
-
     def eigenvalues(at: Array) -> Array:
         return np.maximum(symmetric_eigenvalues(later.gram(at)), 0.0)
 
     return Excitation(
-        t, window, settings.rho, regression.parameters, known(regression, t[-1:]),
+        t, window, settings.rho, regression.parameters, known_at(regression, t[-1:], tol),
         t_c=partial(_t_c, later, settings.rho, tol),
         lambda_min=lambda: float(eigenvalues(t[-1:])[0, 0]) if later.p else 0.0,
-        known=partial(known, later, t), gram_eigenvalues=partial(eigenvalues, t),
+        known=partial(known_at, later, t, tol), gram_eigenvalues=partial(eigenvalues, t),
         pe_level=lambda: window_level(
             [segment.outer for segment in later.segments], t, window, later.resets
         ),
     )
+
+
+def known_at(regression: LinearRegression, at: Array, tol: float) -> Knowledge:
+    """What is known at some times (N,) from ψ, resolved to ``tol``."""
+    return knowledge(regression.gram(at), *_beside(regression, at, tol))
 
 
 def _beside(regression: LinearRegression, at: Array, tol: float) -> tuple[Array, Array, float]:

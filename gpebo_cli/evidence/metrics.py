@@ -18,6 +18,7 @@ from gpebo_cli.kernels.laws_numpy import last_above
 from gpebo_cli.model.descriptor import Array, BoolArray
 
 SETTLED = 0.01  # share of an error at the start, below which it has settled
+_TINY = float(np.finfo(float).tiny)
 _NOTHING = 1e-6  # of a quantity's size: an error that starts below this is none
 DECAY = -float(np.log(SETTLED))  # exponent of an exponential that has settled
 
@@ -73,25 +74,26 @@ def measure_squares(
     """
     out = np.full((5, len(of_eta)), np.nan)
     seen, known = judged & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
-    above = (None, None) if last is None else last.T
+    times = _norms_settled(t, squares, None if last is None else last.T)
     if seen.any() or not judged.any():
-        out[0] = _norm_settled(t, squares[0], above[0])
+        out[0] = times[0]
         out[2] = np.abs(of_eta[:, seen]).max(axis=1, initial=0.0)
     if known.any():
-        out[1] = _norm_settled(t, squares[1], above[1])
+        out[1] = times[1]
         out[3] = np.abs(of_x[:, known]).max(axis=1)
         out[4] = time_rms(t, squares[1])
     return out
 
 
-def _norm_settled(t: Array, squares: Array, last: Array | None) -> Array:
-    """:func:`settling_time` (G,) of norms in units of sizes, from their squares (G, M).
+def _norms_settled(t: Array, squares: Sequence[Array], last: Array | None) -> Array:
+    """:func:`settling_time` (2, G) of two norms in units of sizes, from their squares (G, M) each.
 
     As in :func:`levels`, a norm that starts at rounding is to stay below 1 % of one.
     """
-    some = squares[:, 0] > _NOTHING**2
-    level = SETTLED**2 * np.where(some, squares[:, 0], 1.0)
-    return settling_time(t, squares, level=level, last=last if some.all() else None)
+    first = np.array([each[:, 0] for each in squares])
+    some = first > _NOTHING**2
+    level = SETTLED**2 * np.where(some, first, 1.0)
+    return _settled(t, squares, level, last if some.all() else None)
 
 
 def levels(first: Array, size: Array) -> Array:
@@ -114,23 +116,36 @@ def settling_times(t: Array, error: Array, level: Array) -> Array:
     return np.where(np.isnan(absolute[..., -1] + level), np.nan, out)
 
 
-def settling_time(
-    t: Array, error: Array, level: Array | None = None, last: Array | None = None
-) -> Array:
+def settling_time(t: Array, error: Array, level: Array | None = None) -> Array:
     """Time (g,) after which a nonnegative error (g, M) stays below 1 % of its initial value.
 
     Or below a ``level`` (g,); NaN if that is never reached, 0 if the error is zero from the start.
     It counts from the first of the times t (M,). Between two of them the logarithm of the error is
-    taken as linear, which is exact where it decays exponentially. ``last`` (g,) is the index of the
-    last one at which it is above the level, −1 for none; None: not known.
+    taken as linear, which is exact where it decays exponentially.
     """
-    level = SETTLED * error[:, :1] if level is None else level[:, None]
+    level = SETTLED * error[:, 0] if level is None else level
+    return np.asarray(_settled(t, [error], level[None])[0])
+
+
+def _settled(
+    t: Array, errors: Sequence[Array], level: Array, last: Array | None = None
+) -> Array:
+    """:func:`settling_time` (c, g) of c errors (g, M) each below levels (c, g).
+
+    ``last`` (c, g) are indices of the last times at which they are above, −1 for none; None: they
+    are not known.
+    """
     if last is None:
-        last = last_above(error[:, :, None], level[:, None])[:, 0]
-    rows = np.arange(len(last))
-    k = np.clip(last, 0, max(len(t) - 2, 0)).astype(np.intp)
-    following = np.minimum(k + 1, len(t) - 1)
-    return settled(t, last, error[rows, k], error[rows, following], level[:, 0])
+        last = np.array([
+            last_above(error[:, :, None], own[:, None, None])[:, 0]
+            for error, own in zip(errors, level, strict=True)
+        ])
+    rows, k = np.arange(level.shape[1]), np.clip(last, 0, max(len(t) - 2, 0)).astype(np.intp)
+    before, after = (
+        np.array([error[rows, place] for error, place in zip(errors, at, strict=True)])
+        for at in (k, np.minimum(k + 1, len(t) - 1))
+    )
+    return settled(t, last, before, after, level)
 
 
 def settled(t: Array, last: Array, before: Array, after: Array, level: Array) -> Array:
@@ -139,10 +154,9 @@ def settled(t: Array, last: Array, before: Array, after: Array, level: Array) ->
     ``last`` is the index of that time among t (M,), −1 where there is none, ``before`` and
     ``after`` are the error there and at the next time, ``level`` is that of the error.
     """
-    tiny = np.finfo(float).tiny
-    high, low, wanted = (np.log(np.maximum(e, tiny)) for e in (before, after, level))
+    high, low, wanted = (np.log(np.maximum(e, _TINY)) for e in (before, after, level))
     with np.errstate(over="ignore"):  # where it does not fall, and the result is another one
-        share = np.maximum((high - wanted) / np.maximum(high - low, tiny), 0.0)
+        share = np.maximum((high - wanted) / np.maximum(high - low, _TINY), 0.0)
     k = np.maximum(np.minimum(last, len(t) - 2), 0).astype(np.intp)
     before, after = t[k], t[np.minimum(k + 1, len(t) - 1)]
     crossed = before + np.minimum(share, 1.0) * (after - before) - t[0]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from gpebo_cli.kernels import _compiled, structure_numpy
 from gpebo_cli.kernels.arrays import Array, IntArray
 
@@ -41,5 +39,5 @@ def reference(
     if isinstance(count, int):
         return count, smallest, first, second, Z1
     a = int(count[0])
-    first, second = (np.argsort(flags == 0, kind="stable") for flags in (first, second))
+    first, second = ((flags == 0).argsort(kind="stable") for flags in (first, second))
     return a, smallest, first, second, Z1[: max(0, len(rows) - a)].T.copy()

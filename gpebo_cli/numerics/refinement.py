@@ -42,15 +42,16 @@ def refine(
     """
     found: Found | None = None
     kept = np.full(mesh.size, -1)
-    floor = np.full(mesh.size, np.inf)  # the tail of the element that each one was cut from
-    missed = np.zeros(mesh.size)  # how many cuts had no effect
+    floor: Array | float = np.inf  # the tail of the element that each one was cut from
+    missed: Array | float = 0.0  # how many cuts had no effect
     while True:
         found, tail = evaluate(mesh, found, kept)
-        # An element that was cut and is no better than the one it comes from shows rounding.
         poor = tail > tol
-        if poor.any():
-            missed = np.where(tail <= 0.25 * floor, 0, missed + 1)
-            poor &= (missed < patience) | (tail >= _ROUNDING)
+        if not poor.any():
+            return mesh, found, tail
+        # An element that was cut and is no better than the one it comes from shows rounding.
+        missed = np.where(tail <= 0.25 * floor, 0.0, missed + 1.0)
+        poor &= (missed < patience) | (tail >= _ROUNDING)
         if not poor.any():
             return mesh, found, tail
         stuck = poor & (missed > 1)
@@ -70,7 +71,7 @@ def refine(
                     )
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         _check_budget(mesh, tail, parts, max_elements, name)
-        before, cut = floor.repeat(parts), tail.repeat(parts)
+        before, cut = (np.broadcast_to(x, len(tail)).repeat(parts) for x in (floor, tail))
         missed = missed.repeat(parts)
         mesh, kept = mesh.split(parts)
         floor = np.where(kept < 0, cut, before)

@@ -12,8 +12,9 @@ from typing import Literal
 import numpy as np
 
 from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
-from gpebo_cli.evidence.knowledge import knowledge
-from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.evidence.excitation import known_at
+from gpebo_cli.evidence.knowledge import Knowledge
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import AffineStateMap, Measurements, Observation, Sampling
 from gpebo_cli.observers.reduced.condensed import condensed, thinned
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
@@ -200,21 +201,17 @@ def _told(
     regression, state_map = found.regression, found.state_map
     if not isinstance(state_map, AffineStateMap):
         return False, 0
-    gram, (start, stop) = regression.gram, regression.mesh.edges[[0, -1]]
-    scale = np.broadcast_to(regression.scale, (regression.mesh.size, regression.p))
+    (start, stop), ends = regression.mesh.edges[[0, -1]], regression.gram.mesh.edges[1:]
+    last, steady = len(ends) - 1, found.growth is None or found.growth < _BLOWN
+    known = known_at(regression, ends[-1:], solver.tol)
 
-    def asked(elements: IntArray) -> tuple[Array, Array, Array, float]:
-        ends = gram.mesh.edges[elements + 1]
-        terms = scale[np.searchsorted(regression.mesh.edges, ends) - 1]
-        return gram.values[elements, -1], terms, ends - start, solver.tol
+    def clear(known: Knowledge) -> bool:
+        return bool(known.margin.max(initial=0.0) >= _CLEAR)
 
-    steady = found.growth is None or found.growth < _BLOWN
-    last = gram.mesh.size - 1
     # What was told is told for good, where later on it drowns in the rounding of a long run.
-    for some in (np.array([last]), last >> np.arange(1, last.bit_length() + 1)):
-        if knowledge(*asked(some)).margin.max(initial=0.0) >= _CLEAR:
-            return steady, system.q + system.n
-    known = knowledge(*asked(np.array([last])))
+    earlier = ends[last >> np.arange(1, last.bit_length() + 1)]
+    if clear(known) or clear(known_at(regression, earlier, solver.tol)):
+        return steady, system.q + system.n
     sound = steady and bool(known.clarity[known.clarity >= 1.0].min(initial=np.inf) > _CLEAR)
     seen = known.states(state_map.gain(np.linspace(start, stop, 11)), state_map.units)[-1]
     return sound, int(known.parameters[0, : system.q].sum() + seen.sum())

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -131,9 +132,9 @@ class EquationForm:
 
     def noise_enters(self, noisy: BoolArray) -> bool:
         """Whether noise of the ``noisy`` ones of [u; y] (m + r,) is in matrices or in slopes."""
-        names = frozenset[str]().union(*self.system.coefficients.signals.values())
-        signals = (*self.system.inputs, *self.system.outputs)
-        return any(signals[j] in names or j in self.interpolated for j in np.flatnonzero(noisy))
+        system, slopes = self.system, (self.system.inputs[j] for j in self.interpolated)
+        names = frozenset(slopes).union(*system.coefficients.signals.values())
+        return not names.isdisjoint(compress((*system.inputs, *system.outputs), noisy))
 
     def driving(self, t: Array, inside: Array, u: Array) -> Array:
         """v (N, ·) at the times t (N,), from the measured inputs u (N, m)."""

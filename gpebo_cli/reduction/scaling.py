@@ -24,6 +24,7 @@ _KEPT = 64  # states, up to which what the pattern of E and A alone decides is k
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 _ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
 _SCALED = 16  # rounds in which rows and columns are brought to the size one
+_SINGULAR = 1e-12  # of the largest: singular values of what terms leave open
 _OPEN = 1e-11  # added to squares of terms: directions that they leave open come to nothing
 _FULL = 400  # factors, up to which their equations are solved as full ones
 _BESIDE_TIES = 0.1234  # decades: where factors are rounded, halves and thirds are not at an edge
@@ -72,7 +73,7 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     """
     n = c.E.shape[2]
     sizes = np.array([largest_over_time(distinct(matrix)[0]) for matrix in (c.E, c.A)])
-    factors, _ = _factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)
+    factors, *_ = _factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)
     r = factors[:n]
     # A factor of all rows is left open, and means nothing.
     weights = 10.0 ** np.rint((r - r[0]) / np.log(10.0)) if n else np.zeros(0)
@@ -96,11 +97,10 @@ def units_at(c: Coefficients) -> Units:
     entries[:, 1, n:, :n], entries[:, 1, n:, n:] = np.abs(c.C[:, 0]), np.abs(c.H[:, 0])
     order = (entries > 0.0).argmax(axis=0).astype(np.int8)
     sizes = np.choose(order, entries)
-    factors, there = _factors(sizes, order, 1.0)
-    terms, logs = _Terms.of(there, order), np.log(sizes[there])
+    factors, there, terms, logs = _factors(sizes, order, 1.0)
     for _ in range(_ROUNDS):
         counts = np.minimum(np.maximum(np.exp(2.0 * (terms @ factors + logs)), _LITTLE), 1.0)
-        factors = -terms.solving(counts)(terms.transposed(logs * counts))
+        factors = terms.nearest(counts, logs)
     factors /= np.log(10.0)
     linked = there[0] | there[1]
     outputs_first = np.array([*range(n, n + r), *range(n)], dtype=np.intp)
@@ -111,28 +111,30 @@ def units_at(c: Coefficients) -> Units:
     return Units(columns[:n], rows[:n], rows[n:], columns[n:])
 
 
-def _factors(sizes: Array, order: NDArray[np.int8], mass: float) -> tuple[Array, BoolArray]:
+def _factors(
+    sizes: Array, order: NDArray[np.int8], mass: float
+) -> tuple[Array, BoolArray, _Terms, Array]:
     """Logarithms of the factors (a + b + 1,) for entries of these sizes and orders (2, a, b).
 
-    And which of them count: not those that turn out to be rounding.
+    And which of them count, not those that turn out to be rounding, their terms and logarithms.
     """
     there = sizes > 0.0
     while True:
         few = sum(sizes.shape[1:]) <= 2 * _KEPT
         balancing = _balancing if few else _balancing.__wrapped__
-        terms, solve, counts = balancing(there.tobytes(), order.tobytes(), sizes.shape, mass)
+        terms, nearest = balancing(there.tobytes(), order.tobytes(), sizes.shape, mass)
         logs = np.log(sizes[there])
-        factors = -solve(terms.transposed(logs * counts))
+        factors = nearest(logs)
         entries = np.exp(terms @ factors + logs)
         if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
-            return factors, there
+            return factors, there, terms, logs
         scaled_sizes = np.zeros_like(sizes)
         scaled_sizes[there] = entries
         rest = scaled_sizes > _NOTHING * np.sqrt(
             scaled_sizes.max(axis=(0, 2))[:, None] * scaled_sizes.max(axis=(0, 1))
         )
         if (rest == there).all():
-            return factors, there
+            return factors, there, terms, logs
         there = rest  # once more without what turned out to be rounding
 
 
@@ -145,6 +147,7 @@ class _Terms(NamedTuple):
     total: int  # a + b + 1 factors
     # Where counts, twice, sums of factors, and sums beside the time, twice, stand in products.
     places: IntArray
+    each: Array | None = None  # (a + b + 1, e) all of it, where there are few
 
     @classmethod
     def of(cls, there: BoolArray, order: NDArray[np.int8]) -> _Terms:
@@ -158,6 +161,8 @@ class _Terms(NamedTuple):
 
     def __matmul__(self, factors: Array) -> Array:
         """What the factors (a + b + 1,) add to each logarithm, (e,)."""
+        if self.each is not None:
+            return factors @ self.each
         found: Array = factors[self.rows] + factors[self.columns] + self.of_time * factors[-1]
         return found
 
@@ -170,37 +175,47 @@ class _Terms(NamedTuple):
         found[-1] = self.of_time @ values
         return found
 
-    def solving(self, counts: Array) -> Callable[[Array], Array]:
-        """The solution of termsᵀ diag(counts) terms x = b, nearly the one with the least norm.
+    def nearest(self, counts: Array, logs: Array) -> Array:
+        """The factors that leave least of logarithms (e,), nearly those of the least norm.
 
-        Singular values of a thousand states would take longer than a run.
+        Squares count so often (e,). Singular values of a thousand states would take longer than a
+        run.
         """
         n = self.total
+        if self.each is not None:
+            counted = self.each * counts
+            whole = counted @ self.each.T
+            whole.flat[:: n + 1] += _OPEN
+            return np.asarray(-np.linalg.solve(whole, counted @ logs), dtype=np.float64)
+        right = -self.transposed(logs * counts)
         with_time = self.transposed(self.of_time * counts)
         own = self.transposed(counts)
         own[-1], with_time[-1] = with_time[-1] + _OPEN, 0.0
         own[:-1] += _OPEN
         values = np.concatenate([counts, counts, own, with_time, with_time])
         if n <= _FULL:
-            return partial(np.linalg.solve, np.bincount(self.places, values, n * n).reshape(n, n))
+            full = np.bincount(self.places, values, n * n).reshape(n, n)
+            return np.asarray(np.linalg.solve(full, right))
         from scipy.sparse import csc_array
         from scipy.sparse.linalg import splu
 
-        solve: Callable[[Array], Array] = splu(
-            csc_array((values, np.divmod(self.places, n)), shape=(n, n))
-        ).solve
-        return solve
+        sparse = csc_array((values, np.divmod(self.places, n)), shape=(n, n))
+        return np.asarray(splu(sparse).solve(right))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _balancing(
     there: bytes, order: bytes, shape: tuple[int, int, int], mass: float
-) -> tuple[_Terms, Callable[[Array], Array], Array]:
-    """The terms, the solution of their least squares, and how much each entry counts."""
+) -> tuple[_Terms, Callable[[Array], Array]]:
+    """The terms, and :meth:`_Terms.nearest` with those of E counted ``mass`` times."""
     present = np.frombuffer(there, dtype=np.bool_).reshape(shape)
     terms = _Terms.of(present, np.frombuffer(order, np.int8).reshape(shape))
     counts = np.where(present.nonzero()[0], 1.0, mass)
-    return terms, terms.solving(counts), counts
+    if terms.total > 2 * _KEPT + 1:
+        return terms, partial(terms.nearest, counts)
+    each = np.array([terms @ factor for factor in np.eye(terms.total)])
+    inverse = np.linalg.pinv((each * counts) @ each.T, rcond=_SINGULAR, hermitian=True)
+    return terms._replace(each=each), partial(np.matmul, -inverse @ (each * counts))
 
 
 def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:

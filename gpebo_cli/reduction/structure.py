@@ -144,12 +144,10 @@ def _analysed(
     system: DescriptorSystem, start: float, stop: float, max_mu: int, rank_tol: float
 ) -> Structure:
     """:func:`analyse` for the first time."""
-    t = _probe_times(system, start, stop)
+    invariant = {"E", "A"} <= system.coefficients.constant
+    t = _probe_times(system, start, stop)[: 1 if invariant else None]
     c = system.coefficients.taylor(t, 0)
     scaling = balance(c)
-    invariant = {"E", "A"} <= system.coefficients.constant
-    if invariant:
-        t = t[:1]
     reason = ""
     for mu in range(max_mu + 1):
         if mu:
@@ -197,14 +195,13 @@ def _in_stages(
     s = balance(system.coefficients.taylor(t, 0), _MASS)
     mu, ranks = 0, None
 
-    def found(t: Array, c: Coefficients) -> Stages:
+    def found(c: Coefficients) -> Stages:
         e, a = scaled(c.E, c.A, s.rows, s.columns, s.time, mu + 1)
-        e, a = (x[:, : len(t)] for x in (e, a))
         return in_stages(e, a, np.zeros((mu + 1, 1, system.n, 0)), rank_tol, 1, ranks)
 
     def lines(t: Array, c: Coefficients, column: IntArray, which: IntArray) -> Array:
         try:
-            smallest = found(t, c).smallest
+            smallest = found(c).smallest
         except UnclearError as unclear:
             raise unclear_ranks(system, t, unclear) from unclear
         return np.asarray(smallest.reshape(-1, _DIP_POINTS, 3)[which, :, column])
@@ -212,7 +209,7 @@ def _in_stages(
     while True:
         c = system.coefficients.taylor(t, mu)
         try:
-            stages = found(t, c)
+            stages = found(c)
         except UnclearError as unclear:
             rounding = unclear.rounding
         else:
@@ -227,7 +224,7 @@ def _in_stages(
     ranks = stages.ranks
     steady = len(t) == 1 or _follow_dips(system, t, stages.smallest, mu, rank_tol, lines)
     none, n, a = np.zeros(0, dtype=np.intp), system.n, stages.A2.shape[1]
-    E, A = (getattr(c, name)[0, : len(t)] * (s.rows[:, None] * s.columns) for name in "EA")
+    E, A = (matrix[0] * (s.rows[:, None] * s.columns) for matrix in (c.E, c.A))
     W1 = transpose(stages.Z1)
     inverse, singular = inverse_or_none(np.concatenate([W1 @ E / s.time, stages.A2], axis=1))
     return Structure(
@@ -320,10 +317,7 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
 def _judged(
     t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, invariant: bool
 ) -> _Levels:
-    """Levels at all times, or at one that says why this μ will not do.
-
-    ``c`` may have more times than t where E and A are constant.
-    """
+    """Levels at all times, or at one that says why this μ will not do."""
     model = (c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1)
     middle, n = len(t) // 2, c.E.shape[2]
     at = t[middle : middle + 1]
@@ -335,9 +329,8 @@ def _judged(
     if failure:
         return _Levels(a, smallest, failure)
     reference = Pivots((mu + 1) * n - a, rows, columns, Z1)
-    E, A = c.E[:, : len(t)], c.A[:, : len(t)]
     bounds, left, dynamics = kernels.structure.bounds(
-        E, A, *model[2:], rows, columns, reference.rank, Z1
+        *model, rows, columns, reference.rank, Z1
     )
     finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
     if invariant:
@@ -347,10 +340,10 @@ def _judged(
     # where a bound is small, or smallest.
     plain = (bounds > max(_PLAIN, 10.0 * rank_tol)).all(axis=1) & (left <= RESIDUAL)
     closer = ~plain
-    closer[np.argmin(bounds, axis=0)] = True
+    closer[bounds.argmin(axis=0)] = True
     closer[middle] = True  # of the reference, whose ranks the others must have
-    which = np.flatnonzero(closer)
-    E, A = (x if x.shape[1] == 1 else x[:, which] for x in (E, A))
+    which = closer.nonzero()[0]
+    E, A = (x if x.shape[1] == 1 else x[:, which] for x in (c.E, c.A))
     counts, exact = kernels.structure.levels(E, A, *model[2:], rank_tol, -1)
     if (counts != a).any():
         sigma = relative_singular_values(E, A, *model[2:])

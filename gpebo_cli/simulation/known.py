@@ -81,13 +81,15 @@ def known_resolved(
     until all known functions are resolved.
     """
     usual = _USUAL * float(mesh.edges[-1] - mesh.edges[0]) / FIRST_ELEMENTS
+    cut = system.m > 0 and "u" not in system.coefficients.constant
     while float(mesh.steps.max()) > usual:
-        kinds = _known_kinds(system, c, mesh)
+        kinds = _known_kinds(system, c, mesh, SHARE * beside)
         if not kinds:
             break
         tail = unresolved_kinds(kinds, mesh.rule)
         poor = (tail > _MARGIN * solver.tol) & (mesh.steps > usual)
         if not poor.any():
+            cut &= not bounded or bool((tail > solver.tol).any())
             break
         parts = wanted_parts(tail, poor, _MARGIN * solver.tol, mesh.rule.stages)
         mesh, _ = mesh.split(np.minimum(parts, np.ceil(mesh.steps / usual).astype(np.intp)))
@@ -98,7 +100,7 @@ def known_resolved(
             break
         mesh, _ = mesh.split(np.where(overlooked, 8, 1).astype(np.intp))
         c = evaluated(mesh)
-    if system.m and "u" not in system.coefficients.constant:
+    if cut:
         def of_inputs(mesh: Mesh, c: Coefficients) -> Array:
             u = c.u[0].reshape(*mesh.points.shape, -1)
             return unresolved(u, mesh.rule, SHARE * beside)
@@ -120,8 +122,11 @@ def cut_where(
     missed: Array | float = 0.0  # cuts in a row without effect
     while True:
         tail = tail_of(mesh, known)
+        poor = tail > tol
+        if not poor.any():
+            return mesh, known
         missed = np.where(tail < 0.25 * before, 0.0, missed + 1.0)
-        poor = (tail > tol) & (missed < np.where(tail > 1e-6, _CUTS, 1))
+        poor &= missed < np.where(tail > 1e-6, _CUTS, 1)
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
         if not poor.any() or too_short.any() or parts.sum() > max_elements:
@@ -179,16 +184,21 @@ def _overlooked(
     return found
 
 
-def _known_kinds(system: DescriptorSystem, c: Coefficients, mesh: Mesh) -> list[Kind]:
-    """Every function of the model with its derivatives.
+def _known_kinds(
+    system: DescriptorSystem, c: Coefficients, mesh: Mesh, least: Array
+) -> list[Kind]:
+    """Every function of the model with its derivatives; inputs count as at ``least`` so large (m,).
 
     Reciprocals of what E holds are among them: the state sees those, and they may be harder to
     resolve by far.
     """
     moving = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
-    kinds = [values for name in moving for values in getattr(c, name)]
+    inputs = [(c.u[0].reshape(*mesh.points.shape, -1), least)] if "u" in moving else []
+    kinds = [values for name in moving for values in getattr(c, name)[name == "u" :]]
     if "E" in moving:
         E = c.E[0].reshape(mesh.points.size, -1)
         size = np.abs(E)
         kinds.append(1.0 / E[:, size.min(axis=0) > _NEAR_ZERO * size.max(axis=0)])
-    return [(values.reshape(*mesh.points.shape, -1), 0.0) for values in kinds if values.size]
+    return [*inputs, *(
+        (values.reshape(*mesh.points.shape, -1), 0.0) for values in kinds if values.size
+    )]

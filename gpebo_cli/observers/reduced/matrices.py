@@ -365,19 +365,15 @@ def weakest(injectivity: Array, elimination: Array) -> tuple[float, int]:
     """
     if not np.isfinite(injectivity).all():
         return float(np.inf), 0
-    H = elimination if len(elimination) > 1 else np.repeat(elimination, len(injectivity), axis=0)
-
-    def exact(which: IntArray) -> Array:
-        # ‖H‖_F/‖H‖₂: the largest eigenvalue of HᵀH has all its digits, and H is of order one.
-        some = H[which] / np.maximum(np.abs(H[which]).max(axis=(1, 2), keepdims=True), TINY)
-        squares = symmetric_eigenvalues(transpose(some) @ some)
-        norms = np.sqrt(np.maximum(squares, 0.0).sum(axis=1) / np.maximum(squares[:, -1], TINY))
-        return np.asarray(injectivity[which] * norms)
-
-    first = np.array([int(np.argmin(injectivity))])
-    # Where n_b = 1 the norms are the same but for rounding, and the first remains a candidate.
-    limit = max(exact(first)[0], injectivity[first[0]])
-    candidates = np.flatnonzero(injectivity <= limit)
-    values = exact(candidates)
-    k = int(np.argmin(values))
+    first, moves = int(injectivity.argmin()), len(elimination) > 1
+    # No column of H is longer than ‖H‖₂. Where n_b = 1 the first remains a candidate.
+    columns = np.square(elimination[first if moves else 0]).sum(axis=0)
+    limit = injectivity[first] * np.sqrt(columns.sum() / columns.max())
+    candidates = (injectivity <= limit).nonzero()[0]
+    H = elimination[candidates] if moves else elimination
+    # ‖H‖_F/‖H‖₂: the largest eigenvalue of HᵀH has all its digits, and H is of order one.
+    H = H / np.maximum(np.abs(H).max(axis=(1, 2), keepdims=True), TINY)
+    squares = np.maximum(symmetric_eigenvalues(transpose(H) @ H), 0.0)
+    values = injectivity[candidates] * np.sqrt(squares.sum(axis=1) / squares[:, -1])
+    k = int(values.argmin())
     return float(values[k]), int(candidates[k])

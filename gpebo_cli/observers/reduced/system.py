@@ -305,7 +305,9 @@ def begin_at(
     P, frame = o.split.projector[0], o.split.frame
     if frame is not None:  # with what may have been given up
         P = frame.projector
-    rank = int(np.rint(np.trace(P)))
+    rank = int(np.rint(P.trace()))
+    if rank == len(begin.names):  # then these are the differential states
+        return initial_extension(xi_a0, system, begin.names)
     V1, _, names = initial_basis(P * units / units[:, None], rank, system.states, units)
     return np.asarray(begin.dual @ V1 @ initial_extension(xi_a0, system, names))
 
