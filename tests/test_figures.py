@@ -427,9 +427,9 @@ def test_a_figure_that_cannot_be_written_names_its_file(tmp_path: Path) -> None:
 
 def test_drawing_leaves_the_settings_of_matplotlib_alone() -> None:
     settings: Any = mpl.rcParams
-    before = {key: settings[key] for key in style.RC}
+    before = {key: settings[key] for key in style.sheet()}
     for _ in draw(make_result(samples=51), ["states"]):
-        assert {key: settings[key] for key in style.RC} == before
+        assert {key: settings[key] for key in style.sheet()} == before
 
 
 def test_lines_differ_without_their_colours() -> None:

@@ -21,7 +21,7 @@ from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.results import files, tables
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import GitState, Provenance, git_state, provenance
-from gpebo_cli.results.summary import plain, summary_text
+from gpebo_cli.results.summary import strict, summary_text
 
 TABLES = [f"{name}.csv" for name in tables.TABLES]
 MADE_BY = Provenance({"gpebo": "0.1.0"}, GitState("c0ffee", False))
@@ -258,8 +258,8 @@ def test_plain_reduces_numpy_and_containers() -> None:
         "b": (np.int64(3), np.bool_(True)),
         "c": np.array([1.0, -np.inf]),
     }
-    assert plain(value) == {"a": None, "b": [3, True], "c": [1.0, None]}
-    assert plain(Path("x")) == "x"
+    assert strict(value) == {"a": None, "b": [3, True], "c": [1.0, None]}
+    assert strict(Path("x")) == "x"
 
 
 def test_summary_keeps_the_order_of_its_keys() -> None:

@@ -24,7 +24,7 @@ from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results import circuit, gallery
 from gpebo_cli.results.figures import describe, overlay
-from gpebo_cli.results.series import blocks, csv_text, differences, reference_text
+from gpebo_cli.results.series import blocks, blocks_text, differences, reference_text
 from gpebo_cli.results.studies import STUDIES
 from gpebo_cli.results.style import TIME, Axis, Curve, Panel, compose, line
 from gpebo_cli.settings import Settings
@@ -184,7 +184,7 @@ def test_the_page_says_whose_the_settings_are(written: Path) -> None:
 
 def test_a_table_has_what_the_picture_has() -> None:
     for name, panels in describe(make_result(thin=7, samples=301)).items():
-        text = csv_text(blocks(panels)).splitlines()
+        text = blocks_text(blocks(panels)).splitlines()
         header, *rows = csv.reader(text)
         table = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
         for panel, axes in zip(panels, compose(panels).axes, strict=True):
@@ -199,7 +199,7 @@ def test_a_table_has_what_the_picture_has() -> None:
 def test_long_names_are_quoted_and_floats_survive() -> None:
     x = np.array([0.1, 1 / 3])
     panel = Panel('error, "of" it', (Curve(x, x / 7, "γ = 1, α = 2", line(0)),))
-    text = csv_text(blocks([panel]))
+    text = blocks_text(blocks([panel]))
     [header, *rows] = csv.reader(text.splitlines())
     assert header == ["t", 'error, "of" it: γ = 1, α = 2']
     assert [[float(cell) for cell in row] for row in rows] == [[v, v / 7] for v in x]

@@ -114,7 +114,7 @@ def _sensors(tried: Sequence[Sensor]) -> list[str]:
 
 
 def _json(examined: Examination, tried: Sequence[Sensor]) -> str:
-    from gpebo_cli.results.summary import plain
+    from gpebo_cli.results.summary import strict
 
     found = examined.assumptions
     content: dict[str, object] = {
@@ -123,7 +123,7 @@ def _json(examined: Examination, tried: Sequence[Sensor]) -> str:
     }
     if tried:
         content["sensors"] = [vars(sensor) for sensor in tried]
-    return json.dumps(plain(content), indent=2, ensure_ascii=False) + "\n"
+    return json.dumps(strict(content), indent=2, ensure_ascii=False) + "\n"
 
 
 def _table(title: str, found: Sequence[Assumption], more: Sequence[str]) -> str:

@@ -24,7 +24,7 @@ from gpebo_cli.experiment import accuracy, doubts
 from gpebo_cli.experiment.assumptions import Observed, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
 from gpebo_cli.experiment.fit import fit_of
-from gpebo_cli.experiment.memory import check_samples
+from gpebo_cli.experiment.memory import check_at_samples
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
 from gpebo_cli.experiment.pace import Pace
@@ -215,7 +215,7 @@ def at_samples(
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
     with stage("observe and estimate") as pace:
         t = sample_times(samples.step, start, stop)
-        check_samples(len(estimator.cases), len(t), system)
+        check_at_samples(len(estimator.cases), len(t), system)
         u, y = source.inputs(t), source.outputs(t)
 
         def fed(

@@ -28,7 +28,7 @@ def check(settings: Settings, system: DescriptorSystem, levels: NoiseLevels, cas
             check_memory(what, _needs(settings, system, levels, cases, rank)[what])
 
 
-def check_samples(cases: int, samples: int, system: DescriptorSystem) -> None:
+def check_at_samples(cases: int, samples: int, system: DescriptorSystem) -> None:
     """The same of estimates at samples."""
     numbers = 2 * _HELD * cases * samples * (system.q + 2 * system.n)
     check_memory(f"{cases} cases at {samples} samples", numbers)

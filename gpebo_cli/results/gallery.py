@@ -15,7 +15,7 @@ from gpebo_cli.results.files import make_folder, remove_files, write_text
 from gpebo_cli.results.names import FORMATS
 from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.report import case_cells, case_rows
-from gpebo_cli.results.series import blocks, csv_text, differences, reference_text
+from gpebo_cli.results.series import blocks, blocks_text, differences, reference_text
 from gpebo_cli.results.studies import CAPTIONS, REFERENCE, STUDIES, Study, heading, stem
 from gpebo_cli.results.style import Panel, compose, save
 
@@ -63,7 +63,7 @@ def write_recipe(
         alt = "Circuit diagram: " + "; ".join(map(_branch_text, circuit.BRANCHES)) + "."
         pictures.append(_save(folder, "circuit", circuit.circuit(), study, alt, formats))
     for name, panels in figures.items():
-        write_text(folder / f"{stem(name)}.csv", csv_text(blocks(panels)))
+        write_text(folder / f"{stem(name)}.csv", blocks_text(blocks(panels)))
         pictures.append(_save(folder, name, compose(panels), study, _alt(name, panels), formats))
     runs = recipe.runs
     verdicts = [f"{_sentence(run.verdict)}." for run in runs.values()] if len(runs) == 1 else []

@@ -80,7 +80,7 @@ def blocks(panels: Sequence[Panel]) -> list[Block]:
     return found
 
 
-def csv_text(table: Sequence[Block], digits: int = 17) -> str:
+def blocks_text(table: Sequence[Block], digits: int = 17) -> str:
     """A header and rows; blocks stand side by side, the shorter ones end in empty cells."""
     header = [name for block in table for name in (block.name, *(c.name for c in block.columns))]
     columns = [v for block in table for v in (block.x, *(c.values for c in block.columns))]
@@ -93,7 +93,7 @@ def reference_text(panels: Sequence[Panel]) -> str:
     first = blocks(panels)[0]
     rows = np.unique(np.linspace(0, len(first.x) - 1, _REFERENCE_ROWS).round().astype(np.intp))
     columns = tuple(Column(c.name, c.values[rows], c.log, c.size) for c in first.columns)
-    return csv_text([Block(first.name, first.x[rows], columns)], digits=10)
+    return blocks_text([Block(first.name, first.x[rows], columns)], digits=10)
 
 
 def differences(panels: Sequence[Panel], reference: Path) -> Iterator[str]:

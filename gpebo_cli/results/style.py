@@ -31,46 +31,15 @@ if TYPE_CHECKING:
 
 WIDTHS = {"column": 3.5, "page": 7.16}  # inches, of a two-column journal
 WIDTH, DPI = WIDTHS["column"], 200
-TEXT = 8.0  # points; the labels of ticks are one point smaller
+TEXT = 8.0  # points, as in _SHEET; the labels of ticks are one point smaller
 PANEL_HEIGHT, SINGLE_HEIGHT = 1.15, 2.0  # inches: one among several, one alone
 MAX_PANELS = 8
 
 ROUNDING = 1e-16  # relative to the size of a signal, errors below this say nothing
 _HUGE = 1e300  # an estimate that diverges further leaves the axis; the axis itself stays finite
 _PAD, _GAP = 0.05, 0.11  # inches: at the edges of a figure, and between panels
+_SHEET = Path(__file__).with_name("gpebo.mplstyle")
 
-# Whatever a user's matplotlibrc says, the figures of a run are the same.
-RC: dict[str, Any] = {
-    "text.usetex": False,
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "mathtext.fontset": "dejavusans",
-    "font.size": TEXT,
-    "axes.labelsize": TEXT,
-    "axes.linewidth": 0.6,
-    "axes.edgecolor": "#333333",
-    "axes.facecolor": "white",
-    "figure.facecolor": "white",
-    "axes.labelpad": 2.0,
-    "axes.grid": False,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    **{
-        f"{axis}tick.{key}": size for axis in "xy" for key, size in
-        {"labelsize": TEXT - 1, "major.width": 0.6, "major.size": 2.5, "major.pad": 2.0}.items()
-    },
-    "legend.fontsize": TEXT,
-    "legend.title_fontsize": TEXT,
-    "legend.labelspacing": 0.25,
-    "legend.handlelength": 2.4,
-    "legend.handletextpad": 0.5,
-    "legend.columnspacing": 1.2,
-    "lines.dash_capstyle": "butt",
-    "lines.solid_capstyle": "butt",
-    "path.simplify": True,
-    "path.simplify_threshold": 0.111,
-    "agg.path.chunksize": 20000,
-}
 # These hold in every style: journals refuse Type 3 fonts, the ids in an SVG file do not vary, and
 # the room that is kept for a legend is that of its lines.
 _ALWAYS: dict[str, Any] = {
@@ -80,11 +49,20 @@ _ALWAYS: dict[str, Any] = {
 
 
 def our_rc(style: str | None = None) -> AbstractContextManager[None]:
-    """Set :data:`RC`, or a style of matplotlib's, for a while."""
+    """Set our own style, or one of matplotlib's, for a while."""
     from matplotlib import rc_context
 
-    ours: Any = {**(RC if style is None else _style(style)), **_ALWAYS}  # keys typed as literals
+    ours: Any = {**(sheet() if style is None else _style(style)), **_ALWAYS}  # keys are literals
     return rc_context(ours)
+
+
+@cache
+def sheet() -> Mapping[str, Any]:
+    """Our own style: whatever a user's matplotlibrc says, the figures of a run are the same."""
+    from matplotlib import rc_params_from_file
+
+    found: Any = rc_params_from_file(_SHEET, use_default_template=False)
+    return dict(found)
 
 
 def check_look(style: str | None, labels: Mapping[str, str]) -> None:
@@ -114,7 +92,7 @@ def _style(name: str) -> dict[str, Any]:
         what = f"figures.style: matplotlib has no style {shown(name)}"
         raise unknown(what, name, sorted(available))
     changed: dict[str, Any] = {**library[name]}  # type: ignore[dict-item]
-    return {**{key: rcParamsDefault[key] for key in RC}, **changed}  # type: ignore[index]
+    return {**{key: rcParamsDefault[key] for key in sheet()}, **changed}  # type: ignore[index]
 
 
 @dataclass(frozen=True)
@@ -450,7 +428,7 @@ def _only_mark_ticks(axes: Axes) -> None:
     axes.set_xlabel("")
     axes.plot(
         ticks, np.zeros(len(ticks)), linestyle="none", marker=3, clip_on=False,  # 3: tick down
-        markersize=RC["xtick.major.size"], markeredgewidth=RC["xtick.major.width"],
+        markersize=sheet()["xtick.major.size"], markeredgewidth=sheet()["xtick.major.width"],
         color=axes.spines["bottom"].get_edgecolor(), transform=axes.get_xaxis_transform(),
     )
 

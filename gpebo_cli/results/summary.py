@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -22,13 +20,14 @@ from gpebo_cli.experiment.result import (
 )
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.results.provenance import Provenance
+from gpebo_cli.schema import plain
 
 MAX_LISTED_CASES = 100  # beyond, cases.csv is the place to look and the summary gives ranges
 
 
 def summary_text(result: RunResult, made_by: Provenance) -> str:
     """Render :func:`summary` as strict JSON: NaN and infinities are ``null``."""
-    content = plain(summary(result, made_by))
+    content = strict(summary(result, made_by))
     return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -79,21 +78,9 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
     }
 
 
-def plain(value: object) -> Any:
+def strict(value: object) -> Any:
     """Reduce ``value`` to what strict JSON knows; a number that is not finite becomes None."""
-    if value is None or isinstance(value, (str, bool, int)):
-        return value
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (Sequence, set, frozenset)):
-        return [plain(item) for item in value]
-    return str(value)
+    return json.loads(json.dumps(plain(value), default=str), parse_constant=lambda _: None)
 
 
 def _change(change: StateChange) -> dict[str, float]:

@@ -23,6 +23,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import AffineStateMap, InitialError, Measurements, Observation
+from gpebo_cli.recordings.hold import edges
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem, driven
 from gpebo_cli.settings import SolverSettings
 
@@ -46,10 +47,9 @@ def thinned(
     if system.coefficients.signals or signals.derivatives is not None:
         return None
     start, stop = signals.span
-    edges = np.unique(np.concatenate([[start], wanted, [stop]]))
-    mesh = Mesh(
-        _edges(edges, system.coefficients.breakpoints(start, stop)), radau_rule(solver.stages)
-    )
+    ends = np.unique(np.concatenate([[start], wanted, [stop]]))
+    cuts = system.coefficients.breakpoints(start, stop)
+    mesh = Mesh(edges(ends, cuts), radau_rule(solver.stages))
     at = signals.at(mesh.edges)
     both = at[:-1, None] + mesh.rule.points[:, None] * np.diff(at, axis=0)[:, None]
     u, y = (Trajectory(mesh, part) for part in np.split(both, [system.m], axis=2))
@@ -72,15 +72,15 @@ def condensed(
     size = np.abs(extension.values[..., :1]).max(axis=(0, 1))  # of ξ_a, (k, 1)
     mesh, (rows, p) = regression.mesh, regression.psi.values.shape[2:]
     Y, offset = regression.Y.values.copy(), state_map.offset.values.copy()
-    edges = _edges(signals.mesh.edges, mesh.edges)
-    cuts = np.searchsorted(edges, mesh.edges - 0.5 * _NEAR * mesh.steps.min())
+    fine = edges(signals.mesh.edges, mesh.edges)
+    cuts = np.searchsorted(fine, mesh.edges - 0.5 * _NEAR * mesh.steps.min())
     first, estimate, count = 0, found.error_estimate, 0
     zeta = np.zeros((len(size), 1))
     errors = _interpolated(errors, mesh, solver.tol)
     factor = np.zeros((0, p + 1))
     while first < mesh.size:
         last = max(first + 1, int(np.searchsorted(cuts, cuts[first] + _AT_ONCE, side="right")) - 1)
-        window = Mesh(edges[cuts[first] : cuts[last] + 1], signals.mesh.rule)
+        window = Mesh(fine[cuts[first] : cuts[last] + 1], signals.mesh.rule)
         seen = _part(signals, window)
         added, zeta, error = driven(
             errors, partial(_beyond, seen, few), window, zeta, tol=solver.tol,
@@ -109,13 +109,6 @@ def condensed(
         ),
         state_map=replace(state_map, offset=Trajectory(mesh, offset)),
     )
-
-
-def _edges(samples: Array, cuts: Array) -> Array:
-    """All samples, and those cuts that are no sample."""
-    k = np.searchsorted(samples, cuts).clip(1, len(samples) - 1)
-    near = np.minimum(np.abs(cuts - samples[k - 1]), np.abs(samples[k] - cuts))
-    return np.union1d(samples, cuts[near > _NEAR * (samples[k] - samples[k - 1])])
 
 
 def _beyond(signals: Trajectory, few: Measurements, t: Array, inside: Array) -> Array:
