@@ -6,11 +6,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.problems import Problem
 from gpebo_cli.configs import files
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.observers import Measurements
+from gpebo_cli.observers import Measurements, observe
+from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.simulate import simulate
 
 DATA = Path(__file__).parent / "data"
 CONF = Path(__file__).parent.parent / "conf"
@@ -35,3 +39,20 @@ def problem(path: Path) -> tuple[dict[str, Any], DescriptorSystem]:
 def seen(signals):
     """What an observer gets to see of a simulation."""
     return Measurements(signals.inputs, signals.outputs)
+
+
+def observed(system, horizon=20.0, solver=None, **settings):
+    """The signals of a simulation, and what an observer makes of them."""
+    solver = solver or SolverSettings()
+    signals = simulate(system, TimeSettings(horizon=horizon), solver).signals
+    return signals, observe(system, seen(signals), solver, **settings)
+
+
+def left_of_identities(system, signals, observation, t):
+    """max |Y − ψη| and max |x̂ − x| at times t (M,) with the true parameters."""
+    eta = observation.truth(t, system.theta_at(t), signals.states)
+    left = observation.regression.Y(t) - np.einsum(
+        "mij,mj->mi", observation.regression.psi(t), eta
+    )
+    x = observation.state_map.at(t)(eta[None])[0]
+    return np.abs(left).max(), np.abs(x - signals.states(t)).max()

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import reference, seen, shipped
+from plants import observed, reference, shipped
 from scipy.linalg import expm
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.experiment.pipeline import run_experiment
-from gpebo_cli.observers import observe
 from gpebo_cli.observers.canonical import unknown_input_matrices
 from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
-from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
 
@@ -100,8 +98,7 @@ def test_all_suitable_outputs_are_stacked():
         "canonical", outputs=["y1", "y2", "y3"],
         C=[[1, 0, 0, 0, 0], [0.5, 0, "c1", "c2", 0], [0, "cos(t)", 0, 0, 0]],
     )
-    signals = simulate(system, TimeSettings(), SOLVER).signals
-    observation = observe(system, seen(signals), SOLVER, name="canonical")
+    _, observation = observed(system, name="canonical")
     assert observation.regression.psi.values.shape[2] == 2
     assert observation.regression.parameters == ("e0_za1", "e0_za2")
 

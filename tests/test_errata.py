@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plants import CONF, seen, shipped
+from plants import CONF, observed, seen, shipped
 from regressions import ETA, fading, regression
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -34,16 +34,11 @@ SOLVER = SolverSettings()
 T = np.linspace(0.0, 20.0, 401)
 
 
-def observation(system, **settings):
-    signals = simulate(system, TimeSettings(), SOLVER).signals
-    return observe(system, seen(signals), SOLVER, **settings)
-
-
 def test_circuit_regressor_is_identically_zero_as_printed():
-    printed = observation(shipped("circuit"), regression="paper").regression
+    printed = observed(shipped("circuit"), regression="paper")[1].regression
     assert np.abs(printed.psi(T)).max() < 1e-12
     assert np.abs(printed.Y(T)).max() < 1e-10
-    corrected = observation(shipped("circuit")).regression
+    corrected = observed(shipped("circuit"))[1].regression
     assert np.linalg.eigvalsh(corrected.gram.final[:, :3])[0] > 0.5
 
 
@@ -210,7 +205,7 @@ def test_observability_is_not_enough_with_unknown_parameters():
         "initial_state": [0, 1],
     })
     assert np.linalg.matrix_rank([[1, 0], [0, 1]]) == 2  # [C; CA]
-    gram = observation(system).regression.gram.final[:, :3]
+    gram = observed(system)[1].regression.gram.final[:, :3]
     assert np.linalg.matrix_rank(gram, tol=1e-9) == 2
     null = np.linalg.eigh(gram)[1][:, 0]
     assert abs(null[0]) > 0.3  # it contains θ
@@ -235,7 +230,7 @@ def test_zero_entries_of_N_that_are_not_divided_by_do_no_harm():
         "N21": "1 + 0.3*sin(t)", "N31": 0, "N32": "1.5 + 0.5*sin(2*t)",
         "c1": "1 + 0.3*cos(t)", "c2": "2 + 0.5*sin(t)",
     })
-    found = observation(system, name="canonical")
+    found = observed(system, name="canonical")[1]
     names = {a.name: a for a in found.assumptions}
     assert names["Assumption 4"].holds
     assert names["Assumption 7"].holds

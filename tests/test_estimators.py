@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import CONF, reference, seen, shipped
+from plants import CONF, observed, reference, shipped
 from regressions import ETA, adjugate, fading, integrate, regression, three
 
 import gpebo_cli
@@ -25,10 +25,8 @@ from gpebo_cli.experiment.pipeline import run_experiment, stream, stream_verdict
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers import observe
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.settings import DataSettings, Settings, SolverSettings, TimeSettings
-from gpebo_cli.simulation.simulate import simulate
+from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 T = np.linspace(0, 10, 101)
 START = [0.3, 0.1, -0.2]
@@ -390,9 +388,7 @@ def test_mixed_regression_holds(make):
 
 
 def test_ls_drem_delta_is_the_reference_one():
-    system = shipped("circuit")
-    signals = simulate(system, TimeSettings(), SolverSettings()).signals
-    observation = observe(system, seen(signals), SolverSettings())
+    _, observation = observed(shipped("circuit"))
     rows = reference("circuit")["at"]
     t = np.array([row["t"] for row in rows])
     found = estimate("ls_drem", observation.regression, t, alpha=1, f0=1).delta(t)[0]

@@ -7,19 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plants import reference, seen, shipped
+from plants import observed, reference, shipped
 from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec
 
 from gpebo_cli.evidence.excitation import assess, persistent
 from gpebo_cli.evidence.metrics import measure_squares, settling_time, time_rms
-from gpebo_cli.observers import observe
 from gpebo_cli.settings import (
     ExcitationSettings,
-    SolverSettings,
-    TimeSettings,
 )
-from gpebo_cli.simulation.simulate import simulate
 
 T = np.linspace(0, 10, 201)
 CLEAN = regression(three, ETA)
@@ -35,8 +31,7 @@ def outer(regression):
 
 def test_eigenvalues_of_the_circuit_match_the_reference():
     system = shipped("circuit")
-    signals = simulate(system, TimeSettings(), SolverSettings()).signals
-    regression = observe(system, seen(signals), SolverSettings()).regression
+    regression = observed(system)[1].regression
     rows = reference("circuit")["at"]
     t = np.array([row["t"] for row in rows])
     found = assess(regression, t, ExcitationSettings())

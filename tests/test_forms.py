@@ -259,34 +259,27 @@ def test_deviations_agree_with_seeds(plant):
     np.testing.assert_allclose(ratio, 1.0, atol=4 / np.sqrt(2 * 100))
 
 
-@pytest.mark.parametrize("plant", CONSTRAINED, ids=lambda p: p["name"])
-def test_forms_agree_with_each_other_where_both_exist(plant):
+def measured(plant):
     """With every state measured, Assumption 1 holds as given, too."""
-    n, m = len(plant["states"]), len(plant["inputs"])
-    plant = {**plant, "outputs": [f"y{i}" for i in range(n)], "C": np.eye(n).tolist()}
-    system, found = plant_from_mapping(plant), []
-    signals = simulate(system, TimeSettings(horizon=5.0), SOLVER).signals
-    seen = Measurements(signals.inputs, signals.outputs, None,
-                        InputDerivatives.of_plant(system, np.ones(m, dtype=bool)))
-    t = np.linspace(0.0, 5.0, 51)
-    for form in ("given", "strangeness_free"):
-        one = observe(system, seen, SOLVER, form=form)
-        gram = one.regression.gram.final
-        eta = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=1e-16)[0]
-        x = one.state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
-        found.append((eta[: system.q], x))
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-11)
+    n = len(plant["states"])
+    return {**plant, "outputs": [f"y{i}" for i in range(n)], "C": np.eye(n).tolist()}
 
 
-@pytest.mark.parametrize("name", ["circuit", "descriptor"])
-def test_both_forms_agree_where_both_exist(name):
-    """As given and with hidden constraints: the same parameters and states, to rounding."""
-    for form in ("given", "strangeness_free"):
-        found, error, of_states = observed(shipped(name), horizon=8.0, form=form)
-        assert np.abs(error).max() < 1e-9
-        assert of_states < 1e-9
-        assert found.note == ""
+FOLLOWING = {  # index 1: no output is differentiated
+    "name": "following", "states": ["a", "z"], "unknowns": {"k": 2}, "outputs": ["y", "w"],
+    "E": [[1, 0], [0, 0]], "A": [["-y", 1], ["y", "-2 - w**2"]], "F": [["sin(t)"], ["-w"]],
+    "C": [[1, 0], [1, 1]], "initial_state": [1, 0],
+}
+
+
+@pytest.mark.parametrize("form", ["given", "strangeness_free"])
+@pytest.mark.parametrize("plant", [
+    *map(measured, CONSTRAINED), FOLLOWING, ROTATING, shipped("circuit"), shipped("descriptor"),
+], ids=lambda p: p["name"] if isinstance(p, dict) else p.name)
+def test_both_forms_find_the_truth_where_both_exist(plant, form):
+    found, error, of_states = observed(plant, 5.0, form=form)
+    assert max(np.abs(error).max(), of_states) < 1e-10
+    assert found.note == ""
 
 
 @pytest.mark.parametrize("settings", [
@@ -301,17 +294,14 @@ def test_remedies_take_the_same_form(settings):
         assert np.abs(result.errors[state][0, -1]) < 1e-9
 
 
-def test_current_coordinates_take_the_same_form():
+@pytest.mark.parametrize("observer", [
+    {"name": "gpebo", "remedy": "current_coordinates"}, {"name": "kalman_bucy"},
+], ids=lambda o: o["name"])
+def test_observers_of_the_current_state_take_the_same_form(observer):
     result = run(
         TANKS, estimator={"name": "least_squares", "f0": 1e-9}, time={"horizon": 10},
-        observer={"name": "gpebo", "remedy": "current_coordinates"},
+        observer=observer,
     )
-    assert np.abs(result.errors["leak"][0, -1]) < 1e-6
-    assert np.abs(result.errors["flow"][0, -1]) < 1e-6
-
-
-def test_the_kalman_bucy_filter_takes_the_same_form():
-    result = run(TANKS, observer="kalman_bucy", time={"horizon": 10})
     assert np.abs(result.errors["leak"][0, -1]) < 1e-6
     assert np.abs(result.errors["flow"][0, -1]) < 1e-6
 
@@ -387,12 +377,6 @@ def test_an_unknown_of_the_outputs_alone_in_an_index_3_plant():
     plant = {**PENDULUM, "unknowns": {"load": 0.7, "offset": 0.25}, "H": [[0, 1]],
              "F": [[*row, 0] for row in PENDULUM["F"]], "D": [[0.3, 0]]}
     _, error, of_states = observed(plant, horizon=20.0)
-    assert np.abs(error).max() < 1e-9
-    assert of_states < 1e-9
-
-
-def test_a_kernel_that_rotates():
-    _, error, of_states = observed(plant_from_mapping(ROTATING), 5.0, form="strangeness_free")
     assert np.abs(error).max() < 1e-9
     assert of_states < 1e-9
 
@@ -490,19 +474,6 @@ def test_an_output_in_equations_that_nobody_differentiates():
     assert "strangeness-free" in found.note
     assert np.abs(error).max() < 1e-9
     assert of_states < 1e-9
-
-
-def test_both_forms_agree_along_signals():
-    """Index 1: nothing is differentiated."""
-    plant = {
-        "name": "p", "states": ["a", "z"], "unknowns": {"k": 2}, "outputs": ["y", "w"],
-        "E": [[1, 0], [0, 0]], "A": [["-y", 1], ["y", "-2 - w**2"]], "F": [["sin(t)"], ["-w"]],
-        "C": [[1, 0], [1, 1]], "initial_state": [1, 0],
-    }
-    for form in ("given", "strangeness_free"):
-        _, error, of_states = observed(plant, 5.0, form=form)
-        assert np.abs(error).max() < 1e-9
-        assert of_states < 1e-9
 
 
 @pytest.mark.parametrize("entry", [(4, 0, "sin(a) + seen/50"), (0, 0, "-seen")])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from examples import gpebo
-from plants import seen, shipped
+from plants import left_of_identities, observed, shipped
 from processes import rows_of
 from regressions import ETA, regression, three
 from scipy.integrate import trapezoid
@@ -19,7 +19,6 @@ from gpebo_cli.experiment.noise import measure, noise_levels
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
@@ -167,10 +166,8 @@ def test_weights_of_one_over_the_variance_are_the_best():
 
 def test_equal_weights_change_nothing():
     system = two_outputs()
-    signals = simulate(system, TimeSettings(horizon=2.0), SolverSettings()).signals
     plain, equal = (
-        observe(system, seen(signals), SolverSettings(), weights=w).regression
-        for w in (None, {"y1": 0.1, "y2": 0.1})
+        observed(system, 2.0, weights=w)[1].regression for w in (None, {"y1": 0.1, "y2": 0.1})
     )
     assert plain.Y.values.tobytes() == equal.Y.values.tobytes()
     assert plain.psi.values.tobytes() == equal.psi.values.tobytes()
@@ -201,23 +198,15 @@ def test_weighted_elimination_is_weighted_least_squares():
     residual = weighted.residual[0] @ (weighted.algebraic[0] @ [1.0, 2.0, 0.0] + scaled)
     assert residual @ residual == pytest.approx(left @ W @ left, rel=1e-12)
     # The observer's equation stays true: w' = A_0 w + b_0 + D_0 θ for any elimination.
-    signals = simulate(system, TimeSettings(horizon=3.0), SolverSettings()).signals
-    observation = observe(system, seen(signals), SolverSettings(), weights=[1, 0.3, 0.05])
-    at = np.linspace(0.0, 3.0, 13)
-    eta = observation.truth(at, system.theta_at(at), signals.states)
-    regression = observation.regression
-    left = regression.Y(at) - np.einsum("mij,mj->mi", regression.psi(at), eta)
-    assert np.abs(left).max() < 1e-10
-    assert observation.state_map.at(at)(eta[None])[0] == pytest.approx(signals.states(at), abs=1e-9)
+    found = observed(system, 3.0, weights=[1, 0.3, 0.05])
+    of_Y, of_x = left_of_identities(system, *found, np.linspace(0.0, 3.0, 13))
+    assert (of_Y < 1e-10, of_x < 1e-9) == (True, True)
 
 
 def test_weights_of_the_canonical_observer():
     system = shipped("canonical")
-    signals = simulate(system, TimeSettings(horizon=2.0), SolverSettings()).signals
     one, half = (
-        observe(
-            system, seen(signals), SolverSettings(), name="canonical", weights=w
-        ).regression
+        observed(system, 2.0, name="canonical", weights=w)[1].regression
         for w in (None, [0.25, 1.0])
     )
     assert half.psi.values == pytest.approx(0.5 * one.psi.values, abs=1e-14)

@@ -12,7 +12,8 @@ import yaml
 from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import seen, shipped
+from plants import left_of_identities, shipped
+from plants import observed as along
 from processes import assert_refused, refused
 from regressions import ETA, three
 from regressions import regression as make_regression
@@ -27,7 +28,6 @@ from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression.dynamics import filtered
@@ -38,7 +38,6 @@ from gpebo_cli.settings import (
     SolverSettings,
     TimeSettings,
 )
-from gpebo_cli.simulation.simulate import simulate
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "examples"
@@ -84,9 +83,7 @@ def relative_error(result, case=0):
 def observed(name, horizon=20.0, **observer):
     mapping = {"rotating": ROTATING, "unbounded": UNBOUNDED, "mixed": MIXED}.get(name)
     system = shipped(name) if mapping is None else plant_from_mapping(mapping)
-    signals = simulate(system, TimeSettings(horizon=horizon), SOLVER).signals
-    found = observe(system, seen(signals), SOLVER, **observer)
-    return system, signals, found
+    return system, *along(system, horizon, **observer)
 
 
 def test_the_plant_is_the_one_that_needs_a_remedy():
@@ -214,14 +211,10 @@ def test_the_regression_holds_in_every_segment(name):
     """Y = ψη and x = offset + gain η with the true parameters of each time, and T η + τ."""
     system, signals, observation = observed(name, remedy="reset", reset_interval=4.0)
     t = np.linspace(0.0, 20.0, 401)
-    eta = observation.truth(t, np.broadcast_to(system.theta, (401, system.q)), signals.states)
-    regression = observation.regression
-    assert len(regression.resets) == 4
-    residual = regression.Y(t) - np.einsum("mij,mj->mi", regression.psi(t), eta)
-    assert np.abs(residual).max() < 1e-9
-    states = observation.state_map.at(t)(eta[None])[0]
-    assert np.abs(states - signals.states(t)).max() < 1e-9
-    for reset in regression.resets:
+    assert len(observation.regression.resets) == 4
+    assert max(left_of_identities(system, signals, observation, t)) < 1e-9
+    eta = observation.truth(t, system.theta_at(t), signals.states)
+    for reset in observation.regression.resets:
         before = eta[np.searchsorted(t, reset.time) - 1]
         after = eta[np.searchsorted(t, reset.time)]
         np.testing.assert_allclose(reset.parameters(before), after, atol=1e-8)
@@ -302,8 +295,8 @@ def test_an_unknown_whose_value_nobody_knows_spoils_no_other():
     """The errors of the extension behind resets do not need θ, as long as it is constant."""
     two = {**MIXED, "unknowns": {"a": 0.7, "b": 0.2}, "F": [[1, 0], [0, 1], [0, 0]]}
     system = plant_from_mapping(two)
-    signals = simulate(system, TimeSettings(horizon=10.0), SOLVER).signals
-    truth = observe(system, seen(signals), SOLVER, remedy="reset", reset_interval=4.0).truth
+    signals, found = along(system, 10.0, remedy="reset", reset_interval=4.0)
+    truth = found.truth
     t = np.linspace(0.0, 10.0, 11)
     known, partly = (np.tile(theta, (11, 1)) for theta in ([0.7, 0.2], [0.7, np.nan]))
     found = truth(t, partly, signals.states)[:, 2:]
@@ -363,8 +356,7 @@ def test_a_gain_of_ones_own_moves_the_eigenvalues():
     """E = I: w' = (A − L C) w + …, so Φ(T) = exp((A − L C) T)."""
     gain = [[2.5], ["1 + 0*t"], [0.3]]
     system = plant_from_mapping(GROWING)
-    signals = simulate(system, TimeSettings(horizon=5.0), SOLVER).signals
-    observation = observe(system, seen(signals), SOLVER, remedy="output_injection", injection=gain)
+    _, observation = along(system, 5.0, remedy="output_injection", injection=gain)
     Phi = expm(5.0 * (np.array(GROWING["A"]) - np.array([[2.5], [1], [0.3]]) @ GROWING["C"]))
     np.testing.assert_allclose(
         observation.state_map.gain(np.array([5.0]))[0], -Phi, atol=1e-10
@@ -383,8 +375,7 @@ def test_the_automatic_gain_does_not_depend_on_units():
     system = plant_from_mapping(UNBOUNDED)
     ratio = []
     for plant, horizon in ((system, 10.0), (fast, 0.01)):
-        signals = simulate(plant, TimeSettings(horizon=horizon), SOLVER).signals
-        o = observe(plant, seen(signals), SOLVER, remedy="output_injection")
+        _, o = along(plant, horizon, remedy="output_injection")
         ratio.append(o.growth_rate * horizon)
     assert ratio[0] < 0.0
     assert slow.growth_rate * 10.0 == pytest.approx(ratio[0], rel=1e-6)
@@ -393,9 +384,8 @@ def test_the_automatic_gain_does_not_depend_on_units():
 
 def test_a_fundamental_matrix_beyond_all_bounds_ends_in_one_line():
     plant = plant_from_mapping({**GROWING, "A": [[9, 1, 0], [-1, 9, 0.2], [0, 0, 8]]})
-    signals = simulate(plant, TimeSettings(horizon=20.0), SOLVER).signals
     with pytest.raises(SolverError, match=r"A_0 is unstable; use observer\.remedy="):
-        observe(plant, seen(signals), SOLVER)
+        along(plant)
 
 
 @pytest.mark.parametrize(
