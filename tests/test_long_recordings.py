@@ -7,17 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpebo_cli import run
+from gpebo_cli import estimators, run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
+from gpebo_cli.evidence.excitation import assess
 from gpebo_cli.experiment.fit import _varies_slowly
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, build
 from gpebo_cli.recordings.hold import Rows, held, recording_mesh
-from gpebo_cli.settings import SolverSettings
+from gpebo_cli.regression import linear
+from gpebo_cli.settings import ExcitationSettings, SolverSettings
 from tests.plants import shipped
+from tests.regressions import ETA, regression, three
 
 STEP = {  # its A jumps, between samples and away from wanted times
     "name": "steps", "states": ["x1", "x2"], "inputs": {"u": 0}, "unknowns": {"a": 1},
@@ -27,6 +30,7 @@ STEP = {  # its A jumps, between samples and away from wanted times
 }
 FAST = {**STEP, "name": "fast", "A": [[-90, 80], [1, -2]], "B": [[0], [1]]}
 PLANTS = {"steps": STEP, "fast": FAST}
+TIMES = np.linspace(0.0, 10.0, 41)
 
 
 def rough(system, hold, rows=700, horizon=4.0):
@@ -227,3 +231,32 @@ def test_an_output_that_is_used_up_for_a_state_is_no_residual():
         assert 0.5 < result.details.fit.ratio * level / 0.02 < 3.0
     without = run("circuit", data=data, uncertainty=False)
     assert without.details.estimation.parameters_std is None
+
+
+@pytest.mark.parametrize("settings", [
+    {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3}, {"name": "gradient"},
+    {"name": "ls_drem"}, {"name": "drem", "gamma": [1e2, 1e4]}, {"name": "mre"}, {"name": "lion"},
+    {"name": "fct", "gamma": [1e2, 1e4]}, {"name": "fct", "extension": "least_squares"},
+    {"name": "power", "gamma": 10.0},
+], ids=str)
+def test_estimators_and_evidence_go_on_from_window_to_window(settings, monkeypatch):
+    """Nothing tells where a long regression was cut: estimates, deviations, excitation, misfit."""
+    signal, t = regression(three, ETA, disturbance=lambda t: 0.1 * np.sin(9.0 * t)), TIMES
+    estimator, looked = estimators.build(settings), ExcitationSettings()
+    found = []
+    for window in (1 << 12, 17):
+        monkeypatch.setattr(linear, "_WINDOW", window)
+        own = replace(signal)
+        assert own.long == (window == 17)
+        made, seen = estimators.estimate(estimator, own, t), assess(own, t, looked)
+        numbers = [
+            made.parameters(slice(None)), made.delta(t), seen.pe_level, seen.known.eigenvalues,
+            seen.gram_eigenvalues, seen.t_c, seen.lambda_min, own.misfit(0.9 * ETA),
+            *made.requirement.evidence.values(),
+        ]
+        if isinstance(estimator, estimators.Affine):
+            for at in estimators.errors(estimator, own):
+                numbers += [np.broadcast_to(x, (len(t), *x.shape[1:])) for x in at(t, t)]
+        found.append([np.array(x, dtype=float) for x in numbers if x is not None])
+    for whole, cut in zip(*found, strict=True):
+        np.testing.assert_allclose(cut, whole, rtol=1e-9, atol=1e-11 * np.nanmax(np.abs(whole)))

@@ -284,7 +284,7 @@ def test_windows_of_excitation_run_through_resets():
     G = (plain.gram(t[whole]) - plain.gram(t[whole] - 3.0))[..., :3]
     inverse = before[(t[whole, None] > edges[list(at)]).sum(axis=1)]
     expected = np.linalg.eigvalsh(np.swapaxes(inverse, 1, 2) @ G @ inverse)[:, 0]
-    level = window_level([segment.outer for segment in cut.segments], t, 3.0, cut.resets)
+    level = window_level([[segment.outer] for segment in cut.segments], t, 3.0, cut.resets)
     assert np.isnan(level[~whole]).all()
     np.testing.assert_allclose(level[whole], expected, rtol=1e-9)
     final = before[3].T @ plain.gram.final[:, :3] @ before[3]

@@ -164,6 +164,11 @@ class ResumableEstimator(GainEstimator):
         """Prepare the estimates at the times t (M,), ascending; nothing is known before."""
         return self.resume(regression, t, ())
 
+    @property
+    def extends(self) -> ResumableEstimator:
+        """The estimator whose extension is known at the end of a part; one that mixes nothing."""
+        return self
+
     @abstractmethod
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> ResumableEstimates:
         """Prepare the estimates at the times t (M,), with extensions known at the start."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -55,7 +55,7 @@ class FilteredEstimator(ResumableEstimator):
         extended = self.extend(regression, filter_rates(self.rates, regression.parameters), before)
         return mixed_estimates(
             self, regression, (mix(extended, t, regression.floor),),
-            lambda: (reached(self.size(regression), extended, known),),
+            lambda: (reached(self.size(regression), extended, known),), known=known,
         )
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
@@ -182,10 +182,6 @@ class RecursiveMixed:
         return energy_requirement(condition, gain, energy, needed, what)
 
 
-# (η̂ (g, M, P), γ∫Δ² (g, M, P or 1), η̂ at the start (1 or g, 1, P)) -> estimates
-Transform = Callable[[Array, Array, Array], Array]
-
-
 @dataclass(frozen=True, eq=False)
 class MixedEstimates:
     """One mixed regression per group; case i belongs to group i // g and has gain i % g."""
@@ -197,13 +193,30 @@ class MixedEstimates:
     at_end: Callable[[], tuple[ExtensionState, ...]]  # of each group; asked for at resets only
     needed: float = DECAY  # of γ∫Δ²
     needed_for: str = "1 % of the initial error"
-    transform: Transform | None = None
+    mu: float | None = None  # of finite time: w_c = min(e^{−γ∫Δ²}, 1 − μ) of the start is taken out
     realisations: tuple[int, ...] = ()
+    known: Known = ()  # of each group at the start
 
     @cached_property
     def reached(self) -> tuple[ExtensionState, ...]:
         """The extension of each group at the end."""
-        return self.at_end()
+        return tuple(
+            replace(state, energy=energy)
+            for state, energy in zip(self.at_end(), self.energies, strict=True)
+        )
+
+    @property
+    def energies(self) -> list[float]:
+        """∫Δ² of each group, with what was known before."""
+        return [
+            before + float(path.energy_at_t[-1])
+            for before, path in zip(self.before, self.groups, strict=True)
+        ]
+
+    @property
+    def before(self) -> list[float]:
+        """∫Δ² of each group before the start."""
+        return [state.energy for state in self.known] or [0.0] * len(self.groups)
 
     def delta(self, t: Array) -> Array:
         """Δ at the times t (M,), one row if it is the same for every case, else one per case."""
@@ -213,9 +226,9 @@ class MixedEstimates:
     @property
     def requirement(self) -> Requirement:
         """γ∫Δ² over the horizon: the error has shrunk by its exponential."""
-        energies = [float(path.energy_at_t[-1]) for path in self.groups]
         return energy_requirement(
-            self.condition, float(self.gains.min()), min(energies), self.needed, self.needed_for
+            self.condition, float(self.gains.min()), min(self.energies), self.needed,
+            self.needed_for,
         )
 
     def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
@@ -238,22 +251,31 @@ class MixedEstimates:
             if start is not None:
                 own = np.repeat(start[done : done + len(gains)], c, axis=1)
             done += len(gains)
-            eta = self.law(path, own, gains)
-            if self.transform is not None:
-                energy = gains[:, None, :] * path.energy_at_t[:, None]
-                eta = self.transform(eta, energy, np.atleast_2d(own)[:, None])
-            pieces.append(eta)
+            if self.mu is None:
+                pieces.append(self.law(path, own, gains))
+                continue
+            # The law goes on from what it had, and not from what was made of it.
+            before, first_one = self.before[group], usual if self.before[group] else own
+            w_c = self._of_start(gains * before) if before else 0.0
+            eta = self.law(path, own + w_c * (first_one - own), gains)
+            w_c = self._of_start(gains[:, None] * (before + path.energy_at_t[:, None]))
+            pieces.append((eta - w_c * np.atleast_2d(first_one)[:, None]) / (1.0 - w_c))
         estimates = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
         return estimates.reshape(*estimates.shape[:2], len(self.start), *self.realisations)
+
+    def _of_start(self, energy: Array) -> Array:
+        """w_c after γ∫Δ² (…)."""
+        return np.asarray(np.minimum(np.exp(-energy), 1.0 - (self.mu or 0.0)))
 
 
 def mixed_estimates(
     settings: GainEstimator, regression: LinearRegression, groups: tuple[ScalarPath, ...],
     at_end: Callable[[], tuple[ExtensionState, ...]] = tuple, condition: str = "Δ not in L2",
+    known: Known = (),
 ) -> MixedEstimates:
     """The estimates with the gains γ of some settings, of mixed regressions."""
     names = regression.parameters
     return MixedEstimates(
         groups, settings.start(names), settings.gains("gamma", names), condition, at_end,
-        realisations=regression.realisations,
+        realisations=regression.realisations, known=known,
     )

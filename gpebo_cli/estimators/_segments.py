@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import chain, islice
 
 import numpy as np
 
-from gpebo_cli.estimators._base import GainEstimator
+from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator
+from gpebo_cli.estimators._mixed import MixedEstimates
 from gpebo_cli.estimators._registry import Several, able
+from gpebo_cli.estimators._vector import VectorEstimates
+from gpebo_cli.estimators.least_squares import LeastSquaresEstimates
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.regression.errors import ErrorsAt, one_after_another
 from gpebo_cli.regression.estimator import (
+    Affine,
     Estimates,
     Estimator,
     Found,
@@ -20,10 +27,11 @@ from gpebo_cli.regression.estimator import (
     ResumableEstimates,
 )
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState, Reset
+from gpebo_cli.regression.resets import ExtensionState, Known, Reset
 
 _FOLLOW = "observer.remedy=current_coordinates needs an estimator that can follow a state"
 _GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
+_MOST = 1 << 23  # numbers of estimates of all cases, which are held at once
 
 
 def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
@@ -31,7 +39,7 @@ def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
     if regression.resets or regression.dynamics is not None:
         return estimator
     return tuned_for(
-        estimator, lambda one: one.estimate(regression, regression.mesh.edges[-1:]).requirement
+        estimator, lambda one: estimate(one, regression, regression.mesh.edges[-1:]).requirement
     )
 
 
@@ -60,7 +68,8 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
         moving = able(estimator, Moving, _FOLLOW)
         return moving.estimate_moving(regression, regression.dynamics, t)
     if not regression.resets:
-        return estimator.estimate(regression, t)
+        found = in_windows(estimator, regression, t)
+        return estimator.estimate(regression, t) if found is None else found
     segments = regression.segments
     first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
     parts: list[ResumableEstimates] = []
@@ -74,6 +83,95 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
         times = np.append(own, segment.mesh.edges[-1])
         parts.append(resumable.resume(segment, times, known))
     return Chain(tuple(parts), regression.resets)
+
+
+@dataclass(frozen=True, eq=False)
+class Gone:
+    """Estimates of every case that are at hand, with what was mixed."""
+
+    values: Array  # (cases, M, p)
+    mixed: Array | None  # Δ (1 or cases, M)
+    requirement: Requirement
+
+    def delta(self, t: Array) -> Array | None:  # noqa: ARG002  protocol
+        """Δ at the times."""
+        return self.mixed
+
+    def parameters(self, cases: slice) -> Array:
+        """η̂ of some cases, (g, M, p)."""
+        return self.values[cases]
+
+
+def in_windows(estimator: Estimator, regression: LinearRegression, t: Array) -> Gone | None:
+    """Estimates at the times t (M,) of a long regression, window by window; None: not so.
+
+    What an estimator holds is that of one window; from one to the next it goes on as after a reset
+    that changes nothing.
+    """
+    if not isinstance(estimator, ResumableEstimator):
+        return None
+    if not regression.long or len(estimator.cases) * t.size * regression.p > _MOST:
+        return None
+    etas: list[Array] = []
+    deltas: list[Array | None] = []
+
+    def parts() -> Iterator[ResumableEstimates]:
+        known: Known = ()
+        start = None
+        for own, window in windowed(regression, t):
+            part = estimator.resume(window, np.append(own, window.mesh.edges[-1]), known)
+            eta = part.parameters(slice(None), start)
+            etas.append(eta[:, :-1])
+            deltas.append(part.delta(own))
+            known = part.reached
+            # The prior of least squares is about where they began.
+            start = None if isinstance(part, LeastSquaresEstimates) else eta[:, -1]
+            yield part
+
+    running = parts()
+    part = next(running)
+    if isinstance(part, VectorEstimates):
+        more = (each.information for each in running if isinstance(each, VectorEstimates))
+        requirement = part.over(chain([part.information], more), regression.mesh.span)
+    elif isinstance(part, LeastSquaresEstimates | MixedEstimates):
+        for part in running:  # noqa: B007  the last one
+            pass
+        requirement = part.requirement
+    else:  # it says what it needs of all data at once
+        return None
+    mixed = None if deltas[0] is None else np.concatenate([d for d in deltas if d is not None], 1)
+    return Gone(np.concatenate(etas, axis=1), mixed, requirement)
+
+
+def errors(estimator: Affine, regression: LinearRegression) -> Sequence[ErrorsAt]:
+    """``estimator.errors`` without resets; of a long regression what one window needs is held."""
+    if not (regression.long and isinstance(estimator, ResumableEstimator)):
+        return estimator.errors(regression)
+    known: list[Known] = [()]
+    for window in regression.windows():
+        end = window.mesh.edges[-1:]
+        known.append(estimator.extends.resume(window, end, known[-1]).reached)
+    starts = np.array([window.mesh.edges[0] for window in regression.windows()])
+
+    @lru_cache(maxsize=1)
+    def of_window(k: int) -> Sequence[ErrorsAt]:
+        window = next(islice(regression.windows(), k, None))
+        return estimator.errors(window, known[k])  # type: ignore[call-arg]
+
+    def of_case(g: int) -> ErrorsAt:
+        return one_after_another(starts, lambda k, t, inside: of_window(k)[g](t, inside))
+
+    return [of_case(g) for g in range(len(estimator.cases))]
+
+
+def windowed(regression: LinearRegression, t: Array) -> Iterator[tuple[Array, LinearRegression]]:
+    """Those of the times t (M,), ascending, that are in each window, and the window."""
+    first = 0
+    for window in regression.windows():
+        end = window.mesh.edges[-1]
+        stop = len(t) if end == regression.mesh.edges[-1] else int(np.searchsorted(t, end))
+        yield t[first:stop], window
+        first = stop
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
@@ -116,10 +116,22 @@ class VectorEstimates:
     start: Array  # (p,)
     gains: Array  # (cases, p or 1)
     t: Array  # (M,)
-    requirement: Requirement
+    information: Trajectory  # MᵀN, or its mean (p, p)
+    told: Requirement | None = None  # what is needed, where that is another than excitation
     realisations: tuple[int, ...] = ()
     reached: tuple[ExtensionState, ...] = ()
     mixed: Trajectory | None = None  # Δ, where the law is that of a mixed regression
+
+    @property
+    def requirement(self) -> Requirement:
+        """Persistent excitation."""
+        return self.told or self.over()
+
+    def over(
+        self, parts: Iterable[Trajectory] | None = None, span: tuple[float, float] | None = None
+    ) -> Requirement:
+        """Persistent excitation by this information, or by its parts in turn over a span."""
+        return persistent(self.information, float(self.gains.min()), parts, span)
 
     def delta(self, t: Array) -> Array | None:
         """Δ at the times t (M,), shape (1, M); None where nothing is mixed."""
@@ -142,10 +154,9 @@ def vector_estimates(
 ) -> VectorEstimates:
     """A law with the gains γ of the settings at the times t (M,), for MᵀN or its mean (p, p)."""
     names = regression.parameters
-    gains = settings.gains("gamma", names)
-    requirement = persistent(information, float(gains.min()))
     return VectorEstimates(
-        law, settings.start(names), gains, np.asarray(t), requirement, regression.realisations
+        law, settings.start(names), settings.gains("gamma", names), np.asarray(t), information,
+        realisations=regression.realisations,
     )
 
 

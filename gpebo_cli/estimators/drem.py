@@ -60,7 +60,7 @@ def follow(
         "γ∫Δ² above the growth of the state", float(gains.min()), energy, grown + DECAY,
         f"1 % of the initial error of a state that may grow by e^{grown:.3g}",
     )
-    return VectorEstimates(law, start, gains, t, requirement, mixed=mixed)
+    return VectorEstimates(law, start, gains, t, diagonal, requirement, mixed=mixed)
 
 
 ESTIMATOR = Drem

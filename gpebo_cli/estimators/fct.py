@@ -62,15 +62,18 @@ class FiniteTime(ResumableEstimator):
         mu, gains = float(self.mu), inner.gains
 
         def at(
-            errors: ErrorsAt, path: ScalarPath, gain: Array, t: Array, inside: Array
+            errors: ErrorsAt, path: ScalarPath, before: float, gain: Array, t: Array, inside: Array
         ) -> ErrorSystem:
-            energy = np.maximum(path.mesh.sampler(t, inside)(path.energy), 0.0)
+            energy = before + np.maximum(path.mesh.sampler(t, inside)(path.energy), 0.0)
             w_c = np.minimum(np.exp(-energy[:, None] * gain), 1.0 - mu)
             found = errors(t, inside)
             return found._replace(C=found.C / (1.0 - w_c)[..., None])
 
         return tuple(
-            partial(at, errors, inner.groups[i // len(gains)], gains[i % len(gains)])
+            partial(
+                at, errors, inner.groups[i // len(gains)], inner.before[i // len(gains)],
+                gains[i % len(gains)],
+            )
             for i, errors in enumerate(self.inner.errors(regression, known))
         )
 
@@ -83,16 +86,10 @@ class FiniteTime(ResumableEstimator):
 
         After a reset the law starts anew from the corrected estimate.
         """
-        inner = self.inner.resume(regression, t, known)
-        mu = float(self.mu)
-
-        def correct(eta: Array, energy: Array, start: Array) -> Array:
-            w_c = np.minimum(np.exp(-energy), 1.0 - mu)
-            return np.asarray((eta - w_c * start) / (1.0 - w_c))
-
-        condition, needed, needed_for = finite_time(mu)
+        condition, needed, needed_for = finite_time(float(self.mu))
         return replace(
-            inner, transform=correct, condition=condition, needed=needed, needed_for=needed_for
+            self.inner.resume(regression, t, known), mu=float(self.mu), condition=condition,
+            needed=needed, needed_for=needed_for,
         )
 
 

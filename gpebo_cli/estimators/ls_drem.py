@@ -59,6 +59,11 @@ class LsDrem(ResumableEstimator):
         """The part that extends the regressor."""
         return self.part(LeastSquares)
 
+    @property
+    def extends(self) -> LeastSquares:
+        """The same part."""
+        return self.least_squares
+
     def axes(self) -> dict[str, Sequence[float]]:
         """α, f₀, β and γ, checked as the least-squares part checks them."""
         self.least_squares.axes()
@@ -98,7 +103,7 @@ class LsDrem(ResumableEstimator):
             for info, case in zip(infos, part.cases, strict=True)
         )
         return mixed_estimates(
-            self, regression, groups, lambda: tuple(info.reached for info in infos), "IE"
+            self, regression, groups, lambda: tuple(info.reached for info in infos), "IE", known
         )
 
 
@@ -151,7 +156,9 @@ def mix_least_squares(
             found, known = at.quotient() if in_own_units else at.spectrum.quotient()
             digits[part] = known.reshape(points.shape)
             quotient[part] = found.reshape(*points.shape, -1)
-            delta[part] = np.prod(_shares(at.spectrum, alpha, f0), axis=1).reshape(points.shape)
+            if not in_own_units:
+                shares = _shares(at.spectrum, alpha, f0)
+                delta[part] = np.prod(shares, axis=1).reshape(points.shape)
         usable = digits > SINGULAR
         if digits.max() > CLEAR:
             break

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -89,13 +90,18 @@ class PowerEstimates(MixedEstimates):
     beta: float
     gamma2: float
 
+    @cached_property
+    def energies(self) -> list[float]:
+        """∫|Δ|^{1+α}, with what was known before."""
+        (path,), (before,) = self.groups, self.before
+        delta = np.abs(path.signals(path.mesh.points.ravel(), path.mesh.inside.ravel())[0])
+        powers = delta.reshape(path.mesh.points.shape) ** (1.0 + self.alpha)
+        return [before + float(Trajectory(path.mesh, powers).integral().final)]
+
     @property
     def requirement(self) -> Requirement:
         """γ∫|Δ|^{1+α} at the end, against what the errors of the start need to be zero."""
-        (path,) = self.groups
-        delta = np.abs(path.signals(path.mesh.points.ravel(), path.mesh.inside.ravel())[0])
-        powers = delta.reshape(path.mesh.points.shape) ** (1.0 + self.alpha)
-        energy = float(Trajectory(path.mesh, powers).integral().final)
+        (path,), (energy,) = self.groups, self.energies
         start = np.repeat(self.start, path.quotient.shape[-1] // len(self.start))
         error = float(np.abs(path.quotient[-1, -1] - start).max(initial=0.0))
         return power_requirement(self.alpha, float(self.gains.min()), energy, error)

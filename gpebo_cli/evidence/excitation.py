@@ -6,7 +6,7 @@ Interval excitation, as the paper's Assumption 2 means it, is G(t_c) = ∫ψᵀ�
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -106,7 +106,7 @@ def assess(
     later = replace(regression)
 
     def eigenvalues(at: Array) -> Array:
-        return np.maximum(symmetric_eigenvalues(later.gram(at)), 0.0)
+        return np.maximum(symmetric_eigenvalues(later.gram_at(at)), 0.0)
 
     return Excitation(
         t, window, settings.rho, regression.parameters, known_at(regression, t[-1:], tol),
@@ -114,14 +114,15 @@ def assess(
         lambda_min=lambda: float(eigenvalues(t[-1:])[0, 0]) if later.p else 0.0,
         known=partial(known_at, later, t, tol), gram_eigenvalues=partial(eigenvalues, t),
         pe_level=lambda: window_level(
-            [segment.outer for segment in later.segments], t, window, later.resets
+            ((part.outer for part in segment.windows()) for segment in later.segments), t, window,
+            later.resets,
         ),
     )
 
 
 def known_at(regression: LinearRegression, at: Array, tol: float) -> Knowledge:
     """What is known at some times (N,) from ψ, resolved to ``tol``."""
-    return knowledge(regression.gram(at), *_beside(regression, at, tol))
+    return knowledge(regression.gram_at(at), *_beside(regression, at, tol))
 
 
 def _beside(regression: LinearRegression, at: Array, tol: float) -> tuple[Array, Array, float]:
@@ -134,27 +135,31 @@ def _beside(regression: LinearRegression, at: Array, tol: float) -> tuple[Array,
 
 def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float | None:
     """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``."""
-    gram = regression.gram  # of parameters that move, on a mesh of its own
-    ends = gram.mesh.edges[1:]
-    of_ends = knowledge(gram.values[:, -1], *_beside(regression, ends, tol))
+    def seen(at: Array, matrices: Array) -> Array:
+        """How well all are told apart, and over what is not rounding; or λ_min over ρ, twice."""
+        if rho is not None:
+            return np.tile(symmetric_eigenvalues(matrices)[:, 0] / rho, (2, 1))
+        known = knowledge(matrices, *_beside(regression, at, tol))
+        return np.array([known.smallest, known.margin])
+
+    of_ends = np.concatenate([
+        seen(part.mesh.edges[1:], part.values[:, -1]) for part in regression.gram_parts()
+    ], axis=1)
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
     # or half as well as they ever are.
-    told = of_ends.smallest[of_ends.margin >= 1.0]
-    enough = min(WELL, 0.5 * float(told.max(initial=0.0)))
+    told = of_ends[0, of_ends[1] >= 1.0]
+    enough = min(WELL, 0.5 * float(told.max(initial=0.0))) if rho is None else 1.0
 
-    def reached(at: Array, matrices: Array) -> Array:
-        """A number that is at least 0 where ψ is exciting: a distance from that in logarithms."""
-        if rho is not None:
-            level = symmetric_eigenvalues(matrices)[:, 0] / rho
-        elif enough:
-            seen = _beside(regression, at, tol)
-            known = of_ends if at is ends else knowledge(matrices, *seen)
-            level = np.minimum(known.smallest / enough, known.margin)
-        else:
-            level = 0.0 * at
-        return np.asarray(np.log(np.maximum(level, _TINY)))
+    def distance(found: Array) -> Array:
+        """At least 0 where ψ is exciting, in logarithms."""
+        return np.asarray(np.log(np.maximum(np.minimum(found[0] / enough, found[1]), _TINY)))
 
-    return _first_time(gram, ends, reached)
+    if not enough:
+        return None
+    return _first_time(
+        regression.gram_parts(), regression.mesh.span, distance(of_ends),
+        lambda *where: distance(seen(*where)),
+    )
 
 
 def estimable(
@@ -177,28 +182,34 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 
 
 def _first_time(
-    gram: Trajectory, edges: Array, reached: Callable[[Array, Array], Array]
+    parts: Iterable[Trajectory], span: tuple[float, float], at_ends: Array,
+    reached: Callable[[Array, Array], Array],
 ) -> float | None:
     """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
 
-    Each round looks at equally many times within the bracket. ``edges`` are the right ends of
-    elements.
+    Each round looks at equally many times within the bracket. The signal is given part by part over
+    a span of time, and ``at_ends`` (K,) is what is reached at the right ends of all elements.
     """
-    mesh = gram.mesh
-    ends = np.flatnonzero(reached(edges, gram.values[:, -1]) >= 0.0)
+    ends = np.flatnonzero(at_ends >= 0.0)
     if len(ends) == 0:
         return None
-
-    points = mesh.points[: ends[0] + 1]  # up to the first element at whose end it is reached
-    matrices = gram.values[: ends[0] + 1].reshape(points.size, *gram.values.shape[2:])
-    levels = reached(points.ravel(), matrices).reshape(points.shape)
-    levels[-1, -1] = max(levels[-1, -1], 0.0)  # rounding; it was reached there
+    left = int(ends[0]) + 1  # elements up to the first at whose end it is reached
+    for part in parts:
+        mesh, gram = part.mesh, part.values[:left]
+        points = mesh.points[:left]
+        levels = reached(points.ravel(), gram.reshape(points.size, *gram.shape[2:]))
+        levels = levels.reshape(points.shape)
+        left -= mesh.size
+        if left <= 0:
+            levels[-1, -1] = max(levels[-1, -1], 0.0)  # rounding; it was reached there
+        if (levels >= 0.0).any():
+            break
     k = int(np.argmax((levels >= 0.0).any(axis=1)))
     points, level = points[k], levels[k]
-    piece = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram.values[k : k + 1])
-    start, horizon = float(mesh.edges[0]), float(mesh.edges[-1] - mesh.edges[0])
+    piece = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram[k : k + 1])
+    start, horizon = span[0], span[1] - span[0]
     at_once = np.minimum(start + _AT_ONCE * horizon, mesh.edges[k + 1 : k + 2])
-    if k == 0 and reached(at_once, piece(at_once)) >= 0.0:
+    if mesh.edges[k] == start and reached(at_once, piece(at_once)) >= 0.0:
         return start
     while True:
         j = int(np.argmax(level >= 0.0))
@@ -211,27 +222,30 @@ def _first_time(
 
 
 def window_level(
-    pieces: Sequence[Trajectory], t: Array, window: float, resets: Sequence[Reset] = ()
+    segments: Iterable[Iterable[Trajectory]], t: Array, window: float, resets: Sequence[Reset] = ()
 ) -> Array:
     """λ_min of ∫_{t−T}^{t} ψᵀψ at the times t (M,); NaN before the first whole one.
 
     Whole elements are summed afresh for every window T, in seconds. The difference G(t) − G(t − T)
-    was rejected: once a regressor has died out, it is the rounding of two large numbers. ``pieces``
-    are [ψᵀψ | ·] (p, p + c) from one reset to the next. What was seen before a reset counts for the
-    parameters after it: T⁻ᵀ G T⁻¹, as in ``ExtensionState.after``.
+    was rejected: once a regressor has died out, it is the rounding of two large numbers. Segments
+    are [ψᵀψ | ·] (p, p + c) from one reset to the next, part by part. What was seen before a reset
+    counts for the parameters after it: T⁻ᵀ G T⁻¹, as in ``ExtensionState.after``.
     """
     level, start, slack = np.full(len(t), np.nan), t - window, 1e-12 * max(1.0, window)
-    whole = (start >= pieces[0].mesh.edges[0] - slack).nonzero()[0]
-    gram = np.zeros((len(whole), *pieces[0].values.shape[2:]))
-    for k, outer in enumerate(pieces):
-        low, high = outer.mesh.edges[[0, -1]]
-        if k:
-            size = largest(pieces[k - 1].integral().final)
-            for i in np.flatnonzero((start[whole] < low) & (t[whole] > low)):
-                gram[i] = ExtensionState(gram[i], size).after(resets[k - 1]).values
-        a, b = np.clip(start[whole], low, high), np.clip(t[whole], low, high)
-        here = np.flatnonzero(b > a)
-        gram[here] += between(outer, a[here], b[here])
+    gram, size, whole = np.zeros((0, 0, 0)), 0.0, np.zeros(0, dtype=np.intp)
+    for k, parts in enumerate(segments):
+        for j, outer in enumerate(parts):
+            low, high = outer.mesh.edges[[0, -1]]
+            if not k + j:
+                whole = (start >= low - slack).nonzero()[0]
+                gram = np.zeros((len(whole), *outer.values.shape[2:]))
+            if k and not j:
+                for i in np.flatnonzero((start[whole] < low) & (t[whole] > low)):
+                    gram[i] = ExtensionState(gram[i], size).after(resets[k - 1]).values
+            size = (size if j else 0.0) + largest(outer.integral().final) if resets else 0.0
+            a, b = np.clip(start[whole], low, high), np.clip(t[whole], low, high)
+            here = np.flatnonzero(b > a)
+            gram[here] += between(outer, a[here], b[here])
     level[whole] = np.maximum(symmetric_eigenvalues(gram).min(axis=1, initial=np.inf), 0.0)
     return level
 
@@ -266,17 +280,19 @@ def sampled_window_level(regression: SampledRegression, window: float) -> Array:
     return level
 
 
-def persistent(outer: Trajectory, gain: float) -> Requirement:
-    """Whether ψ keeps exciting, and enough at γ = ``gain``, by ``outer``, ψᵀψ (p, p).
+def persistent(
+    outer: Trajectory, gain: float, parts: Iterable[Trajectory] | None = None,
+    span: tuple[float, float] | None = None,
+) -> Requirement:
+    """Whether ψ keeps exciting, and enough at γ = ``gain``, by ψᵀψ (p, p); or by its parts in turn.
 
     The evidence is the smallest λ_min of ∫ψᵀψ (or of what takes its place) over sliding windows of
     a tenth of the horizon. An error shrinks by about exp(−γ λ_min) per window while γ λ_min is
     small, so 1 % within the horizon's ten windows needs γ λ_min ≥ ln(100)/10.
     """
-    mesh = outer.mesh
-    length = float(mesh.edges[-1] - mesh.edges[0]) / WINDOWS
-    t = np.linspace(mesh.edges[0], mesh.edges[-1], 10 * WINDOWS + 1)
-    level = float(np.nanmin(window_level([outer], t, length)))
+    span = outer.mesh.span if span is None else span
+    length, parts = (span[1] - span[0]) / WINDOWS, [outer] if parts is None else parts
+    level = float(np.nanmin(window_level([parts], np.linspace(*span, 10 * WINDOWS + 1), length)))
     needed = DECAY / WINDOWS
     return Requirement(
         name="PE",

@@ -30,7 +30,7 @@ _LEAST = 1e-6  # of what would explain Y alone: a parameter smaller than that ha
 
 def natural_sizes(regression: LinearRegression, p: int) -> Array:
     """√(∫Y²/∫ψ_j²) (p,): the size of a parameter that alone would explain Y; zeros for others."""
-    energy = np.einsum("jj->j", regression.gram.final[:, : regression.p])
+    energy = np.einsum("jj->j", regression.gram_final[:, : regression.p])
     if len(energy) != p:
         return np.zeros(p)
     mesh, squares = regression.mesh, (regression.Y.values[:, 1:] ** 2).sum(axis=-1)

@@ -161,7 +161,7 @@ def visible(
     state_map = observation.state_map
     if isinstance(state_map, AffineStateMap) and observation.names is None:
         gain, offset, growth = state_map.gain(t), state_map.offset(t), observation.growth
-        h = observation.regression.gram.final[:, observation.regression.p]
+        h = observation.regression.gram_final[:, observation.regression.p]
         return lambda known: (
             known.states(gain, state_map.units) & known.resolved(h, offset, gain, growth)
         )

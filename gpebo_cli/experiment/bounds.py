@@ -74,7 +74,7 @@ def bounded(
     check_keys(given, ("states", "unknowns"), "observer.bounds")
     eye = np.eye(p)[:, columns]
     unknowns = _sides(given.get("unknowns", {}), system.unknowns, "observer.bounds.unknowns")
-    gram = observation.regression.gram(t)[:, columns][:, :, columns]
+    gram = observation.regression.gram_at(t)[:, columns][:, :, columns]
     least = _FLOOR * np.diag(np.diag(gram[-1]) + np.finfo(float).tiny)
     return BoundedEstimates(
         estimates, gram + least, state_map, columns, t,

@@ -108,7 +108,7 @@ def _with_unknowns(eta: Array, regression: LinearRegression, horizon: Array) -> 
     if S is None:
         return eta
     each = np.moveaxis(eta, 1, 2)
-    weight = regression.gram(horizon)[..., : eta.shape[1]]
+    weight = regression.gram_at(horizon)[..., : eta.shape[1]]
     flat = each.reshape(-1, eta.shape[1])
     theta = S.fitted(flat, np.repeat(weight, len(flat), axis=0))
     whole = np.concatenate([each, theta.reshape(*each.shape[:2], -1)], axis=2)

@@ -18,7 +18,7 @@ from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
 from gpebo_cli.observers import AffineStateMap, Observation
-from gpebo_cli.regression.errors import ErrorSystem
+from gpebo_cli.regression.errors import ErrorSystem, one_after_another
 from gpebo_cli.regression.linear import LinearRegression
 
 
@@ -116,17 +116,8 @@ def joined_observation(
         each.regression.mesh.edges[0] + by for each, by in zip(observations, shifts, strict=True)
     ])
 
-    def errors_at(t: Array, inside: Array) -> ErrorSystem:
-        piece = np.maximum(np.searchsorted(starts, inside, side="right") - 1, 0)
-        found: list[Array] = []
-        for k in np.unique(piece):
-            chosen = piece == k
-            system = errors[k](t[chosen] - shifts[k], inside[chosen] - shifts[k])
-            for i, part in enumerate(system):
-                if len(found) <= i:
-                    found.append(np.zeros((len(t), *part.shape[1:])))
-                found[i][chosen] = part
-        return ErrorSystem(*found)
+    def errors_at(k: int, t: Array, inside: Array) -> ErrorSystem:
+        return errors[k](t - shifts[k], inside - shifts[k])
 
     def truth(t: Array, theta: Array, states: Trajectory) -> Array:  # noqa: ARG001  of each its own
         eta = np.concatenate([
@@ -161,7 +152,8 @@ def joined_observation(
         ),
         truth=truth, error_estimate=max(each.error_estimate for each in observations),
         growth=max(growth, default=None), growth_rate=max(rates, default=None), respond=None,
-        errors=errors_at if same and len(errors) == len(observations) else None,
+        errors=one_after_another(starts, errors_at)
+        if same and len(errors) == len(observations) else None,
         starts=starts,
     )
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gpebo_cli.estimators import ResumableEstimator
+from gpebo_cli.estimators import errors as behind
 from gpebo_cli.evidence.uncertainty import (
     SampledDeviations,
     after_reset,
@@ -135,7 +136,7 @@ def standard_deviations(
     else:
         found = [
             deviations(errors, of_case, gain, edges, rows, variances, t, observation.starts)
-            for of_case, gain in zip(estimator.errors(regression), gains, strict=True)
+            for of_case, gain in zip(behind(estimator, regression), gains, strict=True)
         ]
     return np.array([eta for eta, _ in found]), np.array([x for _, x in found])
 

@@ -74,6 +74,11 @@ class Mesh:
         """Number of elements K."""
         return len(self.edges) - 1
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time, seconds."""
+        return float(self.edges[0]), float(self.edges[-1])
+
     @cached_property
     def steps(self) -> Array:
         """Element lengths, shape (K,)."""

@@ -79,7 +79,7 @@ class Measurements:
     @property
     def span(self) -> tuple[float, float]:
         """First and last time, seconds."""
-        return float(self.mesh.edges[0]), float(self.mesh.edges[-1])
+        return self.mesh.span
 
     def at(
         self, t: Array, inside: Array | None = None, system: DescriptorSystem | None = None

@@ -201,7 +201,7 @@ def _told(
     regression, state_map = found.regression, found.state_map
     if not isinstance(state_map, AffineStateMap):
         return False, 0
-    (start, stop), ends = regression.mesh.edges[[0, -1]], regression.gram.mesh.edges[1:]
+    ends = regression.mesh.edges[1:]
     last, steady = len(ends) - 1, found.growth is None or found.growth < _BLOWN
     known = known_at(regression, ends[-1:], solver.tol)
 
@@ -213,7 +213,7 @@ def _told(
     if clear(known) or clear(known_at(regression, earlier, solver.tol)):
         return steady, system.q + system.n
     sound = steady and bool(known.clarity[known.clarity >= 1.0].min(initial=np.inf) > _CLEAR)
-    seen = known.states(state_map.gain(np.linspace(start, stop, 11)), state_map.units)[-1]
+    seen = known.states(state_map.gain(np.linspace(*regression.mesh.span, 11)), state_map.units)[-1]
     return sound, int(known.parameters[0, : system.q].sum() + seen.sum())
 
 

@@ -92,12 +92,12 @@ class FittedMap(StateMap):
 
     def gains(self, t: Array, states: Array) -> Array:
         """∂θ̂/∂η̂ (g, M, q, k) at the times t (M,) and estimates θ̂ (g, M, q)."""
-        weight = self.regression.gram(t)[..., : self.regression.p]
+        weight = self.regression.gram_at(t)[..., : self.regression.p]
         return np.array([self.parametrisation.gain(of_case, weight) for of_case in states])
 
     def at(self, t: Array) -> Reconstruction:
         """θ̂ (g, M, q) of η̂ (g, M, k) at the times t (M,)."""
-        weight, S = self.regression.gram(t)[..., : self.regression.p], self.parametrisation
+        weight, S = self.regression.gram_at(t)[..., : self.regression.p], self.parametrisation
         return lambda eta: np.array([S.fitted(of_case, weight) for of_case in eta])
 
 

@@ -34,6 +34,28 @@ class ErrorSystem(NamedTuple):
 ErrorsAt = Callable[[Array, Array], ErrorSystem]
 
 
+def one_after_another(
+    starts: Array, pieces: Callable[[int, Array, Array], ErrorSystem]
+) -> ErrorsAt:
+    """Systems that each hold from one of the ``starts`` (k,) on, by number, times and inside."""
+
+    def at(t: Array, inside: Array) -> ErrorSystem:
+        piece = np.maximum(np.searchsorted(starts, inside, side="right") - 1, 0)
+        numbers = np.unique(piece)
+        if len(numbers) == 1:
+            return pieces(int(numbers[0]), t, inside)
+        found: list[Array] = []
+        for k in numbers.tolist():
+            chosen = piece == k
+            for i, part in enumerate(pieces(k, t[chosen], inside[chosen])):
+                if len(found) <= i:
+                    found.append(np.zeros((len(t), *part.shape[1:])))
+                found[i][chosen] = part
+        return ErrorSystem(*found)
+
+    return at
+
+
 class ErrorSteps(NamedTuple):
     """The same of an observer at K samples, with the errors e before and e' after each step.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -18,6 +18,8 @@ from gpebo_cli.regression.parametrisation import Parametrisation
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
 _SINGULAR = 1e-10  # singular values of ψ with columns of equal size that count as zero, relatively
+_WINDOW = 1 << 12  # elements at most, and
+_AT_ONCE = 1 << 22  # numbers of [ψᵀψ | ψᵀY] at most, that are made at once of a long regression
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,15 +102,50 @@ class LinearRegression:
                 known = ExtensionState(pieces[-1][-1, -1], level).after(reset).values
         return Trajectory(self.mesh, np.concatenate(pieces))
 
+    def gram_parts(self) -> Iterator[Trajectory]:
+        """[G | h] one window after the other, so that little of it is held."""
+        known: Array | float = 0.0
+        for window in self.windows():
+            part = window.gram
+            if window is not self:  # what it holds is its own
+                np.add(part.values, known, out=part.values)
+                known = part.final.copy()
+            yield part
+
+    @cached_property
+    def gram_final(self) -> Array:
+        """[G | h] at the end, (p, p + c)."""
+        for part in self.gram_parts():
+            final = part.final
+        return final
+
+    def gram_at(self, t: Array) -> Array:
+        """[G | h] at the times t (M,), (M, p, p + c)."""
+        start, stop = self.mesh.span
+        if (t == stop).all():
+            return np.repeat(self.gram_final[None], len(t), axis=0)
+        found = np.empty((len(t), *self.gram_final.shape))
+        for part in self.gram_parts():
+            first, last = part.mesh.edges[[0, -1]].tolist()
+            some = ((t >= first) | (first == start)) & ((t < last) | (last == stop))
+            if some.any():
+                found[some] = part(t[some])
+        return found
+
     @cached_property
     def root(self) -> Array:
         """R (k, p + 1) with |R [−η; 1]|² = ∫‖Y − ψη‖²; of one realisation, without resets."""
         if self.factor is not None:
             return self.factor
-        mesh = self.mesh
-        weights = np.sqrt(mesh.steps[:, None] * mesh.rule.integration[-1])[..., None, None]
-        both = weights * np.concatenate([self.psi.values, self.Y.values[..., None]], axis=3)[:, 1:]
-        return np.asarray(np.linalg.qr(both.reshape(-1, self.p + 1), mode="r"))
+        found = np.zeros((0, self.p + 1))
+        for window in self.windows():
+            mesh, psi, Y = window.mesh, window.psi.values, window.Y.values
+            weights = np.sqrt(mesh.steps[:, None] * mesh.rule.integration[-1])[..., None, None]
+            both = weights * np.concatenate([psi, Y[..., None]], axis=3)[:, 1:]
+            rows = both.reshape(-1, self.p + 1)
+            rows = np.concatenate([found, rows]) if len(found) else rows
+            found = np.asarray(np.linalg.qr(rows, mode="r"))
+        return found
 
     def misfit(self, eta: Array) -> float:
         """∫‖Y − ψη‖² for parameters η (p,)."""
@@ -123,20 +160,47 @@ class LinearRegression:
         """The regression between one reset and the next, each about its own parameters."""
         if not self.resets:
             return (self,)
-        mesh = self.mesh
-        cuts = np.searchsorted(mesh.edges, [reset.time for reset in self.resets])
-        out = []
-        bounds = pairwise([0, *(int(cut) for cut in cuts), mesh.size])
-        scale = np.broadcast_to(self.scale, (mesh.size, self.p))
+        cuts = np.searchsorted(self.mesh.edges, [reset.time for reset in self.resets])
         floors = (self.floor, *(reset.floor for reset in self.resets))
-        for (first, last), floor in zip(bounds, floors, strict=True):
-            piece = Mesh(mesh.edges[first : last + 1], mesh.rule)
-            out.append(replace(
-                self, Y=Trajectory(piece, self.Y.values[first:last]),
-                psi=Trajectory(piece, self.psi.values[first:last]), resets=(), floor=floor,
-                scale=scale[first:last],
-            ))
-        return tuple(out)
+        return tuple(
+            self._part(first, last, floor)
+            for (first, last), floor in zip(
+                pairwise([0, *cuts.tolist(), self.mesh.size]), floors, strict=True
+            )
+        )
+
+    def windows(self) -> Iterator[LinearRegression]:
+        """The regression, or parts of a long one, one after the other, about the same parameters.
+
+        What is made of one of them does not have to be held for the next.
+        """
+        if not self.long:
+            yield self
+            return
+        for first in range(0, self.mesh.size, self._window):
+            yield self._part(first, min(first + self._window, self.mesh.size), self.floor)
+
+    @property
+    def long(self) -> bool:
+        """Whether there are several windows."""
+        plain = not (self.resets or self.dynamics or self.realisations)
+        return plain and self.mesh.size > _WINDOW
+
+    @property
+    def _window(self) -> int:
+        """Elements in a window."""
+        each = len(self.mesh.rule.points) * self.p * (self.p + 1)
+        return max(1, min(_WINDOW, _AT_ONCE // max(1, each)))
+
+    def _part(self, first: int, last: int, floor: float) -> LinearRegression:
+        """The elements from one number to another, without what was before."""
+        piece, own = Mesh(self.mesh.edges[first : last + 1], self.mesh.rule), slice(first, last)
+        scale = np.broadcast_to(self.scale, (self.mesh.size, self.p))
+        return replace(
+            self, Y=Trajectory(piece, self.Y.values[own]),
+            psi=Trajectory(piece, self.psi.values[own]), resets=(), floor=floor, scale=scale[own],
+            factor=None,
+        )
 
 
 def least_squares(root: Array) -> Array:

@@ -38,6 +38,7 @@ class ExtensionState:
     level: float  # size that data of one segment alone have given Ω, the largest so far
     memory: float = 1.0  # z of least squares with forgetting
     surplus: float = SURPLUS  # how many times ``level`` a reset may make of Ω
+    energy: float = 0.0  # ∫Δ² of a law behind it since it began
 
     def after(self, reset: Reset) -> ExtensionState:
         """The same knowledge of η₊ = T η + τ.
@@ -77,7 +78,7 @@ class ExtensionState:
         # What nothing was known of, and what no other one has become, is no rounding of others.
         idle = ~omega.any(axis=0) & (reset.transform == np.eye(len(omega))).all(axis=0)
         values[idle], values[:, :-1][:, idle] = 0.0, 0.0
-        return replace(self, values=reset.keep * values)
+        return replace(self, values=reset.keep * values, energy=0.0)
 
     def carries(self, reset: Reset) -> Array:
         """S (p, p) of :meth:`after`: what it makes of an error of 𝒴."""
