@@ -94,7 +94,7 @@ class Gone:
     requirement: Requirement
 
     def delta(self, t: Array) -> Array | None:  # noqa: ARG002  protocol
-        """Δ at the times."""
+        """Δ (1 or cases, M) at the times of the estimates."""
         return self.mixed
 
     def parameters(self, cases: slice) -> Array:

@@ -130,7 +130,7 @@ class VectorEstimates:
     def over(
         self, parts: Iterable[Trajectory] | None = None, span: tuple[float, float] | None = None
     ) -> Requirement:
-        """Persistent excitation by this information, or by its parts in turn over a span."""
+        """Persistent excitation by this information (p, p), or by its parts in turn over a span."""
         return persistent(self.information, float(self.gains.min()), parts, span)
 
     def delta(self, t: Array) -> Array | None:
