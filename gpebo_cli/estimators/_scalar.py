@@ -317,11 +317,12 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     what a number can be; names the time).
     """
     p = extended.values.shape[-2]
-    finite = np.isfinite(extended.values).all(axis=(1, 2, 3))
+    finite = np.isfinite(extended.values)
     if not finite.all():
+        first = int(np.argmin(finite.all(axis=(1, 2, 3))))
         raise SolverError(
             "Ω, which is made of squares of ψ, is too large for a number near t = "
-            f"{extended.mesh.edges[int(np.argmin(finite))]:.4g}; write Y and ψ in larger units"
+            f"{extended.mesh.edges[first]:.4g}; write Y and ψ in larger units"
         )
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:

@@ -91,9 +91,9 @@ def metrics_of(numbers: Array, parameters: Sequence[str], system: DescriptorSyst
     return replace(Metrics(*numbers[: len(METRICS)]), seconds_to_1pct=each)
 
 
-# η̂ (g, M, p) on the grid -> the numbers that ``Metrics`` are made of (c, g), and η̂ (g, k, p) and
-# x̂ (g, k, n) at the samples that are kept
-_Evaluation = Callable[[Array], tuple[Array, Array, Array]]
+# η̂ (g, M, p) on the grid -> the numbers that ``Metrics`` are made of (c, g); η̂ (g, k, p) and
+# x̂ (g, k, n) at the samples that are kept are written where the others say
+_Evaluation = Callable[[Array, Array, Array], Array]
 
 
 def evaluation(
@@ -107,10 +107,10 @@ def evaluation(
     if not isinstance(state_map, AffineStateMap) or (alone and state_map.large):
         reconstruct = state_map.at(grid)
 
-        def evaluate(eta: Array) -> tuple[Array, Array, Array]:
+        def evaluate(eta: Array, kept: Array, seen: Array) -> Array:
             x_hat = reconstruct(eta)
-            numbers = numbers_of(grid, eta - truth, x_hat - x, sizes, judged)
-            return numbers, eta[:, chosen], x_hat[:, chosen]
+            kept[:], seen[:] = eta[:, chosen], x_hat[:, chosen]
+            return numbers_of(grid, eta - truth, x_hat - x, sizes, judged)
 
         return evaluate
     sampler = state_map.offset.mesh.sampler(grid)
@@ -132,7 +132,7 @@ def evaluation(
         """Of η̂ (g, p) and x̂ (g, n) at one time."""
         return [eta[:, k] - truth[k], offset[k] + eta[:, k] @ gain[k].T - x[k]]
 
-    def evaluate_affine(eta: Array) -> tuple[Array, Array, Array]:
+    def evaluate_affine(eta: Array, kept: Array, seen: Array) -> Array:
         """The norms, with x̂ only where it is needed: on the grid its errors are numbers."""
         eta = np.asarray(eta, dtype=np.float64)
         of_eta, of_x = errors_at(eta, -1)
@@ -152,11 +152,11 @@ def evaluation(
             times[np.isnan(np.hstack([of_eta, of_x]))] = np.nan
             times[:, :p][:, ~judged] = np.nan
             numbers = np.concatenate([numbers, times.T])
-        kept = eta.take(chosen, axis=1)
-        x_hat = np.empty((len(eta), *offset_kept.shape))  # a product per time serves all cases
-        np.matmul(kept.swapaxes(0, 1), gain_kept, out=x_hat.swapaxes(0, 1))
-        x_hat += offset_kept
-        return numbers, kept, x_hat
+        kept[:] = eta.take(chosen, axis=1)
+        # A product per time serves all cases.
+        np.matmul(kept.swapaxes(0, 1), gain_kept, out=seen.swapaxes(0, 1))
+        seen += offset_kept
+        return numbers
 
     return evaluate_affine
 

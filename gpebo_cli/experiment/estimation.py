@@ -385,8 +385,7 @@ def _estimate(
             whole = np.zeros((*eta.shape[:2], p))
             whole[..., columns] = eta
             eta = whole
-        found, parameters[part], estimated[part] = evaluate(eta)
-        numbers[:, part] = found[: len(numbers)]
+        numbers[:, part] = evaluate(eta, parameters[part], estimated[part])[: len(numbers)]
         done(part.stop)
     explaining = parameters[:, -1].copy()
     parameters[..., np.isnan(told[0])] = np.nan

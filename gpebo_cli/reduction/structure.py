@@ -303,10 +303,11 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
         edges, _ = system.coefficients.resolved(initial_edges(start, stop, jumps))
         steps = edges[1:] - edges[:-1]
         narrow = (steps < 0.4 * (stop - start) / FIRST_ELEMENTS).nonzero()[0]
-        narrow = narrow[:: 1 + len(narrow) * _NARROW // _MOST_PROBES]
-        places = (np.arange(_NARROW) + 0.5) / _NARROW
-        looks = edges[narrow, None] + steps[narrow, None] * places
-        t = np.unique(np.concatenate([t, looks.ravel()])) if len(narrow) else t
+        if len(narrow):
+            narrow = narrow[:: 1 + len(narrow) * _NARROW // _MOST_PROBES]
+            places = (np.arange(_NARROW) + 0.5) / _NARROW
+            looks = edges[narrow, None] + steps[narrow, None] * places
+            t = np.unique(np.concatenate([t, looks.ravel()]))
     if not len(jumps):
         return t
     cuts = np.concatenate([[start], jumps, [stop]])
