@@ -193,7 +193,8 @@ def check_sizes(system: DescriptorSystem, t: Array) -> None:
             source = source.of_time if system.depends_on_outputs else source
             if system.n <= _FEW:
                 entries |= source.taylor(t, 0)._asdict()
-        whole = np.concatenate([distinct(values)[0].ravel() for values in entries.values()])
+        some = (distinct(values)[0].ravel() for values in entries.values() if values.size)
+        whole = np.concatenate([initial, *some])
         E = np.abs(distinct(entries["E"])[0]) if "E" in entries else initial[:0]
         if whole.dot(whole) <= LARGEST and E[E > 0.0].min(initial=1.0) >= 1.0 / LARGEST:
             return  # no need to look at each

@@ -279,9 +279,9 @@ def _refuse_overflow(
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
         heaviest = np.square(weight.max(initial=0.0))
         # A sum is finite only where all its terms are; a finite one says it at once.
-        finite = all(
-            isfinite(heaviest * x.ravel().dot(x.ravel())) or np.isfinite(x * weight).all()
-            for x in (distinct(c.E), distinct(c.A))
+        E, A = distinct(c.E), distinct(c.A)
+        finite = isfinite(heaviest * (np.vdot(E, E) + np.vdot(A, A))) or all(
+            np.isfinite(x * weight).all() for x in (E, A)
         )
     if not finite:
         raise ModelError(
@@ -325,8 +325,9 @@ def _judged(
     # A μ that will not do fails at one time already.
     a, smallest, rows, columns, Z1 = kernels.structure.reference(*model, middle, rank_tol)
     smallest = smallest[None]
-    failure = f"{a} constraints appear for {n} states (t = {at[0]:.6g})"
-    failure = failure if a > n else _why_not(at, smallest, rank_tol)
+    failure = _why_not(at, smallest, rank_tol) if a <= n else (
+        f"{a} constraints appear for {n} states (t = {at[0]:.6g})"
+    )
     if failure:
         return _Levels(a, smallest, failure)
     reference = Pivots((mu + 1) * n - a, rows, columns, Z1)

@@ -242,9 +242,9 @@ def _amplification(form: StrangenessFree, units: Array, step: float) -> Array:
     found = form.amplification.copy()
     T, E1 = np.abs(T), np.abs(E1)
     sizes = T / units[:, None] * (E1 @ units)[:, None]
-    rounding = np.where(sizes > NOTHING * sizes.max(initial=0.0), 1.0, 1.0 / EPS)
-    found[:, :-1] += largest_over_time((T * rounding) @ E1)
-    within = np.minimum(step * largest_over_time(T @ np.abs(A1)), 1.0)
+    rounding = np.where(sizes > NOTHING * sizes.max(initial=0.0), T, T / EPS)
+    found[:, :-1] += (rounding @ E1).max(axis=0)
+    within = np.minimum(step * (T @ np.abs(A1)).max(axis=0), 1.0)
     once = within @ found
     return np.asarray(found + once + within @ once)
 
