@@ -81,10 +81,10 @@ def read_table(path: Path) -> tuple[list[str], np.ndarray[Any, np.dtype[np.float
 @contextmanager
 def refused(
     *parts: str, by: type[Exception] = ConfigError, begins: str = ""
-) -> Iterator[None]:
+) -> Iterator[pytest.ExceptionInfo[Exception]]:
     """What is done inside is refused in one line with all these parts."""
     with pytest.raises(by) as caught:
-        yield
+        yield caught
     said = str(caught.value)
     assert len(said.splitlines()) == 1
     assert said.startswith(begins)

@@ -317,30 +317,6 @@ def test_wrong_usage_is_a_config_error_on_one_line(words, expected):
         run(**{"plant": "circuit", **words})
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("name: mine\nname: other\n", "the key name stands twice"),
-        ("name: [\n", "not valid YAML"),
-        ("- 1\n", "expected a mapping"),
-        (MINE + "title: ${oc.env:HOME}\n", "${…} is not allowed"),
-        (MINE.replace("-1", "-z"), "the name 'z' is not defined"),
-    ],
-)
-def test_a_file_is_read_as_carefully_as_by_the_command(tmp_path, text, expected):
-    path = tmp_path / "mine.yaml"
-    path.write_text(text)
-    with refused("mine.yaml", expected):
-        run(path)
-
-
-def test_a_plant_with_a_shipped_name_is_refused(tmp_path):
-    (tmp_path / "plant").mkdir()
-    (tmp_path / "plant" / "circuit.yaml").write_text(MINE)
-    with pytest.raises(ConfigError, match="would be ignored; rename it"):
-        run("circuit", config_dir=tmp_path)
-
-
 def test_a_plant_that_cannot_be_used_is_a_model_error():
     singular = {**yaml.safe_load(MINE), "E": [[0]], "A": [[0]]}
     with pytest.raises(ModelError) as caught:

@@ -155,15 +155,18 @@ def test_a_pole_that_no_point_of_a_first_mesh_hits_is_refused(power):
         }, observer="none", time={"horizon": 10})
 
 
+def slit(width):
+    """A run of q' = −1000 exp(−((y − a)/w)²) q with y' = 0.1: ln q falls by 10⁴ w √π."""
+    return run({
+        "name": "slit", "states": ["p", "q"], "inputs": {"u": 0.1}, "outputs": ["y"],
+        "E": [[1, 0], [0, 1]], "A": [[0, 0], [0, f"-1000*exp(-((y - 0.46371)/{width})**2)"]],
+        "B": [[1], [0]], "C": [[1, 0]], "initial_state": [0, 1],
+    }, observer="none", time={"horizon": 10})
+
+
 @pytest.mark.parametrize("width", [1e-4, 1e-5])
 def test_a_narrow_pulse_along_an_output_is_seen(width):
-    """q' = −1000 exp(−((y − a)/w)²) q with y' = 0.1: ln q falls by 10⁴ w √π."""
-    pulse = f"-1000*exp(-((y - 0.46371)/{width})**2)"
-    found = run({
-        "name": "slit", "states": ["p", "q"], "inputs": {"u": 0.1}, "outputs": ["y"],
-        "E": [[1, 0], [0, 1]], "A": [[0, 0], [0, pulse]], "B": [[1], [0]], "C": [[1, 0]],
-        "initial_state": [0, 1],
-    }, observer="none", time={"horizon": 10})
+    found = slit(width)
     assert found["q"][-1] == pytest.approx(np.exp(-1e4 * width * np.sqrt(np.pi)), rel=1e-6)
 
 
@@ -174,12 +177,8 @@ def test_a_narrow_pulse_along_an_output_is_seen(width):
 def test_a_pulse_along_an_output_that_is_not_followed_far_enough_is_said(least, monkeypatch):
     for name, value in least.items():
         monkeypatch.setattr(f"gpebo_cli.{name}", value)
-    told = run({
-        "name": "slit", "states": ["p", "q"], "inputs": {"u": 0.1}, "outputs": ["y"],
-        "E": [[1, 0], [0, 1]], "A": [[0, 0], [0, "-1000*exp(-((y - 0.46371)/1e-5)**2)"]],
-        "B": [[1], [0]], "C": [[1, 0]], "initial_state": [0, 1],
-    }, observer="none", time={"horizon": 10}).verdict
-    assert "nothing bounds what functions that change so often do between" in told
+    said = slit(1e-5).verdict
+    assert "nothing bounds what functions that change so often do between" in said
 
 
 @pytest.mark.parametrize(("w", "power"), [("25*pi", 2000), ("2.5*pi", 20000)])

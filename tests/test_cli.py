@@ -20,9 +20,12 @@ from processes import (
     environment,
     process,
     python,
+    refused,
     rows_of,
     wait_for,
 )
+
+from gpebo_cli import run
 
 FAST = ["figures=none", "time.samples=51"]
 
@@ -482,6 +485,8 @@ def test_a_file_that_would_be_ignored_is_refused(tmp_path, mine):
     (mine / "plant" / "circuit.yaml").write_text(MINE)
     done = gpebo("run", "--config-dir", mine, "plant=circuit", *FAST, cwd=tmp_path)
     assert_refused(done, "would be ignored; rename it")
+    with refused("would be ignored; rename it"):
+        run("circuit", config_dir=mine)
 
 
 def test_a_plant_may_have_a_number_for_a_name(tmp_path):

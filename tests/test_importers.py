@@ -588,11 +588,6 @@ def test_a_large_plant_has_its_matrices_in_a_file_beside_it(tmp_path, monkeypatc
     assert_repeats(tmp_path / "a", "signals.csv")
 
 
-def archive(path, **arrays):
-    np.savez(path, **arrays)
-    return path
-
-
 @pytest.mark.parametrize(("content", "message"), [
     ({"A": np.eye(3)}, "A is 3 × 3, and there are 2 states (x1, x2) and there are 2 states"),
     ({"A": np.array([[1, "a"], [0, 1]], dtype=object)}, "not an array of real numbers"),
@@ -660,7 +655,8 @@ def test_sparse_matrices_from_python(tmp_path):
 
 
 def test_what_is_measured_and_unknown_of_matrices(tmp_path):
-    path = archive(tmp_path / "m.npz", A=A, B=B, C=np.ones((2, 2)), D=np.ones((2, 1)))
+    path = tmp_path / "m.npz"
+    np.savez(path, A=A, B=B, C=np.ones((2, 2)), D=np.ones((2, 1)))
     plant = from_file(path, "p", measure="x2", unknown="u1").mapping()
     assert (plant["C"], plant["F"], plant["unknowns"]) == ([[0, 1]], [[0], [1]], {"u1": 0.0})
     assert "B" not in plant

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 
 import pytest
+from processes import python
 
 from gpebo_cli.cli import interrupts
 
@@ -62,7 +62,5 @@ def test_without_a_signal_nothing_happens_and_all_is_as_before():
 
 def test_a_signal_before_anything_is_loaded_is_answered():
     words = "from gpebo_cli.cli import start; import signal; signal.raise_signal(signal.SIGINT)"
-    done = subprocess.run(
-        [sys.executable, "-c", words], check=False, capture_output=True, text=True
-    )
+    done = python("-c", words)
     assert (done.returncode, done.stderr) == (130, "gpebo: error: interrupted\n")

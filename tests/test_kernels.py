@@ -428,18 +428,16 @@ def test_where_the_pivots_will_not_do_both_say_so():
 
 
 @needs_kernels
-@pytest.mark.parametrize("value", [np.inf, np.nan, 1e200, 1e100])
-def test_numbers_too_large_for_squares_are_left_to_lapack(value):
-    arguments = list(_levels(np.random.default_rng(0), times=2))
-    arguments[1][0, 1, 0, 0] = value
+@pytest.mark.parametrize(("scale", "value", "constraints"), [
+    *((1.0, value, -1) for value in (np.inf, np.nan, 1e200, 1e100)),  # their squares overflow
+    (1e-70, 0.0, -1),  # squares vanish
+    (1.0, 0.0, 1),  # the rank contradicts this number
+])
+def test_what_pivots_cannot_decide_is_left_to_lapack(scale, value, constraints):
+    E, A, *others = _levels(np.random.default_rng(0), times=2, constraints=constraints)
+    A[0, 1, 0, 0] += value
     compiled = import_module("gpebo_cli.kernels._compiled")
-    assert compiled.levels(*arguments) is None
-
-
-@needs_kernels
-def test_a_number_of_constraints_that_the_rank_contradicts_is_left_to_lapack():
-    compiled = import_module("gpebo_cli.kernels._compiled")
-    assert compiled.levels(*_levels(np.random.default_rng(0), constraints=1)) is None
+    assert compiled.levels(scale * E, scale * A, *others) is None
 
 
 @needs_kernels
@@ -459,13 +457,6 @@ def test_a_chain_says_how_far_it_is_finite():
     with np.errstate(over="ignore", invalid="ignore"):
         one, other = both("elements", "chain", (1e200 * maps, *others))
     assert one[1] == other[1] == 1
-
-
-@needs_kernels
-def test_numbers_too_small_for_squares_are_left_to_lapack():
-    E, A, *others = _levels(np.random.default_rng(0), times=2)
-    compiled = import_module("gpebo_cli.kernels._compiled")
-    assert compiled.levels(1e-70 * E, 1e-70 * A, *others) is None
 
 
 def test_kernels_are_there_where_they_were_asked_for():

@@ -64,6 +64,14 @@ def manufactured(n, d, blocks, seed, varying):
     return plant, [sp.lambdify(t, entry, "numpy") for entry in x]
 
 
+def simulated(plant, exact):
+    """A simulation, and the largest error of its states beside the largest state."""
+    result = simulate(plant, TimeSettings(horizon=5.0), SolverSettings())
+    times = np.linspace(0, 5, 201)
+    truth = np.array([entry(times) for entry in exact]).T
+    return result, np.abs(result.signals.states(times) - truth).max() / np.abs(truth).max()
+
+
 @pytest.mark.parametrize(
     ("n", "d", "blocks", "varying"),
     [
@@ -78,12 +86,9 @@ def manufactured(n, d, blocks, seed, varying):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_manufactured_solution_is_found(n, d, blocks, varying, seed):
     plant, exact = manufactured(n, d, blocks, seed, varying)
-    result = simulate(plant, TimeSettings(horizon=5.0), SolverSettings())
+    result, error = simulated(plant, exact)
     assert result.structure.index == max(blocks)
     assert result.structure.d == d
-    times = np.linspace(0, 5, 201)
-    truth = np.array([entry(times) for entry in exact]).T
-    error = np.abs(result.signals.states(times) - truth).max() / np.abs(truth).max()
     assert error < 1e-9
     assert error < 10 * result.error_estimate
 
@@ -105,11 +110,7 @@ def test_any_start_of_a_manufactured_system_ends_on_its_constraints():
 
 def test_the_estimate_forgets_an_elimination_that_was_not_used():
     """Where pivots will not do singular vectors do, and only their rounding counts."""
-    plant, exact = manufactured(20, 12, [4, 2, 2], 11, True)
-    result = simulate(plant, TimeSettings(horizon=5.0), SolverSettings())
-    times = np.linspace(0, 5, 201)
-    truth = np.array([entry(times) for entry in exact]).T
-    error = np.abs(result.signals.states(times) - truth).max() / np.abs(truth).max()
+    result, error = simulated(*manufactured(20, 12, [4, 2, 2], 11, True))
     assert error < result.error_estimate < 1e3 * error
 
 

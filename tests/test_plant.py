@@ -6,30 +6,24 @@ import pickle
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
+from plants import shipped
 from processes import refused
 
 from gpebo_cli import run
+from gpebo_cli.configs import files
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.model.descriptor import MATRIX_NAMES, CoefficientSource, DescriptorSystem
+from gpebo_cli.model.descriptor import MATRIX_NAMES, CoefficientSource
 from gpebo_cli.model.plant import KEYS, plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
-PLANTS = Path(__file__).parents[1] / "conf" / "plant"
 TIMES = np.array([0.0, 0.4, 1.7, 6.3, 19.5])
 
 Plain = dict[str, Any]
-
-
-def shipped(name: str) -> DescriptorSystem:
-    """A plant of this project."""
-    return plant_from_mapping(yaml.safe_load((PLANTS / f"{name}.yaml").read_text("utf-8")))
 
 
 def mine(**changes: object) -> Plain:
@@ -96,7 +90,7 @@ def test_circuit_matrices() -> None:
 
 def test_circuit_names_and_values() -> None:
     system = shipped("circuit")
-    assert (system.name, system.source) == ("circuit", "")
+    assert (system.name, system.source) == ("circuit", "circuit.yaml")
     assert system.states == ("e1", "e2", "il", "ir1", "ir2", "iv")
     assert (system.inputs, system.outputs, system.unknowns) == (("V",), ("y",), ())
     assert system.initial_state.tolist() == [0, 1, 2, 0.25, 0, -0.25]
@@ -158,7 +152,7 @@ def test_canonical() -> None:
 
 @pytest.mark.parametrize("name", ["circuit", "descriptor", "canonical"])
 def test_shipped_plants_use_documented_keys_only(name: str) -> None:
-    plain = yaml.safe_load((PLANTS / f"{name}.yaml").read_text("utf-8"))
+    plain = files.shipped(f"plant/{name}")
     assert set(plain) <= set(KEYS)
     assert plain["title"]
     assert plain["reference"]
@@ -345,6 +339,16 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "no C": (lambda: without("C"), "C is missing; there is 1 output (y), so it needs 1 row of 2"),
     "A is a number": (lambda: mine(A=0), "A must be a list of 2 rows, not '0'"),
     "A is text": (lambda: mine(A="R"), "A must be a list of 2 rows, not 'R'"),
+    "A is an array of another size": (lambda: mine(A=np.eye(3)), "A is 3 × 3, and"),
+    "an entry twice": (
+        lambda: mine(A={"x1,x2": 1, "x1": {"x2": 2}}), "A has the entry x1,x2 twice"
+    ),
+    "an entry of a row": (
+        lambda: mine(A={"x1": 3}), "A has 'x1': '3'; write entries as 'row,column': value ("
+    ),
+    "an entry of no state": (
+        lambda: mine(A={"x1,q": 3}), "A: column 'q' is no state, and no number from 0 to 1; "
+    ),
     "A has too few rows": (lambda: mine(A=[[0, 1]]), "A has 1 row but there are 2 states (x1, x2)"),
     "A has too many columns": (
         lambda: mine(A=[[0, 1, 2], [0, 1, 2]]),
@@ -365,8 +369,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "unknown is empty": (
         lambda: mine(unknowns={"a": None}, F=[[0], [0]]), "unknowns.a is empty; write its true"
     ),
-    "entry is empty": (lambda: mine(E=[[1, None], [0, 0]]), "E[0][1] is empty"),
-    "entry is a list": (lambda: mine(E=[[1, [0]], [0, 0]]), "E[0][1] is a list"),
+    "entry is empty": (lambda: mine(E=[[1, None], [0, 0]]), "E[0][1] is empty; write a number or"),
+    "entry is a list": (lambda: mine(E=[[1, [0]], [0, 0]]), "E[0][1] is a list; write a number"),
     "entry is hostile": (lambda: mine(E=[[1, "__import__('os')"], [0, 0]]), "E[0][1] = "),
     "no initial state": (lambda: without("initial_state"), "initial_state is missing"),
     "initial state lacks": (lambda: mine(initial_state={"x1": 1}), "initial_state lacks x2"),
@@ -378,11 +382,19 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: mine(initial_state=[1, 2, 3]),
         "initial_state has 3 values but there are 2 states (x1, x2)",
     ),
-    "initial state a number": (lambda: mine(initial_state=0), "initial_state must map states"),
+    "initial state a number": (lambda: mine(initial_state=0), "must map states to numbers or list"),
     "initial state of time": (
         lambda: mine(initial_state={"x1": "1 + t", "x2": 0}),
         "initial_state.x1 = '1 + t' must not depend on t",
     ),
+    "initial state too short": (lambda: mine(initial_state=[0]), "initial_state has 1 value but"),
+    "label with a formula's end": (
+        lambda: mine(labels={"x1": "$x$"}), "labels.x1: expected 1 to 80 characters"
+    ),
+    "label of nothing": (
+        lambda: mine(labels={"q": "x"}), "labels has 'q', which is no state, input, output or unk"
+    ),
+    "matrices is a number": (lambda: mine(matrices=3), "matrices is the name of an .npz file, not"),
     "units of nothing": (lambda: mine(units={"x3": "V"}), "units has 'x3'"),
     "units is text": (lambda: mine(units="V"), "units must be a mapping"),
     "unit is a list": (lambda: mine(units={"x1": ["V"]}), "units.x1 must be one line of text"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from examples import gpebo
 from plants import shipped
-from processes import assert_refused, begin, process, python
+from processes import assert_refused, begin, process, python, refused
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 
@@ -494,18 +494,25 @@ STREAM = Settings(
     [
         ({"data": DataSettings("csv", "-", "cubic")}, "cubic"),
         ({"observer": {"name": "gpebo", "sample_time": 0.1}}, "sample_time"),
-        ({"time": TimeSettings(0.0, 5.0, 11)}, "horizon"),
+        (
+            {"time": TimeSettings(0.0, 5.0, 11)},
+            "ends with its last; leave time.start and time.horizon",
+        ),
+        (
+            {"estimator": {"name": "drem", "gamma": [1, 2]}},
+            "make 2 cases; a stream has room for one",
+        ),
     ],
 )
 def test_what_a_stream_cannot_do(changes, part):
-    with pytest.raises(ConfigError, match=part):
+    with refused(part):
         stream(replace(STREAM, **changes), shipped("circuit"))
 
 
-def test_a_stream_has_one_case():
-    several = replace(STREAM, estimator={"name": "drem", "gamma": [1, 2]})
-    with pytest.raises(ConfigError, match="2 cases"):
-        stream(several, shipped("circuit"))
+def test_before_its_first_sample_a_stream_has_reached_no_time():
+    online = Online(STREAM, shipped("circuit"), "zoh", 0.0, np.zeros(2))
+    with pytest.raises(ValueError, match="there have been no samples"):
+        _ = online.reached
 
 
 # Streams as processes -------------------------------------------------------------------------

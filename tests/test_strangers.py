@@ -310,11 +310,14 @@ BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     ("- 1\n", "expected a mapping"),
     ("", "expected a mapping"),
     (PLANT + "title: \udcff\n", "not text in UTF-8"),
+    (PLANT + "title: ${oc.env:HOME}\n", "${…} is not allowed"),
 ])
 def test_a_file_that_is_no_data_is_one_line(tmp_path, text, expected):
     folder, _ = prepared(tmp_path, "plant/x.yaml", text)
     done = gpebo("run", "--config-dir", folder, "plant=x", *SHORT, cwd=tmp_path)
     assert_refused(done, expected)
+    with refused("x.yaml", expected):
+        run(folder / "plant" / "x.yaml")
 
 
 # Any text ------------------------------------------------------------------------------------

@@ -265,7 +265,8 @@ def between(signal: Trajectory, a: Array, b: Array) -> Array:
 def sampled_window_level(regression: SampledRegression, window: float) -> Array:
     """λ_min of ∫ψᵀψ over the last ``window`` seconds at every sample (K,), to a sample's length.
 
-    NaN before the first whole window. Every window is summed afresh, as in :func:`window_level`.
+    It is NaN before the first whole window. Every window is summed afresh, as in
+    :func:`window_level`.
     """
     t, p = regression.t, regression.p
     level = np.full(len(t), np.nan)

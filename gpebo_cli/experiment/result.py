@@ -1,7 +1,7 @@
 """What a run returns: sampled signals with their names, evidence, and how long each stage took.
 
-Plain frozen dataclasses over arrays, time first. The output layer turns them into tables,
-figures and ``summary.json``; nothing in here knows about files, pandas or matplotlib.
+These are plain frozen dataclasses over arrays, time first. The output layer turns them into
+tables, figures and ``summary.json``; nothing in here knows about files, pandas or matplotlib.
 """
 
 from __future__ import annotations

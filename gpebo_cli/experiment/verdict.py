@@ -30,7 +30,7 @@ def verdict(
 ) -> str:
     """The last line: exciting or not and from when on, and how well the state is known.
 
-    Without true states: how well the estimates explain the data.
+    Without true states it says how well the estimates explain the data.
     """
     if excitation.rho is None:
         level = f"λ_min(G) = {excitation.level:.3g} with unit diagonal"

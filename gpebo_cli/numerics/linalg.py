@@ -116,9 +116,9 @@ def symmetric_eigenvalues(matrices: Array) -> Array:
 def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
     """All z_k of z_{k+1} = a_k z_k + b_k, shape (K + 1, ...), with a and b (K, ...).
 
-    For few recurrences a parallel prefix scan: it composes neighbouring affine maps in log2(K)
-    vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the recurrence. For
-    many, the recurrence itself, each step vectorised over all of them.
+    Few recurrences are found by a parallel prefix scan: it composes neighbouring affine maps in
+    log2(K) vectorised steps and never divides, so with 0 ≤ a ≤ 1 it is as stable as the recurrence.
+    Many are followed step by step, each step vectorised over all of them.
     """
     shape = np.broadcast_shapes(factor.shape, shift.shape)
     out = np.empty((shape[0] + 1, *shape[1:]))

@@ -1,9 +1,10 @@
 """From samples to signals: what is assumed between samples, as piecewise polynomials on a mesh.
 
-* zoh: the last sample is held; order 1 in the time between samples. Right for what a digital
+* zoh: the last sample is held; order 1 in the time between samples. It is right for what a digital
   controller put out.
-* linear: straight lines between samples; order 2.
-* cubic: the C² spline through the samples (not-a-knot ends); order 4. Wrong for noise and jumps.
+* linear: samples are joined by straight lines; order 2.
+* cubic: the C² spline through the samples (not-a-knot ends); order 4. It is wrong for noise and
+  jumps.
 """
 
 from __future__ import annotations

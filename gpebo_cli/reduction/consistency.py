@@ -1,8 +1,8 @@
 """Consistent values: at the start, and after a jump of the input.
 
-Two different questions. At the start the user's x0 may break constraints, and the differential
-part of it is kept. At a jump the solution is already running and what happens to it is decided
-by the equation itself, in the sense of distributions.
+These are two different questions. At the start the user's x0 may break constraints, and the
+differential part of it is kept. At a jump the solution is already running and what happens to it
+is decided by the equation itself, in the sense of distributions.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class Scaling:
     """Constant scalings under which ranks are judged: rows, states and the unit of time.
 
     Farads beside kiloohms would otherwise make an honest equation look like a rank deficiency.
-    Powers of two, so that scaling commits no rounding error.
+    They are powers of two, so that scaling commits no rounding error.
     """
 
     rows: Array  # (n,)

@@ -150,7 +150,7 @@ def whiteness(result: RunResult) -> list[Panel]:
 def parameter_error(result: RunResult, estimation: EstimationResult) -> list[Panel]:
     """Fig. 6: error of every parameter (for the circuit, the initial conditions).
 
-    Where θ varies, of the unknowns only, as in ``parameters``.
+    Where θ varies, only those of the unknowns are drawn, as in ``parameters``.
     """
     truth = estimation.true_parameters
     size = np.nan_to_num(np.max(np.abs(truth), axis=0))
@@ -528,7 +528,7 @@ def _estimate_limits(
 ) -> tuple[float, float] | None:
     """Show the truth and all estimates, but do not let a wild one flatten the truth to a line.
 
-    ``size`` of a truth that hardly moves.
+    ``size`` takes the place of the range of a truth that hardly moves.
     """
     known = truth[np.isfinite(truth)]
     if not known.size:
