@@ -25,6 +25,7 @@ _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 _ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
 _SCALED = 16  # rounds in which rows and columns are brought to the size one
 _SINGULAR = 1e-12  # of the largest: singular values of what terms leave open
+_SOLVED = 1 << 13  # factors times terms, up to which products with what solves for them pay
 _OPEN = 1e-11  # added to squares of terms: directions that they leave open come to nothing
 _FULL = 400  # factors, up to which their equations are solved as full ones
 _BESIDE_TIES = 0.1234  # decades: where factors are rounded, halves and thirds are not at an edge
@@ -203,7 +204,7 @@ class _Terms(NamedTuple):
         return np.asarray(splu(sparse).solve(right))
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _balancing(
     there: bytes, order: bytes, shape: tuple[int, int, int], mass: float
 ) -> tuple[_Terms, Callable[[Array], Array]]:
@@ -211,7 +212,7 @@ def _balancing(
     present = np.frombuffer(there, dtype=np.bool_).reshape(shape)
     terms = _Terms.of(present, np.frombuffer(order, np.int8).reshape(shape))
     counts = np.where(present.nonzero()[0], 1.0, mass)
-    if terms.total > 2 * _KEPT + 1:
+    if terms.total > 2 * _KEPT + 1 or terms.total * len(counts) > _SOLVED:
         return terms, partial(terms.nearest, counts)
     each = np.array([terms @ factor for factor in np.eye(terms.total)])
     inverse = np.linalg.pinv((each * counts) @ each.T, rcond=_SINGULAR, hermitian=True)
