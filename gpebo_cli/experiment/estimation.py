@@ -360,11 +360,12 @@ def _estimate(
     else:
         seen = np.ones(n, dtype=bool)
     estimates, columns = made(estimator)
+    requirement = estimates.requirement
     if observation.estimator is None:
-        raised = estimators.raised(estimator, estimates.requirement)
+        raised = estimators.raised(estimator, requirement)
         if raised is not estimator:
             estimator, (estimates, columns) = raised, made(raised)
-    requirement = estimates.requirement
+            requirement = estimates.requirement
     if observation.bounds:
         estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
     told = accuracy.told(determined), accuracy.told(seen)
