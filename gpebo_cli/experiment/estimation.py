@@ -281,6 +281,7 @@ def at_samples(
         doubts=online.doubts(
             made.parameters[:, -1],
             np.append(sizes[0], np.where(np.isnan(sizes[1]), online.largest, sizes[1])),
+            columns, by.requirement,
         ),
     ).with_deviations(std)
     with stage("excitation"):

@@ -257,15 +257,20 @@ class Online:
         ))
 
     def doubts(
-        self, final: Array | None = None, sizes: Array | None = None
+        self, final: Array | None = None, sizes: Array | None = None,
+        columns: IntArray | None = None, requirement: Requirement | None = None,
     ) -> tuple[Mapping[str, float], tuple[str, ...]]:
-        """How far ``final`` estimates (G, p) may be off, and warnings of that; None: the newest."""
+        """How far ``final`` estimates (G, p) may be off, and warnings of that; None: the newest.
+
+        They are about some ``columns`` (k,), with the ``requirement`` that those have.
+        """
         _, known, _ = self._newest
         return doubted.of_estimates(
             self.root, self._final if final is None else final, self.last_states, self.last_states,
             [*self.parameters, *self._system.states],
             np.append(self.natural_sizes, self.largest) if sizes is None else sizes,
-            known, self._seen, known.independent, self.requirement,
+            known, self._seen, known.independent if columns is None else columns,
+            requirement or self.requirement,
         )
 
     def fit(self) -> Fit:
