@@ -64,6 +64,13 @@ def test_of_columns_that_are_nearly_equal_one_is_estimated(small, sizes, order):
     assert order.index(2) in found.independent
 
 
+NEURON = {
+    "name": "neuron", "states": ["V", "W"], "unknowns": {"a": 0.7, "gI": 1}, "outputs": ["v"],
+    "E": [[1, 0], [0, 12.5]], "A": [["1 - v**2/3", -1], [1, -0.8]],
+    "F": [[0, 0.5], [1, 0]], "C": [[1, 0]], "initial_state": [-1, 1],
+}
+
+
 @pytest.mark.parametrize("estimator", ["least_squares", "drem"])
 def test_what_grows_hides_no_parameters_that_were_told_before(estimator):
     """FitzHugh and Nagumo's neuron: a, gI and e0_W stand for one another, and Φ grows to 1e7.
@@ -71,13 +78,16 @@ def test_what_grows_hides_no_parameters_that_were_told_before(estimator):
     V is measured. Where none but e0_V was estimated, for that was all that the Gram matrix still
     showed at the end, it was off by 1.
     """
-    plant = {
-        "name": "neuron", "states": ["V", "W"], "unknowns": {"a": 0.7, "gI": 1}, "outputs": ["v"],
-        "E": [[1, 0], [0, 12.5]], "A": [["1 - v**2/3", -1], [1, -0.8]],
-        "F": [[0, 0.5], [1, 0]], "C": [[1, 0]], "initial_state": [-1, 1],
-    }
-    found = run(plant, estimator=estimator, time={"horizon": 60, "samples": 61})
+    found = run(NEURON, estimator=estimator, time={"horizon": 60, "samples": 61})
     assert np.abs(found.errors["V"])[..., 10:].max() < 2e-3
+
+
+def test_estimates_far_from_least_squares_are_told_at_samples():
+    """The law stops learning, and Φ makes ten times V of 1e-4 of e0_V."""
+    found = run(NEURON, estimator="exciting", time={"horizon": 20, "samples": 21},
+                observer={"sample_time": 0.01})
+    assert np.abs(found.errors["V"])[..., -1].max() > 5.0
+    assert "V are up to" in "".join(found.details.warnings)
 
 
 def test_an_unknown_without_effect_is_not_told_after_resets():
