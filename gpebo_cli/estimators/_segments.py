@@ -89,13 +89,14 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
 class Gone:
     """Estimates of every case that are at hand, with what was mixed."""
 
+    t: Array  # (M,)
     values: Array  # (cases, M, p)
     mixed: Array | None  # Δ (1 or cases, M)
     requirement: Requirement
 
-    def delta(self, t: Array) -> Array | None:  # noqa: ARG002  protocol
-        """Δ (1 or cases, M) at the times of the estimates."""
-        return self.mixed
+    def delta(self, t: Array) -> Array | None:
+        """Δ (1 or cases, k) at some of the times of the estimates, (k,)."""
+        return None if self.mixed is None else self.mixed[:, np.searchsorted(self.t, t)]
 
     def parameters(self, cases: slice) -> Array:
         """η̂ of some cases, (g, M, p)."""
@@ -140,7 +141,7 @@ def in_windows(estimator: Estimator, regression: LinearRegression, t: Array) -> 
     else:  # it says what it needs of all data at once
         return None
     mixed = None if deltas[0] is None else np.concatenate([d for d in deltas if d is not None], 1)
-    return Gone(np.concatenate(etas, axis=1), mixed, requirement)
+    return Gone(t, np.concatenate(etas, axis=1), mixed, requirement)
 
 
 def errors(estimator: Affine, regression: LinearRegression) -> Sequence[ErrorsAt]:
