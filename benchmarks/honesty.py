@@ -76,11 +76,15 @@ def slope(a: Array) -> Array:
     return a[1:] * np.arange(1, len(a)).reshape(-1, *[1] * (a.ndim - 1))
 
 
-def rotation(n: int, rng: Random, speed: float) -> Jet:
-    """Matrices (K + 1, N, n, n) of a product of plane rotations with constant speeds."""
+def rotation(n: int, rng: Random, speed: float, among: Array | None = None) -> Jet:
+    """Matrices (K + 1, N, n, n) of a product of plane rotations with constant speeds.
+
+    Only the coordinates ``among`` those that are given are turned, all by default.
+    """
+    turned = np.arange(n) if among is None else among
     planes = [
-        (*rng.choice(n, 2, replace=False), rng.uniform(-speed, speed), rng.uniform(0, 6.3))
-        for _ in range(n if n > 1 else 0)
+        (*rng.choice(turned, 2, replace=False), rng.uniform(-speed, speed), rng.uniform(0, 6.3))
+        for _ in range(len(turned) if len(turned) > 1 else 0)
     ]
 
     def jet(t: Array, order: int) -> Array:

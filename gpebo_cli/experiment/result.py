@@ -92,6 +92,7 @@ class SimulationResult(SignalsResult):
     impulses: tuple[tuple[float, str], ...]  # (time, state) where a jump puts a Dirac impulse
     error_estimate: float  # relative to each state's own size, the largest
     state_errors: Array | None = None  # (n,) the estimate for each state, relative to its own size
+    vague: tuple[str, ...] = ()  # states of which few digits are known
     linear_solves: float | None = None  # what Newton's method cost; None: the plant is linear
     bounded: bool = True  # known functions are, between the times at which they are evaluated
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 
 import numpy as np
 
@@ -219,6 +220,7 @@ def _sample_simulation(
         moved=tuple(_changes(system, system.initial_state, simulation.initial_state, start, size)),
         jumps=tuple(jumps), impulses=tuple(impulses),
         error_estimate=simulation.error_estimate, state_errors=simulation.state_errors,
+        vague=tuple(compress(system.states, [] if simulation.vague is None else simulation.vague)),
         linear_solves=None if simulation.effort is None else simulation.effort.linear_solves,
         elements=signals.mesh.size, bounded=simulation.bounded,
     )

@@ -113,6 +113,7 @@ def simulation_verdict(simulated: SimulationResult) -> str:
         f"simulated: index {simulated.index}, {simulated.differential} differential and "
         f"{simulated.algebraic} algebraic equations, error estimate "
         f"{simulated.error_estimate:.1e} of each state's size{newton_note(simulated)}"
+        f"{_vague_note(simulated)}"
     )
 
 
@@ -120,13 +121,22 @@ def simulation_note(simulated: SimulationResult | None, tol: float) -> str:
     """What the last line of a run has to say of the simulation, from "; " on."""
     if simulated is None:
         return ""
-    told = newton_note(simulated)
+    told = newton_note(simulated) + _vague_note(simulated)
     if simulated.error_estimate > _AMPLIFIED * tol:
         told += (
             "; the simulation is not as good as solver.tol, only to "
             f"{simulated.error_estimate:.1e} of each state's size"
         )
     return told
+
+
+def _vague_note(simulated: SimulationResult) -> str:
+    if not simulated.vague:
+        return ""
+    return (
+        f"; less than three digits are known of {', '.join(simulated.vague)} "
+        "(error_estimate.by_state in summary.json)"
+    )
 
 
 def pauses_note(rows: Rows) -> str:

@@ -63,6 +63,7 @@ class LinearSolution:
     lost: float | None  # from when on a component's error exceeds the component
     extras: tuple[Array, ...] = ()  # of the coefficients, (K, s + 1, ...) each, or (1, 1, ...)
     uncertain: Array | None = None  # (n, columns) estimated errors at the end
+    vague: BoolArray | None = None  # (n, columns) components of which few digits are known
 
 
 # X at the nodes of each element = ``homogeneous`` X(left end) + ``particular``: the first one
@@ -103,18 +104,19 @@ def solve(
     homogeneous, particular, noise, *extras = maps
     if restarts:
         noise = _with_instants(noise, Trajectory(mesh, values), np.array(list(restarts)))
-    errors, lost, last = estimated_errors(
+    errors = estimated_errors(
         problem, mesh, homogeneous[:, -1], particular[:, -1], noise, values
     )
-    if lost == mesh.size and errors.max(initial=0.0) > _AMPLIFIED * tol:
-        errors = np.maximum(errors, _rounded_otherwise(problem, mesh, values, restarts or {}))
+    if errors.lost == mesh.size and errors.estimate > _AMPLIFIED * tol:
+        other = _rounded_otherwise(problem, mesh, values, restarts or {})
+        errors = errors._replace(largest=np.maximum(errors.largest, other))
     left = float(tail.max(initial=0.0))
     if left > _COARSE:
-        errors = np.maximum(errors, left)
-    estimate = max(left, float(errors.max(initial=0.0)))
+        errors = errors._replace(largest=np.maximum(errors.largest, left * errors.own))
     return LinearSolution(
-        Trajectory(mesh, values), estimate, errors,
-        None if lost == mesh.size else float(mesh.edges[lost + 1]), tuple(extras), last,
+        Trajectory(mesh, values), max(left, errors.estimate), errors.relative,
+        None if errors.lost == mesh.size else float(mesh.edges[errors.lost + 1]), tuple(extras),
+        errors.last, None if problem.units is None else errors.vague(tol),
     )
 
 
@@ -134,8 +136,7 @@ def _rounded_otherwise(
 
     maps = _element_maps(replace(problem, coefficients=coefficients), mesh, None)
     other, _ = _chain(maps, problem, mesh, restarts)
-    size = np.maximum(np.abs(values).max(axis=(0, 1)), np.finfo(float).tiny)
-    found = CHANCE * np.abs(other - values).max(axis=(0, 1)) / size
+    found = CHANCE * np.abs(other - values).max(axis=(0, 1))
     return np.where(np.isfinite(found), found, np.inf)
 
 
@@ -146,10 +147,10 @@ def _not_finite(
     count = _modest(values)
     if count:
         homogeneous, particular, noise = (array[:count] for array in maps[:3])
-        _, lost, _ = estimated_errors(
+        lost = estimated_errors(
             problem, Mesh(mesh.edges[: count + 1], mesh.rule), homogeneous[:, -1],
             particular[:, -1], noise, values[:count],
-        )
+        ).lost
         if lost < count:
             return nothing_left(problem.name, float(mesh.edges[lost + 1]))
     return SolverError(
@@ -177,7 +178,7 @@ def _tail_of_numbers(
     tail = np.zeros(mesh.size)
     if count:
         part = slice(count)
-        if problem.apart:
+        if problem.units is not None:
             last, particular = (np.abs(array[part, -1]) for array in maps[:2])
             made_of = last @ np.abs(values[part, 0]) + particular
         else:  # lengths are said: there may be no components

@@ -19,7 +19,7 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.mesh import SHARE, Mesh
 from gpebo_cli.numerics.problem import LinearProblem
 
@@ -33,15 +33,38 @@ _ROUNDING = 8.0  # units in the last place that cannot be resolved
 LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _SAME = 1e-9  # relative difference of rates that are constant
 _FAINT = 1e-6  # of the largest state: errors below that do not end a solution
+_FEW = 1e-3  # of a component: beyond that an error leaves less than three digits
 NOTHING = 8.0 * EPS  # of what it is made of: a component that is smaller is rounding itself
 
 
 class Errors(NamedTuple):
     """Estimated errors of each component, and where they exceed it."""
 
-    relative: Array  # (n, columns) to the component's largest value
+    largest: Array  # (n, columns) over time
+    own: Array  # (n, columns) the component's largest value, or what it is made of
+    beside: Array  # (n, columns) the same, or the largest component in units of this one
     lost: int  # first element at whose end a component is lost, or their number
-    last: Array  # (n, columns) of the right end, as it is
+    last: Array  # (n, columns) of the right end
+
+    @property
+    def relative(self) -> Array:
+        """To each component's own size."""
+        relative = self.largest / self.own
+        return np.where(np.isfinite(relative), relative, np.inf)
+
+    @property
+    def estimate(self) -> float:
+        """The largest; what has too few digits counts beside the others: it may be zero."""
+        found = self
+        if self.own is not self.beside:
+            known = np.where(self.largest < _FEW * self.own, self.own, self.beside)
+            found = self._replace(own=known)
+        return float(found.relative.max(initial=0.0))
+
+    def vague(self, tol: float) -> BoolArray:
+        """Which have too few digits, and may be more than ``tol`` of what is beside them."""
+        few = self.largest >= _FEW * self.own
+        return np.asarray(few & (self.largest > tol * self.beside))
 
 
 def estimated_errors(
@@ -95,19 +118,22 @@ def judged_errors(
     with np.errstate(over="ignore", invalid="ignore"):
         through = _through_constraints(problem, own)
         total = largest + tail + noise + EPS * (VALUE * own + through)
-        coupled = np.maximum(np.maximum(made_of, through), problem.floor)
-        if problem.apart:
-            scale = np.where(own > NOTHING * coupled, own, coupled)
-        else:
+        if problem.units is None:
             scale = np.maximum(np.maximum(own, problem.floor), SHARE * own.max(initial=0.0))
-        scale = np.maximum(scale, _TINY)
+            beside = scale = np.maximum(scale, _TINY)
+        else:
+            # Rounding that constraints amplify is no size to compare with: it is the error itself.
+            coupled = np.maximum(made_of, problem.floor)
+            scale = np.maximum(np.where(own > NOTHING * coupled, own, coupled), _TINY)
+            beside = np.maximum(scale, problem.units * (own / problem.units).max(initial=0.0))
         # A state that is nothing beside the others is not lost: there is nothing to be known of it.
         known = np.maximum(scale, _FAINT * own.max(initial=0.0))
+        if problem.units is not None:
+            known = np.where(scale <= NOTHING * through, np.maximum(known, through), known)
         lost = len(carried)
         if not (largest < known).all():
             lost = int(np.argmin((carried < known).all(axis=(1, 2))))
-        relative = total / scale
-    return Errors(np.where(np.isfinite(relative), relative, np.inf), lost, carried[-1])
+    return Errors(total, scale, beside, lost, carried[-1])
 
 
 def random_signs(K: int, n: int, kinds: int = 1) -> Array:
@@ -129,7 +155,7 @@ def least_sizes(problem: LinearProblem, made_of: Array, tol: float) -> Array:
     A share of what they are ``made_of``, and where ``tol`` of them is rounding that constraints let
     through.
     """
-    if not problem.apart:
+    if problem.units is None:
         made_of = np.full_like(made_of, made_of.max(initial=0.0))
     least = np.maximum(SHARE * made_of, problem.floor)
     return np.maximum(least, _ROUNDING * EPS / tol * _through_constraints(problem, made_of))

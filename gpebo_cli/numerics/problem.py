@@ -61,8 +61,8 @@ class LinearProblem:
     # (n, n + 1) by how much relative rounding of the components, and of 1, reaches each component
     amplification: Array | None = None
     renewal: Renewal | None = None
-    # Whether components have units of their own: then one that is small beside the others counts
-    # for itself, unless it is small beside what it is made of.
-    apart: bool = False
+    # Where components have units of their own, one that is small beside the others counts for
+    # itself, unless it is small beside what it is made of.
+    units: Array | None = None  # (n, 1)
     uncertain: Array | None = None  # (n, columns) errors of the start beside rounding
     told: bool = False  # whether the monitor has all components among its signals

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from gpebo_cli.errors import SolverError
+from gpebo_cli.errors import RoundingError, SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.mesh import Mesh, unresolved_kinds
@@ -60,14 +60,15 @@ def refine(
             there, other = evaluate(moved, found, np.full(mesh.size, -1))
             left = float(other[stuck].max())
             if np.mean(np.minimum(np.abs(other / tail - 1.0), 1.0)[stuck]) > _OTHER:
-                if left <= _LOST and (missed > 1).sum() > _MANY:
+                many = (missed > 1).sum() > _MANY
+                if left <= _LOST and many:
                     return mesh, there, other
-                if left * stuck.sum() > _SOME:
+                if many or left * stuck.sum() > _SOME:
                     t = mesh.edges[int(np.argmax(np.where(stuck, other, 0.0)))]
-                    raise SolverError(
+                    raise RoundingError(
                         f"the {name} cannot be resolved near t = {t:.6g}: rounding in its "
                         f"equations is {left:.1e} of it, whatever the elements; accepted is a "
-                        "solver.tol above that, or equations that lose fewer digits"
+                        "solver.tol above that, or equations that lose fewer digits", there,
                     )
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         _check_budget(mesh, tail, parts, max_elements, name)

@@ -179,10 +179,11 @@ def solve(
         )
     except StiffError:
         return None
-    errors, lost, _ = _errors(march, problem, mesh, found)
+    errors = _errors(march, problem, mesh, found)
+    lost = errors.lost
     return LinearSolution(
         found.trajectory,
-        max(float(tail.max(initial=0.0)), float(errors.max(initial=0.0))), errors,
+        max(float(tail.max(initial=0.0)), errors.estimate), errors.relative,
         None if lost == mesh.size else float(mesh.edges[lost + 1]), found.extras,
     )
 

@@ -90,7 +90,7 @@ def solve(
         extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
         extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in extras)
         sizes = largest_over_time(values, 2)
-        plain = replace(problem, apart=False)
+        plain = replace(problem, units=None)
         tail = unresolved_signals(plain, mesh.rule, values, extras, sizes, tol)
         poor = tail > 1e3 * tol  # its dense output is of lower order than its steps
         if not poor.any():

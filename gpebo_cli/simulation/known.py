@@ -22,6 +22,7 @@ from gpebo_cli.numerics.mesh import (
     Mesh,
     initial_edges,
     initial_mesh,
+    legendre_tail,
     unresolved,
     unresolved_kinds,
 )
@@ -174,13 +175,12 @@ def _overlooked(
             for of, count in ((c, mesh.rule.stages + 1), (seen, looks))
         )
         size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodes).max(axis=(0, 1)))
-        moves = np.ptp(nodes, axis=(0, 1)) > 0.0
-        there = (actual != nodes[:1, :1]).any(axis=(0, 1)) | moves
         missed = np.abs(mesh.rule.interpolation(places) @ nodes - actual).max(axis=1)
-        far = (missed[:, there] / size[there]).max(axis=1, initial=0.0)
-        if far.max(initial=0.0) > _SURPRISE * least:
-            tail = unresolved(nodes[..., moves], mesh.rule)
-            found |= far > _SURPRISE * np.maximum(tail, least)
+        far = (missed > _SURPRISE * least * size).any(axis=0)
+        if far.any():  # each beside its own tail: rounding of one says nothing of another
+            tail = legendre_tail(nodes[..., far], mesh.rule, size[far])
+            least_of = np.maximum(tail, least * size[far])
+            found |= (missed[:, far] > _SURPRISE * least_of).any(axis=1)
     return found
 
 

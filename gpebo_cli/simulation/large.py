@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gpebo_cli.errors import RoundingError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import series
@@ -178,7 +179,7 @@ def large_simulation(
     try:
         with np.errstate(all="ignore"):
             return _simulated(plant, mesh, cuts, solver, bounded=bounded)
-    except UndecidedError:
+    except (UndecidedError, RoundingError):
         return None
 
 
@@ -260,7 +261,8 @@ def _simulated(
         return [(x, least[:, 0]), (y, of_y[:, 0]), (u, shares)]
 
     problem = LinearProblem(
-        _no_coefficients, z0[:, None], monitor, f"plant {system.name}", floor_z, apart=True,
+        _no_coefficients, z0[:, None], monitor, f"plant {system.name}", floor_z,
+        units=units[:, None],
     )
     solution = series.solve(
         problem, equation, mesh, units=units, tol=tol, max_elements=solver.max_elements,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.reduction.consistency import Jump
 from gpebo_cli.reduction.structure import Structure
@@ -38,3 +38,4 @@ class Simulation:
     effort: Effort | None = None  # of Newton's method, where the plant is not linear
     state_errors: Array | None = None  # (n,) of each state relative to its own largest value
     lost: float | None = None  # from when on rounding errors exceed a state
+    vague: BoolArray | None = None  # (n,) states of which few digits are known

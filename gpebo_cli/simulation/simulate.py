@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from gpebo_cli.errors import ModelError, SolverError
+from gpebo_cli.errors import ModelError, RoundingError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
 from gpebo_cli.model.text import FollowsSignals
 from gpebo_cli.numerics.collocation import solve
@@ -139,16 +139,25 @@ def _simulate_linear(
     floor = SHARE * np.abs(system.initial_state)
     if first.basis is not None:
         floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
+    units = structure.scaling.columns[:, None]
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
-        _amplification(first, structure.scaling.columns, float(mesh.steps.max())), apart=True,
+        _amplification(first, structure.scaling.columns, float(mesh.steps.max())),
+        units=units,
     )
     if independent:
         problem = replace(problem, coefficients=explicit)
-    own = ivp.solve if independent else partial(solve, known=_equations(first))
-    solution = own(
-        problem, mesh, tol=solver.tol, max_elements=solver.max_elements, restarts=restarts
+    own = partial(
+        ivp.solve if independent else partial(solve, known=_equations(first)), mesh=mesh,
+        tol=solver.tol, max_elements=solver.max_elements, restarts=restarts,
     )
+    try:
+        solution = own(problem)
+    except RoundingError as error:  # perhaps of states that are zero: others are what counts then
+        most = (largest_over_time(error.found[1], 2) / units).max(initial=0.0)
+        floor = np.maximum(floor[:, None], SHARE * most * units)
+        problem = replace(problem, floor=floor)
+        solution = own(problem)
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
     u, C, *direct = solution.extras
@@ -159,6 +168,7 @@ def _simulate_linear(
         jumps=tuple((t, *happened[t]) for t in sorted(happened)),
         error_estimate=solution.error_estimate, bounded=bounded,
         state_errors=solution.errors[:, 0], lost=solution.lost,
+        vague=None if solution.vague is None else solution.vague[:, 0],
     )
 
 
