@@ -6,6 +6,8 @@ import re
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from plants import reference, shipped
 from processes import refused
 from scipy.integrate import solve_ivp
@@ -347,6 +349,34 @@ def test_start_need_not_be_zero():
     result = simulate(system, TimeSettings(start=3.0, horizon=5.0), SOLVER)
     t = np.linspace(3, 8, 77)
     np.testing.assert_allclose(result.signals.states(t)[:, 0], np.sin(t), atol=1e-12)
+
+
+@settings(deadline=None, max_examples=12)
+@given(
+    st.sampled_from([1e6, 1e9, 1.7e9, -1e9]), st.floats(0.5, 100.0), st.floats(1.0, 3000.0),
+    st.sampled_from(["sin({w}*{t})", "sign(sin({w}*{t}))", "exp(-(({t} - 1.3)*{w})**2)"]),
+)
+def test_a_start_far_from_zero_changes_no_more_than_times_are_rounded(start, w, rate, text):
+    """Refused before, or 15,000 elements, some of them of no length."""
+    def told(t):
+        hidden = int(text.startswith("sin("))  # its derivative is asked for, too
+        system = plant(
+            states=["x", "w", "z"], E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]],
+            A=[[-rate, 1, 0], [0, f"-1 - 0.5*sin({w}*{t})", hidden], [0, hidden, 1 - hidden]],
+            B=[[rate], [1], [1]], inputs={"u": text.format(w=w, t=t)}, initial_state=[1, 0, 0],
+        )
+        began = 0.0 if t == "t" else start
+        return simulate(system, TimeSettings(start=began, horizon=3.0), SolverSettings())
+
+    there, here = told(f"(t - {start!r})"), told("t")
+    assert there.signals.mesh.size <= here.signals.mesh.size + 100
+    t = np.linspace(0.0, 3.0, 301)
+    x, true = there.signals.states(np.clip(start + t, start, start + 3.0)), here.signals.states(t)
+    # The grid itself is rounded: by that, a state moves as fast as it moves at all.
+    slope = np.gradient(here.signals.states(np.linspace(0.0, 3.0, 3001)), 1e-3, axis=0)
+    rounded = np.spacing(abs(start)) * np.abs(slope).max(axis=0)
+    size = np.abs(true).max(axis=0)
+    assert (np.abs(x - true).max(axis=0) <= 10 * there.state_errors * size + rounded).all()
 
 
 @pytest.mark.parametrize("where", [3.21, 9.99, 13.37, 17.08])

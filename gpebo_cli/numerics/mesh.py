@@ -28,6 +28,7 @@ _FOOT = 1e-8  # of its final size: what a component was before may be that wrong
 _WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
 _MANY = 1 << 16  # numbers, from which on sampling them by element pays
 _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
+_BLUR = 8.0 * np.finfo(float).eps
 _EQUAL = 1e-11  # relative difference of lengths that is rounding
 _TINY = float(np.finfo(np.float64).tiny)
 _WINDOW = 1 << 12  # elements of a long mesh that are solved together
@@ -68,6 +69,11 @@ class Mesh:
 
     def __repr__(self) -> str:
         return f"<mesh of {self.size} elements, t = {self.edges[0]:g} to {self.edges[-1]:g} s>"
+
+    @property
+    def blur(self) -> Array:
+        """Shares (K,) of an element's length by which rounding of times moves its nodes."""
+        return np.asarray(_BLUR * np.abs(self.edges[1:]) / self.steps)
 
     @property
     def size(self) -> int:

@@ -49,6 +49,7 @@ def refine(
         poor = tail > tol
         if not poor.any():
             return mesh, found, tail
+        poor &= tail > mesh.blur
         # An element that was cut and is no better than the one it comes from shows rounding.
         missed = np.where(tail <= 0.25 * floor, 0.0, missed + 1.0)
         poor &= (missed < patience) | (tail >= _ROUNDING)
@@ -119,8 +120,12 @@ def _check_budget(
             f"t = {t:.6g} (tail {tail[worst]:.1e}); raise solver.max_elements or solver.tol"
         )
     if short:
+        far = abs(mesh.edges[0]) > mesh.edges[-1] - mesh.edges[0]
+        why = (
+            f"times there are told apart to {np.spacing(abs(t)):.1g} s only: let them begin at 0"
+            if far else "is there a jump or a singularity?"
+        )
         raise SolverError(
             f"the {name} cannot be resolved near t = {t:.6g}: elements reached the "
-            f"resolution of floating point (tail {tail[worst]:.1e}); is there a jump or a "
-            "singularity?"
+            f"resolution of floating point (tail {tail[worst]:.1e}); {why}"
         )

@@ -127,7 +127,7 @@ def cut_where(
         if not poor.any():
             return mesh, known
         missed = np.where(tail < 0.25 * before, 0.0, missed + 1.0)
-        poor &= missed < np.where(tail > 1e-6, _CUTS, 1)
+        poor &= (missed < np.where(tail > 1e-6, _CUTS, 1)) & (tail > mesh.blur)
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
         if not poor.any() or too_short.any() or parts.sum() > max_elements:
