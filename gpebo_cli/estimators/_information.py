@@ -79,15 +79,14 @@ class InformationAt:
         F⁻¹ has ones on its diagonal; directions in which F⁻¹ is rounding stay where they start.
         """
         p = len(start)
-        weight = (self.memory * f0)[:, None, None]
-        left, right = alpha * self.values[..., :p], alpha * self.values[..., p:]
+        gram, right = self.values[..., :p], alpha * self.values[..., p:]
         if start.any():
-            right -= left @ start[:, None]
-        diagonal = np.einsum("mii->mi", left)
-        diagonal += weight[..., 0]
+            right -= alpha * gram @ start[:, None]
+        diagonal = alpha * np.einsum("mii->mi", gram) + (self.memory * f0)[:, None]
         unit = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))[..., None]
-        left *= unit
+        left = gram * (alpha * unit)
         left *= transpose(unit)
+        np.einsum("mii->mi", left)[:] = diagonal * unit[..., 0] ** 2
         right *= unit
         try:
             moved = np.linalg.solve(left, right)
@@ -170,7 +169,7 @@ def information(
         gram = regression.gram
         if known is not None:
             gram = Trajectory(gram.mesh, gram.values + known.values)
-        memory = np.full(regression.outer.values.shape[:2], before)
+        memory = np.full(regression.mesh.points.shape, before)
         return Information(gram, Trajectory(regression.mesh, memory), level)
     if bound is None:
         start = None if known is None else beta * known.values

@@ -125,8 +125,9 @@ class Knowledge:
             return np.ones((len(kernel), gain.shape[1]), dtype=bool)
         last = gain[len(gain) - len(kernel) :]
         if units is not None:  # the row of a state that no parameter has part in is rounding
-            own = np.abs(gain) / units[:, None]
-            whole = own.max(axis=1, initial=0.0, where=np.isfinite(own))
+            own = np.abs(gain)
+            own /= units[:, None]
+            whole = np.fmax.reduce(own, axis=1, initial=0.0)
             whole = np.maximum.accumulate(whole)[-len(last) :, None]
             last = np.where(own[-len(last) :] <= _NOISE * whole, 0.0, last)
         scaled = last / self.sizes[:, None, :]

@@ -48,6 +48,7 @@ from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals
 
 _SAMPLES_AT_ONCE = 2048
+_HIDING = 10.0  # growth of Φ, from which on the end may hide what data told before
 _PER_QUANTITY = 1000  # cases up to which each quantity's own time is told
 _BATCH = 1 << 21  # numbers held at once while cases are evaluated: beyond it calls cost little
 
@@ -105,7 +106,7 @@ def continuous(
         excitation = assess(regression, t, settings.excitation, settings.solver.tol)
     with stage("estimate") as pace:
         known, seen_at = excitation.final, visible(observation, t, system.states)
-        if not known.parameters.all():
+        if not known.parameters.all() and (observation.growth or np.inf) > _HIDING:
             known = excitation.known
         seen, names = seen_at(known), (regression.parameters, system.states)
         told = dict(zip(system.states, seen[-1], strict=True))

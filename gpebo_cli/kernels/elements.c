@@ -453,10 +453,9 @@ static int through_element(const Call *call, Part *q, npy_intp k, npy_intp part,
         q->A = call->in[5] + part * call->step[5];
         q->decay = call->in[6] + part * call->step[6];
         q->f = call->in[7] + first + part++ * call->step[7];
-        for (npy_intp r = 0; r < d; r++) {
-            const double size = q->weight[r] * largest_size(q->terms + r * q->below, q->width);
-            q->size[r] = so_far[r] = larger(size, so_far[r]);
-        }
+        const double *left = q->terms;
+        for (npy_intp r = 0; r < d; r++, left += q->below)
+            q->size[r] = so_far[r] = larger(q->weight[r] * largest_size(left, q->width), so_far[r]);
         const npy_intp count = expanded(q);
         converged &= count > 0;
         for (; node + some < s && (i + 1 == parts || nodes[node + some] * parts <= i + 1); some++)

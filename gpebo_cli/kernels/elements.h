@@ -29,27 +29,13 @@ static inline void combine(double *out, const double *initial, const double *a, 
     COMBINE(1)
 }
 
-/* `enlarge` for a fixed number of columns. */
-#define ENLARGE(block)                                                                             \
-    for (; j + block <= width; j += block) {                                                       \
-        double most[block];                                                                        \
-        for (int c = 0; c < block; c++)                                                            \
-            most[c] = size[j + c];                                                                 \
-        for (npy_intp i = 0; i < rows; i++)                                                        \
-            for (int c = 0; c < block; c++)                                                        \
-                most[c] = larger(most[c], fabs(values[i * width + j + c]));                        \
-        for (int c = 0; c < block; c++)                                                            \
-            size[j + c] = most[c];                                                                 \
-    }
-
 /* size (width,): at least the largest number of each column of values (rows, width). */
-static inline void enlarge(double *size, const double *values, npy_intp rows, npy_intp width)
+static inline void enlarge(double *restrict size, const double *restrict values, npy_intp rows,
+                           npy_intp width)
 {
-    npy_intp j = 0;
-    ENLARGE(16)
-    ENLARGE(8)
-    ENLARGE(4)
-    ENLARGE(1)
+    for (npy_intp i = 0; i < rows; i++, values += width)
+        for (npy_intp j = 0; j < width; j++)
+            size[j] = larger(size[j], fabs(values[j]));
 }
 
 /* The largest of `least` and all values (count,); what is not a number stays. */

@@ -68,14 +68,16 @@ def in_frame(
     H = kernel @ X1
     Lambda, on_basis = from_left(A), _across(algebraic, domain)
     # [A_0 | D_0 | of u and y] = [Λ B | E⁺F | E⁺B, 0] − Λ H Q1ᵀ [𝒜 B | G | g_signals]
-    whole = joined(
-        _across(Lambda, domain), from_left(F), from_left(B), np.zeros((1, d, r)), axis=2
-    )
+    times = max(map(len, (E, A, B, F, C)))
     through = joined(on_basis, G, g_signals, axis=2)
     back = _across(Lambda, kernel) @ X1
-    if back.any():
-        whole = whole - back @ (np.swapaxes(Q1, 1, 2) @ through)
-    times = max(map(len, (E, A, B, F, C)))
+    touched = back.any(axis=(0, 2))  # of many states few are moved by those that are eliminated
+    parts = _across(Lambda, domain), from_left(F), from_left(B), np.zeros((1, d, r))
+    whole = joined(*parts, axis=2)
+    if touched.any() and len(back) > len(whole):
+        whole = np.broadcast_to(whole, (len(back), *whole.shape[1:])).copy()
+    if touched.any():
+        whole[:, touched] -= back[:, touched] @ (np.swapaxes(Q1, 1, 2) @ through)
     whole = np.broadcast_to(whole, (times, *whole.shape[1:]))
     of_dynamics = slice(1 if len(E) == len(A) == len(C) == 1 else times)
     return (
@@ -136,7 +138,8 @@ def regression_signals(
         offset = z[:, :, 0] @ basis.T
     else:
         offset = np.zeros((len(z), len(basis)))
-        gain = np.zeros((len(z), len(basis), z.shape[2] - 1))
+        gain = np.empty((len(z), len(basis), z.shape[2] - 1))
+        gain[:, ~basis.any(axis=1)] = 0.0
         offset[:, axes] = z[:, :, 0]
         if isinstance(axes, slice):  # at once: another copy is as large
             np.multiply(z[:, :, 1:], -signs[1:], out=gain[:, axes])

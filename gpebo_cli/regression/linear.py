@@ -17,6 +17,7 @@ from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.parametrisation import Parametrisation
 from gpebo_cli.regression.resets import ExtensionState, Reset
 
+_MANY = 16  # parameters, from which on G at the end is made without those at all other points
 _SINGULAR = 1e-10  # singular values of ψ with columns of equal size that count as zero, relatively
 _WINDOW = 1 << 12  # elements at most, and
 _AT_ONCE = 1 << 22  # numbers of [ψᵀψ | ψᵀY] at most, that are made at once of a long regression
@@ -115,6 +116,9 @@ class LinearRegression:
     @cached_property
     def gram_final(self) -> Array:
         """[G | h] at the end, (p, p + c)."""
+        if self.p >= _MANY and not (self.resets or self.dynamics or "gram" in vars(self)):
+            rows = (window._weighted() for window in self.windows())  # noqa: SLF001
+            return np.asarray(sum(own[:, : self.p].T @ own for own in rows))
         for part in self.gram_parts():
             final = part.final
         return final
@@ -139,13 +143,18 @@ class LinearRegression:
             return self.factor
         found = np.zeros((0, self.p + 1))
         for window in self.windows():
-            mesh, psi, Y = window.mesh, window.psi.values, window.Y.values
-            weights = np.sqrt(mesh.steps[:, None] * mesh.rule.integration[-1])[..., None, None]
-            both = weights * np.concatenate([psi, Y[..., None]], axis=3)[:, 1:]
-            rows = both.reshape(-1, self.p + 1)
+            rows = window._weighted()  # noqa: SLF001
             rows = np.concatenate([found, rows]) if len(found) else rows
             found = np.asarray(np.linalg.qr(rows, mode="r"))
         return found
+
+    def _weighted(self) -> Array:
+        """Rows √w [ψ | Y] at all nodes, (K s rows, p + c), w being their weights in an integral."""
+        psi, mesh = self.psi.values, self.mesh
+        weights = np.sqrt(mesh.steps[:, None] * mesh.rule.integration[-1])[..., None, None]
+        both = np.concatenate([psi, with_realisations(psi, self.Y.values)], axis=3)[:, 1:]
+        both *= weights
+        return both.reshape(-1, both.shape[3])
 
     def misfit(self, eta: Array) -> float:
         """∫‖Y − ψη‖² for parameters η (p,)."""
