@@ -12,6 +12,7 @@ from scipy.linalg import eigh, null_space
 from scipy.sparse import csr_matrix
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from benchmarks import ladders
 from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import OnDemand
@@ -307,6 +308,25 @@ def test_a_thousand_states_take_no_square_of_memory():
     assert peak < 8 * n * n * 20  # one matrix at all points would be ten times as much
     x = found.signals.states.values
     np.testing.assert_allclose(x[..., -1], x[..., 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("varying", "states", "experiment"), [(False, 6, 4), (True, 10, 4.5)])
+def test_little_more_than_the_result_is_held(varying, states, experiment):
+    """Of 41 states over all elements, and of Φ and G, which are 41 times as much each."""
+    system = ladders.plant(ladders.ladder(41, "index 1"), np.ones(41), varying=varying)
+    time, solver = {"horizon": 20.0, "samples": 101}, {"tol": 1e-9}
+
+    def simulated():
+        return simulate.simulate(system, TimeSettings(**time), SolverSettings(**solver))
+
+    def observed():
+        least_squares = {"name": "least_squares", "f0": 1e-12}
+        return run(system, estimator=least_squares, time=time, solver=solver)
+
+    for work, most in ((simulated, states), (observed, experiment * 2 * 41)):
+        size = simulated().signals.states.values.nbytes
+        work()  # what is kept for good is there then
+        assert ladders._peak(work) < most * size
 
 
 def observed(unknown, n=CELLS, **observer):

@@ -150,7 +150,8 @@ class Spectrum:
 def check_held(regression: LinearRegression, count: int) -> None:
     """Refuse so many :func:`information` at once, where they would hold too much memory."""
     what = f"{count} combinations of alpha, f0 and beta, each with matrices of its own,"
-    check_memory(what, _HELD * regression.outer.values.size * count)
+    each = regression.gram_final.size * regression.mesh.points.size
+    check_memory(what, _HELD * each * count)
 
 
 def information(

@@ -8,11 +8,10 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, CoefficientSource
-from gpebo_cli.model.entries import Entries
+from gpebo_cli.model.entries import Entries, Places
 from gpebo_cli.model.expressions import (
     Assembly,
     Bounds,
@@ -125,22 +124,27 @@ class TextCoefficients:
 
     def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
-        moving, targets = self.tape.taylor(t, order, inside), self.assembly.targets
-        values: dict[str, Array] = {}
-        places: dict[str, tuple[NDArray[np.intp], ...]] = {}
-        for k, (name, matrix) in enumerate(zip(MATRIX_NAMES, self.assembly.fixed, strict=True)):
+        moving, values = self.tape.taylor(t, order, inside), []
+        for fixed, columns, _ in self._places:
+            found = moving[:, :, columns] if columns.stop else moving[:, :1, columns]
+            if len(fixed):
+                own, found = found, np.zeros((*found.shape[:2], len(fixed) + found.shape[2]))
+                found[0, :, : len(fixed)] = fixed
+                found[:, :, len(fixed) :] = own
+            values.append(found)
+        places = (where for _, _, where in self._places)
+        return Entries(Coefficients(*values), dict(zip(MATRIX_NAMES, places, strict=True)))
+
+    @cached_property
+    def _places(self) -> list[tuple[Array, slice, Places]]:
+        """Of each matrix its constant entries, which results of the tape are others, and where."""
+        found, targets = [], self.assembly.targets
+        for k, matrix in enumerate(self.assembly.fixed):
             fixed, columns = np.flatnonzero(matrix), np.flatnonzero(targets[:, 0] == k)
             there = np.concatenate([fixed, targets[columns, 1]])
-            found = moving[:, :1, :0]
-            if len(columns):  # in a row
-                found = moving[:, :, columns[0] : columns[-1] + 1]
-            if len(fixed):
-                own, found = found, np.zeros((order + 1, found.shape[1], len(there)))
-                found[0, :, : len(fixed)] = matrix.flat[fixed]
-                found[:, :, len(fixed) :] = own
-            values[name] = found
-            places[name] = np.unravel_index(there, matrix.shape)
-        return Entries(Coefficients(**values), places)
+            some = slice(columns[0], columns[-1] + 1) if len(columns) else slice(0)  # in a row
+            found.append((matrix.flat[fixed], some, np.unravel_index(there, matrix.shape)))
+        return found
 
     @property
     def of_time(self) -> TextCoefficients:

@@ -45,7 +45,8 @@ def refine(
     floor: Array | float = np.inf  # the tail of the element that each one was cut from
     missed: Array | float = 0.0  # how many cuts had no effect
     while True:
-        found, tail = evaluate(mesh, found, kept)
+        held, found = [found], None  # ``evaluate`` may let go of it
+        found, tail = evaluate(mesh, held.pop(), kept)
         poor = tail > tol
         if not poor.any():
             return mesh, found, tail

@@ -50,6 +50,7 @@ _DIGITS = 1e-2  # of the tolerance, to which series go on
 _ROUGH = 0.02  # to which errors are carried
 _LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
+_IN_CACHE = 1 << 12  # numbers
 _WORTH = 0.5  # columns times that share, from which on it is multiplied as if it were
 _TINY = float(np.finfo(float).tiny)
 _FEW_COLUMNS = 4  # whose errors are carried one by one
@@ -159,8 +160,10 @@ def solve(
             return None
         if parts.max(initial=1.0) > 1.0:
             mesh = mesh.split(np.maximum(parts, 1.0).astype(np.intp))[0]
+    del A  # another one would be as much again
 
-    def evaluate(mesh: Mesh, _before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
+    def evaluate(mesh: Mesh, before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
+        del before
         A, f, extras = equation(mesh)
         values, change = _marched(march, A, f, problem, mesh, tol, restarts or {})
         looked = Looked.at(values, mesh.rule)
@@ -264,12 +267,15 @@ def _powers(
         return values[:1, None], np.ones(mesh.size, dtype=np.intp) if parts is None else parts
     terms = rule.to_legendre @ values.reshape(mesh.size, rule.stages + 1, w)
     counts = (largest_over_time(terms) > tol * size).any(axis=1)
-    terms = terms[:, : 1 + int(np.flatnonzero(counts).max(initial=0))].copy()
+    terms = terms[:, : 1 + int(np.flatnonzero(counts).max(initial=0))]
     degrees = np.arange(terms.shape[1])
+    whole = _legendre_powers(len(degrees), 1) @ terms
     if parts is None:
-        sizes = _largest_shares(_legendre_powers(len(degrees), 1) @ terms, size)[:, 1:]
+        sizes = _largest_shares(whole, size)[:, 1:]
         rates = ((sizes * (sizes > tol)) ** (1.0 / degrees[1:])).max(axis=1, initial=0.0)
         parts = np.ceil(np.clip(_DECAY * rates, 1.0, _MOST_PARTS)).astype(np.intp)
+    if parts.max(initial=1) == 1:
+        return whole, parts
     found, first = np.empty((parts.sum(), len(degrees), w)), parts.cumsum() - parts
     for count in set(parts.tolist()):
         some, changed = parts == count, _legendre_powers(len(degrees), count)
@@ -279,8 +285,11 @@ def _powers(
 
 def _largest_shares(values: Array, size: Array) -> Array:
     """Largest sizes (K, g) of values (K, g, w) in units of a size (w,)."""
-    shares = values / size
-    return np.asarray(np.abs(shares, out=shares).max(axis=2, initial=0.0))
+    found, some = np.empty(values.shape[:2]), max(1, _IN_CACHE // max(values[0].size, 1))
+    for first in range(0, len(values), some):
+        shares = values[first : first + some] / size
+        np.abs(shares, out=shares).max(axis=2, initial=0.0, out=found[first : first + some])
+    return found
 
 
 @lru_cache

@@ -22,7 +22,8 @@ import numpy as np
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.model.entries import Entries, Places
 from gpebo_cli.model.expressions import jets
-from gpebo_cli.reduction.scaling import Scaling, balance
+from gpebo_cli.numerics.linalg import largest_over_time
+from gpebo_cli.reduction.scaling import Scaling, balance_entries
 
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
 _SOUND = 0.1  # of the largest entry of its row, in units of the states
@@ -290,10 +291,9 @@ class _Equations:
 
 def scaling_of(found: Entries, n: int) -> Scaling:
     """:func:`balance` of the entries of n equations."""
-    dense = {name: np.zeros((1, 1, n, n)) for name in "EA"}
-    for name, whole in dense.items():
-        whole[0, 0][found.places[name]] = np.abs(getattr(found.values, name)[0]).max(axis=0)
-    return balance(found.values._replace(**dense))
+    sizes = [largest_over_time(getattr(found.values, name)[0]) for name in "EA"]
+    (i, j), kind = np.hstack([found.places[name] for name in "EA"]), [*map(len, sizes)]
+    return balance_entries(np.concatenate(sizes), (np.repeat([0, 1], kind), i, j), n)
 
 
 def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
@@ -304,14 +304,19 @@ def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
     E = _Equations(found.values.E, found.places["E"], np.zeros((n, 1, 1)), units)
     equation_of = _leading(E, A)
     shifts = _shifted(E, A, equation_of)
+    count = len(shifts)
     others, mu = _without_others(A, equation_of)
     states = np.array(sorted(equation_of), dtype=np.intp)
     chosen = np.array([equation_of[k] for k in states.tolist()], dtype=np.intp)
+    matrix = A.assembled(chosen, states)
+    left = tuple(
+        (i, {k: a[0].copy() for k, a in row.items()}, phi[0].copy())
+        for i, row, phi in (*reversed(others), *shifts)
+    )
+    del A.values, A.rows, others, shifts  # what is known comes in the place of all that
     return Explicit(
-        states, *A.assembled(chosen, states), A.forcing(chosen),
-        tuple((i, {k: a[0] for k, a in row.items()}, phi[0])
-              for i, row, phi in (*reversed(others), *shifts)),
-        len(shifts), mu, units, min(E.least, A.least), scaling.weights,
+        states, *matrix, A.forcing(chosen), left,
+        count, mu, units, min(E.least, A.least), scaling.weights,
     )
 
 

@@ -74,7 +74,30 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     """
     n = c.E.shape[2]
     sizes = np.array([largest_over_time(distinct(matrix)[0]) for matrix in (c.E, c.A)])
-    factors, *_ = _factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)
+    return _scaling(_factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)[0], n)
+
+
+def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n: int) -> Scaling:
+    """:func:`balance` of n equations by entries of these sizes (e,): 0 of E or 1 of A, i and j."""
+    some = sizes > 0.0
+    while True:
+        (kind, i, j), logs = (place[some] for place in places), np.log(sizes[some])
+        terms = _Terms.at(i, j, np.asarray(kind - 1, dtype=np.float64), (n, n))
+        factors = terms.nearest(np.ones(len(logs)), logs)
+        entries = np.exp(terms @ factors + logs)
+        if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
+            return _scaling(factors, n)
+        most = np.zeros((2, n))
+        for largest, place in zip(most, (i, j), strict=True):
+            np.maximum.at(largest, place, entries)
+        rest = entries > _NOTHING * np.sqrt(most[0, i] * most[1, j])
+        if rest.all():
+            return _scaling(factors, n)
+        some[some] = rest  # as in ``_factors``
+
+
+def _scaling(factors: Array, n: int) -> Scaling:
+    """From the logarithms of the factors (2 n + 1,)."""
     r = factors[:n]
     # A factor of all rows is left open, and means nothing.
     weights = 10.0 ** np.rint((r - r[0]) / np.log(10.0)) if n else np.zeros(0)
@@ -153,9 +176,14 @@ class _Terms(NamedTuple):
     @classmethod
     def of(cls, there: BoolArray, order: NDArray[np.int8]) -> _Terms:
         """For the entries that are ``there``, derivatives of this ``order`` (2, a, b)."""
-        (kind, i, j), (_, a, b) = there.nonzero(), there.shape
+        kind, i, j = there.nonzero()
         of_time = np.asarray(kind + order[kind, i, j] - 1, dtype=np.float64)
-        j, n = a + j, a + b + 1
+        return cls.at(i, j, of_time, there.shape[1:])
+
+    @classmethod
+    def at(cls, i: IntArray, j: IntArray, of_time: Array, shape: tuple[int, ...]) -> _Terms:
+        """For entries (e,) of rows i and columns j of a matrix of this shape."""
+        j, n = shape[0] + j, sum(shape) + 1
         every, last = np.arange(n), np.full(n, n - 1)
         down = np.concatenate([i, j, every, every, last])
         return cls(i, j, of_time, n, down * n + np.concatenate([j, i, every, last, every]))

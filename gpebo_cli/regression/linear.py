@@ -92,7 +92,8 @@ class LinearRegression:
             ones = np.ones(self.p)
             return filtered(self.outer, 0.0 * ones, ones, self.dynamics)
         if not self.resets:
-            return self.outer.integral()
+            held = self.p < _MANY or "outer" in vars(self)
+            return (self if held else replace(self)).outer.integral()
         pieces, known = [], np.zeros((self.p, self.p + 1))
         level = 0.0
         for segment, reset in zip(self.segments, (*self.resets, None), strict=True):

@@ -99,8 +99,7 @@ class _Plant:
 
     def entries(self, mesh: Mesh) -> Coefficients:
         """Every entry at the points of a mesh."""
-        if self.eliminated:
-            del self.form  # two of them would be as much again
+        vars(self).pop("form", None)  # two of them would be as much again
         self.at, self.eliminated = mesh, False
         self.found = entries(
             self.system.coefficients, mesh.points.ravel(), self.order, mesh.inside.ravel()
@@ -244,6 +243,7 @@ def _simulated(
     x0, z0 = _start(plant)
     floor_z = SHARE * np.abs(form.reduced(x0))[:, None]
     floor = form.sizes_from(floor_z)
+    del form  # there may be others, on meshes that are finer
 
     def equation(mesh: Mesh) -> series.Equation:
         form = plant.eliminate(mesh)
