@@ -350,3 +350,29 @@ def test_a_figure_of_a_recording_shows_where_states_swing():
     for panel in panels:
         assert panel.limits[0] < -0.9
         assert panel.limits[1] > 0.9
+
+
+@pytest.mark.parametrize("hold", ["linear", "zoh"])
+def test_the_error_estimate_is_that_of_a_finer_solution(hold):
+    """Along a rough recording: neither a tenth nor ten times of what a finer tolerance changes."""
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.02, 0.3, 60))
+    data = {"t": t, "u": rng.standard_normal(60), "y": rng.standard_normal(60)}
+    plant = {
+        "name": "tank", "states": ["h"], "inputs": {"u": 0}, "unknowns": {"gain": 1, "leak": 1},
+        "outputs": ["y"], "E": [[1]], "A": [[-1]], "F": [["u", -1]], "C": [[1]],
+        "initial_state": {"h": 0},
+    }
+    rough, fine = (
+        api_run(
+            plant, observer="kalman_bucy", data={**data, "hold": hold}, solver={"tol": tol},
+            noise={"name": "gaussian", "outputs": 0.1}, time={"samples": 997},
+        ).details for tol in (1e-2, 1e-11)
+    )
+    found = max(
+        (np.abs(one - other) / np.abs(other).max(axis=1)).max() for one, other in (
+            (rough.estimation.parameters, fine.estimation.parameters),
+            (rough.estimation.parameters_std, fine.estimation.parameters_std),
+        )
+    )
+    assert 0.1 < rough.regression.error_estimate / found < 10.0

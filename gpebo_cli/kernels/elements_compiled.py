@@ -43,14 +43,12 @@ def chain(
     return values, int(whole[0])
 
 
-def carried_errors(
-    values: Array, *others: Any, renew: Callable[[Array, Array], Array] | None = None
-) -> tuple[Array, Array]:
-    """In C for few components that nothing replaces."""
-    small = renew is None and _is_small(*values.shape[2:])
+def carried_errors(values: Array, *others: Any) -> tuple[Array, Array]:
+    """In C for few components."""
+    small = _is_small(*values.shape[2:])
     found: tuple[Array, Array] = (
         _compiled.carried_errors(values, *others) if small
-        else elements_numpy.carried_errors(values, *others, renew=renew)
+        else elements_numpy.carried_errors(values, *others)
     )
     return found
 

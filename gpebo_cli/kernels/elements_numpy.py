@@ -112,8 +112,7 @@ def chain(
 
 def carried_errors(
     values: Array, to_legendre: Array, powers: Array, last: Array, particular: Array, noise: Array,
-    signs: Array, h: Array, level: float, end: float, chance: float, same: float, *,
-    renew: Callable[[Array, Array], Array] | None = None,
+    signs: Array, h: Array, level: float, end: float, chance: float, same: float,
 ) -> tuple[Array, Array]:
     """How far errors of elements may be carried, and what else counts of the solution.
 
@@ -129,8 +128,7 @@ def carried_errors(
     by less than ``level`` over two degrees are noise; ``end`` units in the last place are lost in
     solving an element; a sum of independent errors may exceed its root mean square by √``chance``;
     rates that differ by less than ``same`` are constant: errors may then be wrong in the same
-    direction each time. ``renew`` says what becomes of errors (e, n, c) of the limit (n, c) at an
-    edge.
+    direction each time.
 
     Returns:
         bounds of the errors at right ends (K, n, c); and the largest over time (5, n, c) of these,
@@ -160,9 +158,6 @@ def carried_errors(
         start[:, 0] = 0.0
         error, ends = start.reshape(n, 2 * S * columns), np.empty_like(added)
         for k in range(K):
-            if k and renew is not None:
-                error = np.moveaxis(error.reshape(n, 2 * S, columns), 1, 0)
-                error = np.moveaxis(renew(values[k - 1, -1], error), 0, 1).reshape(n, -1)
             ends[k] = error = last[k if len(last) > 1 else 0] @ error + added[k]
         squares = np.square(ends).reshape(K, n, 2, S, columns).sum(axis=3)
         rates = noise[..., :n] / h[: len(noise), None, None]

@@ -102,6 +102,10 @@ def solve(
     if whole < mesh.size:
         raise _not_finite(problem, mesh, maps, values, float(mesh.edges[whole]))
     homogeneous, particular, noise, *extras = maps
+    left = float(tail.max(initial=0.0))
+    if problem.renewal is not None:
+        of_each = np.full(problem.start.shape, left)
+        return LinearSolution(Trajectory(mesh, values), left, of_each, None, tuple(extras))
     if restarts:
         noise = _with_instants(noise, Trajectory(mesh, values), np.array(list(restarts)))
     errors = estimated_errors(
@@ -110,7 +114,6 @@ def solve(
     if errors.lost == mesh.size and errors.estimate > _AMPLIFIED * tol:
         other = _rounded_otherwise(problem, mesh, values, restarts or {})
         errors = errors._replace(largest=np.maximum(errors.largest, other))
-    left = float(tail.max(initial=0.0))
     if left > _COARSE:
         errors = errors._replace(largest=np.maximum(errors.largest, left * errors.own))
     return LinearSolution(
@@ -145,7 +148,7 @@ def _not_finite(
 ) -> SolverError:
     """Why a solution is not finite: it grows, or what rounding left of something small does."""
     count = _modest(values)
-    if count:
+    if count and problem.renewal is None:
         homogeneous, particular, noise = (array[:count] for array in maps[:3])
         lost = estimated_errors(
             problem, Mesh(mesh.edges[: count + 1], mesh.rule), homogeneous[:, -1],
@@ -394,7 +397,7 @@ def _chain(
     restarts: Mapping[float, Callable[[Array], Array]],
 ) -> tuple[Array, int]:
     """Point values (K, s + 1, n, columns), and how many elements in front are finite."""
-    renew = None if problem.renewal is None else problem.renewal.state
+    renew = problem.renewal
     homogeneous, particular, *_ = maps
     if not restarts:
         return elements.chain(homogeneous, particular, problem.start, renew)

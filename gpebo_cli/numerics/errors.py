@@ -77,12 +77,11 @@ def estimated_errors(
     equation, [of each component, and alone], can bring about in an element; relative rounding of
     them is an error.
     """
-    rule, renewal = mesh.rule, problem.renewal
+    rule = mesh.rule
     noise[:, :, values.shape[2] :] += _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
     carried, largest = elements.carried_errors(
         values, rule.to_legendre, rule.to_next, last, particular, noise,
         random_signs(len(values), len(problem.start), 2), mesh.steps, LEVEL, END, CHANCE**2, _SAME,
-        renew=None if renewal is None else renewal.error,
     )
     if problem.uncertain is not None:
         of_start = np.zeros((len(values), 1, *last.shape[1:]))

@@ -33,14 +33,6 @@ class LinearEquation(NamedTuple):
 Monitor = Callable[[Array, tuple[Array, ...]], Iterable[tuple[Any, float | Array]]]
 
 
-class Renewal(NamedTuple):
-    """An equivalent value at every edge to continue with: a basis whose columns grow is changed."""
-
-    state: Callable[[Array], Array]  # what replaces the limit from the left (n, columns)
-    # What becomes of small errors (e, n, columns) of that limit, which is the first argument
-    error: Callable[[Array, Array], Array]
-
-
 @dataclass(frozen=True)
 class LinearProblem:
     """The equation, and which other signals of the solution have to be resolved by the mesh.
@@ -60,7 +52,9 @@ class LinearProblem:
     floor: float | Array = 0.0
     # (n, n + 1) by how much relative rounding of the components, and of 1, reaches each component
     amplification: Array | None = None
-    renewal: Renewal | None = None
+    # An equivalent value at every edge to continue with, in place of the limit from the left (n,
+    # columns): a basis whose columns grow is changed. What errors do is then not known.
+    renewal: Callable[[Array], Array] | None = None
     # Where components have units of their own, one that is small beside the others counts for
     # itself, unless it is small beside what it is made of.
     units: Array | None = None  # (n, 1)

@@ -19,7 +19,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, Renewal
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 
 _WINDOWS = 10  # to a horizon
@@ -56,9 +56,9 @@ def window_gramians(
         found = products(values, extras)
         return [(found.reshape(*found.shape[:2], -1), 0.0)]
 
-    anew = Renewal(lambda reached: np.eye(len(reached)), lambda _, error: np.zeros_like(error))
     problem = LinearProblem(
-        coefficients, np.eye(n), monitor, "observability Gramian", renewal=anew
+        coefficients, np.eye(n), monitor, "observability Gramian",
+        renewal=lambda reached: np.eye(len(reached)),
     )
     mesh = Mesh(mesh.edges, radau_rule(max(mesh.rule.stages, _STAGES)))
     solution = solve(problem, mesh, tol=tol, max_elements=max_elements)

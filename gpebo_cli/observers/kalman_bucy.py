@@ -319,7 +319,7 @@ class KalmanBucy:
                 noise.variances + (np.nan if unknown else 0.0),
             ),
             truth=CurrentState(known),
-            error_estimate=max(evidence.error_estimate, filtered.error_estimate),
+            error_estimate=filtered.error_estimate,
             assumptions=(
                 *evidence.assumptions,
                 Assumption(
