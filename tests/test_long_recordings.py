@@ -11,12 +11,14 @@ from gpebo_cli import estimators, run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.excitation import assess
+from gpebo_cli.evidence.groups import grouped
 from gpebo_cli.experiment.fit import _varies_slowly
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Measurements, build
-from gpebo_cli.recordings.hold import Rows, held, recording_mesh
+from gpebo_cli.recordings.hold import held, recording_mesh
 from gpebo_cli.regression import linear
 from gpebo_cli.settings import ExcitationSettings, SolverSettings
 from tests.plants import shipped
@@ -143,8 +145,8 @@ def test_a_bend_at_a_sample_within_a_group_is_no_edge():
     """Edges elsewhere, such as a jump of the matrices, stay."""
     samples, jump = np.linspace(0.0, 100.0, 20_001), 12.3456
     edges = np.sort(np.append(samples, jump))
-    rows = Rows(samples, lines=False)
-    groups = uncertainty._grouped(rows, 100.0, np.array([50.0]), np.zeros(1), 20, 16)
+    rows = Rows(samples)
+    groups = grouped(rows, 100.0, np.array([50.0]), np.zeros(1), 20, 16)
     mesh, fresh, _ = uncertainty._mesh(edges, groups)
     expected = np.union1d(groups.starts, [jump, 100.0])
     np.testing.assert_array_equal(mesh.edges, expected)

@@ -18,7 +18,7 @@ from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.recordings.hold import Rows
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.results.report import run_lines
 from gpebo_cli.settings import DataSettings, NoiseSettings, Settings, TimeSettings
 
@@ -59,7 +59,7 @@ def test_the_mean_of_white_samples():
     t = np.array([0.1, 0.25, 1.0, 7.03, 10.0])
     of_eta, of_x = deviations(
         directly, summing(f0), np.full((5, 1, 1), 2.0), np.linspace(0, 10, 5),
-        Rows(np.arange(100) * step, lines=False), np.array([sigma**2]), t,
+        Rows(np.arange(100) * step), np.array([sigma**2]), t,
     )
     whole = np.floor(t / step + 1e-9)
     part = t - whole * step
@@ -79,7 +79,7 @@ def test_the_level_is_that_of_the_residual_less_what_the_fit_takes():
             lambda t, sample=sample: np.repeat(sample, t.shape[1]).reshape(*t.shape, 1),
             ["a"], 5.0, 5,
         )
-        found.append(noise_level(directly, regression, Rows(mesh_edges, False), np.ones(1)) ** 2)
+        found.append(noise_level(directly, regression, Rows(mesh_edges), np.ones(1)) ** 2)
     assert np.mean(found) == pytest.approx(0.09, rel=4.0 * np.sqrt(2.0 / 4.0 / 400))
 
 
@@ -161,6 +161,9 @@ UNEVEN = np.cumsum(np.random.default_rng(0).uniform(0.1, 1.0, 8))
     ([UNEVEN], "linear", {"name": "least_squares", "beta": 0.3}, {}),
     ([UNEVEN], "linear", {"name": "gradient"}, {"remedy": "reset", "reset_times": [2.0, 3.0]}),
     ([PAUSE, UNEVEN], "linear", {"name": "least_squares"}, {}),
+    ([PAUSE], "cubic", {"name": "least_squares"}, {}),
+    ([PAUSE, UNEVEN], "cubic", {"name": "least_squares", "beta": 0.3}, {}),
+    ([UNEVEN], "cubic", {"name": "gradient"}, {"remedy": "reset", "reset_times": [2.0, 3.0]}),
 ])
 def test_of_a_recording_every_row_counts_as_one_error(times, hold, estimator, more, tmp_path):
     """Variances of what each row's error does by itself add up, in pauses, too; of two files."""

@@ -13,18 +13,17 @@ orthogonal transformations: no variance can become negative, whatever the roundi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
+from gpebo_cli.evidence.groups import Groups, grouped
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.recordings.hold import PAUSE, Rows
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
@@ -36,9 +35,9 @@ _MOST_PARTS = 8
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
 _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
+_AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
 _GROUPS = 2000  # of samples, by which many of them are replaced at first
 _PER_ELAPSED = 64  # groups at least, since the start, at first
-_AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
 _BESIDE = 8  # errors that stand beside each other in a factor
 _STIFF = 1e12  # rates times steps, from which on rows count alike
 _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
@@ -58,11 +57,11 @@ def deviations(
     most, per, before = len(rows.t) // _GROUPS, _PER_ELAPSED, list[Array]()
     anew = edges[:1] if starts is None else starts
     while True:
-        groups = _grouped(rows, edges[-1], t, anew, most, per)
+        groups = grouped(rows, edges[-1], t, anew, most, per)
         *found, _ = propagated(
             observer, estimator, gain, edges, groups, variances, t, None, starts
         )
-        if most <= 1 or (before and all(map(_agree, before, found))):
+        if groups.alone or (before and all(map(_agree, before, found))):
             return found[0], found[1]
         finer = 4 if before else 2
         before, most, per = found, most // finer, per * finer
@@ -71,82 +70,6 @@ def deviations(
 def _agree(coarse: Array, fine: Array) -> bool:
     largest = fine.max(axis=0, initial=0.0)
     return bool((np.abs(coarse - fine) <= _AGREE * (fine + _AGREE * largest)).all())
-
-
-class Groups(NamedTuple):
-    """Rows in groups: one error for each, that moves integrals as all of its own together do."""
-
-    starts: Array  # (G,) the times of their first rows, and
-    after: Array  # (G,) of the rows behind these
-    shares: Array  # (G,) of a row's deviation
-    others: Array  # the times of all other rows
-    lines: bool  # as of the rows
-
-    def weights(self, t: Array, group: IntArray, until: Array) -> Array:
-        """Shares at times t (…,) of the errors that count there, (1 or 2, …).
-
-        Of a group's own one and of the next one's, which it gives way to ``until`` (G,).
-        """
-        if not self.lines:
-            return np.ones((1, *t.shape))
-        tau = (t - self.starts[group]) / (until - self.starts)[group]
-        return np.asarray([1.0 - tau, tau])
-
-
-def _grouped(rows: Rows, end: float, t: Array, starts: Array, most: int, per: int) -> Groups:
-    """Rows (N,) up to ``end`` in groups of up to ``most``.
-
-    After k rows from a start they are of up to k/``per``. The row at or before a time of ``t`` or
-    ``starts`` is the first one of its group, and so are those on both sides of a pause.
-    """
-    if most <= 1:
-        return each_alone(rows)
-    instants, lines = rows
-    if not lines:  # nothing is held from the end on
-        instants = instants[: np.searchsorted(instants, end)]
-    count = len(instants)
-    near = 1e-6 * float(np.diff(instants).min())
-
-    def at(times: Array) -> IntArray:
-        return np.searchsorted(instants, times + near, side="right").clip(1) - 1
-
-    steps = np.diff(instants, append=max(end, instants[-1]))
-    pauses = np.flatnonzero(steps > PAUSE * np.median(steps))
-    fresh = at(starts)
-    bounds = np.unique(np.concatenate([
-        [0, count - 1, count], at(t), fresh, pauses, (pauses + 1).clip(max=count)
-    ]))
-    origins = fresh[np.searchsorted(fresh, bounds, side="right").clip(1) - 1]
-    found: list[int] = []
-    for (k, stop), origin in zip(pairwise(bounds.tolist()), origins.tolist(), strict=False):
-        while k < stop:
-            found.append(k)
-            k += max(1, min(most, (k - origin) // per))  # noqa: PLW2901
-    first = np.array(found)
-    if lines:  # what each row counts for, and what the first ones of groups do, with lines between
-        own, whole = (_of_lines(x) for x in (instants, instants[first]))
-        group = np.repeat(np.arange(len(first)), np.diff(first, append=count))
-        tau = (instants - instants[first][group]) / np.diff(instants[first], append=np.inf)[group]
-        squares = np.bincount(group, (1.0 - tau) * own**2)
-        squares[1:] += np.bincount(group, tau * own**2)[:-1]
-    else:
-        whole, squares = (np.add.reduceat(steps**power, first) for power in (1, 2))
-    return Groups(
-        instants[first], instants[(first + 1).clip(max=count - 1)], np.sqrt(squares) / whole,
-        np.delete(instants, first), lines,
-    )
-
-
-def _of_lines(t: Array) -> Array:
-    """∫ of what straight lines between times (N,) make of 1 at one of them and 0 at the others."""
-    half = 0.5 * np.diff(t)
-    return np.asarray(np.append(half, 0.0) + np.append(0.0, half))
-
-
-def each_alone(rows: Rows) -> Groups:
-    """Rows, each with its own error."""
-    t = rows.t
-    return Groups(t, np.append(t[1:], np.inf), np.ones(len(t)), t[:0], rows.lines)
 
 
 def propagated(
@@ -170,8 +93,10 @@ def propagated(
         anew[np.searchsorted(mesh.edges, starts)] = True
     anew[0] = L is None  # else an error of the last row goes on
     fresh[0] &= anew[0] or _among(mesh.edges[:1], groups.starts, 1e-3 * mesh.steps[0])[0]
-    beside = group[:, None] + np.arange(1 + groups.lines)  # the errors that count in an element
-    shares = groups.shares[beside.clip(max=len(groups.shares) - 1)]
+    # The errors that count in an element.
+    beside = groups.first[group, None] + np.arange(1 + groups.memory.shape[1])
+    beside = beside.clip(max=len(groups.shares) - 1)
+    shares, memory = groups.shares[beside], groups.memory[beside]
     for first in range(0, mesh.size, stretch):
         part = slice(first, first + stretch)
         joint = _joint(observer, estimator, mesh, part, n)
@@ -182,8 +107,8 @@ def propagated(
         element, places = sampler.element[chosen], sampler.weights[chosen]
         wanted, place = np.unique(element - first, return_inverse=True)
         factors, L = _factors(
-            maps[:, -1], fresh[part], anew[part], shares[part, :, None] * np.sqrt(variances), L,
-            zeta, wanted,
+            maps[:, -1], fresh[part], anew[part], shares[part, :, None] * np.sqrt(variances),
+            memory[part], L, zeta, wanted,
         )
         if not len(wanted):
             continue
@@ -195,8 +120,9 @@ def propagated(
         o, e = observer(t[chosen], inside), estimator(t[chosen], inside)
         eta = e.C @ reached[:, zeta:]
         rows = o.C.shape[1] - n  # of Y; those of the offset stand below
-        # Errors of one row and the one behind it, not of many.
-        now = groups.weights(t[chosen], group[element], groups.after) / shares[element].T
+        now = groups.weights(t[chosen], group[element], groups.after)
+        if not groups.alone:  # errors of one row and the one behind it, not of many
+            now = now / shares[element].T
         e_now = sum(
             each[:, None, None] * before[:, size + k * signals : size + (k + 1) * signals]
             for k, each in enumerate(now)
@@ -418,15 +344,15 @@ def _joint(
 
 
 def _factors(
-    ends: Array, fresh: BoolArray, anew: BoolArray, deviations: Array, L: Array | None, zeta: int,
-    wanted: IntArray,
+    ends: Array, fresh: BoolArray, anew: BoolArray, deviations: Array, memory: Array,
+    L: Array | None, zeta: int, wanted: IntArray,
 ) -> tuple[Array, Array]:
     """L of [ζ; s; e] at the left ends of elements ``wanted`` (W, d + a (m + r), ·), and at the end.
 
     The errors of several rows stand in L side by side, before it is made triangular again. An
     element makes ``ends`` of it (K, d, d + a (m + r)). Of the a errors that count, with
-    ``deviations`` (K, a, m + r), the first gives way to another one where ``fresh``, and all of
-    them do where ``anew``; ζ is zero there.
+    ``deviations`` (K, a, m + r) and a ``memory`` (K, a, a − 1) of those before them, the first
+    gives way to another one where ``fresh``, and all of them do where ``anew``; ζ is zero there.
     """
     size, (alive, signals) = ends.shape[1], deviations.shape[1:]
     own, whole = np.arange(signals), size + alive * signals
@@ -446,6 +372,10 @@ def _factors(
                 used = whole
             L[size : whole - signals] = L[size + signals :]
             L[whole - signals :] = 0.0
+            for back, share in enumerate(memory[k, block].tolist(), 2):
+                if share:
+                    before = whole - back * signals
+                    L[whole - signals :] += share * L[before : before + signals]
             L[whole - signals + own, used + own] = deviations[k, block]
             used += signals
         if asked[k]:

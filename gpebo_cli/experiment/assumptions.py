@@ -22,10 +22,10 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import inverse_or_none
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Measurements, Observation, Observer, build
 from gpebo_cli.observers._base import AffineStateMap
 from gpebo_cli.observers.gpebo import Gpebo
-from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.reduction.scaling import scales_of
@@ -144,7 +144,7 @@ def _per_unit(
     if observation.errors is None or not plain or not isinstance(state_map, AffineStateMap):
         return {}
     (start, stop), rows = seen.span, None if seen.noise is None else seen.noise.rows
-    rows = rows or Rows(np.arange(start, stop, settings.noise.sample_time), lines=False)
+    rows = rows or Rows(np.arange(start, stop, settings.noise.sample_time))
     of_eta, of_x = of_least_squares(
         observation.errors, regression, known, state_map.gain(np.array([stop]))[0], rows,
         np.concatenate([np.zeros(system.m), np.ones(system.r)]),

@@ -28,8 +28,8 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import SignalNoise
-from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.schema import per_name
 from gpebo_cli.settings import NoiseSettings
 from gpebo_cli.simulation.signals import Signals

@@ -18,8 +18,8 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Sampling, build, sampling
-from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of

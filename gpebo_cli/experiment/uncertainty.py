@@ -8,19 +8,19 @@ import numpy as np
 
 from gpebo_cli.estimators import ResumableEstimator
 from gpebo_cli.estimators import errors as behind
+from gpebo_cli.evidence.groups import each_alone
 from gpebo_cli.evidence.uncertainty import (
     SampledDeviations,
     after_reset,
     deviations,
-    each_alone,
     noise_level,
     propagated,
 )
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers._base import Differentiable, Observation
-from gpebo_cli.recordings.hold import Rows
 from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.estimator import Affine, Estimator
 from gpebo_cli.regression.linear import LinearRegression
@@ -89,7 +89,7 @@ def _rows(source: Source, noise: NoiseSettings) -> Rows:
     if source.rows is not None:
         return source.rows
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
-    return Rows(np.arange(start, stop, noise.sample_time), lines=False)
+    return Rows(np.arange(start, stop, noise.sample_time))
 
 
 def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
@@ -163,6 +163,7 @@ def _over_resets(
 ) -> Iterator[tuple[Array, Array]]:
     """Deviations of every case, from segment to segment."""
     segments, resets = regression.segments, regression.resets
+    groups = each_alone(rows, regression.mesh.edges[:1])
     cuts = np.searchsorted(t, [reset.time for reset in resets], side="left")
     parts = np.split(np.arange(len(t)), cuts)
     known: tuple[ExtensionState, ...] = ()
@@ -175,8 +176,7 @@ def _over_resets(
         reached = estimator.resume(segment, mesh.edges[-1:], known).reached
         for g, system in enumerate(systems):
             *of, L = propagated(
-                errors, system, gains[g][own], mesh.edges, each_alone(rows), variances,
-                t[own], factors[g],
+                errors, system, gains[g][own], mesh.edges, groups, variances, t[own], factors[g],
             )
             found[g].append((of[0], of[1]))
             if reset is not None:

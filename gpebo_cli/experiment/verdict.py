@@ -13,7 +13,7 @@ from gpebo_cli.experiment.result import ActiveBound, Fit, RecordingResult, Simul
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
-from gpebo_cli.recordings.hold import PAUSE, Rows
+from gpebo_cli.numerics.rows import PAUSE, Rows
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model

@@ -23,7 +23,7 @@ from gpebo_cli.model.descriptor import (
 )
 from gpebo_cli.model.text import switching
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, aside
-from gpebo_cli.recordings.hold import Rows
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps
 from gpebo_cli.regression.estimator import Estimator

@@ -10,15 +10,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource
 from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
-
-PAUSE = 5.0  # times the median step: a longer one
 
 # (times (N,), where it is decided which samples they are between (N,)) -> values (N, c)
 Held = Callable[[Array, Array], Array]
@@ -28,24 +25,6 @@ _FIRST_ELEMENTS = 24  # at least this many, as for a simulation
 _PROBED = 64  # elements on which the plant's matrices are looked at
 _SAME = 1e-13  # slopes that differ by less than this share of the signal's size are the same
 _SMALLEST = 1e-9  # an edge nearer than this share of a step to a sample is that sample
-
-
-class Rows(NamedTuple):
-    """Where signals were sampled: each row has an error of its own."""
-
-    t: Array  # (N,) seconds, ascending
-    lines: bool  # errors between them are on straight lines; else they are held from each one on
-
-    def intensities(self, t: Array) -> Array:
-        """Of white noise that moves integrals as errors of variance 1 do, at times t (M,), in s.
-
-        What lines make of an error beside a time has a part in the steps on both sides.
-        """
-        step = np.diff(self.t)
-        if self.lines:
-            wide = np.pad(step, 1, mode="edge")
-            step = 0.25 * (wide[:-2] + 2.0 * step + wide[2:])
-        return np.asarray(step[np.searchsorted(self.t, t, side="right").clip(1, len(step)) - 1])
 
 
 def held(t: Array, values: Array, hold: str) -> Held:

@@ -12,7 +12,8 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
 from gpebo_cli.model.text import FollowsSignals
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.recordings.hold import Rows, held, recording_mesh
+from gpebo_cli.numerics.rows import Rows
+from gpebo_cli.recordings.hold import held, recording_mesh
 from gpebo_cli.recordings.table import Samples, Table, read_table
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
@@ -42,7 +43,7 @@ class Recording:
         """Those of the span, whose ends count as rows."""
         t, (start, stop) = self.table.samples.t, self.span
         inner = t[(t > start) & (t < stop)]
-        return Rows(np.concatenate([[start], inner, [stop]]), lines=self.hold != "zoh")
+        return Rows(np.concatenate([[start], inner, [stop]]), self.hold)
 
     def sampled(self, t: Array) -> Samples:
         """All signals at the times t (N,) of the span.

@@ -1,0 +1,34 @@
+"""Where signals are sampled; recordings have rows, and so has the noise of simulations."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gpebo_cli.model.descriptor import Array
+
+PAUSE = 5.0  # times the median step: a longer one
+
+
+class Rows(NamedTuple):
+    """Where signals were sampled: each row has an error of its own."""
+
+    t: Array  # (N,) seconds, ascending
+    hold: str = "zoh"  # what is assumed between them, of their errors, too
+
+    @property
+    def lines(self) -> bool:
+        """Whether errors between rows are on straight lines, or near them; else they are held."""
+        return self.hold != "zoh"
+
+    def intensities(self, t: Array) -> Array:
+        """Of white noise that moves integrals as errors of variance 1 do, at times t (M,), in s.
+
+        What lines make of an error beside a time has a part in the steps on both sides.
+        """
+        step = np.diff(self.t)
+        if self.lines:
+            wide = np.pad(step, 1, mode="edge")
+            step = 0.25 * (wide[:-2] + 2.0 * step + wide[2:])
+        return np.asarray(step[np.searchsorted(self.t, t, side="right").clip(1, len(step)) - 1])
