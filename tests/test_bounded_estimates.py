@@ -22,43 +22,69 @@ TANK = {
 HORIZON, F0 = 8.0, 1e-3
 LOW = -0.84
 BOUNDS = {"states": {"h1": [LOW, None]}, "unknowns": {"leak": [0, None]}}
-# z = (h1, h2, leak, sin t, cos t) moves by itself: a step is an exponential.
-M = np.zeros((5, 5))
-M[:2, :2], M[0, 2], M[0, 3] = TANK["A"], -1.0, 1.0
-M[3, 4], M[4, 3] = 1.0, -1.0
+
+
+def autonomous(A, of_leak, of_sine):
+    """z = (x, leak, sin t, cos t) moves by itself: a step is an exponential."""
+    n = len(A)
+    out = np.zeros((n + 3, n + 3))
+    out[:n, :n], out[:n, n], out[:n, n + 1] = A, of_leak, of_sine
+    out[-2, -1], out[-1, -2] = 1.0, -1.0
+    return out
+
+
+M = autonomous(TANK["A"], [-1, 0], [1, 0])
 TRUE = np.array([1.0, 0.0, -0.05, 0.0, 1.0])
+OTHERS = {  # a plant, the same without algebraic states, its start, and the output's place
+    "with a force of a spring and a damper": (
+        TANK | {
+            "states": ["p", "v", "f"], "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]],
+            "A": [[0, 1, 0], [0, 0, 1], [-2, -0.4, -1]], "B": [[0], [1], [0]],
+            "F": [[0], [-1], [0]], "C": [[1, 0, 0]], "initial_state": {"p": 1, "v": 0.5, "f": -2.2},
+        }, autonomous([[0, 1], [-2, -0.4]], [0, -1], [0, 1]), [1.0, 0.5], 0,
+    ),
+    "of three in a row": (
+        TANK | {
+            "states": ["a", "b", "c"], "E": np.eye(3).tolist(),
+            "A": [[-1, 0.2, 0], [1, -0.7, 0.1], [0, 0.5, -0.3]], "B": [[1], [0], [0]],
+            "F": [[0], [-1], [0]], "C": [[0, 0, 1]], "initial_state": {"a": 1, "b": 0, "c": 0.5},
+        }, autonomous([[-1, 0.2, 0], [1, -0.7, 0.1], [0, 0.5, -0.3]], [0, -1, 0], [1, 0, 0]),
+        [1.0, 0.0, 0.5], 2,
+    ),
+}
 
 
-def full_information(bounds, horizon, at):
-    """h1(0), h2(0) and the leak of the least sum of squares, h1 being bounded at one time.
+def full_information(bounds, horizon, at, M=M, true=TRUE, output=1):
+    """x(0) and the leak of the least sum of squares, the first state being bounded at one time.
 
     The unknowns are the states at all nodes of a Gauss rule and at that time, and the leak; steps
     of the plant are equations between them.
     """
+    size = len(M) - 3
     nodes, weights = np.polynomial.legendre.leggauss(8)
     edges = np.linspace(0.0, horizon, 11)
     h = np.diff(edges)[:, None]
     points = (edges[:-1, None] + h * (nodes + 1.0) / 2.0).ravel()
     rule = dict(zip(points.tolist(), (h * weights / 2.0).ravel().tolist(), strict=True))
     t = np.unique([0.0, at, *points])
-    n = 2 * len(t) + 1  # unknowns: states one after the other, then the leak
+    n = size * len(t) + 1  # unknowns: states one after the other, then the leak
     P, q = np.zeros(n), np.zeros(n)
     rows, right = [], []
     for k, time in enumerate(t):
-        P[2 * k + 1] = rule.get(time, 0.0)
-        q[2 * k + 1] = -rule.get(time, 0.0) * (expm(M * time) @ TRUE)[1]
+        P[size * k + output] = rule.get(time, 0.0)
+        q[size * k + output] = -rule.get(time, 0.0) * (expm(M * time) @ true)[output]
         if k:
             step = expm(M * (time - t[k - 1]))
-            known = step[:2, 3:] @ [np.sin(t[k - 1]), np.cos(t[k - 1])]
-            for i in range(2):
+            known = step[:size, -2:] @ [np.sin(t[k - 1]), np.cos(t[k - 1])]
+            for i in range(size):
                 row = np.zeros(n)
-                row[2 * k + i] = 1.0
-                row[2 * k - 2 : 2 * k] = -step[i, :2]
-                row[-1] = -step[i, 2]
+                row[size * k + i] = 1.0
+                row[size * (k - 1) : size * k] = -step[i, :size]
+                row[-1] = -step[i, size]
                 rows.append(row)
                 right.append(known[i])
-    P[[0, 1, -1]] += F0
-    place = {"states": 2 * int(np.searchsorted(t, at)), "unknowns": n - 1}
+    P[[*range(size), -1]] += F0
+    place = {"states": size * int(np.searchsorted(t, at)), "unknowns": n - 1}
     low = {"states": LOW, "unknowns": 0.0}
     sides = np.zeros((len(bounds), n))
     sides[np.arange(len(bounds)), [place[kind] for kind in bounds]] = -1.0
@@ -71,7 +97,7 @@ def full_information(bounds, horizon, at):
         np.append(right, [-low[kind] for kind in bounds]),
         [clarabel.ZeroConeT(len(rows)), clarabel.NonnegativeConeT(len(bounds))], settings,
     ).solve().x)
-    return np.array([x[0], x[1], x[-1], 0.0, 1.0])
+    return np.array([*x[:size], x[-1], 0.0, 1.0])
 
 
 def h1(time, start):
@@ -111,6 +137,26 @@ def test_least_squares_within_bounds_is_the_full_information_programme(kinds):
     assert min(h1(t, [*ours, 0.0, 1.0]) for t in time) >= (LOW - 1e-9 if "states" in kinds else -1)
     active = {bound.name for bound in result.details.estimation.active[0]}
     assert active == {{"states": "h1", "unknowns": "leak"}[kind] for kind in kinds}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_plants_within_bounds_are_the_full_information_programme(name):
+    plant, matrix, start, output = OTHERS[name]
+    result = run(
+        plant, estimator={"name": "least_squares", "f0": F0},
+        observer={"bounds": {"unknowns": {"leak": [0, None]}}},
+        time={"horizon": HORIZON, "samples": 9},
+    )
+    expected = full_information(
+        ["unknowns"], HORIZON, 5.0, matrix, np.array([*start, -0.05, 0.0, 1.0]), output
+    )
+    there, names = expm(matrix * HORIZON) @ expected, plant["states"][: len(start)]
+    np.testing.assert_allclose(
+        [result.estimates[f"e0_{each}"][0, -1] for each in names], -expected[: len(start)],
+        atol=1e-8,
+    )
+    ours = [result.estimates[each][0, -1] for each in (*names, "leak")]
+    np.testing.assert_allclose(ours, there[: len(start) + 1], atol=1e-8)
 
 
 def test_estimates_respect_bounds_at_all_times_whatever_the_estimator(tmp_path):

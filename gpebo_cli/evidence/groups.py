@@ -34,7 +34,7 @@ class Groups(NamedTuple):
     memory: Array  # (C, a − 1) of the errors before each one; a of them count at a time
     first: IntArray  # (G,) of those that count from each start on
     others: Array  # the times of all other rows
-    knots: Array = _NONE  # of splines
+    knots: Array = _NONE  # (N + 4 for each of them,) of splines
     knot: IntArray = _NOWHERE  # (G,) that at each start
 
     @property
@@ -106,7 +106,7 @@ def _of_lines(t: Array) -> Array:
 
 
 def each_alone(rows: Rows, starts: Array) -> Groups:
-    """Rows, each with its own error; splines begin anew at ``starts``."""
+    """Rows, each with its own error; splines begin anew at ``starts`` (S,), in seconds."""
     t = rows.t
     pieces = np.split(t, np.searchsorted(t, starts[1:] - 1e-6 * np.diff(t).min()))
     pieces = [np.append(x, after[:1]) for x, after in pairwise([*pieces, _NONE])]
