@@ -65,7 +65,6 @@ def ours(tol: float, gammas: list[float] | None = None) -> Solve:
     What only a reader asks for, such as t_c and the last line, is not computed.
     """
     settings = Settings(
-        plant={},
         estimator={"name": "drem", "gamma": gammas or GAMMA},
         time=TimeSettings(horizon=HORIZON, samples=_GRID),
         solver=SolverSettings(tol=tol),

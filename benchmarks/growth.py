@@ -39,7 +39,7 @@ def experiment(
 
     gamma: Any = 1e10 if gains == 1 else np.logspace(6, 12, gains).tolist()
     settings = Settings(
-        plant={}, estimator={"name": "drem", "gamma": gamma},
+        estimator={"name": "drem", "gamma": gamma},
         time=TimeSettings(horizon=horizon, samples=samples), solver=SolverSettings(tol=1e-9),
     )
     system = load_plant(name)

@@ -58,7 +58,7 @@ def run(system: DescriptorSystem, method: Method, level: float, seed: int) -> Ru
     """One run; ``level`` is the standard deviation of the outputs' noise."""
     noise = NoiseSettings(sample_time=SAMPLE_TIME, outputs=level, seed=seed)
     return run_experiment(
-        Settings(plant={}, estimator=method.estimator, observer=method.observer, noise=noise),
+        Settings(estimator=method.estimator, observer=method.observer, noise=noise),
         system,
     )
 

@@ -62,9 +62,7 @@ def run(system: DescriptorSystem, estimator: Mapping[str, object], level: float)
     noise = NoiseSettings(
         name="gaussian", outputs=level, sample_time=SAMPLE_TIME, seeds=SEEDS if level else 1
     )
-    settings = Settings(
-        plant={}, estimator=estimator, time=TimeSettings(samples=51), noise=noise
-    )
+    settings = Settings(estimator=estimator, time=TimeSettings(samples=51), noise=noise)
     return run_experiment(settings, system)
 
 
@@ -132,7 +130,7 @@ def step_figure(path: Path) -> None:
     """The recipe theta_step: estimates of an unknown that steps; and with a reset at the step."""
     recipe = shipped("experiment/theta_step")
     settings = Settings(
-        plant={}, estimator={"name": "least_squares", **recipe["estimator"]},
+        estimator={"name": "least_squares", **recipe["estimator"]},
         time=TimeSettings(horizon=float(recipe["time"]["horizon"])),
         noise=NoiseSettings(name="gaussian", outputs=0.01),
     )
@@ -168,7 +166,7 @@ def matrices_table() -> str:
             cells = []
             for remedy in ("none", "noise_free"):
                 result = run_experiment(Settings(
-                    plant={}, estimator={"name": "least_squares", "f0": 1e-12},
+                    estimator={"name": "least_squares", "f0": 1e-12},
                     observer={"name": "gpebo", "remedy": remedy},
                     time=TimeSettings(horizon=horizon, samples=51),
                     noise=NoiseSettings("gaussian", sample_time, level, seeds=SEEDS),

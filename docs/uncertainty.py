@@ -56,7 +56,7 @@ def errors_over_seeds(
     All errors of the estimates are affine in the signals': one response serves all estimators.
     """
     noise = NoiseSettings(name="gaussian", outputs=LEVEL, sample_time=SAMPLE_TIME)
-    settings = Settings(plant={}, estimator={}, noise=noise, time=TimeSettings(horizon=20.0))
+    settings = Settings(estimator={}, noise=noise, time=TimeSettings(horizon=20.0))
     levels = noise_levels(noise, system)
     source = sources.simulated(settings, system, levels, None)
     made = build(observer or {"name": "gpebo"})

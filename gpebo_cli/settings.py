@@ -110,9 +110,8 @@ class OutputSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """One run, complete."""
+    """One run, complete but for its plant."""
 
-    plant: Mapping[str, object]
     estimator: Mapping[str, object]
     time: TimeSettings = field(default_factory=TimeSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)

@@ -125,7 +125,7 @@ def make_result(
         reached, reached + 0.3, np.abs(estimated[:, -1] - truth).max(1, initial=0.0), final, final
     )
     return RunResult(
-        settings=Settings(plant={}, estimator={"name": "drem", "gamma": list(gammas)}),
+        settings=Settings(estimator={"name": "drem", "gamma": list(gammas)}),
         system=make_system(units),
         simulation=simulation,
         regression=regression,

@@ -140,7 +140,7 @@ def run_system(plant, horizon=HORIZON, **observer):
     from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 
     return run_experiment(Settings(
-        {}, {"name": "ls_drem", "f0": 1e-9}, TimeSettings(0.0, horizon, 31),
+        {"name": "ls_drem", "f0": 1e-9}, TimeSettings(0.0, horizon, 31),
         SolverSettings(max_elements=3000), {"name": "gpebo", **observer},
     ), plant_from_mapping(plant))
 

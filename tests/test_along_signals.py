@@ -105,7 +105,7 @@ def test_a_stream_gives_what_a_run_at_samples_gives(hold):
     u, y = signals.inputs(t), signals.outputs(t)
     estimator = {"name": "least_squares", "f0": 1e-9}
     online = stream(Settings(
-        plant={}, estimator=estimator, observer={"name": "gpebo"}, data=DataSettings(hold=hold),
+        estimator=estimator, observer={"name": "gpebo"}, data=DataSettings(hold=hold),
         time=TimeSettings(np.nan, np.nan),
     ), system)(0.0, np.append(u[0], y[0]))  # fmt: skip
     rows = [online.feed(t[k : k + 1], u[k : k + 1], y[k : k + 1]).parameters for k in range(101)]

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def found(system, **observer):
-    settings = Settings(plant={}, estimator={}, observer={"name": "gpebo", **observer})
+    settings = Settings(estimator={}, observer={"name": "gpebo", **observer})
     return {a.name: a for a in examine(settings, system).assumptions}
 
 

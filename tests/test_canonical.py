@@ -17,7 +17,6 @@ SOLVER = SolverSettings()
 
 def run(system, estimator=None, samples=2001, **observer):
     settings = Settings(
-        plant={},
         estimator=estimator or {"name": "ls_drem", "gamma": 100.0, "f0": 1e-6},
         observer={"name": "canonical", **observer},
         time=TimeSettings(samples=samples),
@@ -115,7 +114,7 @@ def test_regression_identity_with_unknown_parameters():
 
 def test_strangeness_free_with_the_general_observer():
     settings = Settings(
-        plant={}, estimator={"name": "ls_drem", "gamma": 100.0, "f0": 1e-6}, time=TimeSettings()
+        estimator={"name": "ls_drem", "gamma": 100.0, "f0": 1e-6}, time=TimeSettings()
     )
     result = run_experiment(settings, shipped("strangeness_free"))
     assert result.simulation.strangeness_index == 0

@@ -716,7 +716,7 @@ def test_a_gain_that_nobody_set_is_raised_where_it_is_too_small(slower, expected
         "A": [[0]], "F": [["1e6"]], "C": [["1e6"]], "initial_state": [1],
     })  # fmt: skip
     found = run_experiment(Settings(
-        plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(horizon=horizon, samples=11)
+        estimator={"name": "ls_drem"}, time=TimeSettings(horizon=horizon, samples=11)
     ), system).estimation
     least = expected / horizon if slower < 1.0 else expected
     assert found.cases[0]["gamma"] == pytest.approx(least, rel=0.05)
@@ -773,7 +773,7 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
     rows = signals.t, signals.inputs, signals.outputs
     for gamma, warned in ((0.5, True), (10.0, False)):
         online = stream(Settings(
-            plant={}, estimator=slow | {"gamma": gamma}, observer={"name": "gpebo"},
+            estimator=slow | {"gamma": gamma}, observer={"name": "gpebo"},
             data=DataSettings(hold="linear"), time=TimeSettings(np.nan, np.nan),
         ), shipped("descriptor"))(0.0, np.append(rows[1][0], rows[2][0]))  # fmt: skip
         online.feed(*rows)

@@ -50,7 +50,7 @@ def test_taylor_coefficients_agree_with_those_of_the_text():
 
 
 def test_the_experiment_does_not_see_where_a_plant_comes_from():
-    settings = Settings(plant={}, estimator={"name": "drem"}, time=TimeSettings(horizon=8.0))
+    settings = Settings(estimator={"name": "drem"}, time=TimeSettings(horizon=8.0))
     ours = run_experiment(settings, circuit())
     text = run_experiment(settings, shipped("circuit"))
     assert ours.simulation.index == 2
@@ -63,7 +63,7 @@ def test_the_result_says_that_nothing_bounds_functions_from_python():
         assert found.bounded is bounded
     for observer in ("none", "gpebo"):
         settings = Settings(
-            plant={}, observer={"name": observer}, estimator={"name": "drem"},
+            observer={"name": observer}, estimator={"name": "drem"},
             time=TimeSettings(horizon=2.0),
         )
         told = run_experiment(settings, circuit()).verdict

@@ -29,9 +29,7 @@ def test_an_input_in_B_alone_cannot_be_designed():
 
 @pytest.mark.parametrize(("current", "holds"), [(CONSTANT, False), (CYCLE, True)])
 def test_the_check_says_whether_the_input_excites(current, holds):
-    settings = Settings(
-        plant={}, estimator={}, observer={"name": "gpebo"}, time=TimeSettings(horizon=600.0)
-    )
+    settings = Settings(estimator={}, observer={"name": "gpebo"}, time=TimeSettings(horizon=600.0))
     examined = examine(settings, shipped("battery", inputs={"current": current}))
     found = {a.name: a for a in examined.assumptions}
     assert found["Assumption 2"].evidence["psi_depends_on"] == "current"
@@ -44,7 +42,7 @@ def test_a_better_input_gives_a_better_estimate():
     for current in (RIPPLE, CYCLE):
         system = shipped("battery", inputs={"current": current})
         result = run_experiment(Settings(
-            plant={}, estimator={"name": "ls_drem"}, observer={"name": "gpebo"},
+            estimator={"name": "ls_drem"}, observer={"name": "gpebo"},
             time=TimeSettings(horizon=600.0, samples=11),
             noise=NoiseSettings("gaussian", sample_time=2.0, outputs=0.002, seeds=50),
         ), system)  # fmt: skip

@@ -47,7 +47,7 @@ def run(system: DescriptorSystem, horizon: float = 20.0, **more: Any) -> RunResu
     noise = more.pop("noise", NoiseSettings())
     return run_experiment(
         Settings(
-            plant={}, estimator=more.pop("estimator", {"name": "drem"}), noise=noise,
+            estimator=more.pop("estimator", {"name": "drem"}), noise=noise,
             time=TimeSettings(horizon=horizon, samples=401),
             observer={"name": "kalman_bucy", **more},
         ),

@@ -220,7 +220,7 @@ def test_the_next_sensors_make_deviations_fall_as_runs_with_them_say(plant_name,
     """
     plant = yaml.safe_load((CONF / "plant" / f"{plant_name}.yaml").read_text())
     observer = {"name": "gpebo", "form": "strangeness_free"}
-    settings = Settings({}, {"name": "ls_drem"}, TimeSettings(horizon=5.0), observer=observer)
+    settings = Settings({"name": "ls_drem"}, TimeSettings(horizon=5.0), observer=observer)
     tried = candidates(settings, plant_from_mapping(plant))
     x = run(plant, observer="none", time={"horizon": 5})
     size = max(np.abs(x[name]).max() for name in plant["outputs"])
@@ -337,7 +337,7 @@ def test_a_run_without_any_choice_converges_where_psi_is_exciting(plant):
 
 def test_check_tells_the_deviation_that_a_run_with_noise_has():
     """Per unit of noise: times σ it is that of least squares in a run."""
-    settings = Settings({}, {"name": "least_squares", "f0": 1e-12})
+    settings = Settings({"name": "least_squares", "f0": 1e-12})
     examined = examine(settings, shipped("descriptor"))
     assert set(examined.deviations) == {n for n, at in examined.estimable.items() if at is not None}
     result = run("descriptor", estimator={"name": "least_squares", "f0": 1e-12},

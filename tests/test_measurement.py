@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,12 +57,12 @@ def flat_mesh(edges, stages=12):
 
 def test_no_noise_is_the_run_without_noise_bit_for_bit():
     system = shipped("descriptor")
-    settings = Settings(plant={}, estimator={"name": "ls_drem"}, time=TIME)
+    settings = Settings(estimator={"name": "ls_drem"}, time=TIME)
     silent = NoiseSettings("gaussian", 0.037, [0.0], {"u": 0.0}, 0.0, "band_limited", 7)
     signals, measured = seen(system, sample_time=0.037)
     assert measured is signals
     without = run_experiment(settings, system)
-    zero = run_experiment(Settings(**{**vars(settings), "noise": silent}), system)
+    zero = run_experiment(replace(settings, noise=silent), system)
     for name in ("parameters", "states"):
         ours, theirs = getattr(zero.estimation, name), getattr(without.estimation, name)
         assert ours.tobytes() == theirs.tobytes()
@@ -71,7 +72,7 @@ def test_no_noise_is_the_run_without_noise_bit_for_bit():
 def test_a_signal_without_noise_of_its_own_keeps_its_bits():
     system = shipped("descriptor")
     settings = Settings(
-        plant={}, estimator={"name": "least_squares"}, time=TIME,
+        estimator={"name": "least_squares"}, time=TIME,
         noise=NoiseSettings(outputs=0.1, sample_time=0.05),
     )
     simulation = run_experiment(settings, system).simulation
@@ -280,9 +281,7 @@ def test_vector_laws_follow_a_regression_that_jumps(name):
     ({"seed": -1}, "noise.seed"),
 ])
 def test_wrong_settings_are_refused_before_anything_is_run(noise, message):
-    settings = Settings(
-        plant={}, estimator={"name": "gradient"}, noise=NoiseSettings(**noise)
-    )
+    settings = Settings(estimator={"name": "gradient"}, noise=NoiseSettings(**noise))
     stages = []
     with pytest.raises(ConfigError, match=message):
         run_experiment(settings, shipped("descriptor"), stages.append)

@@ -19,7 +19,7 @@ LEAST_SQUARES = {"name": "least_squares", "f0": 1e-12}
 
 def found(system, remedy, horizon, sigma, sample_time=0.05, seeds=1, **more):
     return run_experiment(Settings(
-        plant={}, estimator=LEAST_SQUARES, observer={"name": "gpebo", "remedy": remedy},
+        estimator=LEAST_SQUARES, observer={"name": "gpebo", "remedy": remedy},
         time=TimeSettings(horizon=horizon, samples=11), solver=SolverSettings(tol=1e-7),
         noise=NoiseSettings("gaussian", sample_time, sigma, seeds=seeds, **more),
     ), system)  # fmt: skip

@@ -57,7 +57,7 @@ def two_outputs(**more):
 
 def settings(system, estimator, horizon=4.0, weights=None, **noise):
     return Settings(
-        plant={}, estimator=estimator, time=TimeSettings(horizon=horizon, samples=11),
+        estimator=estimator, time=TimeSettings(horizon=horizon, samples=11),
         observer={"name": "gpebo", "weights": weights},
         noise=NoiseSettings(name="gaussian", **noise),
     )
@@ -235,7 +235,7 @@ def test_wrong_weights(weights, message):
 def test_seeds_of_nothing_are_refused(observer, noise, message):
     system = shipped("canonical")
     wrong = Settings(
-        plant={}, estimator={"name": "gradient"}, observer={"name": observer},
+        estimator={"name": "gradient"}, observer={"name": observer},
         noise=NoiseSettings(**noise),
     )
     with pytest.raises(ConfigError, match=message):

@@ -61,7 +61,7 @@ def signals_of(result):
 
 def simulated(name="circuit", samples=1001, horizon=20.0):
     return run_experiment(
-        Settings(plant={}, estimator=ESTIMATOR, time=TimeSettings(0.0, horizon, samples)),
+        Settings(estimator=ESTIMATOR, time=TimeSettings(0.0, horizon, samples)),
         shipped(name),
     )
 
@@ -69,7 +69,7 @@ def simulated(name="circuit", samples=1001, horizon=20.0):
 def recorded(path, name="circuit", hold="linear", time=WHOLE, **more):
     data = DataSettings("csv", path, hold)
     return run_experiment(
-        Settings(plant={}, estimator=ESTIMATOR, time=time, data=data, **more), shipped(name)
+        Settings(estimator=ESTIMATOR, time=time, data=data, **more), shipped(name)
     )
 
 

@@ -149,7 +149,7 @@ def test_of_a_rank_of_E_that_changes_between_two_parts_of_a_stream():
         **HIDDEN, "E": [[1, 0], [0, "step(t - 1)"]], "A": [[-1, 1], [1, -1]], "C": [[1, 1]],
         "inputs": {"u": 0},
     })
-    settings = Settings({}, {"name": "least_squares"}, observer={"name": "gpebo", "form": "given"})
+    settings = Settings({"name": "least_squares"}, observer={"name": "gpebo", "form": "given"})
     online = Online(settings, switched, "zoh", 0.0, np.zeros(2))
     online.feed(np.array([0.0, 0.5]), np.zeros((2, 1)), np.zeros((2, 1)))
     with pytest.raises(ModelError, match=r"rank of E changes from 1 to 2 before t = 1;"):

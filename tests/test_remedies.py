@@ -64,7 +64,7 @@ WITH_UNKNOWN = {**UNBOUNDED, "unknowns": {"theta": 0.7}, "F": [[0], [0], [1], [0
 def run(mapping, horizon=40.0, estimator=None, samples=401, **observer):
     return run_experiment(
         Settings(
-            plant={}, estimator=estimator or {"name": "least_squares"},
+            estimator=estimator or {"name": "least_squares"},
             time=TimeSettings(horizon=horizon, samples=samples),
             observer={"name": "gpebo", **observer},
         ),
@@ -407,7 +407,7 @@ def test_a_fundamental_matrix_beyond_all_bounds_ends_in_one_line():
 def test_settings_that_do_not_fit(observer, message):
     system = plant_from_mapping(UNBOUNDED)
     with refused(message):
-        examine(Settings(plant={}, estimator={}, observer={"name": "gpebo", **observer}), system)
+        examine(Settings(estimator={}, observer={"name": "gpebo", **observer}), system)
 
 
 @pytest.mark.parametrize("remedy", ["output_injection", "reset"])
@@ -415,7 +415,7 @@ def test_many_seeds_are_one_run_per_seed_with_every_remedy(remedy):
     """With output injection they are one more right-hand side, with resets a run each."""
     def settings_of(seed, seeds):
         return Settings(
-            plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(horizon=10.0),
+            estimator={"name": "ls_drem"}, time=TimeSettings(horizon=10.0),
             observer={"name": "gpebo", "remedy": remedy},
             noise=NoiseSettings(outputs=0.01, sample_time=0.1, seed=seed, seeds=seeds),
         )
@@ -436,7 +436,7 @@ def test_remedies_bear_noise_and_weights(remedy):
     results = [
         run_experiment(
             Settings(
-                plant={}, estimator={"name": "least_squares"}, noise=noise,
+                estimator={"name": "least_squares"}, noise=noise,
                 time=TimeSettings(horizon=40.0, samples=201),
                 observer={"name": "gpebo", "form": "given", "remedy": kind, "weights": [2.0]},
             ),
@@ -464,7 +464,7 @@ class Outsider:
 )
 def test_estimators_of_other_packages_are_refused_where_they_cannot_go_on(remedy, message):
     settings_of = Settings(
-        plant={}, estimator={}, time=TimeSettings(horizon=20.0),
+        estimator={}, time=TimeSettings(horizon=20.0),
         observer={"name": "gpebo", "remedy": remedy},
     )
     with pytest.raises(ConfigError, match=message):

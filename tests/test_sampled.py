@@ -26,7 +26,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.regression.text import regression_from_mapping
-from gpebo_cli.settings import DataSettings, Settings, TimeSettings
+from gpebo_cli.settings import DataSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 RNG = np.random.default_rng(7)
@@ -34,14 +34,14 @@ RNG = np.random.default_rng(7)
 
 def run(system, estimator, horizon=5.0, **observer):
     settings = Settings(
-        plant={}, estimator=estimator, time=TimeSettings(0.0, horizon, 2001),
+        estimator=estimator, time=TimeSettings(0.0, horizon, 2001),
         observer={"name": "gpebo", **observer},
     )
     return run_experiment(settings, system)
 
 
 def signals(system, t):
-    found = simulate(system, TimeSettings(0.0, float(t[-1]), 11), Settings({}, {}).solver).signals
+    found = simulate(system, TimeSettings(0.0, float(t[-1]), 11), SolverSettings()).signals
     return found.inputs(t), found.outputs(t)
 
 
@@ -162,7 +162,7 @@ def test_a_gain_at_samples_is_the_one_in_continuous_time(gamma):
 def test_at_most_as_many_samples_are_kept_as_are_asked_for():
     system = shipped("circuit")
     settings = Settings(
-        plant={}, estimator={"name": "ls_drem"}, time=TimeSettings(0.0, 2.0, 21),
+        estimator={"name": "ls_drem"}, time=TimeSettings(0.0, 2.0, 21),
         observer={"name": "gpebo", "sample_time": 0.01},
     )
     few = run_experiment(settings, system)
@@ -178,7 +178,7 @@ def test_it_does_not_matter_how_samples_are_grouped():
     u, y = signals(system, t)
     able = ("fct", "power", "exciting", "gradient", "mre", "instrumental", "annihilator")
     for name in ("ls_drem", "least_squares", "drem", *able):
-        settings = Settings(plant={}, estimator={"name": name})
+        settings = Settings(estimator={"name": name})
         whole = Online(settings, system, "linear", t[0], np.append(u[0], y[0])).feed(t, u, y)
         parts = Online(settings, system, "linear", t[0], np.append(u[0], y[0]))
         cuts = [0, 1, 2, 9, 40, 60]
@@ -198,7 +198,7 @@ def test_every_case_is_what_it_is_alone():
     def found(f0, gamma):
         estimator = {"name": "ls_drem", "f0": f0, "gamma": gamma}
         first = np.append(u[0], y[0])
-        return Online(Settings({}, estimator), system, "zoh", t[0], first).feed(t, u, y)
+        return Online(Settings(estimator), system, "zoh", t[0], first).feed(t, u, y)
 
     together = found([1e-4, 1.0], [1.0, 10.0])
     alone = [found(f0, gamma) for f0 in (1e-4, 1.0) for gamma in (1.0, 10.0)]
@@ -220,7 +220,7 @@ def test_assumption_1_is_judged_by_its_weakest_sample():
     assert smallest == pytest.approx(0.5 / np.sqrt(1.25), rel=1e-4)
     t = np.arange(0.0, 6.0, 0.01)
     u, y = signals(system, t)
-    online = Online(Settings(plant={}, estimator={"name": "least_squares"},
+    online = Online(Settings(estimator={"name": "least_squares"},
                              observer={"name": "gpebo", "form": "given"}),
                     system, "zoh", 0.0, np.append(u[0], y[0]))
     for part in (slice(0, 200), slice(200, 400), slice(400, 600)):  # π is in the second one
@@ -233,7 +233,7 @@ def test_what_is_remembered_does_not_grow():
     system = shipped("circuit")
     t = np.arange(0.0, 4.0, 0.01)
     u, y = signals(system, t)
-    online = Online(Settings(plant={}, estimator={"name": "ls_drem"}), system, "zoh", 0.0,
+    online = Online(Settings(estimator={"name": "ls_drem"}), system, "zoh", 0.0,
                     np.append(u[0], y[0]))
     sizes = []
     for part in (slice(0, 100), slice(100, 200), slice(200, 400)):
@@ -484,7 +484,7 @@ def test_settings_that_make_no_samples(plant, observer, part):
 
 
 STREAM = Settings(
-    plant={}, estimator={"name": "ls_drem"}, data=DataSettings("csv", "-"),
+    estimator={"name": "ls_drem"}, data=DataSettings("csv", "-"),
     time=TimeSettings(-np.inf, np.inf, 11),
 )
 

@@ -106,7 +106,7 @@ def test_deviations_are_those_of_the_seeds(name, remedy, chosen):
 def fed(system, estimator, t, u, y, hold="linear", noise=None, cut=0):
     """Every estimate, deviation and level of a stream, the rows in one batch or in two."""
     settings = Settings(
-        plant={}, estimator=estimator, data=DataSettings("csv", "-", hold),
+        estimator=estimator, data=DataSettings("csv", "-", hold),
         time=TimeSettings(-np.inf, np.inf, 11), noise=noise or NoiseSettings(),
     )
     online = stream(settings, system)(float(t[0]), np.append(u[0], y[0]))

@@ -115,7 +115,7 @@ def test_the_observer_is_not_told():
 def test_forgetting_follows_a_step_and_remembering_does_not(name):
     system = shipped("descriptor", unknowns={"theta1": "1.5 + step(t - 10)", "theta2": -0.8})
     settings = Settings(
-        plant={}, estimator={"name": name, "beta": [0.0, 1.0]}, time=TimeSettings(horizon=30.0)
+        estimator={"name": name, "beta": [0.0, 1.0]}, time=TimeSettings(horizon=30.0)
     )
     result = run_experiment(settings, system)
     before = np.searchsorted(result.estimation.t, 9.9)
@@ -137,9 +137,7 @@ def test_forgetting_follows_a_step_and_remembering_does_not(name):
 
 
 def test_a_constant_unknown_is_drawn_with_e0_where_it_is_asked_for():
-    settings = Settings(
-        plant={}, estimator={"name": "least_squares"}, time=TimeSettings(horizon=2.0)
-    )
+    settings = Settings(estimator={"name": "least_squares"}, time=TimeSettings(horizon=2.0))
     result = run_experiment(settings, shipped("descriptor"))
     assert [panel.name for panel in parameters(result)] == list(result.estimation.names)
     assert "parameters" not in describe(result)

@@ -44,8 +44,8 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     build(settings.estimator)  # used or not: its name becomes part of a folder's
     hydra = cfg.hydra if "hydra" in cfg else HydraConfig.get()
     source = described_in(hydra.runtime.choices, arguments)
-    system = system_from_mapping(settings.plant, source)
-    config["plant"] = located(settings.plant, source)
+    system = system_from_mapping(config["plant"], source)
+    config["plant"] = located(config["plant"], source)
     return Job(settings, system, configuration.complete(config, settings))
 
 

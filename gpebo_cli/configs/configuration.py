@@ -45,7 +45,6 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
             raise unknown(f"{key}: no such key", key, KEYS, "the configuration has")
     data = read(DataSettings, _group(config, "data"), "data")
     built = Settings(
-        plant=config["plant"],
         data=data,
         estimator=_group(config, "estimator"),
         time=_time(config, recorded=data.name == "csv"),

@@ -79,9 +79,9 @@ def run_experiment(
 ) -> RunResult:
     """Simulate the plant, observe it, estimate, and collect the evidence.
 
-    ``settings.plant`` is not read, ``system`` is the plant. Progress is called with the name of
-    each stage as it starts, and of a long one again with its ``share`` (:class:`Stage`) as it gets
-    on. The ``estimator`` is used instead of the one that the settings name.
+    Progress is called with the name of each stage as it starts, and of a long one again with its
+    ``share`` (:class:`Stage`) as it gets on. The ``estimator`` is used instead of the one that the
+    settings name.
 
     Raises:
         ConfigError: settings that do not fit the plant.
