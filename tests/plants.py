@@ -18,6 +18,15 @@ from gpebo_cli.simulation.simulate import simulate
 
 DATA = Path(__file__).parent / "data"
 CONF = Path(__file__).parent.parent / "conf"
+DECAYING = """\
+name: mine
+states: [x]
+outputs: [y]
+E: [[1]]
+A: [[-1]]
+C: [[1]]
+initial_state: {x: 1}
+"""
 
 
 def shipped(name: str, **changes: Any) -> DescriptorSystem:

@@ -6,13 +6,14 @@ import csv
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from gpebo_cli.errors import ConfigError
@@ -76,6 +77,12 @@ def read_table(path: Path) -> tuple[list[str], np.ndarray[Any, np.dtype[np.float
     with path.open(encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)
     return header, np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
+
+
+def write_table(path: Path, columns: Mapping[str, object]) -> str:
+    """Write columns as a CSV file, without rounding; the name of the file."""
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return str(path)
 
 
 @contextmanager

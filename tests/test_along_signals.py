@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from plants import DATA, seen
+from processes import write_table
 
 from gpebo_cli import run
 from gpebo_cli.errors import ConfigError, GpeboError, ModelError
@@ -40,10 +41,10 @@ def signals_of(name, horizon):
 def recording(path, system, signals, horizon, rate):
     """A CSV of the signals, ``rate`` rows per second."""
     t = np.arange(round(horizon * rate) + 1) / rate
-    rows = np.column_stack([t, signals.inputs(t), signals.outputs(t)])
-    names = ",".join(["t", *system.inputs, *system.outputs])
-    np.savetxt(path, rows, "%.17g", ",", header=names, comments="")
-    return str(path)
+    columns = [t, *signals.inputs(t).T, *signals.outputs(t).T]
+    return write_table(
+        path, dict(zip(["t", *system.inputs, *system.outputs], columns, strict=True))
+    )
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -171,10 +172,8 @@ def test_the_kalman_bucy_filter_is_that_of_the_linear_plant_along_the_signals():
 def test_a_divisor_that_passes_through_zero_is_named_with_its_time(hold, sample_time, tmp_path):
     """Also where no sample is zero; simulations end there (test_state_affine)."""
     t = np.arange(41) / 20
-    duty, y = 0.5 + 0.1 * np.sin(3 * t), 18 * (1.021 - t)
-    np.savetxt(tmp_path / "r.csv", np.column_stack([t, duty, y]), "%.17g", ",",
-               header="t,duty,y", comments="")  # fmt: skip
-    data = {"name": "csv", "file": str(tmp_path / "r.csv"), "hold": hold}
+    columns = {"t": t, "duty": 0.5 + 0.1 * np.sin(3 * t), "y": 18 * (1.021 - t)}
+    data = {"name": "csv", "file": write_table(tmp_path / "r.csv", columns), "hold": hold}
     entry = r"F\[1\]\[0\] = '-1/y' divides by something that passes through zero near t = 1\.0"
     with pytest.raises(ConfigError, match=entry):
         run(problem("boost")["plant"], data=data, observer={"sample_time": sample_time})
@@ -193,15 +192,14 @@ def test_an_output_that_touches_zero_is_named_with_its_time(entry, tmp_path):
             run(plant, time={"horizon": 4})
     t = np.linspace(0.0, np.pi + 1.0, 51)
     t[38] = np.pi
-    np.savetxt(tmp_path / "r.csv", np.column_stack([t, -np.sin(t), 1 + np.cos(t)]), "%.17g", ",",
-               header="t,u,y", comments="")  # fmt: skip
+    file = write_table(tmp_path / "r.csv", {"t": t, "u": -np.sin(t), "y": 1 + np.cos(t)})
     source = plant_from_mapping(plant).coefficients
     near = np.array([3.0, np.pi - 1e-7, 3.3])  # never exactly zero
     if "/" in entry:
         with pytest.raises(ConfigError, match=r"passes through zero near t = 3\.14"):
             source.taylor(near, 0, near, np.column_stack([-np.sin(near), 1 + np.cos(near)])[None])
     for observer in ({}, {"sample_time": 0.1, "hold": "linear"}):
-        data = {"name": "csv", "file": str(tmp_path / "r.csv"), "hold": "zoh"}
+        data = {"name": "csv", "file": file, "hold": "zoh"}
         with pytest.raises(GpeboError, match=re.escape(f"F[1][0] = '{entry}' has no finite value")):
             run(plant, data=data, observer={"name": "gpebo", **observer})
 

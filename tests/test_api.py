@@ -15,6 +15,7 @@ import pytest
 import yaml
 from examples import ROOT, assert_repeats, gpebo
 from omegaconf import OmegaConf
+from plants import DECAYING
 from processes import assert_refused, install, process, python, refused
 
 import gpebo_cli
@@ -35,16 +36,6 @@ from gpebo_cli import (
     system_from_functions,
 )
 from gpebo_cli.api.choice import choose, default
-
-MINE = """\
-name: mine
-states: [x]
-outputs: [y]
-E: [[1]]
-A: [[-1]]
-C: [[1]]
-initial_state: {x: 1}
-"""
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +148,7 @@ def test_the_folder_is_the_command_lines_byte_for_byte(circuit, tmp_path):
 
 
 def test_a_saved_folder_repeats_itself(tmp_path):
-    (tmp_path / "mine.yaml").write_text(MINE)
+    (tmp_path / "mine.yaml").write_text(DECAYING)
     result = run(tmp_path / "mine.yaml", gamma=(1, 2.5), time={"samples": 51})
     folder = result.save(tmp_path / "first", figures=False)
     assert folder == tmp_path / "first"
@@ -260,7 +251,7 @@ def test_arrays_are_gains_too():
 
 def test_a_folder_of_ones_own(tmp_path):
     (tmp_path / "plant").mkdir()
-    (tmp_path / "plant" / "mine.yaml").write_text(MINE)
+    (tmp_path / "plant" / "mine.yaml").write_text(DECAYING)
     (tmp_path / "estimator").mkdir()
     (tmp_path / "estimator" / "fast.yaml").write_text("name: drem\ngamma: 1e12\n")
     assert "mine" in available("plant", tmp_path)
@@ -268,7 +259,7 @@ def test_a_folder_of_ones_own(tmp_path):
     assert result.cases[0]["gamma"] == 1e12
     assert load_plant("mine", tmp_path).source.endswith("mine.yaml")
     (tmp_path / "plant" / "lab").mkdir()
-    (tmp_path / "plant" / "lab" / "other.yaml").write_text(MINE)
+    (tmp_path / "plant" / "lab" / "other.yaml").write_text(DECAYING)
     (tmp_path / "plant" / "loop").symlink_to(tmp_path / "plant")  # it is not followed
     names = set(available("plant", tmp_path))
     assert {"mine", "lab/other", "circuit", "published/hires"} < names
@@ -318,7 +309,7 @@ def test_wrong_usage_is_a_config_error_on_one_line(words, expected):
 
 
 def test_a_plant_that_cannot_be_used_is_a_model_error():
-    singular = {**yaml.safe_load(MINE), "E": [[0]], "A": [[0]]}
+    singular = {**yaml.safe_load(DECAYING), "E": [[0]], "A": [[0]]}
     with pytest.raises(ModelError) as caught:
         run(singular)
     assert isinstance(caught.value, GpeboError)

@@ -13,6 +13,7 @@ import examples
 import inprocess
 import pytest
 import yaml
+from plants import DECAYING
 from processes import (
     ROOT,
     assert_refused,
@@ -29,17 +30,7 @@ from gpebo_cli import run
 
 FAST = ["figures=none", "time.samples=51"]
 
-MINE = """\
-name: mine
-title: a decaying state
-reference: nowhere
-states: [x]
-outputs: [y]
-E: [[1]]
-A: [[-1]]
-C: [[1]]
-initial_state: {x: 1}
-"""
+MINE = DECAYING + "title: a decaying state\nreference: nowhere\n"
 
 
 def gpebo(*words, cwd, **more):
@@ -491,9 +482,6 @@ def test_a_file_that_would_be_ignored_is_refused(tmp_path, mine):
 
 def test_a_plant_may_have_a_number_for_a_name(tmp_path):
     (tmp_path / "plant").mkdir()
-    (tmp_path / "plant" / "2024.yaml").write_text(
-        "name: year\nstates: [x]\noutputs: [y]\nE: [[1]]\nA: [[-1]]\nC: [[1]]\n"
-        "initial_state: {x: 1}\n"
-    )
+    (tmp_path / "plant" / "2024.yaml").write_text(DECAYING)
     done = gpebo("run", "--config-dir", ".", "plant=2024", "figures=none", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import CONF, observed, reference, shipped
+from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
 
 import gpebo_cli
@@ -805,8 +806,8 @@ def test_so_they_are_of_several_recordings(tmp_path):
     files = [tmp_path / name for name in ("a.csv", "b.csv")]
     signals = gpebo_cli.run("descriptor", observer="none").details.simulation
     for file, count in zip(files, (401, 301), strict=True):
-        rows = np.column_stack([signals.t, signals.inputs, signals.outputs])[:count]
-        np.savetxt(file, rows, "%.17g", ",", header="t,u,y", comments="")
+        write_table(file, {"t": signals.t[:count], "u": signals.inputs[:count, 0],
+                           "y": signals.outputs[:count, 0]})
     several = {"name": "csv", "file": [str(file) for file in files], "hold": "cubic"}
     slow = {"name": "ls_drem", "gamma": 1.5, "f0": 0.01, "initial": 1e5}
     details = gpebo_cli.run("descriptor", estimator=slow, data=several).details

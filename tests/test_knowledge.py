@@ -13,7 +13,7 @@ from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import shipped
-from processes import assert_refused, rows_of
+from processes import assert_refused, rows_of, write_table
 from random_systems import largest_error, random_system, run_system
 
 from gpebo_cli import run
@@ -260,8 +260,7 @@ def recorded(folder, plant=None, noise=0.01):
     made = run(folder / "plant" / "half_seen.yaml", observer="none",
                time={"horizon": 20, "samples": 2001})
     y = made["y"] + noise * rng.normal(size=2001)
-    np.savetxt(folder / "r.csv", np.column_stack([made.t, made["u"], y]), delimiter=",",
-               header="t,u,y", comments="")
+    write_table(folder / "r.csv", {"t": made.t, "u": made["u"], "y": y})
     done = gpebo("run", "--config-dir", ".", "plant=half_seen", "data=csv", "data.file=r.csv",
                  "estimator=ls_drem", "hydra.run.dir=out", *(plant or []), cwd=folder)
     assert done.returncode == 0, done.stderr

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import os
@@ -19,7 +18,7 @@ from examples import assert_repeats, gpebo
 from hypothesis import given
 from hypothesis import strategies as st
 from plants import shipped
-from processes import assert_refused, refused
+from processes import assert_refused, refused, write_table
 from scipy.io import savemat
 
 from gpebo_cli import check, run
@@ -42,14 +41,6 @@ from gpebo_cli.settings import (
 
 WHOLE = TimeSettings(-np.inf, np.inf, 201)
 ESTIMATOR = {"name": "ls_drem"}
-
-
-def write(path, columns):
-    with open(path, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(columns)
-        writer.writerows(zip(*(map(repr, map(float, c)) for c in columns.values()), strict=True))
-    return str(path)
 
 
 def signals_of(result):
@@ -83,7 +74,7 @@ def test_estimates_converge_to_those_of_the_run_as_samples_get_finer(tmp_path, h
     for samples in (201, 401, 801):
         made = simulated(samples=samples, horizon=10.0)
         result = recorded(
-            write(tmp_path / "r.csv", signals_of(made)), hold=hold,
+            write_table(tmp_path / "r.csv", signals_of(made)), hold=hold,
             time=TimeSettings(0.0, 10.0, samples),
         )
         difference = result.estimation.parameters[0, -1] - made.estimation.parameters[0, -1]
@@ -97,7 +88,7 @@ def test_estimates_converge_to_those_of_the_run_as_samples_get_finer(tmp_path, h
 def test_a_cubic_recording_reproduces_the_estimates(tmp_path):
     made = simulated()
     columns = signals_of(made)
-    path = write(tmp_path / "r.csv", columns)
+    path = write_table(tmp_path / "r.csv", columns)
     result = recorded(path, hold="cubic", time=TimeSettings(0.0, 20.0, 1001))
     late = made.signals.t > 3.0
     difference = np.abs(result.estimation.states - made.estimation.states)[0]
@@ -111,13 +102,9 @@ def test_a_cubic_recording_reproduces_the_estimates(tmp_path):
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 def test_a_run_on_held_signals_is_reproduced_to_rounding(tmp_path, hold):
-    made = simulated(samples=201)
-    first = recorded(
-        write(tmp_path / "1.csv", signals_of(made)), hold=hold, time=TimeSettings(0.0, 20.0, 201)
-    )
-    again = recorded(
-        write(tmp_path / "2.csv", signals_of(first)), hold=hold, time=TimeSettings(0.0, 20.0, 201)
-    )
+    made, span = simulated(samples=201), TimeSettings(0.0, 20.0, 201)
+    first = recorded(write_table(tmp_path / "1.csv", signals_of(made)), hold=hold, time=span)
+    again = recorded(write_table(tmp_path / "2.csv", signals_of(first)), hold=hold, time=span)
     np.testing.assert_array_equal(again.signals.outputs, first.signals.outputs)
     np.testing.assert_array_equal(again.estimation.parameters, first.estimation.parameters)
     np.testing.assert_array_equal(again.estimation.states, first.estimation.states)
@@ -125,7 +112,7 @@ def test_a_run_on_held_signals_is_reproduced_to_rounding(tmp_path, hold):
 
 def test_unknown_parameters_of_a_recording_are_estimated_and_their_truth_is_not_known(tmp_path):
     made = simulated("descriptor")
-    result = recorded(write(tmp_path / "r.csv", signals_of(made)), "descriptor", "cubic")
+    result = recorded(write_table(tmp_path / "r.csv", signals_of(made)), "descriptor", "cubic")
     truth = result.estimation.true_parameters
     assert np.isnan(truth[:, :2]).all()
     np.testing.assert_allclose(truth[:, 2:], [[-1.0, 1.0]] * len(truth), atol=1e-12)
@@ -137,7 +124,7 @@ def test_unknown_parameters_of_a_recording_are_estimated_and_their_truth_is_not_
 @pytest.mark.filterwarnings("error")
 def test_without_states_nothing_is_compared_and_the_fit_is_told(tmp_path):
     columns = signals_of(simulated())
-    path = write(tmp_path / "r.csv", {k: columns[k] for k in ("V", "t", "y")})
+    path = write_table(tmp_path / "r.csv", {k: columns[k] for k in ("V", "t", "y")})
     result = recorded(path, hold="cubic")
     for name, values in result.metrics.columns.items():
         assert np.isnan(values).all() != name.startswith(STANDING)  # which needs no truth
@@ -150,7 +137,7 @@ def test_without_states_nothing_is_compared_and_the_fit_is_told(tmp_path):
 
 def test_some_of_the_states_are_compared_where_some_are_recorded(tmp_path):
     columns = signals_of(simulated())
-    path = write(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y", "e2")})
+    path = write_table(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y", "e2")})
     result = recorded(path, hold="cubic")
     assert np.isfinite(result.metrics.final_error_states[0])
     known = ~np.isnan(result.estimation.true_parameters[-1])
@@ -158,7 +145,7 @@ def test_some_of_the_states_are_compared_where_some_are_recorded(tmp_path):
 
 
 def test_the_span_may_be_a_part_of_the_recording(tmp_path):
-    path = write(tmp_path / "r.csv", signals_of(simulated()))
+    path = write_table(tmp_path / "r.csv", signals_of(simulated()))
     result = recorded(path, hold="cubic", time=TimeSettings(5.003, 10.0, 101))
     assert result.signals.t[0] == 5.003
     assert result.signals.t[-1] == pytest.approx(15.003)
@@ -353,7 +340,7 @@ def test_blank_lines_count_unless_they_are_the_last(tmp_path, blank):
 
 def test_many_rows_are_read_in_seconds(tmp_path):
     t = np.arange(200_000) * 0.1
-    path = write(tmp_path / "r.csv", {"t": t, "V": np.sin(t), "y": np.cos(t)})
+    path = write_table(tmp_path / "r.csv", {"t": t, "V": np.sin(t), "y": np.cos(t)})
     start = perf_counter()
     found = read_table(DataSettings("csv", path), shipped("circuit")).samples
     assert perf_counter() - start < 4.0
@@ -535,8 +522,8 @@ def test_measured_columns_are_what_the_observer_sees(tmp_path):
     columns = signals_of(simulated(samples=401))
     wrong = {name: np.zeros(401) for name in ("V", "y")}
     beside = {"V_measured": columns["V"], "y_measured": columns["y"]}
-    plain = recorded(write(tmp_path / "plain.csv", columns))
-    read = recorded(write(tmp_path / "beside.csv", {**columns, **wrong, **beside}))
+    plain = recorded(write_table(tmp_path / "plain.csv", columns))
+    read = recorded(write_table(tmp_path / "beside.csv", {**columns, **wrong, **beside}))
     np.testing.assert_array_equal(read.estimation.states, plain.estimation.states)
     np.testing.assert_array_equal(read.signals.outputs, plain.signals.outputs)
 
@@ -553,7 +540,7 @@ def test_a_recording_without_an_observer_is_refused(tmp_path):
 
 def test_a_recording_from_the_command_line(tmp_path):
     columns = signals_of(simulated("descriptor", 301, 10.0))
-    path = write(tmp_path / "rec.csv", {k: columns[k] for k in ("t", "u", "y")})
+    path = write_table(tmp_path / "rec.csv", {k: columns[k] for k in ("t", "u", "y")})
     words = ["plant=descriptor", f"data.file={path}", "data.hold=cubic", "estimator=ls_drem"]
     done = gpebo("run", *words, "hydra.run.dir=out", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -593,7 +580,7 @@ def test_what_is_wrong_with_a_recording_is_one_line(tmp_path, words, part):
 def test_a_data_frame_from_python(tmp_path):
     columns = signals_of(simulated(samples=401))
     frame = pd.DataFrame({"time": columns["t"] / 60.0, "V": columns["V"], "y": columns["y"]})
-    path = write(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y")})
+    path = write_table(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y")})
     data = {"frame": frame, "columns": {"t": "time"}, "time_unit": "min"}
     result = run("circuit", estimator="ls_drem", data=data)
     expected = run("circuit", estimator="ls_drem", data=path)
@@ -607,7 +594,7 @@ def test_a_data_frame_from_python(tmp_path):
 
 def test_a_recording_from_python(tmp_path):
     columns = signals_of(simulated(samples=401))
-    path = write(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y")})
+    path = write_table(tmp_path / "r.csv", {k: columns[k] for k in ("t", "V", "y")})
     from_path = run("circuit", estimator="ls_drem", data=Path(path))
     cubic = run("circuit", estimator="ls_drem", data={"file": path, "hold": "cubic"})
     assert from_path.t[-1] == 20.0
@@ -720,7 +707,7 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
              "E": [[1]], "A": [[0]], "phi": ["cos(t)"], "C": [[1]]}
     (tmp_path / "plant").mkdir()
     (tmp_path / "plant" / "level.yaml").write_text(yaml.safe_dump(plant))
-    np.savetxt(tmp_path / "log.csv", np.c_[t, y], "%.17g", ",", header="t,y", comments="")
+    write_table(tmp_path / "log.csv", {"t": t, "y": y})
     command = ("new", "recording", "log.csv", "--plant", "level", "--config-dir", ".")
     assert gpebo(*command, cwd=tmp_path).returncode == 0
     data = yaml.safe_load((tmp_path / "data" / "log.yaml").read_text())
@@ -732,7 +719,7 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
     savemat(tmp_path / "log.mat", {"t": t, "y": y})
     of_mat = read_table(replace(settings, file=str(tmp_path / "log.mat")), system).samples
     np.testing.assert_allclose(of_mat.outputs[:, 0], read, rtol=1e-15)
-    with pytest.raises(ConfigError, match=r"9999 is a gap \(data.gaps\); data.missing says"):
+    with pytest.raises(ConfigError, match=r"9999\.0 is a gap \(data.gaps\); data.missing says"):
         read_table(replace(settings, missing="refuse"), system)
 
 
@@ -757,8 +744,7 @@ def written(folder, name, start, V, h1, rows=401, noise=0.0, seed=0):
     made = run(plant, observer="none", time={"start": start, "horizon": 8, "samples": rows})
     table = made.to_pandas("signals").reset_index()[["t", "V", "y"]]
     table["y"] += noise * np.random.default_rng(seed).standard_normal(rows)
-    table.to_csv(folder / name, index=False)
-    return str(folder / name)
+    return write_table(folder / name, table)
 
 
 def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
@@ -839,7 +825,6 @@ def test_a_recording_says_whether_what_follows_its_signals_is_bounded(gain, boun
 @pytest.mark.parametrize(("hold", "told"), [("zoh", True), ("linear", False)])
 def test_pauses_through_which_samples_are_held_are_said(hold, told, tmp_path):
     t = np.concatenate([np.arange(0.0, 2.0, 0.1), np.arange(5.0, 7.0, 0.1)])
-    table = np.column_stack([t, np.sin(t), np.cos(t)])
-    np.savetxt(tmp_path / "r.csv", table, delimiter=",", header="t,u,y", comments="")
-    said = run("descriptor", data={"file": str(tmp_path / "r.csv"), "hold": hold}).verdict
+    file = write_table(tmp_path / "r.csv", {"t": t, "u": np.sin(t), "y": np.cos(t)})
+    said = run("descriptor", data={"file": file, "hold": hold}).verdict
     assert ("through 1 pause of up to 3.1 s the last sample is held" in said) == told

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from examples import assert_repeats, gpebo
-from processes import assert_refused, rows_of
+from processes import assert_refused, rows_of, write_table
 
 from gpebo_cli import ConfigError, SolverError, check, run
 from gpebo_cli.regression.text import regression_from_mapping
@@ -45,8 +45,7 @@ def test_it_stands_in_place_of_a_plant_and_an_observer(tmp_path):
 def test_signals_from_a_recording(tmp_path):
     t = np.linspace(0.0, 10.0, 2001)
     write(tmp_path, {**SINE, "signals": {"s": None, "y": None}, "Y": ["y"], "psi": [["s", 1]]})
-    rows = np.column_stack([t, np.sin(t), 2 * np.sin(t) - 1])
-    np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header="t,s,y", comments="", fmt="%.17g")
+    write_table(tmp_path / "r.csv", {"t": t, "s": np.sin(t), "y": 2 * np.sin(t) - 1})
     done = gpebo("run", "--config-dir", ".", "regression=sine", "data.file=r.csv", "figures=none",
                  "estimator=ls_drem", "hydra.run.dir=a", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -118,8 +117,7 @@ def test_a_stream_is_the_file_at_its_samples(tmp_path):
     given = {**OPERATORS, "signals": {"s": None, "y": None}, "unknowns": {"a": 2.0, "b": -1.0},
              "Y": ["2*lp(y, 1) - lp(s, 2)"], "psi": [["lp(y, 1)", "lp(s, 2)"]]}
     write(tmp_path, given)
-    rows = np.column_stack([t, np.sin(3 * t), np.cos(t)])
-    np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header="t,s,y", comments="", fmt="%.17g")
+    write_table(tmp_path / "r.csv", {"t": t, "s": np.sin(3 * t), "y": np.cos(t)})
     done = gpebo(
         "run", "--config-dir", ".", "regression=operators", "data.file=-", "data.hold=linear",
         "estimator=least_squares", cwd=tmp_path, text=(tmp_path / "r.csv").read_text(),

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from inprocess import gpebo
 from omegaconf import OmegaConf
+from plants import DECAYING
 from processes import assert_refused, refused
 
 from gpebo_cli import run
@@ -23,15 +24,6 @@ from gpebo_cli.configs.configuration import KEYS
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 
-PLANT = """\
-name: mine
-states: [x]
-outputs: [y]
-E: [[1]]
-A: [[-1]]
-C: [[1]]
-initial_state: {x: 1}
-"""
 REGRESSION = "name: mine\nunknowns: {a: 1}\nsignals: {u: sin(t), y: sin(t)}\nY: [y]\npsi: [[u]]\n"
 RECIPE = "time: {horizon: 0.1, samples: 3}\nfigures: none\n"
 SHORT = ["observer=none", "figures=none", "time.horizon=0.1", "time.samples=3"]
@@ -84,7 +76,7 @@ FORMS = {
     "twice": "# @package _global_\nhydra: {mode: RUN}\ndefaults: [_self_]\ntitle: a\nP",
 }
 KINDS = {
-    "plant": ("plant/x.yaml", PLANT, ["plant=x", *SHORT]),
+    "plant": ("plant/x.yaml", DECAYING, ["plant=x", *SHORT]),
     "regression": ("regression/x.yaml", REGRESSION, ["regression=x", "figures=none"]),
     "estimator": ("estimator/x.yaml", "name: drem\n", ["estimator=x", *SHORT]),
     "experiment": ("experiment/x.yaml", RECIPE, ["experiment=x", *SHORT]),
@@ -192,8 +184,8 @@ def test_the_second_line_holds_without_the_first(tmp_path, override):
 
 
 @pytest.mark.parametrize(("group", "text"), [
-    ("plant", PLANT.replace("mine", "../../marker")),
-    ("plant", PLANT.replace("mine", "a/../../../marker")),
+    ("plant", DECAYING.replace("mine", "../../marker")),
+    ("plant", DECAYING.replace("mine", "a/../../../marker")),
     ("estimator", "name: ../../../marker\n"),
     ("observer", "name: kalman_bucy\nestimator: x/../../../../marker\n"),
     ("observer", "name: gpebo\nestimator: x/../../../../marker\n"),
@@ -208,9 +200,9 @@ def test_a_name_cannot_lead_elsewhere(tmp_path, group, text):
 
 @pytest.mark.parametrize("choice", ["../x", "../../x", "lab/../../x", "/etc/x", "lab", "x/", "."])
 def test_a_choice_cannot_lead_elsewhere(tmp_path, choice):
-    folder, _ = prepared(tmp_path, "plant/lab/y.yaml", PLANT)
+    folder, _ = prepared(tmp_path, "plant/lab/y.yaml", DECAYING)
     for place in (tmp_path / "x.yaml", folder / "x.yaml"):
-        place.write_text(PLANT)
+        place.write_text(DECAYING)
     assert_refused(
         gpebo("run", "--config-dir", folder, f"plant={choice}", *SHORT, cwd=tmp_path)
     )
@@ -218,10 +210,10 @@ def test_a_choice_cannot_lead_elsewhere(tmp_path, choice):
 
 
 def test_links_lead_nowhere_but_inside(tmp_path):
-    folder, marker = prepared(tmp_path, "plant/mine.yaml", PLANT)
+    folder, marker = prepared(tmp_path, "plant/mine.yaml", DECAYING)
     outside = tmp_path / "outside"
     outside.mkdir()
-    (outside / "x.yaml").write_text(PLANT)
+    (outside / "x.yaml").write_text(DECAYING)
     (folder / "plant" / "file.yaml").symlink_to(outside / "x.yaml")
     (folder / "plant" / "lab").symlink_to(outside)
     (folder / "plant" / "inside.yaml").symlink_to("mine.yaml")
@@ -269,7 +261,7 @@ class Call:
 
 
 def test_pickles_are_not_opened(tmp_path):
-    text = PLANT.replace("A: [[-1]]", "matrices: m.npz")
+    text = DECAYING.replace("A: [[-1]]", "matrices: m.npz")
     folder, marker = prepared(tmp_path, "plant/x.yaml", text)
     np.savez(folder / "plant" / "m.npz", A=np.array([[Call(marker)]], dtype=object))
     (folder / "a.npz").write_bytes((folder / "plant" / "m.npz").read_bytes())
@@ -298,19 +290,19 @@ BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     ("a: *b\n", "stands for nothing"),
     ("a: " + "[" * 100_000, "levels deep"),
     ("#" * 2_000_001, "bytes; at most"),
-    (PLANT.replace("name: mine\n", ""), "name is missing"),
-    (PLANT + "name: other\n", "the key name stands twice"),
-    (PLANT + "1: 2\n", "a key must be text"),
-    (PLANT + "[1, 2]: 2\n", "a key must be text"),
-    (PLANT + "title: !!binary aGFsbG8=\n", "a file is plain data"),
-    (PLANT + "n: 0x_\n", "a number that cannot be read"),
-    (PLANT + f"n: {'9' * 5000}\n", "a number that cannot be read"),
+    (DECAYING.replace("name: mine\n", ""), "name is missing"),
+    (DECAYING + "name: other\n", "the key name stands twice"),
+    (DECAYING + "1: 2\n", "a key must be text"),
+    (DECAYING + "[1, 2]: 2\n", "a key must be text"),
+    (DECAYING + "title: !!binary aGFsbG8=\n", "a file is plain data"),
+    (DECAYING + "n: 0x_\n", "a number that cannot be read"),
+    (DECAYING + f"n: {'9' * 5000}\n", "a number that cannot be read"),
     ("name: [", "not valid YAML"),
     ("name: a\0b\n", "not valid YAML"),
     ("- 1\n", "expected a mapping"),
     ("", "expected a mapping"),
-    (PLANT + "title: \udcff\n", "not text in UTF-8"),
-    (PLANT + "title: ${oc.env:HOME}\n", "${…} is not allowed"),
+    (DECAYING + "title: \udcff\n", "not text in UTF-8"),
+    (DECAYING + "title: ${oc.env:HOME}\n", "${…} is not allowed"),
 ])
 def test_a_file_that_is_no_data_is_one_line(tmp_path, text, expected):
     folder, _ = prepared(tmp_path, "plant/x.yaml", text)

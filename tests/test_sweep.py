@@ -10,6 +10,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from plants import DECAYING
 from processes import assert_refused, begin, rows_of, wait_for
 from processes import process as gpebo
 from scipy.integrate import trapezoid
@@ -174,14 +175,10 @@ def test_only_a_sweep_is_resumed(tmp_path):
 def test_a_plant_that_has_changed_is_not_mixed_with_the_old_one(tmp_path):
     plant = tmp_path / "plant" / "mine.yaml"
     plant.parent.mkdir()
-    text = (
-        "name: mine\nstates: [x]\noutputs: [y]\nE: [[1]]\nA: [[-1]]\nC: [[1]]\n"
-        "initial_state: {x: 1}\n"
-    )
-    plant.write_text(text)
+    plant.write_text(DECAYING)
     words = ["run", "-m", "--config-dir", ".", "plant=mine", "estimator.gamma=1,2", *FAST]
     assert gpebo(*words, "hydra.sweep.dir=sweep", cwd=tmp_path).returncode == 0
-    plant.write_text(text.replace("-1", "-2"))
+    plant.write_text(DECAYING.replace("-1", "-2"))
     done = gpebo(*words, "resume=sweep", cwd=tmp_path)
     assert_refused(done, "a configuration file has changed")
 
