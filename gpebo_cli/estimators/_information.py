@@ -27,6 +27,7 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 
 _PICARD_ROUNDS = 200
+_IN_CACHE = 1 << 15  # numbers of matrices that are solved with at once
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
@@ -78,21 +79,25 @@ class InformationAt:
         The spectrum, which many gains share, is not needed for it. It is solved in units in which
         F⁻¹ has ones on its diagonal; directions in which F⁻¹ is rounding stay where they start.
         """
-        p = len(start)
-        gram, right = self.values[..., :p], alpha * self.values[..., p:]
-        if start.any():
-            right -= alpha * gram @ start[:, None]
-        diagonal = alpha * np.einsum("mii->mi", gram) + (self.memory * f0)[:, None]
-        unit = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))[..., None]
-        left = gram * (alpha * unit)
-        left *= transpose(unit)
-        np.einsum("mii->mi", left)[:] = diagonal * unit[..., 0] ** 2
-        right *= unit
-        try:
-            moved = np.linalg.solve(left, right)
-        except np.linalg.LinAlgError:
-            moved = np.linalg.pinv(left, p * EPS, hermitian=True) @ right
-        return np.asarray(start[:, None] + unit * moved)
+        p, found = len(start), []
+        some = max(1, _IN_CACHE // max(p * p, 1))
+        for first in range(0, max(len(self.values), 1), some):
+            values, memory = (x[first : first + some] for x in (self.values, self.memory))
+            gram, right = values[..., :p], alpha * values[..., p:]
+            if start.any():
+                right -= alpha * gram @ start[:, None]
+            diagonal = alpha * np.einsum("mii->mi", gram) + (memory * f0)[:, None]
+            unit = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))[..., None]
+            left = gram * (alpha * unit)
+            left *= transpose(unit)
+            np.einsum("mii->mi", left)[:] = diagonal * unit[..., 0] ** 2
+            right *= unit
+            try:
+                moved = np.linalg.solve(left, right)
+            except np.linalg.LinAlgError:
+                moved = np.linalg.pinv(left, p * EPS, hermitian=True) @ right
+            found.append(start[:, None] + unit * moved)
+        return np.concatenate(found)
 
     def quotient(self) -> tuple[Array, Array]:
         """G_z⁻¹ h_z (M, p, c), and to how many digits, λ_min/λ_max (M,).
