@@ -837,3 +837,14 @@ def test_what_fct_hands_on_is_declared_as_where_it_goes():
 def test_one_wrong_gain_of_many_is_refused(last):
     with pytest.raises(ConfigError, match=r"estimator\.gamma"):
         estimators.build({"name": "drem", "gamma": [1.0] * 9 + [last]}).cases(["a"])
+
+
+def test_steps_below_rounding_that_add_up_are_followed():
+    """η̄ = t/1000, of which each step is less than 𝐘/Δ is known to: η̂ lags behind by 1/γ."""
+    mesh = initial_mesh(0.0, 10.0, [], 400, radau_rule(4))
+    ones, t = np.ones(mesh.points.shape), np.linspace(5.0, 10.0, 6)
+    path = scalar_path(mesh, None, ones, 1e-9 * ones, 1e-3 * mesh.points[..., None], t, 1.0)
+    found = scalar_law(path, np.zeros(1), np.array([[10.0]]))
+    np.testing.assert_allclose(found[0, :, 0], 1e-3 * (t - 0.1), atol=1e-12)
+    nothing = scalar_path(mesh, None, ones, 0.0 * ones, 0.0 * mesh.points[..., None], t, 1.0)
+    assert (scalar_law(nothing, np.ones(1), np.array([[10.0]])) == 1.0).all()

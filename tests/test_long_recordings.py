@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,9 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.rows import Rows
-from gpebo_cli.observers import Measurements, build
+from gpebo_cli.observers import Measurements, build, gpebo
+from gpebo_cli.observers.reduced import extension
+from gpebo_cli.observers.reduced import system as reduced
 from gpebo_cli.recordings.hold import held, recording_mesh
 from gpebo_cli.regression import linear
 from gpebo_cli.settings import ExcitationSettings, SolverSettings
@@ -244,6 +247,7 @@ def test_an_output_that_is_used_up_for_a_state_is_no_residual():
 def test_estimators_and_evidence_go_on_from_window_to_window(settings, monkeypatch):
     """Nothing tells where a long regression was cut: estimates, deviations, excitation, misfit."""
     signal, t = regression(three, ETA, disturbance=lambda t: 0.1 * np.sin(9.0 * t)), TIMES
+    t = t[(t < 3.0) | (t > 6.0)]  # some windows have none
     estimator, looked = estimators.build(settings), ExcitationSettings()
     found = []
     for window in (1 << 12, 17):
@@ -263,3 +267,28 @@ def test_estimators_and_evidence_go_on_from_window_to_window(settings, monkeypat
         found.append([np.array(x, dtype=float) for x in numbers if x is not None])
     for whole, cut in zip(*found, strict=True):
         np.testing.assert_allclose(cut, whole, rtol=1e-9, atol=1e-11 * np.nanmax(np.abs(whole)))
+
+
+def test_a_row_more_takes_few_more_bytes(monkeypatch):
+    """In terms of ψ's, which is made along the motor's signals: held, and added by estimating."""
+    for module in (mesh, linear):
+        monkeypatch.setattr(module, "_WINDOW", 32)
+    for module in (extension, reduced):
+        monkeypatch.setattr(module, "AT_ONCE", 32 * 7)
+    monkeypatch.setattr(gpebo, "_LONG", 32)
+    plant, observer, t = shipped("motor"), build({"name": "gpebo"}), np.linspace(0.0, 0.1, 21)
+    law, found = estimators.build({"name": "drem", "gamma": 1.0}), []
+    for rows in (40, 80, 200):  # the first ones fill caches
+        signals = rough(plant, "linear", rows, 0.1)
+        signals = replace(signals, wanted=t, asked=np.union1d(signals.mesh.edges, t))
+        tracemalloc.start()
+        seen = observer.observe(plant, signals, SolverSettings())
+        held, _ = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        estimators.estimate(law, seen.regression, t)
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        found.append([seen.regression.psi.values.nbytes, held, most - held])
+    psi, held, added = np.subtract(found[2], found[1])
+    assert 1.0 <= held / psi < 1.6
+    assert added / psi < 0.3

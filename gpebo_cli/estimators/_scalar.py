@@ -114,8 +114,11 @@ def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
 
     From η̂ = ``start``, (p,), or (g, p) for each gain its own, with the gains γ (g, p or 1).
     """
+    if not (path.digits > SINGULAR).any():  # nothing is known, and η̂ does not move
+        wide = np.broadcast_to(start, (len(gains), start.shape[-1]))
+        return wide[:, None].repeat(len(path.t), axis=1)
     variation, size = _variation(path, float(gains.max(initial=0.0)), start)
-    if variation <= _CONSTANT * size:
+    if variation <= _CONSTANT * size and not _drifts(path, float(gains.max()), size):
         return constant_law(path, start, gains)
     if variation <= _SMALL * size:
         return linear_law(path, start, gains)
@@ -150,6 +153,15 @@ def _variation(path: ScalarPath, gain: float, start: Array) -> tuple[float, floa
         rounding = _SLACK * _ROUNDING / np.maximum(path.digits[much], _ROUNDING)
         change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
     return float((weight * change).max(initial=0.0)), float(size)
+
+
+def _drifts(path: ScalarPath, gain: float, size: float) -> bool:
+    """Whether small steps of η̄, beside η̂ of a ``size``, add up to more than its rounding."""
+    weight = np.minimum(1.0, gain * path.energy)[..., None]
+    rounding = _SLACK * _ROUNDING / np.maximum(path.digits, _ROUNDING)
+    rounding = np.maximum(rounding, rounding[-1, -1])[..., None]
+    change = np.abs(path.quotient - path.quotient[-1, -1]) - size * rounding
+    return bool((weight * change).max(initial=0.0) > _CONSTANT * size)
 
 
 def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:

@@ -120,10 +120,11 @@ def in_windows(estimator: Estimator, regression: LinearRegression, t: Array) -> 
         known: Known = ()
         start = None
         for own, window in windowed(regression, t):
-            part = estimator.resume(window, np.append(own, window.mesh.edges[-1]), known)
-            eta = part.parameters(slice(None), start)
+            times = np.append(own, window.mesh.edges[-1])
+            part = estimator.resume(window, times, known)
+            eta, delta = part.parameters(slice(None), start), part.delta(times)
             etas.append(eta[:, :-1])
-            deltas.append(part.delta(own))
+            deltas.append(None if delta is None else delta[:, :-1])
             known = part.reached
             # The prior of least squares is about where they began.
             start = None if isinstance(part, LeastSquaresEstimates) else eta[:, -1]

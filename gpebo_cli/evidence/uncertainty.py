@@ -20,7 +20,7 @@ from gpebo_cli.evidence.groups import Groups, grouped
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
@@ -39,6 +39,7 @@ _AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is
 _GROUPS = 2000  # of samples, by which many of them are replaced at first
 _PER_ELAPSED = 64  # groups at least, since the start, at first
 _BESIDE = 8  # errors that stand beside each other in a factor
+_ROWS = 1 << 15  # that are looked at at once
 _STIFF = 1e12  # rates times steps, from which on rows count alike
 _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
 
@@ -220,8 +221,10 @@ def noise_level(
     own = own.clip(start, stop)
     root = regression.factor
     if root is None:
-        both = np.concatenate([regression.psi(own), regression.Y(own)[:, :, None]], axis=2)
-        root = np.linalg.qr(both.reshape(-1, p + 1), mode="r") * np.sqrt((stop - start) / len(own))
+        root = np.sqrt((stop - start) / len(own)) * triangular(
+            np.concatenate([regression.psi(t), regression.Y(t)[:, :, None]], axis=2)
+            .reshape(-1, p + 1) for t in np.array_split(own, 1 + len(own) // _ROWS)
+        )
     _, sigma, Vt = np.linalg.svd(root[:, :p], full_matrices=False)
     known = sigma > np.sqrt(_SINGULAR) * sigma.max(initial=0.0)
     inverse = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)[:, None] * Vt

@@ -113,8 +113,7 @@ def evaluation(
             return numbers_of(grid, eta - truth, x_hat - x, sizes, judged)
 
         return evaluate
-    sampler = state_map.offset.mesh.sampler(grid)
-    offset, gain = sampler(state_map.offset.values), sampler(state_map.gain.values)
+    offset, gain = state_map.offset(grid), state_map.gain(grid)
     size, p = np.concatenate(sizes), truth.shape[1]
     offset_kept, gain_kept = offset[chosen], np.swapaxes(gain[chosen], 1, 2)
 

@@ -80,13 +80,17 @@ def continuous(
     observer: Observer, estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
     """Observer and estimator as differential equations (SolverError)."""
-    t = source.t
+    t, goes_on = source.t, isinstance(estimator, estimators.ResumableEstimator)
 
     def observe(signals: Source | Signals) -> Observation:
         known = signals if isinstance(signals, Source) else source
+        asked = None
+        if _blind(known) and known.samples is not None and not source.pieces and goes_on:
+            inside = (known.samples > t[0]) & (known.samples < t[-1])
+            asked = np.union1d(t, known.samples[inside])
         seen = Measurements(
             signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.rows),
-            known.derivatives, known.t if known.recording else None,
+            known.derivatives, known.t if known.recording else None, asked,
             sum(each.inputs.mesh.points.size for each in source.pieces if each is not known),
         )
         return observer.observe(system, seen, settings.solver)
@@ -186,6 +190,11 @@ def _with_deviations(
         std, "", regression.root, final, estimation.requirement, columns
     )
     return estimation.with_deviations(told), why
+
+
+def _blind(source: Source) -> bool:
+    """Whether nobody knows the true states."""
+    return source.recording is not None and not source.recording.known_states
 
 
 def _one_fit(observation: Observation) -> bool:
@@ -340,8 +349,8 @@ def _estimate(
     kept = t[kept_samples(len(cases), len(t), settings.output.max_rows)]
     # Where nobody knows the truth there is nothing to measure between the samples that are kept;
     # and each time with bounds is a programme of its own.
-    blind = source.recording is not None and not source.recording.known_states
-    points = kept if observation.bounds or blind else regression.mesh.points.ravel()
+    at_kept = bool(observation.bounds) or _blind(source)
+    points = kept if at_kept else regression.mesh.points.ravel()
     grid = np.unique(np.concatenate([points, state_map.times, kept]))
     chosen = np.searchsorted(grid, kept)
 

@@ -6,6 +6,7 @@ singular value: a one-column product of size 1e-17 has rank 0, not 1.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import prod
 
 import numpy as np
@@ -157,3 +158,14 @@ def largest(extended: Array) -> float:
     if len(rest) > 1:
         norm = max(norm, float(np.linalg.svd(rest, compute_uv=False)[:, 0].max()))
     return norm * size
+
+
+def triangular(pieces: Iterable[Array]) -> Array:
+    """R (k, c) with RᵀR = ΣAᵀA of rows A (N, c) that come piece by piece."""
+    found: Array | None = None
+    for rows in pieces:
+        whole = rows if found is None else np.concatenate([found, rows])
+        found = np.asarray(np.linalg.qr(whole, mode="r"))
+    if found is None:
+        raise ValueError("there are no rows")
+    return found

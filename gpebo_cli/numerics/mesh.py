@@ -112,11 +112,15 @@ class Mesh:
 
     def trajectory(self, flat: Array) -> Trajectory:
         """The signal (K, s + 1, …) with these values, one point after the other."""
-        return Trajectory(self, flat.reshape(*self.points.shape, *flat.shape[1:]))
+        return Trajectory(self, flat.reshape(self.size, len(self.rule.points), *flat.shape[1:]))
 
     def along(self, signal: Callable[[Array, Array], Array]) -> Trajectory:
         """A signal, (N, …) at times (N,) and where jumps are decided, at all points."""
         return self.trajectory(signal(self.points.ravel(), self.inside.ravel()))
+
+    def sampled(self, t: Array, values: Array) -> Samples:
+        """A signal of which nothing but its values (M, …) at some times (M,) is kept."""
+        return Samples(self, values[None], t)
 
     def windows(self) -> list[Mesh]:
         """This mesh, or the pieces of a long one that are solved one after the other."""
@@ -283,6 +287,20 @@ class Trajectory:
             found = elements.chain(own[group], forced, at_start[None, some])[0]
             filtered[..., some] = found[:, :, 0]
         return Trajectory(mesh, filtered.reshape(self.values.shape))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Samples(Trajectory):
+    """A signal of which only values at some times are kept, (1, M, …); there is none in between."""
+
+    t: Array  # (M,) ascending
+
+    def __call__(self, t: Array, inside: Array | None = None) -> Array:  # noqa: ARG002
+        """Values at times t (N,), which are among those (ValueError: they are not)."""
+        k = self.t.searchsorted(t).clip(max=len(self.t) - 1)
+        if (self.t[k] != t).any():
+            raise ValueError("a signal is asked for where it was not kept")
+        return np.asarray(self.values[0, k])
 
 
 def joined(pieces: Sequence[Trajectory]) -> Trajectory:

@@ -22,7 +22,7 @@ from gpebo_cli.model.descriptor import (
     differential_order,
 )
 from gpebo_cli.model.text import switching
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, aside
+from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory, aside
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps
@@ -33,6 +33,7 @@ from gpebo_cli.schema import per_name
 from gpebo_cli.settings import SolverSettings
 
 _HELD = 3  # arrays of every kind that are alive at once; measured
+_KEPT, _BESIDE = 1.15, 45  # the same of windows, and numbers that deviations hold for a sample
 _LARGE = 32  # parameters, from which on gains are not sampled for one case
 
 ByName = float | Sequence[float] | Mapping[str, float]
@@ -69,6 +70,8 @@ class Measurements:
     noise: SignalNoise | None = None  # for an observer that weighs by it; None: there is none
     derivatives: InputDerivatives | None = None  # of the inputs; None: they are not known
     wanted: Array | None = None  # (N,) times that results are for; None: all
+    # (M,) times at which the state map is asked for, if estimators go on from window to window;
+    asked: Array | None = None  # None: any
     beside: int = 0  # points of the meshes of other recordings, whose results are kept as well
 
     @property
@@ -101,11 +104,16 @@ class Measurements:
         if self.wanted is None:
             return
         start, stop = self.span
-        p = system.q + differential_order(system, start)
-        each = times * _HELD * (p + 1) * (system.n + p + system.m + system.r)
+        n, signals, rank = system.n, system.m + system.r, differential_order(system, start)
+        p, points = system.q + rank, self.mesh.points.size + self.beside
+        numbers = times * _HELD * (p + 1) * (n + p + signals) * points
+        if self.asked is not None and times == 1.0:
+            # Y, ψ and the signals at all points, and the state map at samples.
+            of_points = (n - rank + system.r) * (p + 1) + signals + 2
+            of_samples = (n + 1) * (p + 2) + signals + _BESIDE
+            numbers = _KEPT * (points * of_points + self.mesh.size * of_samples)
         check_memory(
-            f"what is made of each of the recording's {self.mesh.size} samples",
-            each * (self.mesh.points.size + self.beside),
+            f"what is made of each of the recording's {self.mesh.size} samples", numbers,
             lambda share: f"time.horizon={share * (stop - start):.3g} fits, and observer=gpebo "
             "takes any number of rows as a stream (data.file=- < FILE)",
         )
@@ -156,13 +164,12 @@ class AffineStateMap(StateMap):
 
     def at(self, t: Array) -> Reconstruction:
         """Sample offset and gain at the times t (M,) once for all cases."""
-        sampler = self.offset.mesh.sampler(t)
-        offset = sampler(self.offset.values)
-        gain = cache(lambda: sampler(self.gain.values))
+        offset, gain = self.offset(t), cache(lambda: self.gain(t))
 
         def reconstruct(eta: Array) -> Array:
             if len(eta) == 1 and self.large:
-                return offset + sampler.products(self.gain.values, eta[0])[None]
+                products = self.gain.mesh.sampler(t).products(self.gain.values, eta[0])
+                return offset + products[None]
             return np.asarray(offset + np.matmul(gain(), eta[..., None])[..., 0])
 
         return reconstruct
@@ -170,7 +177,7 @@ class AffineStateMap(StateMap):
     @property
     def large(self) -> bool:
         """Whether gains are so large that for one case they should not be sampled."""
-        return bool(self.gain.values.shape[3] >= _LARGE)
+        return self.gain.values.shape[3] >= _LARGE and not isinstance(self.gain, Samples)
 
     def gains(self, t: Array, states: Array) -> Array:
         """The gain at the times t (M,) for every case of x̂ (g, M, n)."""

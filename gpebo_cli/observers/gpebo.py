@@ -18,7 +18,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import AffineStateMap, Measurements, Observation, Sampling
 from gpebo_cli.observers.reduced.condensed import condensed, thinned
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
-from gpebo_cli.observers.reduced.system import reduced_system
+from gpebo_cli.observers.reduced.system import SMALL, reduced_system
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
 from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain
@@ -88,6 +88,8 @@ class Gpebo:
     ) -> Observation:
         """The regression and the state map, with the remedy."""
         keeps = isinstance(self.remedy, Plain | OutputInjection) and not self.bounds
+        if not keeps or signals.mesh.size < _LONG or system.n > SMALL or solver.name == "ivp":
+            signals = replace(signals, asked=None)
         few = thinned(system, signals, solver) if keeps else None
         if few is None:
             return self._observe(system, signals, solver)
@@ -110,7 +112,8 @@ class Gpebo:
         # it is only when elements are cut that such a time is met.
         try:
             found = self._on("auto", system, signals, few(100 * signals.mesh.size))
-            if not found.note and not _same_on_both_forms(found, system, signals):
+            short = signals.mesh.size < _LONG
+            if short and not found.note and not _same_on_both_forms(found, system, signals):
                 known = _told(found, system, solver)
             why = "which determines more than the equations as given"
             if not known[0]:

@@ -229,7 +229,7 @@ class KalmanBucy:
         """
         signals.check_memory(system, _HELD)
         known = reduced_system(
-            system, signals, solver, xi_a0=self.xi_a0, form=self.form
+            system, replace(signals, asked=None), solver, xi_a0=self.xi_a0, form=self.form
         )
         evidence = Plain().observe(known)
         mesh, q, split = known.mesh, system.q, known.first.split

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -46,7 +46,7 @@ class Given:
     ) -> Observation:
         """The regression of the system's text; there is no state."""
         given = _text_of(system)
-        signals.check_memory(system)
+        replace(signals, asked=None).check_memory(system)
         regression, error = given.on(
             signals.inputs, signals.outputs if given.Y is None else None, solver.tol,
             solver.max_elements,

@@ -89,8 +89,9 @@ def load(
         table=table,
         hold=data.hold,
         span=span,
-        inputs=Trajectory(mesh, both.values[..., :m]),
-        outputs=Trajectory(mesh, both.values[..., m:]),
+        # Copies: each call of a kernel would make one of a part of all, as long as that is.
+        inputs=Trajectory(mesh, both.values[..., :m].copy()),
+        outputs=Trajectory(mesh, both.values[..., m:].copy()),
         states=_states(samples, span, smooth=data.hold == "cubic"),
         bounded=bounded,
     )

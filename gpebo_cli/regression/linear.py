@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import largest
+from gpebo_cli.numerics.linalg import largest, triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import Dynamics, filtered
@@ -142,12 +142,7 @@ class LinearRegression:
         """R (k, p + 1) with |R [−η; 1]|² = ∫‖Y − ψη‖²; of one realisation, without resets."""
         if self.factor is not None:
             return self.factor
-        found = np.zeros((0, self.p + 1))
-        for window in self.windows():
-            rows = window._weighted()  # noqa: SLF001
-            rows = np.concatenate([found, rows]) if len(found) else rows
-            found = np.asarray(np.linalg.qr(rows, mode="r"))
-        return found
+        return triangular(window._weighted() for window in self.windows())  # noqa: SLF001
 
     def _weighted(self) -> Array:
         """Rows √w [ψ | Y] at all nodes, (K s rows, p + c), w being their weights in an integral."""

@@ -53,7 +53,7 @@ def thinned(
     at = signals.at(mesh.edges)
     both = at[:-1, None] + mesh.rule.points[:, None] * np.diff(at, axis=0)[:, None]
     u, y = (Trajectory(mesh, part) for part in np.split(both, [system.m], axis=2))
-    return replace(signals, inputs=u, outputs=y, wanted=None)
+    return replace(signals, inputs=u, outputs=y, wanted=None, asked=None)
 
 
 def condensed(

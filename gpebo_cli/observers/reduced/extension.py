@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,6 +36,7 @@ from gpebo_cli.observers.reduced.split import comparable, units_along
 from gpebo_cli.observers.reduced.system import AT_ONCE, SMALL, ReducedSystem, measured
 from gpebo_cli.simulation import ivp
 
+_ROOM = 1.1  # times what elements that are not cut take
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 
 
@@ -44,17 +44,38 @@ _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still 
 class Extension:
     """The dynamic extension on the mesh that resolves it and everything computed from it."""
 
-    trajectory: Trajectory  # [ξ_a | ξ_b | Φ] (k, 1 + q + n_a)
+    trajectory: Trajectory  # [ξ_a | ξ_b | Φ] (k, 1 + q + n_a), perhaps at both ends only
     error_estimate: float  # relative to each signal's own size, the largest
     assembled: Assembled
     scale: Array  # (K, p) size of the terms of each column of ψ so far, element by element
     units: Array  # (k,) of the coordinates
     weakest: tuple[float, float]  # smallest singular value behind Assumption 1, and its time
+    asked: Array | None = None  # (M,) times of the assembled offset and gain; None: all points
 
     @property
     def mesh(self) -> Mesh:
         """The mesh."""
         return self.trajectory.mesh
+
+    @property
+    def state_map(self) -> tuple[Trajectory, Trajectory]:
+        """Offset (n,) and gain (n, p) of the state."""
+        found, mesh = self.assembled, self.mesh
+        if self.asked is None:
+            return mesh.trajectory(found.offset), mesh.trajectory(found.gain)
+        return mesh.sampled(self.asked, found.offset), mesh.sampled(self.asked, found.gain)
+
+    def kept_at(self, t: Array) -> Extension:
+        """The same with the state's offset and gain at the times t (M,) only, and z at the ends."""
+        sampler, (first, stop) = self.mesh.sampler(t), self.mesh.span
+        offset, gain = (sampler(signal.values) for signal in self.state_map)
+        z = self.trajectory.values
+        ends = self.mesh.sampled(np.array([first, stop]), np.stack([z[0, 0], z[-1, -1]]))
+        return replace(
+            self, trajectory=ends, asked=t, assembled=replace(
+                self.assembled, offset=offset, gain=gain
+            ),
+        )
 
     def growth(self, q: int) -> tuple[float, float]:
         """Largest entry of Φ in comparable units, in which its columns start at size 1.
@@ -109,7 +130,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         return _assembled(reduced, _in_units(marched, units), monitor.latest, as_found=True)
     known, large, monitor.axes = None if large else known, False, None
     if len(windows) > 1:
-        return joined(_over(windows, reduced, problem, monitor))
+        return joined(_over(windows, reduced, problem, monitor), mesh.size)
     own = ivp.solve if solver.name == "ivp" else partial(solve, known=known)
     solution = own(problem, mesh, **limits)
     return _assembled(reduced, _in_units(solution, units), monitor.latest, as_found=False)
@@ -168,7 +189,8 @@ def _over(
     windows: Iterable[Mesh], reduced: ReducedSystem, problem: LinearProblem, monitor: _Monitor
 ) -> Iterator[Extension]:
     """The extension on one window after the other, so that little is held beside the result."""
-    solver, units = reduced.solver, monitor.units
+    solver, units, asked = reduced.solver, monitor.units, reduced.signals.asked
+    end = reduced.signals.span[1]
     for window in windows:
         solution = solve(problem, window, tol=solver.tol, max_elements=solver.max_elements)
         values = solution.trajectory.values
@@ -177,35 +199,67 @@ def _over(
             floor=np.maximum(problem.floor, largest_over_time(values, 2)),
         )
         found = monitor.next_window(len(values))
-        yield _assembled(reduced, _in_units(solution, units), found, as_found=False)
+        part = _assembled(reduced, _in_units(solution, units), found, as_found=False)
+        if asked is None:
+            yield part
+            continue
+        first, stop = part.mesh.span
+        upto = len(asked) if stop == end else asked.searchsorted(stop)
+        yield part.kept_at(asked[asked.searchsorted(first) if first > asked[0] else 0 : upto])
 
 
-def joined(parts: Iterable[Extension]) -> Extension:
-    """One extension of those on neighbouring meshes."""
-    whole, rest = defaultdict[str, list[Array]](list), list[tuple[Any, ...]]()
+def joined(parts: Iterable[Extension], elements: int) -> Extension:
+    """One extension of those on neighbouring meshes, of about so many elements in all."""
+    whole, rest = dict[str, _Filled](), list[tuple[Any, ...]]()
     for part in parts:
         found = part.assembled
-        whole["edges"].append(part.mesh.edges[:-1])
-        whole["scale"].append(part.scale)
-        whole["z"].append(part.trajectory.values)
-        for name in OVER_TIME:
-            whole[name].append(getattr(found, name))
+        pieces = {
+            "edges": part.mesh.edges[:-1], "scale": part.scale, "z": part.trajectory.values,
+            **({} if part.asked is None else {"asked": part.asked}),
+            **{name: getattr(found, name) for name in OVER_TIME},
+        }
+        for name, piece in pieces.items():
+            if name not in whole:
+                whole[name] = _Filled(piece, elements / part.mesh.size)
+            whole[name].add(piece)
         rest.append((part.error_estimate, part.weakest, found.Y_scale, found.column_scale,
                      found.largest, found.moving))
-    whole["edges"].append(part.mesh.edges[-1:])
+    whole["edges"].add(part.mesh.edges[-1:])
     errors, weak, of_Y, of_columns, largest, moving = zip(*rest, strict=True)
-    # One after the other, so that no two of them are held twice.
-    over_time: dict[str, Any] = {name: np.concatenate(whole.pop(name)) for name in [*whole]}
+    over_time: dict[str, Any] = {name: filled.values for name, filled in whole.items()}
     mesh = Mesh(over_time.pop("edges"), part.mesh.rule)
-    z, scale = over_time.pop("z"), over_time.pop("scale")
+    z, scale, asked = over_time.pop("z"), over_time.pop("scale"), over_time.pop("asked", None)
     return Extension(
-        Trajectory(mesh, z), max(errors),
+        Trajectory(mesh, z) if asked is None else mesh.sampled(
+            np.array(mesh.span), np.stack([z[0, 0], z[-1, -1]])
+        ), max(errors),
         replace(
             found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
             largest=np.max(largest, axis=0), moving=np.max(moving, axis=0),
         ),
-        np.maximum.accumulate(scale, axis=0), part.units, min(weak),
+        np.maximum.accumulate(scale, axis=0), part.units, min(weak), asked,
     )
+
+
+class _Filled:
+    """Pieces in one array, in which there is room for them, so that none is held twice."""
+
+    def __init__(self, first: Array, times: float) -> None:
+        self._room = np.empty((int(_ROOM * times * len(first)) + 1, *first.shape[1:]))
+        self._stop = 0
+
+    def add(self, piece: Array) -> None:
+        """One more piece (N, …)."""
+        start, self._stop = self._stop, self._stop + len(piece)
+        if self._stop > len(self._room):
+            more = np.empty((self._stop - start + start // 4, *piece.shape[1:]))
+            self._room = np.concatenate([self._room[:start], more])
+        self._room[start : self._stop] = piece
+
+    @property
+    def values(self) -> Array:
+        """All that was added."""
+        return self._room[: self._stop]
 
 
 def _assembled(

@@ -57,9 +57,7 @@ def observation(
             parameters=reduced.parameters,
             scale=extension.scale, resets=resets,
         ),
-        state_map=AffineStateMap(
-            mesh.trajectory(final.offset), mesh.trajectory(final.gain), reduced.form.units.states
-        ),
+        state_map=AffineStateMap(*extension.state_map, reduced.form.units.states),
         truth=truth,
         error_estimate=extension.error_estimate,
         assumptions=reduced.assumptions(extension.weakest),
