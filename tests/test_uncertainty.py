@@ -508,3 +508,33 @@ def test_estimates_that_noise_did_not_bring_where_they_are_have_no_deviations(sa
         found = run("battery", data=data, estimator=name, observer={"sample_time": sample_time})
         assert (found.details.estimation.parameters_std is not None) == known
         assert ("farther from least squares" in found.verdict) != known
+
+
+@pytest.mark.parametrize("name", ["gradient", "drem", "least_squares"])
+def test_a_stream_says_deviations_where_a_run_at_samples_does(name):
+    """Not while what the estimator needs is not met and it is far from least squares so far."""
+    made = run("battery", observer="none", time={"horizon": 200.0, "samples": 101})
+    noisy = made["v"] + 0.002 * np.random.default_rng(0).standard_normal(101)
+    noise = {"name": "gaussian", "outputs": 0.002}
+    found = run(
+        "battery", data={"t": made.t, "current": made["current"], "v": noisy}, estimator=name,
+        observer={"sample_time": 2.0, "hold": "linear"}, noise=noise,
+    ).details
+    settings = Settings(
+        estimator={"name": name}, data=DataSettings("csv", "-", "linear"),
+        time=TimeSettings(-np.inf, np.inf, 11), noise=NoiseSettings(**noise),
+    )
+    online = stream(settings, found.system)(0.0, np.array([made["current"][0], noisy[0]]))
+    parts = [
+        online.feed(made.t[part], made["current"][part, None], noisy[part, None])
+        for part in (slice(7), slice(7, 101))
+    ]
+    std = np.concatenate([np.where(m.by_noise[..., None], m.std, np.nan)[0] for m in parts])
+    assert np.isnan(std[0]).all()
+    if name == "gradient":
+        assert np.isnan(std).all()
+        assert found.estimation.parameters_std is None
+    else:
+        ours = np.hstack([found.estimation.parameters_std[0], found.estimation.states_std[0]])
+        assert np.isfinite(std[10:]).all()
+        np.testing.assert_allclose(std, ours, rtol=1e-6)

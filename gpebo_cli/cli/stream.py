@@ -43,11 +43,11 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
             header = ["t", *(f"{name}_hat" for name in names), "lambda_min"]
             estimates = np.hstack([made.parameters[0], made.states[0]])
             columns = [came.t, estimates, made.gram_eigenvalues[:, :1]]
-            if made.std is not None and made.level is not None:
+            if made.std is not None and made.level is not None and made.by_noise is not None:
                 header += [f"{name}_std" for name in names]
                 std = made.std[0] * made.level[:, None]  # NaN: the estimates explain any rows
-                untouched = ~made.std[0, :, : len(online.parameters)].any(axis=1, keepdims=True)
-                columns.append(np.where(untouched | np.isnan(std), np.inf, std))
+                known = made.by_noise[0][:, None] & ~np.isnan(std)
+                columns.append(np.where(known, std, np.inf))
             head = [",".join(header).encode() + b"\n"] if first else []
             _write([*head, *rows_text(np.column_stack(columns))])
         if wrong:

@@ -165,9 +165,10 @@ class RecursiveMixed:
         self, settings: GainEstimator, parameters: Sequence[str], mixing: Mixing,
         condition: str = "Δ not in L2", groups: int = 1, mu: float = 1.0,
     ) -> None:
-        self._mixing, self._condition = mixing, condition
+        self._mixing = mixing
+        self._aim = (condition, DECAY, "1 % of the initial error") if mu == 1.0 else finite_time(mu)
         gains = settings.gains("gamma", parameters)
-        self._law = ScalarLaw(settings.start(parameters), gains, groups, mu)
+        self._law = ScalarLaw(settings.start(parameters), gains, groups, mu, self._aim[1])
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
@@ -176,9 +177,8 @@ class RecursiveMixed:
     @property
     def requirement(self) -> Requirement:
         """γ∫Δ² so far, at the smallest gain and in the group that has the least."""
-        law, aim = self._law, (self._condition, DECAY, "1 % of the initial error")
-        condition, needed, what = aim if law.mu == 1.0 else finite_time(law.mu)
-        gain, energy = float(law.gains.min()), float(law.energy.min())
+        condition, needed, what = self._aim
+        gain, energy = float(self._law.gains.min()), float(self._law.energy.min())
         return energy_requirement(condition, gain, energy, needed, what)
 
 

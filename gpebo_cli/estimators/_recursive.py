@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gpebo_cli.estimators._information import Spectrum
+from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, transpose
@@ -82,8 +83,10 @@ class ScalarLaw:
     With μ < 1 its estimates are (η̂ − w_c η̂(0))/(1 − w_c), w_c = min(e^{−γ∫Δ²}, 1 − μ).
     """
 
-    def __init__(self, start: Array, gains: Array, groups: int, mu: float = 1.0) -> None:
-        self._start, self.mu = start, mu
+    def __init__(
+        self, start: Array, gains: Array, groups: int, mu: float = 1.0, needed: float = DECAY
+    ) -> None:
+        self._start, self.mu, self._needed = start, mu, needed  # of γ∫Δ²
         self.gains = gains  # (g, 1 or p)
         self._eta = np.broadcast_to(start, (groups, len(gains), len(start))).copy()
         self._steps = Steps()
@@ -108,6 +111,7 @@ class ScalarLaw:
         self._eta = eta[-1]
         so_far = self.energy + np.cumsum(energy, axis=0)
         self.energy = so_far[-1]
+        met = self.gains.min() * so_far.min(axis=1) >= self._needed
         w_c = np.minimum(np.exp(-self.gains * so_far[:, :, None, None]), 1.0 - self.mu)
         eta = (eta - w_c * self._start) / (1.0 - w_c)
         K, D, g, p = eta.shape
@@ -116,6 +120,7 @@ class ScalarLaw:
         return SampledEstimates(
             parameters, shown,
             behind and (lambda: self._errors(*behind(), decay, of_new, of_old, had, 1.0 - w_c)),
+            met,
         )
 
     def _errors(

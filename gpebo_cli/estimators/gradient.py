@@ -81,7 +81,7 @@ class RecursiveGradient(VectorRecursion):
         done = -np.expm1(-np.minimum(sigma, _ALL) ** 2)
         done = np.divide(done, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
         L = transpose((U * done[..., None, :]) @ Vt * roots)
-        eta, shrunk = self.advance(L, rows[..., :p], rows[..., p])
+        eta, shrunk, met = self.advance(L, rows[..., :p], rows[..., p])
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δη̂' = (I − LN) δη̂ + L δY, of every case."""
@@ -92,7 +92,7 @@ class RecursiveGradient(VectorRecursion):
                 for own, A in zip(L, shrunk, strict=True)
             )
 
-        return SampledEstimates(eta, None, errors)
+        return SampledEstimates(eta, None, errors, met)
 
 
 ESTIMATOR = Gradient

@@ -32,6 +32,7 @@ from gpebo_cli.regression.samples import SampledRegression, integrating
 from gpebo_cli.schema import number
 
 _DIGITS = 1e-12  # reciprocal condition of Ω below which some direction is rounding
+_NEEDED = 99.0  # αλ_min(G)/f₀: 1 % of the initial error is left
 _FEW = 3  # gains, and
 _SMALL = 8  # parameters, from which on a few systems are solved instead of taking eigenvectors
 
@@ -215,9 +216,9 @@ class LeastSquaresEstimates(Unmixed):
 def ratio_requirement(reached: float) -> Requirement:
     """Whether α λ_min(G)/f₀ is enough."""
     return Requirement(
-        name="λ_min(G) → ∞", holds=reached >= 99.0,
-        evidence={"alpha_lambda_min_over_f0": reached, "needed": 99.0},
-        text=f"α λ_min(G)/f₀ = {reached:.3g}; 1 % of the initial error needs 99",
+        name="λ_min(G) → ∞", holds=reached >= _NEEDED,
+        evidence={"alpha_lambda_min_over_f0": reached, "needed": _NEEDED},
+        text=f"α λ_min(G)/f₀ = {reached:.3g}; 1 % of the initial error needs {_NEEDED:g}",
     )
 
 
@@ -229,7 +230,7 @@ class RecursiveLeastSquares:
         self._start = settings.start(parameters)
         betas, self._which = np.unique([c["beta"] for c in self._cases], return_inverse=True)
         self._root = InformationRoot(len(parameters), betas)
-        self._ratios = np.zeros(len(self._cases))
+        self._ratio = 0.0
 
     def spectra(self, regression: SampledRegression) -> list[Spectrum]:
         """The spectrum of G_z at the samples, of every case."""
@@ -240,10 +241,11 @@ class RecursiveLeastSquares:
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
         spectra = self.spectra(regression)
-        self._ratios = np.array([
-            case["alpha"] * s.eigenvalues[-1].min(initial=np.inf) / (case["f0"] * s.memory[-1])
+        ratios = np.min([
+            case["alpha"] * s.eigenvalues.min(axis=1, initial=np.inf) / (case["f0"] * s.memory)
             for case, s in zip(self._cases, spectra, strict=True)
-        ])
+        ], axis=0)
+        self._ratio = float(ratios[-1])
         solved = [
             solution(s, case["alpha"], case["f0"], self._start)
             for case, s in zip(self._cases, spectra, strict=True)
@@ -257,12 +259,12 @@ class RecursiveLeastSquares:
                 for own, case, s in zip(filters, self._cases, spectra, strict=True)
             )
 
-        return SampledEstimates(np.array(solved)[..., 0], None, errors)
+        return SampledEstimates(np.array(solved)[..., 0], None, errors, ratios >= _NEEDED)
 
     @property
     def requirement(self) -> Requirement:
         """α λ_min(G)/f₀ so far."""
-        return ratio_requirement(float(self._ratios.min()))
+        return ratio_requirement(self._ratio)
 
 
 def solution(s: Spectrum, alpha: float, f0: float, start: Array) -> Array:

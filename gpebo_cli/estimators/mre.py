@@ -119,7 +119,7 @@ class RecursiveMemoryExtension(VectorRecursion):
         V = roots[..., None] * V
         # It is the mean of e^{−x} over 0 to M.
         L = (V * mean_decay(np.maximum(M, 0.0))[..., None, :]) @ transpose(V)
-        eta, shrunk = self.advance(L, omega, whole[..., p])
+        eta, shrunk, met = self.advance(L, omega, whole[..., p])
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δ𝒴 of the filters, δη̂' = (I − L∫Ω) δη̂ + L ∫δ𝒴, of every case."""
@@ -136,7 +136,7 @@ class RecursiveMemoryExtension(VectorRecursion):
                 out.append(ErrorRecursion(A, of_old, of_new, np.eye(p, 2 * p, p)[None]))
             return tuple(out)
 
-        return SampledEstimates(eta, None, errors)
+        return SampledEstimates(eta, None, errors, met)
 
 
 ESTIMATOR = MemoryExtension

@@ -16,7 +16,7 @@ _ASTRAY = 0.02  # of a quantity's size: estimates that differ by more are differ
 _EXACT = 1e-3  # of it: so do those of a law that is done, if less than
 _DONE = 30.0  # times this is what it has left of the errors it began with
 _BEYOND = 4.0  # deviations: noise does not bring estimates farther away
-_UNFINISHED = (  # why there are no deviations
+UNFINISHED = (  # why there are no deviations
     "what the estimator needs is not met, and estimates are farther from least squares over the "
     "same data than noise brings them; use estimator=least_squares or other gains"
 )
@@ -52,7 +52,24 @@ def finished(
     if not far.any():
         return std, why
     std[far] = np.nan
-    return None if far.all() else std, _UNFINISHED
+    return None if far.all() else std, UNFINISHED
+
+
+def moved_by_noise(
+    std: Array, parameters: Array, roots: Array, met: BoolArray | None
+) -> BoolArray:
+    """At which of K samples (G, K) noise alone may have brought η̂ (G, K, p) where it is.
+
+    It has moved η̂, and what is required is ``met`` (K,) by then (None: nobody knows), or η̂ is as
+    near to least squares of the data so far, by their roots (K, p + 1, p + 1), as deviations (G, K,
+    p + n) bring it.
+    """
+    own = std[..., : parameters.shape[2]]
+    out: BoolArray = np.asarray(own.any(axis=2))
+    for k in [] if met is None else np.flatnonzero(~met):
+        away = np.abs(parameters[:, k] - least_squares(roots[k]))
+        out[:, k] &= (away <= _BEYOND * own[:, k]).all(axis=1)
+    return out
 
 
 def _about(root: Array, columns: IntArray) -> Array:

@@ -277,12 +277,9 @@ def at_samples(
     kept = chosen[kept_samples(len(by.cases), len(chosen), settings.output.max_rows)]
     still = doubts.still(parameters, by.requirement, online.natural_sizes)
     told = np.concatenate([parameters, states], axis=2)[:, kept]
-    std, gains = made.at(kept, ~np.isnan(told) & ~still[:, None, None])
-    nobody = settings.uncertainty and parameters.size and std is None
-    std, why = doubts.finished(
-        std, none_at_samples(len(by.cases)) if nobody else "", online.root,
-        made.parameters[:, -1], by.requirement, columns,
-    )
+    std, gains, why = made.at(kept, ~np.isnan(told), still)
+    if settings.uncertainty and parameters.size and std is None:
+        why = why or none_at_samples(len(by.cases))
     estimation = EstimationResult(
         cases=by.cases, t=t[kept], names=online.parameters, parameters=parameters[:, kept],
         true_parameters=truth[kept], states=states[:, kept],

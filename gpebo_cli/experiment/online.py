@@ -45,17 +45,24 @@ class OnlineEstimates:
     std: Array | None = None  # (G, K, p + n) deviations, to be multiplied by
     level: Array | None = None  # (K,) that of the noise so far, 1 where it is known
     gain: Array | None = None  # ∂x̂/∂η̂ (K, n, p), or of each case (G, K, n, p), where std is
+    by_noise: BoolArray | None = None  # (G, K) whether noise may have brought η̂ where it is
 
-    def at(self, kept: IntArray, told: BoolArray) -> tuple[Array | None, Array | None]:
-        """Deviations (G, M, p + n) at some samples (M,), NaN where not ``told``, and ∂x̂/∂η̂ there.
+    def at(
+        self, kept: IntArray, told: BoolArray, still: BoolArray
+    ) -> tuple[Array | None, Array | None, str]:
+        """Deviations at some samples (M,), ∂x̂/∂η̂ there, and why there are none at the end.
 
-        The latter has a shape (G, M, n, p).
+        The first (G, M, p + n) are NaN where not ``told``, and of cases (G,) that stand ``still``,
+        the second are (G, M, n, p).
         """
-        if self.std is None or self.level is None or self.gain is None:
-            return None, None
+        if self.std is None or self.level is None or self.gain is None or self.by_noise is None:
+            return None, None, ""
+        told = told & (self.by_noise[:, kept] & ~still[:, None])[..., None]
+        why = "" if (self.by_noise[:, -1] | still).all() else doubted.UNFINISHED
         std = np.where(told, self.std[:, kept] * self.level[-1], np.nan)
         gain = self.gain[..., kept, :, :]
-        return std, np.broadcast_to(gain, (len(std), *gain.shape[-3:]))
+        gain = np.broadcast_to(gain, (len(std), *gain.shape[-3:]))
+        return None if why and not told.any() else std, gain, why
 
     def with_some(self, few: OnlineEstimates, columns: IntArray) -> OnlineEstimates:
         """The same with the estimates of some of the parameters (k,), the others being zero."""
@@ -70,7 +77,7 @@ class OnlineEstimates:
             gain[..., columns] = few.gain
         return replace(
             self, parameters=wide, states=few.states, delta=few.delta, std=std, level=few.level,
-            gain=gain,
+            gain=gain, by_noise=few.by_noise,
         )
 
 
@@ -78,7 +85,7 @@ def joined(parts: Sequence[OnlineEstimates]) -> OnlineEstimates:
     """What consecutive samples gave, as if they had come at once."""
     regressions = [part.regression for part in parts]
     axes = {"parameters": 1, "states": 1, "delta": 1, "gram_eigenvalues": 0, "seen": 0,
-            "extension": 0, "std": 1, "level": 0, "gain": -3}
+            "extension": 0, "std": 1, "level": 0, "gain": -3, "by_noise": 1}
     known = {name: [getattr(part, name) for part in parts] for name in axes}
     whole: dict[str, Any] = {
         name: None if any(part is None for part in found) else np.concatenate(found, axes[name])
@@ -165,10 +172,13 @@ class Online:
         states = block.offset + np.einsum("knp,gkp->gkn", gain, made.parameters)
         if block.fit is not None:
             states, gain = block.fit(made.parameters, transpose(S) @ S)
-        std, level = None, None
+        std, level, by_noise = None, None, None
         if self._deviations is not None and block.errors is not None and made.errors is not None:
             std, level = self._deviations.update(
                 block.errors, made.errors(), block.regression, gain, roots[:, 0]
+            )
+            by_noise = doubted.moved_by_noise(
+                std * level[:, None], made.parameters, roots[:, 0], made.met
             )
         eigenvalues = sigma[:, ::-1] ** 2
         seen = known.states(gain if gain.ndim == 3 else gain[0], block.units)
@@ -182,7 +192,7 @@ class Online:
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
             block.regression, made.parameters, states, made.delta, eigenvalues, known, seen,
-            block.extension, std, level, None if std is None else gain,
+            block.extension, std, level, None if std is None else gain, by_noise,
         )
 
     def truth(self, extension: Array) -> observers.Truth:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from gpebo_cli.findings import Requirement
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt
 from gpebo_cli.regression.linear import LinearRegression
@@ -149,6 +149,7 @@ class SampledEstimates:
     # Of every case how errors of Y become errors of η̂, to be asked at every update or never; None:
     # nobody knows.
     errors: Callable[[], Sequence[ErrorRecursion]] | None = None
+    met: BoolArray | None = None  # (K,) whether what is required had come by then, where errors are
 
 
 class Recursion(Protocol):
