@@ -19,6 +19,8 @@ from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 LARGE = 1e3  # of Φ: above it, states may be differences of terms that leave nothing of them
 _UNRESOLVED = 10.0  # tolerances of the terms of a column of ψ: what is smaller says nothing
 _SINGULAR = 1e-12  # eigenvalues of N below this are rounding of products of float64 numbers
+_DIGITS = 6  # of what a column has to say, by which one is preferred to another
+_SURE = 1e6  # times its level: an eigenvalue that decides which parameters are estimated
 _SEEN = 1e-6  # part in the kernel of N beyond which a direction is not known
 _NOISE = 1e-12  # of a column of a gain in the states' own units: beyond what extensions are good to
 _MIXED = 1e-14  # over an eigenvalue of N: how far its vector may turn into the kernel's
@@ -86,22 +88,24 @@ class Knowledge:
         """Parameters that can be estimated together, the determined ones included.
 
         The others, set to zero, change nothing that is determined: along the kernel of N the
-        regression is the same. Of the times those count at which most of them can be told apart:
-        data say no less later, but beside what grows their Gram matrix shows it no longer.
+        regression is the same. The first time counts at which as many as ever can be told apart for
+        sure: what data say later must not change estimates of the past, and beside what grows
+        their Gram matrix shows it no longer.
         """
         if self.parameters[-1].all():
             return np.arange(self.parameters.shape[1])
         clear = self.clarity >= 1.0
-        rank, least = clear.sum(axis=1), np.where(clear, self.eigenvalues, np.inf).min(axis=1)
-        m = int(np.argmax(np.where(rank == rank.max(), least, -1.0)))
+        rank, least = clear.sum(axis=1), np.where(clear, self.clarity, _SURE).min(axis=1)
+        m = int(np.argmax(np.where(rank == rank.max(), np.minimum(least, _SURE), -1.0)))
         known, level = self.parameters[m], self.level[m]
         normalised = (self.vectors[m] * np.maximum(self.eigenvalues[m], 0.0)) @ self.vectors[m].T
         first = np.flatnonzero(known | self.parameters[-1]).tolist()
         rest, chosen = [j for j in range(len(known)) if j not in first], list[int]()
         left = normalised.copy()  # what those that are chosen do not explain of the others
         while first or rest:
-            # Of those that may stand for one another the one with the most to say comes first.
-            j = max(first or rest, key=left.diagonal().__getitem__)
+            # Of those that may stand for one another the one with the most to say comes first, and
+            # rounding does not decide which: alone, each has the size one.
+            j = max(first or rest, key=left.diagonal().round(_DIGITS).__getitem__)
             (first or rest).remove(j)
             more = [*chosen, j]
             if not known[j]:  # no eigenvalue is above what is left of a column
