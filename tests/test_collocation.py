@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.kernels import elements as bound
 from gpebo_cli.numerics.collocation import merged, solve, solve_constant
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
@@ -314,22 +313,20 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
 
 
 def test_a_short_element_keeps_the_digits_of_equations_without_derivatives():
-    """x' = M ν, 0 = b − N x − ν: in 1e-11 s a pivot among the slopes took 11 of 16 digits of ν."""
-    rng = np.random.default_rng(4)
-    rule, p, k = radau_rule(14), 4, 2
-    E, A, f = np.zeros((1, p + k, p + k)), np.zeros((15, p + k, p + k)), np.zeros((15, p + k, 1))
-    E[0, :p, :p] = np.eye(p)
-    A[:, :p, p:] = rng.uniform(0.0, 1.0, (p, k)) * (1.0 + 1e-11 * rng.normal(size=(15, 1, 1)))
-    A[:, p:, :p] = -np.swapaxes(A[:, :p, p:], 1, 2)
-    A[:, p:, p:] = -np.eye(k)
-    f[:, p:] = rng.normal(size=(k, 1))
+    """x' = M ν, 0 = b − Mᵀx − ν: in 1e-11 s a pivot among the slopes took 11 of 16 digits of ν."""
+    p, k, rng = 4, 2, np.random.default_rng(4)
+    E, A, f = np.zeros((1, p + k, p + k)), np.zeros((p + k, p + k)), np.zeros((p + k, 1))
+    E[0, :p, :p], A[p:, p:] = np.eye(p), -np.eye(k)
+    A[:p, p:] = rng.uniform(0.0, 1.0, (p, k))
+    A[p:, :p], f[p:] = -A[:p, p:].T, rng.normal(size=(k, 1))
 
-    def found():
-        maps = bound.element_maps(
-            rule.differentiation, np.array([1e-11]), E, A, f, None, None, np.array([0]), 1
-        )
-        return maps[0][0] @ np.ones(p + k) + maps[1][0, ..., 0]
+    def coefficients(t, inside):
+        moves = 1.0 + np.sin(inside)[:, None, None]
+        return LinearEquation(E, A * moves, f * moves)
 
-    for x in by_both(found):
-        left = A[1:, p:] @ x[..., None] + f[1:, p:]
+    start = np.concatenate([np.ones((p, 1)), f[p:] + A[p:, :p] @ np.ones((p, 1))])
+    mesh = Mesh(np.array([0.0, 0.1, 0.1 + 1e-11, 0.2]), radau_rule(14))
+    problem = LinearProblem(coefficients, start, name="law")
+    for found in by_both(lambda: solve(problem, mesh, tol=1e-9, max_elements=9)):
+        left = A[p:] @ found.trajectory.values + f[p:]
         assert np.abs(left).max() < 1e-13

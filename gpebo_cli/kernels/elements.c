@@ -142,6 +142,8 @@ static int solve_group(const Equation *q, const npy_intp *members, npy_intp coun
 {
     const npy_intp m = q->s * q->d, n = q->n, columns = q->columns, sides = n + count * columns;
     const npy_intp length = row_length(m, sides);
+    for (npy_intp i = 0; i < m; i++)
+        memset(W + i * length + m + sides, 0, (length - m - sides) * sizeof(double));
     lengthen(q, members[0]);
     assemble(q, members[0], W, length);
     for (npy_intp k = 0; k < count; k++) {

@@ -72,8 +72,8 @@ static inline npy_intp row_length(npy_intp m, npy_intp columns)
     return (m + sides + PANEL - 1) / PANEL * PANEL;
 }
 
-/* Solves A X = B by elimination with row pivoting. W holds [A | B] in m rows of row_length(m,
-   columns) numbers; A is destroyed and B becomes X. 0 if a pivot is exactly zero. */
+/* Solves A X = B by elimination with row pivoting. W holds [A | B | 0] in m rows of
+   row_length(m, columns) numbers; A is destroyed and B becomes X. 0 if a pivot is exactly zero. */
 int eliminate(double *W, npy_intp m, npy_intp columns);
 
 #endif

@@ -108,24 +108,9 @@ static inline void solve_panel(double *W, npy_intp m, npy_intp length, npy_intp 
     }
 }
 
-/* Rows of [A | B] times powers of two that make the largest number of A in each about 1, and zeros
-   behind B. In a short element D/h is large beside rows without E: those would lose their digits. */
-static inline void compare_rows(double *W, npy_intp m, npy_intp columns, npy_intp length)
-{
-    for (double *row = W; row < W + m * length; row += length) {
-        double largest = ldexp(1.0, -1000);
-        for (npy_intp j = 0; j < m; j++)
-            largest = larger(fabs(row[j]), largest);
-        const double scale = ldexp(1.0, -ilogb(largest));
-        for (npy_intp j = 0; j < length; j++)
-            row[j] = j < m + columns ? scale * row[j] : 0.0;
-    }
-}
-
 EVERY_WIDTH int eliminate(double *W, npy_intp m, npy_intp columns)
 {
     const npy_intp length = row_length(m, columns);
-    compare_rows(W, m, columns, length);
     for (npy_intp k = 0; k < m; k += PANEL) { /* the last panel may be narrow: nothing is below */
         const npy_intp width = m - k < PANEL ? m - k : PANEL;
         if (!factor_panel(W, m, length, k, width))

@@ -301,6 +301,11 @@ def _solve_elements(
     k, s = len(h), rule.stages
     basis, offset = (None, None) if c.constraints is None else c.constraints
     group, groups = np.arange(k), k
+    if c.E is not None and len(c.A) > 1 and not (some := c.E.any(axis=(0, 2))).all():
+        # In a short element D/h is large beside rows without E, whose unknowns would be taken from
+        # rows with it, and lose their digits: those are divided by h, too.
+        weights = np.where(some, 1.0, (1.0 / h).repeat(s + 1)[:, None])[..., None]
+        c = c._replace(A=c.A * weights, f=c.f * weights)
     solve: Callable[..., tuple[Array, Array]] = elements.element_maps
     if _is_constant(c):
         group, h = equal_lengths(h)
