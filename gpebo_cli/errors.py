@@ -8,7 +8,6 @@ returns :attr:`GpeboError.exit_code`; anything else that escapes is a bug.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 _MOST = 2.0  # GB
 
@@ -31,14 +30,6 @@ class ModelError(GpeboError):
 
 class SolverError(GpeboError):
     """The solver cannot reach the tolerance it was asked for."""
-
-
-class RoundingError(SolverError):
-    """The same, because what it ``found`` is rounding in a part."""
-
-    def __init__(self, message: str, found: Any) -> None:
-        super().__init__(message)
-        self.found = found
 
 
 def check_memory(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from gpebo_cli.errors import RoundingError, SolverError
+from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.mesh import Mesh, unresolved_kinds
@@ -25,6 +25,14 @@ Found = TypeVar("Found")
 # (mesh, what was found on the mesh before, the old element of each new one or −1)
 # -> (what is found, the tail of each element (K,))
 Evaluate = Callable[[Mesh, "Found | None", IntArray], tuple[Found, Array]]
+
+
+class RoundingError(SolverError):
+    """The solver cannot reach the tolerance, for what it ``found`` is rounding in a part."""
+
+    def __init__(self, message: str, found: Any) -> None:
+        super().__init__(message)
+        self.found = found
 
 
 def refine(

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gpebo_cli.errors import RoundingError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import series
@@ -29,6 +28,7 @@ from gpebo_cli.numerics.mesh import (
 )
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.numerics.refinement import RoundingError
 from gpebo_cli.reduction.consistency import Jump
 from gpebo_cli.reduction.constant import ConstantForm, constant_form
 from gpebo_cli.reduction.explicit import (

@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from gpebo_cli.errors import ModelError, RoundingError, SolverError
+from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
 from gpebo_cli.model.text import FollowsSignals
 from gpebo_cli.numerics.collocation import solve
@@ -17,6 +17,7 @@ from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
+from gpebo_cli.numerics.refinement import RoundingError
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jumps
 from gpebo_cli.reduction.strangeness_free import StrangenessFree, direct_part, strangeness_free_form
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
