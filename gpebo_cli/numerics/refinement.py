@@ -69,7 +69,7 @@ def refine(
             moved = Mesh(mesh.edges + 64 * EPS * np.abs(mesh.edges).max(), mesh.rule)
             there, other = evaluate(moved, found, np.full(mesh.size, -1))
             left = float(other[stuck].max())
-            if np.mean(np.minimum(np.abs(other / tail - 1.0), 1.0)[stuck]) > _OTHER:
+            if np.mean(np.minimum(np.abs(other[stuck] / tail[stuck] - 1.0), 1.0)) > _OTHER:
                 many = (missed > 1).sum() > _MANY
                 if left <= _LOST and many:
                     return mesh, there, other
