@@ -55,9 +55,12 @@ def raised(estimator: Estimator, requirement: Requirement) -> Estimator:
     return estimator.raised(requirement) if isinstance(estimator, GainEstimator) else estimator
 
 
-def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Estimates:
+def estimate(
+    estimator: Estimator, regression: LinearRegression, t: Array, shown: Array | None = None
+) -> Estimates:
     """``estimator.estimate`` from segment to segment, at the times t (M,), ascending.
 
+    What is mixed is asked for at some of them, ``shown`` (k,); None: at all.
     At a reset η̂ becomes T η̂ + τ and the extension ``ExtensionState.after``. A time at which
     there is a reset belongs to what follows it.
     """
@@ -68,7 +71,7 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
         moving = able(estimator, Moving, _FOLLOW)
         return moving.estimate_moving(regression, regression.dynamics, t)
     if not regression.resets:
-        found = in_windows(estimator, regression, t)
+        found = in_windows(estimator, regression, t, t if shown is None else shown)
         return estimator.estimate(regression, t) if found is None else found
     segments = regression.segments
     first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
@@ -89,25 +92,27 @@ def estimate(estimator: Estimator, regression: LinearRegression, t: Array) -> Es
 class Gone:
     """Estimates of every case that are at hand, with what was mixed."""
 
-    t: Array  # (M,)
     values: Array  # (cases, M, p)
-    mixed: Array | None  # Δ (1 or cases, M)
+    shown: Array  # (k,) some of their times
+    mixed: Array | None  # Δ (1 or cases, k)
     requirement: Requirement
 
     def delta(self, t: Array) -> Array | None:
-        """Δ (1 or cases, k) at some of the times of the estimates, (k,)."""
-        return None if self.mixed is None else self.mixed[:, np.searchsorted(self.t, t)]
+        """Δ (1 or cases, j) at some of the times that were to be shown, (j,)."""
+        return None if self.mixed is None else self.mixed[:, np.searchsorted(self.shown, t)]
 
     def parameters(self, cases: slice) -> Array:
         """η̂ of some cases, (g, M, p)."""
         return self.values[cases]
 
 
-def in_windows(estimator: Estimator, regression: LinearRegression, t: Array) -> Gone | None:
+def in_windows(
+    estimator: Estimator, regression: LinearRegression, t: Array, shown: Array
+) -> Gone | None:
     """Estimates at the times t (M,) of a long regression, window by window; None: not so.
 
     What an estimator holds is that of one window; from one to the next it goes on as after a reset
-    that changes nothing.
+    that changes nothing. Δ is found at the times ``shown`` (k,).
     """
     if not isinstance(estimator, ResumableEstimator):
         return None
@@ -119,10 +124,11 @@ def in_windows(estimator: Estimator, regression: LinearRegression, t: Array) -> 
     def parts() -> Iterator[ResumableEstimates]:
         known: Known = ()
         start = None
-        for own, window in windowed(regression, t):
-            times = np.append(own, window.mesh.edges[-1])
-            part = estimator.resume(window, times, known)
-            eta, delta = part.parameters(slice(None), start), part.delta(times)
+        windows = zip(windowed(regression, t), windowed(regression, shown), strict=True)
+        for (own, window), (looked, _) in windows:
+            end = window.mesh.edges[-1]  # there may be no other time
+            part = estimator.resume(window, np.append(own, end), known)
+            eta, delta = part.parameters(slice(None), start), part.delta(np.append(looked, end))
             etas.append(eta[:, :-1])
             deltas.append(None if delta is None else delta[:, :-1])
             known = part.reached
@@ -142,7 +148,7 @@ def in_windows(estimator: Estimator, regression: LinearRegression, t: Array) -> 
     else:  # it says what it needs of all data at once
         return None
     mixed = None if deltas[0] is None else np.concatenate([d for d in deltas if d is not None], 1)
-    return Gone(t, np.concatenate(etas, axis=1), mixed, requirement)
+    return Gone(np.concatenate(etas, axis=1), shown, mixed, requirement)
 
 
 def errors(estimator: Affine, regression: LinearRegression) -> Sequence[ErrorsAt]:

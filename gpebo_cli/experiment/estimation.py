@@ -360,8 +360,8 @@ def _estimate(
 
     def made(by: estimators.Estimator) -> tuple[estimators.Estimates, IntArray]:
         if about_own:
-            return _estimates(by, observation, grid, known.independent)
-        return estimators.estimate(by, regression, grid), np.arange(p)
+            return _estimates(by, observation, grid, kept, known.independent)
+        return estimators.estimate(by, regression, grid, kept), np.arange(p)
 
     if about_own:
         determined = known.parameters[-1]
@@ -434,18 +434,19 @@ def _doubts(
 
 
 def _estimates(
-    estimator: estimators.Estimator, observation: Observation, grid: Array, columns: IntArray
+    estimator: estimators.Estimator, observation: Observation, grid: Array, kept: Array,
+    columns: IntArray,
 ) -> tuple[estimators.Estimates, IntArray]:
     """The estimates of some of the parameters, and of which: all, where settings are one each."""
     some, columns = _about(observation, columns)
     try:
-        return estimators.estimate(estimator, some, grid), columns
+        return estimators.estimate(estimator, some, grid, kept), columns
     except ConfigError:
         if some is observation.regression:
             raise
         # As many numbers in its settings as parameters.
         whole = observation.regression
-        return estimators.estimate(estimator, whole, grid), np.arange(whole.p)
+        return estimators.estimate(estimator, whole, grid, kept), np.arange(whole.p)
 
 
 def _about(observation: Observation, columns: IntArray) -> tuple[LinearRegression, IntArray]:
