@@ -50,6 +50,10 @@ class Effort:
 Solve = Callable[[DescriptorSystem, TimeSettings, SolverSettings], tuple[Trajectory, float]]
 
 
+class SlidesError(SolverError):
+    """Newton's method does not converge where outputs pass a jump or a kink."""
+
+
 def follow(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings, solve: Solve
 ) -> Effort:
@@ -60,7 +64,7 @@ def follow(
     t, stop = time.start, time.start + time.horizon
     length, x = time.horizon, system.initial_state
     pieces: list[Trajectory] = []
-    refused: ConfigError | None = None
+    refused: GpeboError | None = None
     refused_until = t
     iterates, work, change = 0, 0.0, 0.0
     at_rest = Linearised(system, _at_rest(x, t, length, solver))
@@ -80,11 +84,11 @@ def follow(
         try:
             piece, count, spent, last = _window(own, window, solver, solve)
         except GpeboError as error:
-            if isinstance(error, ConfigError):
+            if isinstance(error, ConfigError | SlidesError):
                 refused, refused_until = error, t + length
             length *= 0.25
             if length < _SHORTEST * time.horizon:
-                # What has a name there is the reason: an entry without a value, a zero divisor.
+                # What has a name there is the reason: no value, a zero divisor, a jump.
                 near = refused is not None and t <= refused_until <= t + _AROUND * time.horizon
                 raise _ends(system, t, x, refused if near and refused else error) from None
             continue
@@ -111,10 +115,11 @@ def _window(
     tolerance, and the change that one more is expected to make.
     """
     guess = _at_rest(system.initial_state, time.start, time.horizon, solver)
-    before, work, was_full = np.inf, 0.0, False
+    before, work, was_full, passed = np.inf, 0.0, False, np.zeros(0)
     for count in range(1, _MOST_ITERATES + 1):
         full = before <= _NEAR or solver.tol >= _LOOSE
         along = Linearised(system, guess)
+        passed = along.switched if len(along.switched) else passed  # one iterate may, the next not
         linear = replace(system, coefficients=along)
         own = solver if full else replace(solver, tol=_LOOSE)
         alike = count > 2 and full == was_full
@@ -141,16 +146,16 @@ def _window(
         if not np.isfinite(change) or (count > 2 and change > _SHRINKS * before):
             break
         guess, before, was_full = found, change, full
-    why = ""
-    if len(along.switched):
-        why = (
-            f"; outputs pass a jump or a kink near t = {along.switched[0]:.9g}, and the equations "
+    said = (
+        f"Newton's method does not converge between t = {time.start:.9g} and "
+        f"t = {time.start + time.horizon:.9g}"
+    )
+    if len(passed):
+        raise SlidesError(
+            f"{said}; outputs pass a jump or a kink near t = {passed[0]:.9g}, and the equations "
             "have no solution that slides along a jump"
         )
-    raise SolverError(
-        f"Newton's method does not converge between t = {time.start:.9g} and "
-        f"t = {time.start + time.horizon:.9g}{why}"
-    )
+    raise SolverError(said)
 
 
 def _at_rest(x: Array, start: float, length: float, solver: SolverSettings) -> Trajectory:
