@@ -55,11 +55,8 @@ class Errors(NamedTuple):
     @property
     def estimate(self) -> float:
         """The largest; what has too few digits counts beside the others: it may be zero."""
-        found = self
-        if self.own is not self.beside:
-            known = np.where(self.largest < _FEW * self.own, self.own, self.beside)
-            found = self._replace(own=known)
-        return float(found.relative.max(initial=0.0))
+        known = np.where(self.largest < _FEW * self.own, self.own, self.beside)
+        return float(self._replace(own=known).relative.max(initial=0.0))
 
     def vague(self, tol: float) -> BoolArray:
         """Which have too few digits, and may be more than ``tol`` of what is beside them."""
