@@ -13,7 +13,7 @@ from gpebo_cli.numerics.collocation import merged, solve, solve_constant
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
-from gpebo_cli.numerics.refinement import resolve
+from gpebo_cli.numerics.refinement import refine, resolve
 from tests.kernel_paths import by_both
 
 
@@ -330,3 +330,14 @@ def test_a_short_element_keeps_the_digits_of_equations_without_derivatives():
     for found in by_both(lambda: solve(problem, mesh, tol=1e-9, max_elements=9)):
         left = A[p:] @ found.trajectory.values + f[p:]
         assert np.abs(left).max() < 1e-13
+
+
+@pytest.mark.parametrize(("start", "said"), [(1e9, "begin at 0"), (0.5, "a jump or a singularity")])
+def test_elements_as_short_as_times_are_told_apart_say_why(start, said):
+    """A tail that no cut makes smaller, in the second element."""
+    def evaluate(mesh, found, kept):
+        return found, (np.arange(mesh.size) == 1).astype(float)
+
+    mesh = Mesh(start + np.array([0.0, 0.5, 1.0]), radau_rule(4))
+    with pytest.raises(SolverError, match=said):
+        refine(evaluate, mesh, tol=1e-9, max_elements=10_000, name="plant p")
