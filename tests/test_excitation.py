@@ -10,6 +10,7 @@ import pytest
 from plants import observed, reference, shipped
 from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec
+from scipy.optimize import brentq
 
 from gpebo_cli.evidence.excitation import assess, persistent
 from gpebo_cli.evidence.metrics import measure_squares, settling_time, time_rms
@@ -59,6 +60,27 @@ def test_t_c_is_the_first_time_the_level_is_reached():
     never = assess(CLEAN, T, ExcitationSettings(rho=1e6))
     assert never.t_c is None
     assert not never.is_ie
+
+
+@pytest.mark.parametrize(("bend", "horizon"), [(1.0, 8.0), (1.0, 80.0), (0.03, 80.0)])
+def test_t_c_is_no_rounding_of_what_g_grows_to(bend, horizon):
+    """ψ = (t, t + b t²): both grow from zero, and are told apart later by the bend of one only."""
+    bent = regression(
+        lambda t: np.stack([t, t + bend * t**2], axis=-1), [1.0, 2.0], horizon
+    )
+    found = assess(bent, np.linspace(0.0, horizon, 101), ExcitationSettings())
+    x = brentq(  # = b t_c: 1 − N12 by the moments of both columns, in x = b t
+        lambda x: 1.0 - (1 / 3 + x / 4) / np.sqrt((1 / 3 + x / 2 + x**2 / 5) / 3) - 1e-4, 0.01, 1.0
+    )
+    assert found.t_c == pytest.approx(x / bend, rel=1e-6)
+    first = assess(bent, 1e-5 * np.arange(3.0), ExcitationSettings()).known
+    assert (first.margin[1:] < 1.0).all()  # one cannot know there, and it is said
+
+
+def test_what_is_told_apart_from_the_start_on_is_so_at_once():
+    """Gram matrices of 1, t, t² with unit diagonal are the same at all times."""
+    powers = regression(lambda t: t[..., None] ** np.arange(3), ETA, 80.0)
+    assert assess(powers, T, ExcitationSettings()).t_c == 0.0
 
 
 def test_the_weakest_direction_is_named():

@@ -18,7 +18,7 @@ from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import largest, symmetric_eigenvalues
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.linear import LinearRegression, interpolation_error
 from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
@@ -26,7 +26,7 @@ from gpebo_cli.settings import ExcitationSettings
 WELL = 1e-4  # share of a column's energy: an error in Y comes out at most a hundredfold
 _TINY = float(np.finfo(float).tiny)
 _PLACES, _SAME_TIME = 17, 1e-14  # in a bracket; of the horizon
-_AT_ONCE = 1e-7  # of the horizon: what is told apart earlier is so as soon as rounding allows
+_SOON = np.logspace(-7.0, -2.0, 11)  # of the first element
 WINDOWS = 10  # default PE window: this many per horizon
 
 
@@ -122,7 +122,8 @@ def assess(
 
 def known_at(regression: LinearRegression, at: Array, tol: float) -> Knowledge:
     """What is known at some times (N,) from ψ, resolved to ``tol``."""
-    return knowledge(regression.gram_at(at), *_beside(regression, at, tol))
+    gram, rounding = regression.gram_with_rounding(at)
+    return knowledge(gram, *_beside(regression, at, tol), rounding)
 
 
 def _beside(regression: LinearRegression, at: Array, tol: float) -> tuple[Array, Array, float]:
@@ -135,31 +136,33 @@ def _beside(regression: LinearRegression, at: Array, tol: float) -> tuple[Array,
 
 def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float | None:
     """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``."""
-    def seen(at: Array, matrices: Array) -> Array:
-        """How well all are told apart, and over what is not rounding; or λ_min over ρ, twice."""
+    def seen(at: Array, matrices: Array, rounding: Array) -> tuple[Array, Array]:
+        """How well all are told apart, or λ_min over ρ, and what of that may be rounding."""
         if rho is not None:
-            return np.tile(symmetric_eigenvalues(matrices)[:, 0] / rho, (2, 1))
-        known = knowledge(matrices, *_beside(regression, at, tol))
-        return np.array([known.smallest, known.margin])
+            level = rounding.max(axis=1, initial=_TINY)
+            return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho
+        known = knowledge(matrices, *_beside(regression, at, tol), rounding)
+        return known.smallest, known.rounding
 
-    of_ends = np.concatenate([
-        seen(part.mesh.edges[1:], part.values[:, -1]) for part in regression.gram_parts()
-    ], axis=1)
+    smallest, level = (np.concatenate(each) for each in zip(*(
+        seen(part.mesh.edges[1:], part.values[:, -1], np.zeros((part.mesh.size, regression.p)))
+        for part in regression.gram_parts()
+    ), strict=True))
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
     # or half as well as they ever are.
-    told = of_ends[0, of_ends[1] >= 1.0]
+    told = smallest[smallest >= level]
     enough = min(WELL, 0.5 * float(told.max(initial=0.0))) if rho is None else 1.0
 
-    def distance(found: Array) -> Array:
-        """At least 0 where ψ is exciting, in logarithms."""
-        return np.asarray(np.log(np.maximum(np.minimum(found[0] / enough, found[1]), _TINY)))
+    def reached(at: Array, matrices: Array, rounding: Array) -> tuple[BoolArray, BoolArray]:
+        """Where ψ is exciting, and where rounding lets one know whether it is."""
+        smallest, level = seen(at, matrices, rounding)
+        there = smallest >= np.maximum(enough, level)
+        return there, there | (level <= enough)
 
     if not enough:
         return None
-    return _first_time(
-        regression.gram_parts(), regression.mesh.span, distance(of_ends),
-        lambda *where: distance(seen(*where)),
-    )
+    at_ends = smallest >= np.maximum(enough, level)
+    return _first_time(regression.gram_parts(), regression.mesh.span, at_ends, reached)
 
 
 def estimable(
@@ -182,43 +185,53 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 
 
 def _first_time(
-    parts: Iterable[Trajectory], span: tuple[float, float], at_ends: Array,
-    reached: Callable[[Array, Array], Array],
+    parts: Iterable[Trajectory], span: tuple[float, float], at_ends: BoolArray,
+    reached: Callable[[Array, Array, Array], tuple[BoolArray, BoolArray]],
 ) -> float | None:
-    """First time at which ``reached`` is not negative: bracketed on the mesh, then narrowed.
+    """First time at which something is ``reached``: bracketed on the mesh, then narrowed.
 
-    Each round looks at equally many times within the bracket. The signal is given part by part over
-    a span of time, and ``at_ends`` (K,) is what is reached at the right ends of all elements.
+    Each round looks at equally many times within the bracket. G is given part by part over a span
+    of time, and ``at_ends`` (K,) is whether it is reached at the right ends of all elements.
     """
-    ends = np.flatnonzero(at_ends >= 0.0)
-    if len(ends) == 0:
+    if not at_ends.any():
         return None
-    left = int(ends[0]) + 1  # elements up to the first at whose end it is reached
+    left = int(np.argmax(at_ends)) + 1  # elements up to the first at whose end it is reached
     for part in parts:
-        mesh, gram = part.mesh, part.values[:left]
-        points = mesh.points[:left]
-        levels = reached(points.ravel(), gram.reshape(points.size, *gram.shape[2:]))
-        levels = levels.reshape(points.shape)
+        mesh, gram, rule = part.mesh, part.values[:left], part.mesh.rule
+        points, shares = mesh.points[:left], np.tile(rule.points, len(gram))
+        ends = gram[:, -1].repeat(len(rule.points), axis=0)
+        there, _ = reached(
+            points.ravel(), gram.reshape(points.size, *gram.shape[2:]),
+            interpolation_error(ends, shares, rule.stages),
+        )
+        there = there.reshape(points.shape)
         left -= mesh.size
         if left <= 0:
-            levels[-1, -1] = max(levels[-1, -1], 0.0)  # rounding; it was reached there
-        if (levels >= 0.0).any():
+            there[-1, -1] = True
+        if there.any():
             break
-    k = int(np.argmax((levels >= 0.0).any(axis=1)))
-    points, level = points[k], levels[k]
-    piece = Trajectory(Mesh(mesh.edges[k : k + 2], mesh.rule), gram[k : k + 1])
-    start, horizon = span[0], span[1] - span[0]
-    at_once = np.minimum(start + _AT_ONCE * horizon, mesh.edges[k + 1 : k + 2])
-    if mesh.edges[k] == start and reached(at_once, piece(at_once)) >= 0.0:
-        return start
+    k = int(np.argmax(there.any(axis=1)))
+    points, there = points[k], there[k]
+    piece = Trajectory(Mesh(mesh.edges[k : k + 2], rule), gram[k : k + 1])
+    (start, stop), length = span, float(mesh.steps[k])
+
+    def looked(at: Array) -> tuple[BoolArray, BoolArray]:
+        share = (at - mesh.edges[k]) / length
+        end = np.broadcast_to(piece.final, (len(at), *piece.final.shape))
+        return reached(at, piece(at), interpolation_error(end, share, rule.stages))
+
+    if mesh.edges[k] == start:  # at once is what is reached as soon as rounding lets one know
+        found, known = looked(start + length * _SOON)
+        if known.any() and found[np.argmax(known)]:
+            return start
     while True:
-        j = int(np.argmax(level >= 0.0))
+        j = int(np.argmax(there))
         low, high = float(points[max(j - 1, 0)]), float(points[j])
-        if high - low <= _SAME_TIME * max(abs(high), horizon):
-            return high if high > at_once[0] else start
+        if high - low <= _SAME_TIME * max(abs(high), stop - start):
+            return high
         points = np.linspace(low, high, _PLACES)
-        level = reached(points, piece(points))
-        level[-1] = max(level[-1], 0.0)
+        there = looked(points)[0]
+        there[-1] = True
 
 
 def window_level(

@@ -55,9 +55,14 @@ class Knowledge:
         return np.asarray(np.maximum(self.eigenvalues.min(axis=1, initial=1.0), 0.0))
 
     @property
+    def rounding(self) -> Array:
+        """What of that eigenvalue may be rounding, (M,)."""
+        return np.asarray(self.level.max(axis=1, initial=_SINGULAR))
+
+    @property
     def margin(self) -> Array:
-        """That eigenvalue over the level of what is not rounding, (M,): from 1 on ψ is exciting."""
-        return np.asarray(self.smallest / self.level.max(axis=1, initial=_SINGULAR))
+        """That eigenvalue over what may be rounding, (M,): from 1 on ψ is exciting."""
+        return np.asarray(self.smallest / self.rounding)
 
     @property
     def share(self) -> Array:
@@ -173,15 +178,19 @@ class Knowledge:
         return np.asarray(error), z / self.sizes[-1]
 
 
-def knowledge(gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:
+def knowledge(
+    gram: Array, terms: Array, elapsed: Array, tol: float = 1e-12, rounding: Array | float = 0.0,
+) -> Knowledge:
     """What is known from G (M, p, p) at M times; further columns are not looked at.
 
     ``terms`` (M, p) or (p,) are sizes of the terms that the columns of ψ are made of, ``elapsed``
-    (M,) the seconds that G has been gathered for. ψ is resolved to ``tol``, relative to its terms.
+    (M,) the seconds that G has been gathered for. ψ is resolved to ``tol``, relative to its terms,
+    and the diagonal of G is good to a ``rounding`` (M, p).
     """
     p = gram.shape[1]
-    energy = np.einsum("mjj->mj", gram[..., :p])
-    sizes, level = _sizes(np.sqrt(np.maximum(energy, 0.0)), terms, elapsed, tol)
+    energy = np.maximum(np.einsum("mjj->mj", gram[..., :p]), _TINY**2)
+    sizes, level = _sizes(np.sqrt(energy), terms, elapsed, tol)
+    level = np.maximum(level, np.minimum(rounding / energy, 1.0))
     factors = np.where(level < 1.0, 1.0 / sizes, 0.0)
     spectrum, vectors = np.linalg.eigh(
         gram[..., :p] * factors[:, :, None] * factors[:, None, :]
