@@ -92,16 +92,16 @@ def _carried(rng, k=6, s=5, n=3, c=2, constant=False):
     )
 
 
-def _series(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True, most=4):
+def _series(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True, most=4, degrees=3):
     """x' = A x + f with a third of the entries, none of them in one row."""
     i, j = np.nonzero(rng.uniform(size=(d, d)) < 0.35 * (np.arange(d) != 1)[:, None])
     parts = rng.integers(1, most, size=k)
-    count, degrees = (1, 1) if constant else (parts.sum(), 3)
+    count, degrees = (1, 1) if constant else (parts.sum(), degrees)
     there = rng.integers(0, 2, size=(count, degrees))
     return (
         radau_rule(s).nodes, rng.uniform(0.1, 0.3, size=k), parts,
         np.searchsorted(i, np.arange(d + 1)), j,
-        rng.normal(size=(count, len(i), degrees)) * there[:, None],
+        rng.normal(size=(count, len(i), degrees)) * there[:, None] / degrees,
         1.0 * np.maximum.accumulate(there[:, ::-1], axis=1)[:, ::-1],
         rng.normal(size=(parts.sum(), 2, d, forced)),
         rng.normal(size=(k, d, c)) if kicked else None, rng.normal(size=(d, c)),
@@ -255,6 +255,7 @@ CASES: list[tuple[str, str, Case]] = [
     *(("elements", "series", partial(_series, **options)) for options in (
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
         {"k": 1, "d": 1, "c": 3, "forced": 3}, {"c": 12}, {"most": 9},
+        {"c": 1, "degrees": 6, "s": 14}, {"c": 1, "constant": True, "forced": 0},
     )),
     *(("elements", "stiff", partial(_stiff, **options)) for options in (
         {}, {"s": 14, "c": 1, "one": True}, {"forced": 0, "kicked": False},

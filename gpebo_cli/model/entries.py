@@ -30,11 +30,6 @@ class Entries(NamedTuple):
         places = [place.tolist() for place in self.places[name]]
         return dict(zip(zip(*places, strict=True), values, strict=True))
 
-    def at_times(self, some: slice) -> Entries:
-        """Those at some of the times."""
-        values = (v if v.shape[1] == 1 else v[:, some] for v in self.values)
-        return Entries(Coefficients(*values), self.places)
-
 
 def is_sparse(value: object) -> TypeGuard[Any]:
     """Whether a matrix is one of SciPy's sparse ones, which nobody has to import to know that."""

@@ -50,7 +50,7 @@ _DIGITS = 1e-2  # of the tolerance, to which series go on
 _ROUGH = 0.02  # to which errors are carried
 _LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
-_IN_CACHE = 1 << 12  # numbers
+_IN_CACHE = 1 << 13  # numbers
 _WORTH = 0.5  # columns times that share, from which on it is multiplied as if it were
 _TINY = float(np.finfo(float).tiny)
 _FEW_COLUMNS = 4  # whose errors are carried one by one
@@ -67,9 +67,10 @@ class Sparse(NamedTuple):
     columns: IntArray  # (e,) of the entries
     entries: Array  # (N or 1, e)
 
-    def sizes(self, mesh: Mesh) -> Array:
-        """The largest of each entry in each element, (K or 1, e)."""
-        return largest_within(at_points(self.entries, mesh.size, mesh.rule.stages))
+    def sizes(self, elements: int) -> Array:
+        """The largest of each entry in each of so many elements, (K or 1, e)."""
+        count = min(elements, len(self.entries))
+        return largest_within(self.entries.reshape(count, len(self.entries) // count, -1))
 
     def full(self) -> Array:
         """With every entry, (N or 1, d, d)."""
@@ -112,16 +113,14 @@ class Sparse(NamedTuple):
 
     def norms(self, entries: Array, units: Array) -> Array:
         """Bounds (K,) of the spectral radius: norms, in units of the states (d,) and without."""
-        count = np.diff(self.rows)
-        of_row = np.repeat(np.arange(len(count)), count)
-        found = []
-        for scaled in (entries, entries * (units[self.columns] / units[of_row])):
-            for place in (of_row, self.columns):
-                order = np.argsort(place, kind="stable")
-                first = np.flatnonzero(np.diff(place[order], prepend=-1))
-                sums = np.add.reduceat(scaled[:, order], first, axis=1) if len(first) else scaled
-                found.append(sums.max(axis=1, initial=0.0))
-        return np.asarray(np.min(found, axis=0))
+        K, d = len(entries), len(units)
+        of_row, first = np.repeat(np.arange(d), np.diff(self.rows)), d * np.arange(K)[:, None]
+        sums = [
+            np.bincount((first + place).ravel(), scaled.ravel(), K * d).reshape(K, d)
+            for scaled in (entries, entries * (units[self.columns] / units[of_row]))
+            for place in (of_row, self.columns)
+        ]
+        return np.asarray(np.max(sums, axis=2, initial=0.0).min(axis=0))
 
 
 Equation = tuple[Sparse, Array, tuple[Array, ...]]
@@ -155,7 +154,7 @@ def solve(
             return None
         march = _Solved(A) if full else by_elimination
     else:
-        parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh), units) / LENGTH)
+        parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh.size), units) / LENGTH)
         if not np.maximum(parts, 1.0).sum() <= min(MOST_ELEMENTS, max_elements):
             return None
         if parts.max(initial=1.0) > 1.0:
@@ -242,11 +241,21 @@ def _series(
 
     With kicks only values at both ends of each element.
     """
-    size = np.maximum(np.abs(A.entries).max(axis=0), _TINY)
-    terms, parts = _powers(A.entries, size, mesh, tol)
+    size = np.maximum(largest_over_time(A.entries), _TINY)
+    degrees = _degrees(A.entries, size, mesh, tol)
+    terms = _powers(degrees)
     decay = _largest_shares(terms, size)
+    later = decay[:, 1:] * (decay[:, 1:] > tol)
+    rates = (later ** (1.0 / np.arange(1, decay.shape[1]))).max(axis=1, initial=0.0)
+    parts = np.ceil(np.clip(_DECAY * rates, 1.0, _MOST_PARTS)).astype(np.intp)
+    parts = np.broadcast_to(parts, mesh.size)
+    if parts.max() > 1:
+        terms = _powers(degrees, parts)
+        decay = _largest_shares(terms, size)
+    del degrees
     decay = np.maximum.accumulate(decay[:, ::-1], axis=1)[:, ::-1]
-    forced = _powers(f.reshape(len(f), -1), np.abs(f).max(axis=0).ravel(), mesh, tol, parts)[0]
+    known = f.reshape(len(f), -1)
+    forced = _powers(_degrees(known, largest_over_time(known), mesh, tol), parts)
     nodes = mesh.rule.nodes if kicks is None else mesh.rule.nodes[-1:]
     return elements.series(
         nodes, mesh.steps, parts, A.rows, A.columns, terms.swapaxes(1, 2), decay,
@@ -254,40 +263,42 @@ def _series(
     )
 
 
-def _powers(
-    values: Array, size: Array, mesh: Mesh, tol: float, parts: IntArray | None = None
-) -> tuple[Array, IntArray]:
-    """Functions (N or 1, w) in powers of the time in each part of elements, (P or 1, g, w).
+def _degrees(values: Array, size: Array, mesh: Mesh, tol: float) -> Array:
+    """Legendre coefficients (K or 1, g, w) of functions (N or 1, w) in each element.
 
-    Degrees that are smaller than ``tol`` of the size (w,) are left out. How many ``parts`` each
-    element has, (K,), is such that coefficients decay, if that is not said.
+    Degrees that are smaller than ``tol`` of the size (w,) are left out.
     """
-    rule, w = mesh.rule, values.shape[1]
-    if len(values) == 1 or not w:
-        return values[:1, None], np.ones(mesh.size, dtype=np.intp) if parts is None else parts
-    terms = rule.to_legendre @ values.reshape(mesh.size, rule.stages + 1, w)
-    counts = (largest_over_time(terms) > tol * size).any(axis=1)
-    terms = terms[:, : 1 + int(np.flatnonzero(counts).max(initial=0))]
-    degrees = np.arange(terms.shape[1])
-    whole = _legendre_powers(len(degrees), 1) @ terms
-    if parts is None:
-        sizes = _largest_shares(whole, size)[:, 1:]
-        rates = ((sizes * (sizes > tol)) ** (1.0 / degrees[1:])).max(axis=1, initial=0.0)
-        parts = np.ceil(np.clip(_DECAY * rates, 1.0, _MOST_PARTS)).astype(np.intp)
-    if parts.max(initial=1) == 1:
-        return whole, parts
-    found, first = np.empty((parts.sum(), len(degrees), w)), parts.cumsum() - parts
+    if len(values) == 1:
+        return values[None]
+    found = mesh.rule.to_legendre @ values.reshape(*mesh.points.shape, -1)
+    counts = (largest_over_time(found) > tol * size).any(axis=1)
+    return found[:, : 1 + int(np.flatnonzero(counts).max(initial=0))]
+
+
+def _powers(degrees: Array, parts: IntArray | None = None) -> Array:
+    """From :func:`_degrees` to powers of the time in each part of elements, (P or 1, g, w).
+
+    How many ``parts`` each element has, (K,); None: one.
+    """
+    g, w = degrees.shape[1:]
+    if parts is None or parts.max() == 1:
+        return np.asarray(_legendre_powers(g, 1) @ degrees)
+    if len(degrees) == g == 1:
+        return degrees
+    found, first = np.empty((parts.sum(), g, w)), parts.cumsum() - parts
     for count in set(parts.tolist()):
-        some, changed = parts == count, _legendre_powers(len(degrees), count)
-        found[first[some, None] + np.arange(count)] = changed @ terms[some, None]
-    return found, parts
+        some, changed = parts == count, _legendre_powers(g, count)
+        found[first[some, None] + np.arange(count)] = changed @ degrees[some, None]
+    return found
 
 
 def _largest_shares(values: Array, size: Array) -> Array:
     """Largest sizes (K, g) of values (K, g, w) in units of a size (w,)."""
-    found, some = np.empty(values.shape[:2]), max(1, _IN_CACHE // max(values[0].size, 1))
+    some = min(len(values), max(1, _IN_CACHE // max(values[0].size, 1)))
+    found, held, rate = np.empty(values.shape[:2]), np.empty((some, *values.shape[1:])), 1.0 / size
     for first in range(0, len(values), some):
-        shares = values[first : first + some] / size
+        part = values[first : first + some]
+        shares = np.multiply(part, rate, out=held[: len(part)])
         np.abs(shares, out=shares).max(axis=2, initial=0.0, out=found[first : first + some])
     return found
 
@@ -364,7 +375,7 @@ def _terms(
     """What right ends are made of, and what rounding of the equation's terms moves, (K, d, c)."""
     K, points = values.shape[:2]
     h, late = mesh.steps[:, None, None], np.abs(mesh.edges[1:, None, None])
-    within = A.product(A.sizes(mesh), sizes)
+    within = A.product(A.sizes(K), sizes)
     moved = np.zeros_like(within)
     if len(A.entries) > 1:
         moved += A.product(np.ptp(A.entries.reshape(K, points, -1), axis=1), sizes)

@@ -168,9 +168,7 @@ class _Terms(NamedTuple):
     rows: IntArray  # (e,) of each entry
     columns: IntArray  # (e,) after all rows
     of_time: Array  # (e,)
-    total: int  # a + b + 1 factors
-    # Where counts, twice, sums of factors, and sums beside the time, twice, stand in products.
-    places: IntArray
+    shape: tuple[int, int]  # (a, b + 1): how many factors rows have, and columns and the time
     each: Array | None = None  # (a + b + 1, e) all of it, where there are few
 
     @classmethod
@@ -183,10 +181,12 @@ class _Terms(NamedTuple):
     @classmethod
     def at(cls, i: IntArray, j: IntArray, of_time: Array, shape: tuple[int, ...]) -> _Terms:
         """For entries (e,) of rows i and columns j of a matrix of this shape."""
-        j, n = shape[0] + j, sum(shape) + 1
-        every, last = np.arange(n), np.full(n, n - 1)
-        down = np.concatenate([i, j, every, every, last])
-        return cls(i, j, of_time, n, down * n + np.concatenate([j, i, every, last, every]))
+        return cls(i, shape[0] + j, of_time, (shape[0], shape[1] + 1))
+
+    @property
+    def total(self) -> int:
+        """How many factors there are."""
+        return sum(self.shape)
 
     def __matmul__(self, factors: Array) -> Array:
         """What the factors (a + b + 1,) add to each logarithm, (e,)."""
@@ -210,26 +210,31 @@ class _Terms(NamedTuple):
         Squares count so often (e,). Singular values of a thousand states would take longer than a
         run.
         """
-        n = self.total
         if self.each is not None:
             counted = self.each * counts
             whole = counted @ self.each.T
-            whole.flat[:: n + 1] += _OPEN
+            whole.flat[:: self.total + 1] += _OPEN
             return np.asarray(-np.linalg.solve(whole, counted @ logs), dtype=np.float64)
-        right = -self.transposed(logs * counts)
-        with_time = self.transposed(self.of_time * counts)
-        own = self.transposed(counts)
-        own[-1], with_time[-1] = with_time[-1] + _OPEN, 0.0
-        own[:-1] += _OPEN
-        values = np.concatenate([counts, counts, own, with_time, with_time])
-        if n <= _FULL:
-            full = np.bincount(self.places, values, n * n).reshape(n, n)
-            return np.asarray(np.linalg.solve(full, right))
+        n, (a, b), right = self.total, self.shape, -self.transposed(logs * counts)
+        with_time, own = (self.transposed(x * counts) for x in (self.of_time, 1.0))
+        own[-1] = with_time[-1]
+        own += _OPEN
+        if n <= _FULL:  # rows, each beside columns and the time only, are eliminated
+            beside = np.bincount(self.rows * b + self.columns - a, counts, a * b).reshape(a, b)
+            beside[:, -1] = with_time[:a]
+            left = np.diag(own[a:])
+            left[-1, :-1] = left[:-1, -1] = with_time[a:-1]
+            share = beside / own[:a, None]
+            others = np.linalg.solve(left - beside.T @ share, right[a:] - right[:a] @ share)
+            return np.concatenate([right[:a] / own[:a] - share @ others, others])
         from scipy.sparse import csc_array
         from scipy.sparse.linalg import splu
 
-        sparse = csc_array((values, np.divmod(self.places, n)), shape=(n, n))
-        return np.asarray(splu(sparse).solve(right))
+        every, last, with_time[-1] = np.arange(n), np.full(n, n - 1), 0.0
+        values = np.concatenate([counts, counts, own, with_time, with_time])
+        down = np.concatenate([self.rows, self.columns, every, every, last])
+        across = np.concatenate([self.columns, self.rows, every, last, every])
+        return np.asarray(splu(csc_array((values, (down, across)), shape=(n, n))).solve(right))
 
 
 @lru_cache(maxsize=64)

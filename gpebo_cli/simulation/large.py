@@ -97,35 +97,31 @@ class _Plant:
         self.at: Mesh | None = None  # of both, and
         self.eliminated = False  # whether ``form`` is of ``found``
 
-    def entries(self, mesh: Mesh) -> Coefficients:
-        """Every entry at the points of a mesh."""
+    def entries(self, mesh: Mesh, every: int = 1) -> Coefficients:
+        """Every entry at every so many points of each element."""
         vars(self).pop("form", None)  # two of them would be as much again
-        self.at, self.eliminated = mesh, False
-        self.found = entries(
-            self.system.coefficients, mesh.points.ravel(), self.order, mesh.inside.ravel()
-        )
+        self.at, self.eliminated = mesh if every == 1 else None, False
+        t, inside = (places[:, ::every].ravel() for places in (mesh.points, mesh.inside))
+        self.found = entries(self.system.coefficients, t, self.order, inside)
         return self.found.values
 
     def eliminate(self, mesh: Mesh, every: int = 1) -> Explicit | ConstantForm:
-        """The explicit form from the entries at every so many points of a mesh (UndecidedError)."""
+        """The explicit form from :meth:`entries` at every so many points (UndecidedError)."""
         if self.at is not mesh:
-            self.entries(mesh)
+            self.entries(mesh, every)
         while not self.eliminated:
-            found = self.found if every == 1 else self.found.at_times(slice(None, None, every))
             try:
-                self.form = self._form(found, forcing(found, self.system.n))
+                self.form = self._form(self.found, forcing(self.found, self.system.n))
             except MoreOrdersError:
                 if self.order == self.most:
                     raise
                 self.order += 1
-                self.entries(mesh)
+                self.entries(mesh, every)
             else:
-                if every == 1:
-                    self.eliminated, values = True, self.found.values
-                    # Nothing else of A is needed now, nor of what others are parts of.
-                    values = values._replace(A=largest_over_time(values.A[0])[None, None])
-                    self.found = self.found._replace(values=Coefficients(*map(np.array, values)))
-                break
+                self.eliminated, values = True, self.found.values
+                # Nothing else of A is needed now, nor of what others are parts of.
+                values = values._replace(A=largest_over_time(values.A[0])[None, None])
+                self.found = self.found._replace(values=Coefficients(*map(np.array, values)))
         return self.form
 
     def _form(self, found: Entries, f: Array) -> Explicit | ConstantForm:
@@ -208,7 +204,7 @@ def _simulated(
     if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
         return None  # what jumps then is for the derivative array to say
     M, units = plant.matrix(), form.units
-    shortest = longest = _LENGTH / max(M.norms(np.abs(M.entries), units).max(), _TINY)
+    shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh.size), units).max(), _TINY)
     stiff = bool(np.ceil(mesh.steps / longest).sum() > series.MOST_ELEMENTS)
     if stiff:
         longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), _TINY)
@@ -218,10 +214,9 @@ def _simulated(
     del form, M
     if bounded:
         mesh = few_elements(system, mesh, cuts, longest)
-        plant.entries(mesh)
     mesh = known_resolved(
         system, plant.entries, lambda t: entries(system.coefficients, t, 0).values, mesh,
-        plant.found.values, beside, solver, bounded=bounded,
+        plant.entries(mesh), beside, solver, bounded=bounded,
     )[0]
     parts = np.maximum(np.ceil(mesh.steps / longest), 1.0)
     if not parts.sum() <= solver.max_elements:
@@ -280,7 +275,7 @@ def _no_coefficients(t: Array, inside: Array) -> LinearEquation:
 def _beside_inputs(found: Entries, size: Array) -> Array:
     """:func:`least_beside` the inputs (m,), with states of some size (n,)."""
     (i, j), (row, column) = found.places["A"], found.places["B"]
-    A, B = (np.abs(values[0]).max(axis=0) for values in (found.values.A, found.values.B))
+    A, B = (largest_over_time(values[0]) for values in (found.values.A, found.values.B))
     there, terms = B > 0.0, np.bincount(i, A * size[j], len(size))
     m = 1 + max([-1, *found.places["u"][0].tolist(), *column.tolist()])
     return least_beside(terms[row[there]] / B[there], column[there], m)
