@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -13,12 +14,13 @@ from plants import shipped
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from gpebo_cli import run
+from gpebo_cli import run, simulation
 from gpebo_cli.errors import ConfigError, GpeboError, SolverError
 from gpebo_cli.model.functions import Names, system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.linearised import Linearised
+from gpebo_cli.simulation.newton import _refuse_slow
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
@@ -243,7 +245,17 @@ def test_an_output_that_moves_nothing_but_rounding_has_no_derivative():
     ({"states": ["x", "z"], "E": [[1, 0], [0, 0]], "A": [[0, 0], [0, "y"]], "phi": [-1, -1],
       "C": [[1, 0]], "initial_state": [1, 1]}, 1e-3),
 ])
-def test_where_a_solution_ends_is_named_with_its_time(plant, near):
+def test_where_a_solution_ends_is_named_with_its_time(plant, near, monkeypatch):
+    real, failed = simulation.simulate.solve, []
+
+    def solve(*args, **options):
+        try:
+            return real(*args, **options)
+        except SolverError as error:
+            failed.append(str(error))
+            raise
+
+    monkeypatch.setattr(simulation.simulate, "solve", solve)
     system = plant_from_mapping({
         "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "C": [[1]],
         "initial_state": [1], **plant,
@@ -251,6 +263,15 @@ def test_where_a_solution_ends_is_named_with_its_time(plant, near):
     with pytest.raises(GpeboError, match="beyond t = ") as caught:
         simulate(system, TimeSettings(horizon=3.0), SOLVER)
     assert float(str(caught.value).split("beyond t = ")[1].split()[0]) == pytest.approx(1, abs=near)
+    assert not failed  # iterates that grow without bounds are not solved: that takes long
+
+
+@pytest.mark.parametrize(("half", "slows"), [(0.998, True), (0.95, False)])
+def test_windows_that_shrink_towards_a_time_are_refused_early(half, slows):
+    """Of 90 s allowed 4 have led to t = 0.999 of 10; the last two of these from ``half``."""
+    time, spent = TimeSettings(horizon=10.0), [(0.0, 0.0), (2.0, half), (4.0, 0.999)]
+    with pytest.raises(SolverError, match="slows down towards t = 0.999") if slows else nullcontext():
+        _refuse_slow(lorenz(), time, spent, 90.0)
 
 
 def test_division_by_an_output_that_crosses_zero_names_the_entry():

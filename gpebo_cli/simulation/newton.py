@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import process_time
+from typing import cast
 
 import numpy as np
 
@@ -34,6 +35,7 @@ _SHORTEST = 1e-8  # of the horizon; where shorter windows are needed the solutio
 _AROUND = 1e-3  # of the horizon: a refusal so near to where the solution ends is about its end
 _SAFETY = 10.0
 _PART = 0.2  # of the computing time allowed, after which it is known whether that will do
+_SOON, _HOPELESS = 0.04, 10.0  # or after so little of it, where the rest takes times all of it
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,9 @@ class Effort:
     last_change: float  # of the states, relative to their size, that the last iterate is expected
 
 
-# Solves a linear plant: (system, time, solver) -> its states, and how fast they may grow in 1/s.
-Solve = Callable[[DescriptorSystem, TimeSettings, SolverSettings], tuple[Trajectory, float]]
+# Solves a linear plant: (system, time, solver, growth) -> its states; None: they may grow faster
+# than that, in 1/s.
+Solve = Callable[[DescriptorSystem, TimeSettings, SolverSettings, float], Trajectory | None]
 
 
 class SlidesError(SolverError):
@@ -69,20 +72,14 @@ def follow(
     iterates, work, change = 0, 0.0, 0.0
     at_rest = Linearised(system, _at_rest(x, t, length, solver))
     at_rest.taylor(np.array([t]), 0)  # refuses by name
-    begin = process_time()
+    begin, spent = process_time(), list[tuple[float, float]]()
     while t < stop - 1e-12 * time.horizon:
-        taken, done = process_time() - begin, (t - time.start) / time.horizon
-        if taken > max(_PART, done) * solver.max_seconds:  # a good part, and too much for that
-            raise SolverError(
-                f"plant {system.name}: the simulation of {time.horizon:g} s would take more "
-                f"computing time than solver.max_seconds = {solver.max_seconds:g} s (the first "
-                f"{t - time.start:.3g} s took {taken:.2g} s); shorten time.horizon, or raise "
-                "solver.max_seconds"
-            )
+        spent.append((process_time() - begin, t))
+        _refuse_slow(system, time, spent, solver.max_seconds)
         length = stop - t if stop - t < 1.25 * length else length
         own, window = replace(system, initial_state=x), replace(time, start=t, horizon=length)
         try:
-            piece, count, spent, last = _window(own, window, solver, solve)
+            piece, count, solves, last = _window(own, window, solver, solve)
         except GpeboError as error:
             if isinstance(error, ConfigError | SlidesError):
                 refused, refused_until = error, t + length
@@ -93,7 +90,7 @@ def follow(
                 raise _ends(system, t, x, refused if near and refused else error) from None
             continue
         pieces.append(piece)
-        iterates, work = iterates + count, work + spent * length / time.horizon
+        iterates, work = iterates + count, work + solves * length / time.horizon
         change = max(change, last)
         t, x = t + length, piece.final
         length *= 2.0 if count <= _FAST else 1.0
@@ -101,9 +98,30 @@ def follow(
     # Once more where elements end at jumps and kinks: those are instants of the iterate before.
     for _ in range((len(pieces) > 1) + (len(Linearised(system, whole).switched) > 0)):
         linear = replace(system, coefficients=Linearised(system, whole))
-        whole, _ = solve(linear, time, solver)
+        whole = cast(Trajectory, solve(linear, time, solver, np.inf))
         iterates, work = iterates + 1, work + 1.0
     return Effort(len(pieces), iterates, work, change)
+
+
+def _refuse_slow(
+    system: DescriptorSystem, time: TimeSettings, spent: list[tuple[float, float]], most: float
+) -> None:
+    """Refuse what will take more than ``most`` seconds, from those ``spent`` until times t.
+
+    Towards a time beyond which there is no solution, or one that swings ever faster, windows
+    shrink, and what is left of the horizon takes times the seconds allowed at the last pace.
+    """
+    taken, t = spent[-1]
+    half = next(then for seconds, then in spent if seconds >= 0.5 * taken)
+    left = (time.start + time.horizon - t) * 0.5 * taken
+    shrink = taken > _SOON * most and left > _HOPELESS * most * (t - half)
+    if shrink or taken > max(_PART, (t - time.start) / time.horizon) * most:
+        near = f", and it slows down towards t = {t:.6g}" if shrink else ""
+        raise SolverError(
+            f"plant {system.name}: the simulation of {time.horizon:g} s would take more computing "
+            f"time than solver.max_seconds = {most:g} s (the first {t - time.start:.3g} s took "
+            f"{taken:.2g} s{near}); shorten time.horizon, or raise solver.max_seconds"
+        )
 
 
 def _window(
@@ -127,12 +145,12 @@ def _window(
             most = max(_FEW_ELEMENTS, _MORE_ELEMENTS * guess.mesh.size)
             own = replace(own, max_elements=min(own.max_elements, most))
         try:
-            found, rate = solve(linear, time, own)
+            found = solve(linear, time, own, _MOST_GROWTH / time.horizon)
         except SolverError:
             if alike:
                 break
             raise
-        if rate * time.horizon > _MOST_GROWTH:
+        if found is None:
             break
         work += 1.0 if full else np.log(_LOOSE) / np.log(solver.tol)
         values = found.values

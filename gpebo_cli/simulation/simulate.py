@@ -61,10 +61,13 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     last: list[Simulation] = []
 
     def solve_linear(
-        linear: DescriptorSystem, window: TimeSettings, settings: SolverSettings
-    ) -> tuple[Trajectory, float]:
-        last[:] = [_simulate_linear(linear, window, settings)]
-        return last[0].signals.states, last[0].structure.growth
+        linear: DescriptorSystem, window: TimeSettings, settings: SolverSettings, growth: float
+    ) -> Trajectory | None:
+        structure = _structure(linear, window, settings)
+        if structure.growth > growth:
+            return None
+        last[:] = [_solved(linear, window, settings, structure)]
+        return last[0].signals.states
 
     plant, source, before = system, cast(FollowsSignals, system.coefficients), None
     for _ in range(_LOOKS):
@@ -96,11 +99,21 @@ def _simulate_linear(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> Simulation:
     """:func:`simulate` for a plant whose matrices depend on time and inputs only."""
-    start, (mesh, cuts, bounded) = time.start, first_mesh(system, time, solver)
-    structure = analyse(
-        system, start, start + time.horizon, max_mu=solver.max_strangeness_index,
+    return _solved(system, time, solver, _structure(system, time, solver))
+
+
+def _structure(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Structure:
+    return analyse(
+        system, time.start, time.start + time.horizon, max_mu=solver.max_strangeness_index,
         rank_tol=solver.rank_tol,
     )
+
+
+def _solved(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings, structure: Structure
+) -> Simulation:
+    """:func:`_simulate_linear` of a plant with this structure."""
+    start, (mesh, cuts, bounded) = time.start, first_mesh(system, time, solver)
     mesh, c, terms = _known_resolved(system, structure, mesh, cuts, solver, bounded=bounded)
     first = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
     independent = solver.name == "ivp"  # the underlying ODE of the derivative array, by scipy
