@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 from math import factorial, prod
 from typing import Any, NamedTuple
@@ -64,8 +64,10 @@ class Looked(NamedTuple):
 class Mesh:
     """Elements [edges[k], edges[k+1]], each with the points of one Radau rule."""
 
-    edges: Array  # (K + 1,) ascending
+    edges: Array  # (K + 1,) ascending, beside ``origin``
     rule: RadauRule
+    # Far from zero, times are told apart to a rounding of that only: elements may be shorter.
+    origin: float = 0.0
 
     def __repr__(self) -> str:
         return f"<mesh of {self.size} elements, t = {self.edges[0]:g} to {self.edges[-1]:g} s>"
@@ -83,7 +85,7 @@ class Mesh:
     @property
     def span(self) -> tuple[float, float]:
         """First and last time, seconds."""
-        return float(self.edges[0]), float(self.edges[-1])
+        return float(self.origin + self.edges[0]), float(self.origin + self.edges[-1])
 
     @cached_property
     def steps(self) -> Array:
@@ -108,6 +110,8 @@ class Mesh:
         inside = points.copy()
         inside[:, 0] += _INSIDE * self.steps
         inside[:, -1] -= _INSIDE * self.steps
+        if self.origin:
+            points, inside = self.origin + points, self.origin + inside
         return points, inside
 
     def trajectory(self, flat: Array) -> Trajectory:
@@ -127,7 +131,7 @@ class Mesh:
         if self.size <= _WINDOW:
             return [self]
         cuts = range(0, self.size, _WINDOW)
-        return [Mesh(self.edges[k : k + _WINDOW + 1], self.rule) for k in cuts]
+        return [replace(self, edges=self.edges[k : k + _WINDOW + 1]) for k in cuts]
 
     def split(self, parts: IntArray) -> tuple[Mesh, IntArray]:
         """Cut element k into ``parts[k]`` equal ones; ``parts`` has shape (K,).
@@ -140,7 +144,7 @@ class Mesh:
         edges = np.empty(len(parent) + 1)
         edges[:-1] = self.edges[parent] + self.steps[parent] * (position / own)
         edges[-1] = self.edges[-1]
-        return Mesh(edges, self.rule), np.where(own == 1, parent, -1)
+        return replace(self, edges=edges), np.where(own == 1, parent, -1)
 
     def sampler(self, t: Array, inside: Array | None = None) -> Sampler:
         """Interpolation from this mesh to the times ``t`` (N,).
@@ -149,8 +153,8 @@ class Mesh:
         """
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
-        rule, t = self.rule, np.asarray(t, dtype=np.float64)
-        belongs = t + _SNAP * np.abs(t) if inside is None else inside
+        rule, t = self.rule, np.asarray(t, dtype=np.float64) - self.origin
+        belongs = t + _SNAP * np.abs(t) if inside is None else inside - self.origin
         return Sampler(*signals.interpolation(
             self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
         ))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -66,7 +67,7 @@ def refine(
             return mesh, found, tail
         stuck = poor & (missed > 1)
         if stuck.sum() > max(_SOME, 0.02 * mesh.size):
-            moved = Mesh(mesh.edges + 64 * EPS * np.abs(mesh.edges).max(), mesh.rule)
+            moved = replace(mesh, edges=mesh.edges + 64 * EPS * np.abs(mesh.edges).max())
             there, other = evaluate(moved, found, np.full(mesh.size, -1))
             left = float(other[stuck].max())
             if np.mean(np.minimum(np.abs(other[stuck] / tail[stuck] - 1.0), 1.0)) > _OTHER:
@@ -74,7 +75,7 @@ def refine(
                 if left <= _LOST and many:
                     return mesh, there, other
                 if many or left * stuck.sum() > _SOME:
-                    t = mesh.edges[int(np.argmax(np.where(stuck, other, 0.0)))]
+                    t = mesh.points[int(np.argmax(np.where(stuck, other, 0.0))), 0]
                     raise RoundingError(
                         f"the {name} cannot be resolved near t = {t:.6g}: rounding in its "
                         f"equations is {left:.1e} of it, whatever the elements; accepted is a "
@@ -122,7 +123,7 @@ def _check_budget(
     cut = (parts > 1).nonzero()[0]
     short = (mesh.steps[cut] < 64 * EPS * np.abs(mesh.edges[cut + 1])).any()
     worst = int(np.argmax(tail))
-    t = mesh.edges[worst]
+    t = mesh.points[worst, 0]
     if parts.sum() > max_elements:
         raise SolverError(
             f"the {name} is not resolved with {max_elements} elements; worst near "

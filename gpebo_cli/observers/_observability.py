@@ -11,7 +11,7 @@ with Ψ = I, so that nothing grows over the horizon.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,7 +60,7 @@ def window_gramians(
         coefficients, np.eye(n), monitor, "observability Gramian",
         renewal=lambda reached: np.eye(len(reached)),
     )
-    mesh = Mesh(mesh.edges, radau_rule(max(mesh.rule.stages, _STAGES)))
+    mesh = replace(mesh, rule=radau_rule(max(mesh.rule.stages, _STAGES)))
     solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
     mesh, values = solution.trajectory.mesh, solution.trajectory.values
     local = Trajectory(mesh, products(values, solution.extras)).integral(local=True).values[:, -1]
@@ -82,4 +82,4 @@ def _sum_windows(mesh: Mesh, transition: Array, local: Array) -> WindowGramians:
         k = first[on] + step
         gramians[on] += transpose(reached[on]) @ local[k] @ reached[on]
         reached[on] = transition[k] @ reached[on]
-    return WindowGramians(edges[first], gramians, window)
+    return WindowGramians(mesh.points[first, 0], gramians, window)

@@ -198,7 +198,9 @@ def run_filter(
     try:
         # The rounding of P(0) is what is left to resolve of a P that has fallen so far.
         tol = max(tol, _LEFT * float(np.finfo(float).eps) * fall)
-        mesh = Mesh(mesh.edges, radau_rule(max(mesh.rule.stages, _STAGES)))
+        # P may fall in less than times far from zero are told apart.
+        rule, begin = radau_rule(max(mesh.rule.stages, _STAGES)), mesh.edges[0]
+        mesh = Mesh(mesh.edges - begin, rule, mesh.origin + begin)
         solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
         P, _ = quotient(solution.trajectory.values)
         error_estimate = _error(problem, solution.trajectory, followed)
@@ -212,11 +214,11 @@ def run_filter(
     size = np.maximum(np.einsum("kjii->kj", P), np.finfo(float).tiny)
     relative = np.linalg.eigvalsh(P)[..., 0] / size
     if relative.min() < -_INDEFINITE:
-        k = int(np.argmin(relative.min(axis=1)))
+        t = solution.trajectory.mesh.points[int(np.argmin(relative.min(axis=1))), 0]
         raise SolverError(
-            f"the covariance of the {name} is not positive semidefinite near "
-            f"t = {solution.trajectory.mesh.edges[k]:.6g} (eigenvalue {relative.min():.1e} of its "
-            "trace); lower observer.P0, or raise observer.regularisation"
+            f"the covariance of the {name} is not positive semidefinite near t = {t:.6g} "
+            f"(eigenvalue {relative.min():.1e} of its trace); lower observer.P0, or raise "
+            "observer.regularisation"
         )
     return Filtered(solution.trajectory, variance, unit, error_estimate, solution.extras)
 
