@@ -378,17 +378,21 @@ def test_the_error_estimate_is_that_of_a_finer_solution(hold):
     assert 0.1 < rough.regression.error_estimate / found < 10.0
 
 
-def test_times_far_from_zero_change_nothing():
+@pytest.mark.parametrize(("observer", "start"), [
+    ("kalman_bucy", 2.0**30), ({"name": "gpebo", "remedy": "output_injection"}, 5.0),
+])
+def test_times_far_from_zero_change_nothing(observer, start):
     """The covariance falls within 1e-9 s; times of 2^30 s are told apart to 2e-7 s."""
 
-    def estimates(start):
+    def found(start):
         plant = {
             "name": "p", "states": ["a", "b"], "outputs": ["y"], "unknowns": {"k": 0.7},
             "parameters": {"T": start}, "E": [[1, 0], [0, 1]], "C": [[1, 0]], "F": [[0], [1]],
             "A": [[0, 1], [-2, "-0.3 - 0.1*cos(t - T)"]], "initial_state": [1, 0],
         }
         time = {"start": start, "horizon": 1, "samples": 11}
-        found = api_run(plant, observer="kalman_bucy", time=time)
-        return [found.estimates[name][0] for name in ("a", "b", "k")]
+        result = api_run(plant, observer=observer, time=time)
+        since = result.details.excitation.t_c - start
+        return np.array([since, *(result.estimates[name][0, -1] for name in ("a", "b", "k"))])
 
-    np.testing.assert_allclose(estimates(2.0**30), estimates(0.0), atol=1e-6)
+    np.testing.assert_allclose(found(start), found(0.0), atol=1e-6)

@@ -134,4 +134,4 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
         weight = dual @ o.split.projector @ basis @ S.at(t, inside)[0] / size**2
         return np.asarray(weight @ transpose(o.algebraic @ basis) @ o.residual)
 
-    return gain, S.mesh
+    return gain, Mesh(np.unique(S.mesh.origin + S.mesh.edges), mesh.rule)
