@@ -166,6 +166,23 @@ def test_splitting_keeps_edges_and_marks_what_is_new():
     assert kept.tolist() == [0, -1, -1, -1, 2]
 
 
+def test_layers_after_many_jumps_are_not_taken_for_rounding():
+    """x' = −r x is set to 1 at 150 times: cuts help once elements are as short as the layers."""
+    times, rate = 0.07 * np.arange(151), 1e8
+
+    def coefficients(t, inside):
+        return LinearEquation(np.eye(1)[None], np.full((1, 1, 1), -rate), np.zeros((1, 1, 1)))
+
+    found = solve(
+        LinearProblem(coefficients, np.ones((1, 1))),
+        Mesh(times, radau_rule(13)), tol=1e-9, max_elements=100_000,
+        restarts=dict.fromkeys(times[1:-1].tolist(), np.ones_like),
+    ).trajectory
+    at = (times[:-1, None] + np.linspace(0.0, 20.0, 9) / rate).ravel()
+    since = at - times[:-1].repeat(9)
+    np.testing.assert_allclose(found(at)[:, 0, 0], np.exp(-rate * since), atol=1e-8)
+
+
 def test_constraints_given_apart_change_nothing():
     """X = T z + offset with another T at every node gives what the whole DAE gives."""
 

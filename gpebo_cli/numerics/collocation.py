@@ -97,7 +97,8 @@ def solve(
         return (maps, values, whole), tail
 
     mesh, (maps, values, whole), tail = refine(
-        evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name
+        evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name,
+        fixed=restarts or (),
     )
     if whole < mesh.size:
         raise _not_finite(problem, mesh, maps, values, float(mesh.edges[whole]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -38,16 +38,17 @@ class RoundingError(SolverError):
 
 def refine(
     evaluate: Evaluate[Found], mesh: Mesh, *, tol: float, max_elements: int, name: str,
-    patience: int = 1,
+    patience: int = 1, fixed: Iterable[float] = (),
 ) -> tuple[Mesh, Found, Array]:
     """Cut the elements of ``mesh`` until the tail of each one is at most ``tol``.
 
     ``evaluate`` finds what is wanted on a mesh, and what each element leaves out of it, relative to
     its size; it may keep what was found on the elements that have not been cut. Edges of the mesh
-    stay edges. After as many cuts without effect as the ``patience`` what is left counts as
-    rounding: what swings within a long element may not become smaller by the first. The result is
-    the mesh, what was found on it, and the tails (K,) (SolverError: if ``max_elements`` do not
-    reach ``tol``, or rounding leaves fewer than three digits; names the time).
+    stay edges, and those at which something happens are ``fixed`` times to the last digit. After as
+    many cuts without effect as the ``patience`` what is left counts as rounding: what swings within
+    a long element may not become smaller by the first. The result is the mesh, what was found on
+    it, and the tails (K,) (SolverError: if ``max_elements`` do not reach ``tol``, or rounding
+    leaves fewer than three digits; names the time).
     """
     found: Found | None = None
     kept = np.full(mesh.size, -1)
@@ -67,7 +68,8 @@ def refine(
             return mesh, found, tail
         stuck = poor & (missed > 1)
         if stuck.sum() > max(_SOME, 0.02 * mesh.size):
-            moved = replace(mesh, edges=mesh.edges + 64 * EPS * np.abs(mesh.edges).max())
+            away = np.where(np.isin(mesh.edges, list(fixed)), 0.0, 64 * EPS)
+            moved = replace(mesh, edges=mesh.edges + away * np.abs(mesh.edges).max())
             there, other = evaluate(moved, found, np.full(mesh.size, -1))
             left = float(other[stuck].max())
             if np.mean(np.minimum(np.abs(other[stuck] / tail[stuck] - 1.0), 1.0)) > _OTHER:

@@ -177,7 +177,7 @@ def solve(
     try:
         mesh, found, tail = refine(
             evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name,
-            patience=1 + stiff,
+            patience=1 + stiff, fixed=restarts or (),
         )
     except StiffError:
         return None
