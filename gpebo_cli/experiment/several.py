@@ -28,20 +28,20 @@ def joined_source(sources: Sequence[Source]) -> Source:
     if len(recordings) < 2:
         return sources[0]
     shifts = _shifts(sources)
-    kept = [slice(None, -1)] * (len(sources) - 1) + [slice(None)]
-    t = np.concatenate([
-        source.t[own] + by for source, own, by in zip(sources, kept, shifts, strict=True)
-    ])
 
-    def together(name: str) -> Array:
-        return np.concatenate([
-            getattr(each, name)[own] for each, own in zip(recordings, kept, strict=True)
-        ])
+    def together(parts: Sequence[Array], by: Sequence[float] | None = None) -> Array:
+        """Of each but the last all but the last sample, in the time of all where they are times."""
+        moved = parts if by is None else list(map(np.add, parts, by))
+        return np.concatenate([*(part[:-1] for part in moved[:-1]), moved[-1]])
 
+    t = together([source.t for source in sources], shifts)
+    rows = [source.rows for source in sources if source.rows is not None]
     known = [set(each.known_states) for each in recordings]
     recording = replace(
-        recordings[0], t=t, inputs=together("inputs"), outputs=together("outputs"),
-        states=together("states"),
+        recordings[0], t=t,
+        inputs=together([each.inputs for each in recordings]),
+        outputs=together([each.outputs for each in recordings]),
+        states=together([each.states for each in recordings]),
         file=", ".join(each.file for each in recordings),
         sha256=", ".join(each.sha256 for each in recordings),
         rows=sum(each.rows for each in recordings), last=recordings[-1].last + shifts[-1],
@@ -54,11 +54,8 @@ def joined_source(sources: Sequence[Source]) -> Source:
     )
     return replace(
         sources[0], t=t, recording=recording, derivatives=None, pieces=tuple(sources),
-        own_t=np.concatenate([each.t[own] for each, own in zip(sources, kept, strict=True)]),
-        rows=sources[0].rows and sources[0].rows._replace(t=np.concatenate([
-            each.rows.t[own] + by for each, own, by in zip(sources, kept, shifts, strict=True)
-            if each.rows is not None
-        ])),
+        own_t=together([source.t for source in sources]),
+        rows=rows[0]._replace(t=together([each.t for each in rows], shifts)),
         inputs=_joined([each.inputs for each in sources], shifts),
         outputs=_joined([each.outputs for each in sources], shifts),
         states=_joined([each.states for each in sources], shifts),

@@ -1,30 +1,35 @@
-"""The matrices of a plant given as text: constants, and expressions on one tape."""
+"""The matrices of a plant given as text: constants, expressions on one tape, tables as inputs."""
 
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import comb
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, CoefficientSource
-from gpebo_cli.model.entries import Entries, Places
+from gpebo_cli.model.entries import Entries, Places, entries_of
 from gpebo_cli.model.expressions import (
     Assembly,
     Bounds,
     Cells,
     Expression,
     Tape,
+    aside,
     breakpoints,
     divisors_of,
     record,
     resolved,
     resolved_along,
     shorten,
+    switched,
+    with_others,
 )
+from gpebo_cli.model.expressions.intervals import Interval, polynomials
 
 # Shape of a matrix, and its entries by position, row after row; what is not there is 0.
 MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
@@ -32,6 +37,40 @@ MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
 # Of its size before and after: a divisor that comes so near zero touches it.
 _TOUCHED = 1e-12
 _KEPT = 16  # edges of cells
+_ROUNDING = 1e-12  # of the largest time: by how much an experiment may exceed a table
+_LOOKS = np.linspace(0.0, 1.0, 9)  # of a piece, where one looks at the sign of what switches
+
+
+@dataclass(frozen=True, eq=False)
+class Piecewise:
+    """A function of time, one polynomial from each sample to the next."""
+
+    where: str  # for messages
+    t: Array  # (N,)
+    pieces: Array  # (degree + 1, N - 1), coefficients of powers of t − t_k
+    corners: Array  # samples (C,) where neighbouring pieces are not one polynomial
+
+    def cover(self, t: Array) -> None:
+        """Refuse times t (M,) beyond the samples (ConfigError)."""
+        first, last = self.t[0], self.t[-1]
+        slack = _ROUNDING * max(abs(first), abs(last))
+        if len(t) and (t.min() < first - slack or t.max() > last + slack):
+            beyond = t.min() if t.min() < first - slack else t.max()
+            raise ConfigError(
+                f"{self.where} is of t = {first:g} to {last:g}, and the experiment needs "
+                f"t = {beyond:g}; set time.start and time.horizon, or give a longer table"
+            )
+
+    def taylor(self, t: Array, order: int, inside: Array) -> Array:
+        """Taylor coefficients (order + 1, M) at times t (M,) (ConfigError)."""
+        self.cover(t)
+        k = np.clip(np.searchsorted(self.t, inside, side="right") - 1, 0, len(self.t) - 2)
+        since, degree = t - self.t[k], len(self.pieces) - 1
+        found = np.zeros((order + 1, len(t)))
+        for j in range(min(order, degree) + 1):
+            for i in range(degree, j - 1, -1):  # Horner's rule
+                found[j] = found[j] * since + comb(i, j) * self.pieces[i, k]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +89,7 @@ class TextCoefficients:
     restricted: TextCoefficients | None = None  # ``of_time``, where that is something else
     divisors: tuple[Expression, ...] = ()  # continuous ones of outputs, with the text they stand in
     cells: Array | None = None  # (number,) edges of cells that are short for another reason
+    tables: Mapping[int, Piecewise] = field(default_factory=dict)  # for inputs, by their numbers
     # What others have found out about these matrices, by what was asked: they never change.
     kept: dict[object, object] = field(default_factory=dict, init=False)
     # Breakpoints (number,) by the span, and edges (number,) of cells by the edges asked for.
@@ -66,7 +106,7 @@ class TextCoefficients:
     def constant(self) -> frozenset[str]:
         """Those of ``MATRIX_NAMES`` that do not depend on time."""
         moving = {MATRIX_NAMES[k] for k in self.assembly.targets[:, 0].tolist()}
-        return frozenset(MATRIX_NAMES) - moving
+        return frozenset(MATRIX_NAMES) - moving - ({"u"} if self.tables else set())
 
     @cached_property
     def zero(self) -> frozenset[str]:
@@ -90,12 +130,33 @@ class TextCoefficients:
                         f"{min(names & self.outputs)}, which is not known here"
                     )
         t = np.asarray(t, dtype=np.float64)
+        if signals is None and self.tables:
+            found, signals = self._tabled(t, order, inside)
+            if not self.signals:
+                return found.along(signals)
         found = Coefficients._make(self.assembly.taylor(t, order, inside, signals))
         if signals is None:
             return found
         if self.divisors:
             self._refuse_crossings(t, inside, signals)
         return found.along(signals)
+
+    def _tabled(self, t: Array, order: int, inside: Array | None) -> tuple[Coefficients, Array]:
+        """What the text says without tables, and [u; 0] (order + 1, N, m + r) with them."""
+        found = Coefficients._make(self.of_time.assembly.taylor(t, order, inside))
+        # Nothing depends on y.
+        known = np.concatenate([found.u, np.zeros((order + 1, len(t), len(self.outputs)))], axis=2)
+        inside = t if inside is None else inside
+        there = aside(t, inside) if self._of_tables.outputs else t  # on its side of what switches
+        for k, table in self.tables.items():
+            known[:, :, k] = table.taylor(there, order, inside)
+        return found, known
+
+    @cached_property
+    def _of_tables(self) -> Tape:
+        """Arguments of sign, abs, min and max that follow tables, and no outputs."""
+        followers = self.tape.following(self.tables) & self.tape.of_time
+        return self.tape.of([s.argument for s in self.tape.switches if s.argument in followers])
 
     @cached_property
     def _divisors(self) -> Tape:
@@ -124,6 +185,8 @@ class TextCoefficients:
 
     def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
+        if self.tables:
+            return entries_of(self.taylor(t, order, inside), self.constant)
         moving, values = self.tape.taylor(t, order, inside), []
         for fixed, columns, _ in self._places:
             found = moving[:, :, columns] if columns.stop else moving[:, :1, columns]
@@ -157,10 +220,30 @@ class TextCoefficients:
         return values
 
     def breakpoints(self, start: float, stop: float) -> Array:
-        """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks."""
+        """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks.
+
+        Samples of tables where they jump or bend, and what they switch, are among them.
+        """
         if (start, stop) not in self._breakpoints:
-            self._breakpoints[start, stop] = breakpoints(self.tape, start, stop)
+            found = breakpoints(self.tape, start, stop)
+            if self.tables:
+                found = self._with_corners(found, start, stop)
+            self._breakpoints[start, stop] = found
         return self._breakpoints[start, stop].copy()
+
+    def _with_corners(self, found: Array, start: float, stop: float) -> Array:
+        """Breakpoints (number,) of the text with those of tables."""
+        for table in self.tables.values():
+            table.cover(np.array([start, stop]))
+        corners = np.concatenate([table.corners for table in self.tables.values()])
+        found = np.union1d(found, corners[(corners > start) & (corners < stop)])
+        if not self._of_tables.outputs or not start < stop:
+            return found
+        edges, _ = self._along_tables(np.concatenate([[start], found, [stop]]))
+        t = edges[:-1, None] + np.diff(edges)[:, None] * _LOOKS
+        t = aside(t, t.mean(axis=1, keepdims=True)).ravel()  # each in its own piece
+        new = switched(self._of_tables, t, lambda t, order: self._tabled(t, order, t)[1])
+        return with_others(np.array([start, *found, stop]), new)[1:-1]
 
     def resolved(self, edges: Array) -> tuple[Array, bool]:
         """Edges of cells in which nothing narrow hides, from edges (K + 1,); see the protocol."""
@@ -171,8 +254,22 @@ class TextCoefficients:
                 edges = np.union1d(edges, self.cells[inner])
             if len(self._resolved) >= _KEPT:
                 self._resolved.clear()  # a stream asks for ever new ones
-            self._resolved[key] = resolved(self._bounds, edges)
+            edges, sure = resolved(self._bounds, edges)
+            edges, also = self._along_tables(edges) if self.tables else (edges, True)
+            self._resolved[key] = edges, sure and also
         return self._resolved[key]
+
+    def _along_tables(self, edges: Array) -> tuple[Array, bool]:
+        """:meth:`resolved` for what follows tables, from edges (K + 1,): they are polynomials."""
+        def cells(low: Array, high: Array) -> list[list[Interval] | None]:
+            half = 0.5 * (high - low)
+            jets = {
+                k: polynomials(table.taylor(low + half, len(table.pieces) - 1, low + half), half)
+                for k, table in self.tables.items()
+            }
+            return [jets.get(k) for k in range(self.m)]
+
+        return self.along(cells, self.tables, edges)
 
     def along(self, signals: Cells, numbers: Container[int], edges: Array) -> tuple[Array, bool]:
         """:meth:`resolved` for what follows the signals of these numbers, whose cells are given.
@@ -198,6 +295,11 @@ class TextCoefficients:
     def with_cells(self, cells: Array) -> TextCoefficients:
         """The same with ``cells`` (number,) among the edges of what is resolved in time."""
         return replace(self, restricted=replace(self.of_time, cells=cells))
+
+    def with_tables(self, tables: Mapping[int, Piecewise]) -> TextCoefficients:
+        """The same with tables for some inputs, by their numbers."""
+        own = None if self.restricted is None else self.restricted.with_tables(tables)
+        return replace(self, tables=tables, restricted=own)
 
     @cached_property
     def _bounds(self) -> Bounds:

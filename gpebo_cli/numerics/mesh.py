@@ -21,7 +21,6 @@ from gpebo_cli.numerics.radau import RadauRule
 # ends of an element see the limit from within. Nodes in between decide for themselves: a jump
 # that nobody announced then shows up as an unresolved element, not as a wrong number.
 _INSIDE = 1e-3
-_ASIDE = 1e-7  # of that way: a signal moves there by 1e-10 of what it does in the element
 FIRST_ELEMENTS = 24  # of a first mesh: enough nodes to notice a pulse, few enough to be free
 SHARE = 1e-3  # of the largest component: what is smaller is measured against that
 _FOOT = 1e-8  # of its final size: what a component was before may be that wrong
@@ -423,8 +422,3 @@ def initial_edges(
     pieces = [np.linspace(a, b, c, endpoint=False)
               for a, b, c in zip(cuts[:-1], cuts[1:], counts, strict=True)]
     return np.append(np.concatenate(pieces), stop)
-
-
-def aside(t: Array, inside: Array) -> Array:
-    """Times (N,) so little from t towards ``inside`` that only what jumps there is another one."""
-    return t + _ASIDE * (inside - t)

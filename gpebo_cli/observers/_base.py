@@ -21,8 +21,9 @@ from gpebo_cli.model.descriptor import (
     IntArray,
     differential_order,
 )
+from gpebo_cli.model.expressions import aside
 from gpebo_cli.model.text import switching
-from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory, aside
+from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps

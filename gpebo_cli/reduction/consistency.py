@@ -8,14 +8,13 @@ is decided by the equation itself, in the sense of distributions.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from math import comb, factorial
+from dataclasses import dataclass
+from math import perm
 
 import numpy as np
 
 from gpebo_cli.errors import ModelError
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.reduction.strangeness_free import StrangenessFree, strangeness_free_form
 from gpebo_cli.reduction.structure import Structure
 
@@ -80,69 +79,59 @@ def jumps(
     """
     if structure.a == 0:  # without constraints the state follows no jump
         return lambda _, before: Jump(before, np.zeros((structure.mu, system.n)))
-    beside = times + widths
+    levels, n, beside = structure.mu + 1, system.n, times + widths
     after = system.coefficients.taylor(times, structure.mu, beside)
     left = system.coefficients.taylor(times, 0, times - widths)
     form = strangeness_free_form(system, structure, times, beside, after)
-    every = {
-        name: np.broadcast_to(part, (len(times), *part.shape[1:]))
-        for name, part in {"E1": form.E1, "A2": form.A2, "basis": form.basis}.items()
-        if part is not None
-    }
-    return partial(_jump, system, structure, times, (left, after), replace(form, **every))
 
+    def at(part: Array, k: int) -> Array:
+        """Of matrices at all times, or of one that is the same at all."""
+        return np.asarray(part[k % len(part)])
 
-def _jump(
-    system: DescriptorSystem, structure: Structure, times: Array,
-    sides: tuple[Coefficients, Coefficients], form: StrangenessFree, k: int, before: Array,
-) -> Jump:
-    """:func:`jumps` at times[k], with what is known of both sides at all of the times."""
-    mu, n, t, after, A2 = structure.mu, system.n, float(times[k]), sides[1], form.A2[k]
-    levels = mu + 1
-    blocks = np.zeros((levels, n, levels, n))
-    for j in range(levels):
-        for i in range(j, levels):
-            sign = (-1.0) ** (i - j) * comb(i, i - j) * factorial(i - j)
-            blocks[j, :, i] += sign * after.E[i - j, k]
-            if i + 1 < levels:
-                blocks[j, :, i + 1] -= sign * after.A[i - j, k]
-    constraints = np.zeros((structure.a, levels, n))
-    constraints[:, 0] = A2
-    system_matrix = np.concatenate(
-        [blocks.reshape(levels * n, levels * n), constraints.reshape(structure.a, levels * n)]
-    )
-    right = np.zeros(len(system_matrix))
-    right[levels * n :] = -(form.f2[k] + A2 @ before)
-    # Rows by their own size: an equation in microfarads weighs as much as one in ohms.
-    size = np.abs(system_matrix).max(axis=1)
-    size[size == 0] = 1.0
-    w, *_ = np.linalg.lstsq(system_matrix / size[:, None], right / size, rcond=1e-12)
-    residual = np.abs(system_matrix @ w - right) / size
-    scale = max(1e-300, float(np.abs(right / size).max(initial=0.0)), float(np.abs(before).max()))
-    if residual.max(initial=0.0) > 1e-7 * scale:
-        raise ModelError(
-            f"plant {system.name}: the jump at t = {t:.6g} has no solution "
-            f"(residual {residual.max() / scale:.1e}): no state after it satisfies the equations; "
-            "use an input without it, or a horizon that ends before"
-        )
-    w = w.reshape(levels, n)
-    significant = np.abs(w[1:]) > _IMPULSE * scale
-    impulses = np.where(significant, w[1:], 0.0)
-    # E or A may jump only where it is not multiplied by an impulse.
-    for name, (before_it, after_it), factors in (
-        ("E", [side.E[0, k] for side in sides], [w[0], *impulses]),
-        ("A", [side.A[0, k] for side in sides], [*impulses]),
-    ):
-        change = after_it - before_it
-        most = max((np.abs(change @ factor).max() for factor in factors), default=0.0)
-        if most > 1e-9 * scale * max(1.0, float(np.abs(change).max())):
+    def jump(k: int, before: Array) -> Jump:
+        t, A2 = float(times[k]), at(form.A2, k)
+        whole = np.zeros((levels * n + structure.a, levels, n))
+        blocks = whole[: levels * n].reshape(levels, n, levels, n)
+        for j in range(levels):
+            for i in range(j, levels):
+                sign = (-1.0) ** (i - j) * perm(i, i - j)
+                blocks[j, :, i] += sign * after.E[i - j, k]
+                if i + 1 < levels:
+                    blocks[j, :, i + 1] -= sign * after.A[i - j, k]
+        whole[levels * n :, 0] = A2
+        matrix, right = whole.reshape(len(whole), -1), np.zeros(len(whole))
+        right[levels * n :] = -(form.f2[k] + A2 @ before)
+        # Rows by their own size: an equation in microfarads weighs as much as one in ohms.
+        size = np.abs(matrix).max(axis=1)
+        size[size == 0] = 1.0
+        w, *_ = np.linalg.lstsq(matrix / size[:, None], right / size, rcond=1e-12)
+        residual = np.abs(matrix @ w - right) / size
+        scale = max(float(x.max(initial=1e-300)) for x in (np.abs(right / size), np.abs(before)))
+        if residual.max(initial=0.0) > 1e-7 * scale:
             raise ModelError(
-                f"plant {system.name}: {name} jumps at t = {t:.6g} where the state has an "
-                "impulse or a jump of its own, and their product is undefined; take the "
-                "conserved quantity (charge, momentum) as the state"
+                f"plant {system.name}: the jump at t = {t:.6g} has no solution "
+                f"(residual {residual.max() / scale:.1e}): no state after it satisfies the "
+                "equations; use an input without it, or a horizon that ends before"
             )
-    state = before + w[0]
-    if form.basis is not None and form.offset is not None:
-        # On the constraints to the last digit: a component that they make zero is zero.
-        state = form.basis[k] @ (form.E1[k] @ state) + form.offset[k]
-    return Jump(state, impulses)
+        w = w.reshape(levels, n)
+        impulses = np.where(np.abs(w[1:]) > _IMPULSE * scale, w[1:], 0.0)
+        # E or A may jump only where it is not multiplied by an impulse.
+        for name, (before_it, after_it), factors in (
+            ("E", (left.E[0, k], after.E[0, k]), [w[0], *impulses]),
+            ("A", (left.A[0, k], after.A[0, k]), [*impulses]),
+        ):
+            change = after_it - before_it
+            most = max((np.abs(change @ factor).max() for factor in factors), default=0.0)
+            if most > 1e-9 * scale * max(1.0, float(np.abs(change).max())):
+                raise ModelError(
+                    f"plant {system.name}: {name} jumps at t = {t:.6g} where the state has an "
+                    "impulse or a jump of its own, and their product is undefined; take the "
+                    "conserved quantity (charge, momentum) as the state"
+                )
+        state = before + w[0]
+        if form.basis is not None and form.offset is not None:
+            # On the constraints to the last digit: a component that they make zero is zero.
+            state = at(form.basis, k) @ (at(form.E1, k) @ state) + form.offset[k]
+        return Jump(state, impulses)
+
+    return jump

@@ -19,6 +19,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import (
     Array,
     BoolArray,
@@ -172,12 +173,8 @@ class EquationForm:
         B, D = value("B"), value("D")
         if extra or self.known_term:
             phi = value("phi")[:, :, None] if self.known_term else np.zeros((1, system.n, 0))
-            count = max(len(B), len(phi))
-            B = np.concatenate([
-                np.broadcast_to(B, (count, *B.shape[1:])), np.zeros((count, system.n, extra)),
-                np.broadcast_to(phi, (count, *phi.shape[1:])),
-            ], axis=2)
-            D = np.concatenate([D, np.zeros((len(D), system.r, extra + phi.shape[2]))], axis=2)
+            B = joined(B, np.zeros((1, system.n, extra)), phi, axis=2)
+            D = joined(D, np.zeros((1, system.r, extra + phi.shape[2])), axis=2)
         hidden = None
         if self.structure is not None:
             hidden = hidden_constraints(system, self.structure, self.units.states, t, c)

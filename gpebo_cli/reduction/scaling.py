@@ -84,16 +84,10 @@ def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n
         (kind, i, j), logs = (place[some] for place in places), np.log(sizes[some])
         terms = _Terms.at(i, j, np.asarray(kind - 1, dtype=np.float64), (n, n))
         factors = terms.nearest(np.ones(len(logs)), logs)
-        entries = np.exp(terms @ factors + logs)
-        if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
-            return _scaling(factors, n)
-        most = np.zeros((2, n))
-        for largest, place in zip(most, (i, j), strict=True):
-            np.maximum.at(largest, place, entries)
-        rest = entries > _NOTHING * np.sqrt(most[0, i] * most[1, j])
+        rest = terms.counting(factors, logs)
         if rest.all():
             return _scaling(factors, n)
-        some[some] = rest  # as in ``_factors``
+        some[some] = rest
 
 
 def _scaling(factors: Array, n: int) -> Scaling:
@@ -149,17 +143,10 @@ def _factors(
         terms, nearest = balancing(there.tobytes(), order.tobytes(), sizes.shape, mass)
         logs = np.log(sizes[there])
         factors = nearest(logs)
-        entries = np.exp(terms @ factors + logs)
-        if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
+        rest = terms.counting(factors, logs)
+        if rest.all():
             return factors, there, terms, logs
-        scaled_sizes = np.zeros_like(sizes)
-        scaled_sizes[there] = entries
-        rest = scaled_sizes > _NOTHING * np.sqrt(
-            scaled_sizes.max(axis=(0, 2))[:, None] * scaled_sizes.max(axis=(0, 1))
-        )
-        if (rest == there).all():
-            return factors, there, terms, logs
-        there = rest  # once more without what turned out to be rounding
+        there[there] = rest  # once more without what turned out to be rounding
 
 
 class _Terms(NamedTuple):
@@ -194,6 +181,16 @@ class _Terms(NamedTuple):
             return factors @ self.each
         found: Array = factors[self.rows] + factors[self.columns] + self.of_time * factors[-1]
         return found
+
+    def counting(self, factors: Array, logs: Array) -> BoolArray:
+        """Which of the entries, with these logarithms (e,), are no rounding beside others."""
+        entries = np.exp(self @ factors + logs)
+        if entries.min(initial=1.0) > _NOTHING * entries.max(initial=1.0):
+            return np.ones(len(entries), dtype=bool)
+        most = np.zeros(self.total)  # of each row and column
+        for place in (self.rows, self.columns):
+            np.maximum.at(most, place, entries)
+        return np.asarray(entries > _NOTHING * np.sqrt(most[self.rows] * most[self.columns]))
 
     def transposed(self, values: Array) -> Array:
         """The product of the transpose with values (e,), (a + b + 1,)."""

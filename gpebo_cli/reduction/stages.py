@@ -72,7 +72,7 @@ def in_stages(
         float(np.abs(x[1]).max(initial=0.0) / max(np.abs(x[0]).max(initial=0.0), _TINY))
         if len(x) > 1 else 0.0 for x in (E, A, f)
     )
-    rounding = [[_some(x, every, axis=1) ** 2 for x in (E, A, f)] for _ in range(2)]
+    rounding = [[x[:, ::every] ** 2 for x in (E, A, f)] for _ in range(2)]
     rows: list[tuple[Array, Array, Array]] = []
     smallest = np.full((len(mass), 3), np.inf)
     while True:
@@ -100,10 +100,8 @@ def in_stages(
         require(size[:, -1] > _CLEAR * _EPS * np.linalg.norm(abs(W2) @ abs(A[0]), axis=(1, 2)))
         Wz = transpose(Uz / size[:, None, :])
         A_z, f_z = Wz @ A_z, Wz @ f_z
-        factors = (
-            (W1, 0), (W2, 0), (Wz, 0), (V, 0), (X, 1), (rate * parts[0][0], 1), (parts[1][0], 1)
-        )
-        *squares, mass_r, terms = (_some(y, every, axis) ** 2 for y, axis in factors)
+        factors = W1, W2, Wz, V, X, rate * parts[0][0], parts[1][0]
+        *squares, mass_r, terms = (y[..., ::every, :, :] ** 2 for y in factors)
         (of_A, of_f), rounding[0] = _rounding(rounding[0], squares, mass_r)
         rows.append((A_z[0], f_z[0], joined(of_A[0], of_f[0], axis=2)))
         noise = _EPS * float(np.sqrt(of_A[0].max()))
@@ -142,11 +140,6 @@ def _rounding(
     return of_z, [_stacked(e_r, of_z[0]), *(
         _stacked(above[:-1], _slope(z, power=2)) for (above, _), z in zip(wrong, of_z, strict=True)
     )]
-
-
-def _some(values: Array, every: int, axis: int = 0) -> Array:
-    """Values at every so many times, along an axis of times or of one."""
-    return values[(slice(None),) * axis + (slice(0, None, every),)]
 
 
 def _slope(a: Array, power: int = 1) -> Array:

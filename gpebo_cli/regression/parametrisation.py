@@ -18,7 +18,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.model.expressions import Tape
+from gpebo_cli.model.expressions import Bounds, Tape
 from gpebo_cli.model.expressions.intervals import Interval
 from gpebo_cli.schema import number, shown
 
@@ -65,19 +65,14 @@ class Parametrisation:
 
     def slopes(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Bounds of ∂S/∂θ (N, k, q) over boxes from ``low`` to ``high`` (N, q), by intervals."""
-        t, count = np.zeros(len(low)), low.shape[1]
-        bounds = np.zeros((2, len(low), len(self.tape.outputs), count))
-        for j in range(count):
-            theta: list[list[Any]] = [
-                [Interval(low[:, i], high[:, i]), float(i == j)] for i in range(count)
-            ]
-            with np.errstate(all="ignore"):
-                places: list[list[Any]] = self.tape.run(t, 1, t, theta)
-            for i, place in enumerate(self.tape.outputs):
-                slope = places[place][1] if len(places[place]) > 1 else 0.0
-                ends = (slope.low, slope.high) if isinstance(slope, Interval) else (slope, slope)
-                bounds[0, :, i, j], bounds[1, :, i, j] = ends
-        return bounds[0], bounds[1]
+        t, box = np.zeros(len(low)), [*map(Interval, low.T, high.T)]
+
+        def along(axis: Array) -> tuple[Array, Array]:
+            theta: list[list[Any] | None] = [[*each] for each in zip(box, axis, strict=True)]
+            return Bounds(self.tape, lambda *_: theta).of(t, t, 1)
+
+        least, most = zip(*map(along, np.eye(len(box))), strict=True)
+        return np.stack(least, axis=3)[1], np.stack(most, axis=3)[1]
 
     def monotone(self, T: Array) -> float:
         """A number that λ_min(T∇S + (T∇S)ᵀ) is nowhere below in the box, for T (q, k).

@@ -26,6 +26,7 @@ from gpebo_cli.model.expressions import (
     Bounds,
     Expression,
     Tape,
+    aside,
     breakpoints,
     nodes,
     parse,
@@ -39,7 +40,7 @@ from gpebo_cli.model.expressions.syntax import signal
 from gpebo_cli.model.expressions.tape import UNKNOWN
 from gpebo_cli.model.plant import plant_from_mapping, read_parameters
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, aside, initial_mesh
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.recordings.drive import driven, tables

@@ -19,10 +19,10 @@ from functools import cached_property
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
-from gpebo_cli.model.expressions import Tape, switched, with_others
+from gpebo_cli.model.expressions import Tape, aside, switched, with_others
 from gpebo_cli.model.text import FollowsSignals, switching
 from gpebo_cli.numerics.linalg import taylor_product
-from gpebo_cli.numerics.mesh import Trajectory, aside
+from gpebo_cli.numerics.mesh import Trajectory
 
 # Share of an output by which it is moved to see what depends on it: G is wrong by the square of it
 # and by rounding over it, which costs Newton's method nothing that could be seen.

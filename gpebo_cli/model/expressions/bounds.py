@@ -38,6 +38,7 @@ _SAME = 1e-12  # of the span: found instants closer than this to another are tha
 _ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
 _MOST_SWITCHED = 1 << 16
 _BISECTIONS = 100  # more than enough to leave two neighbouring floats
+_ASIDE = 1e-7  # of a way that is itself 1e-3 of an element: a signal hardly moves there
 
 
 # From the ends of cells of time, (N,) and (N,), to Taylor coefficients of each signal anywhere in
@@ -326,3 +327,8 @@ def halved(sign: Callable[[Array], Array], before: Array, low: Array, high: Arra
         left = sign(half) == before
         low, high = np.where(left, half, low), np.where(left, high, half)
     return high
+
+
+def aside(t: Array, inside: Array) -> Array:
+    """Times (N,) so little from t towards ``inside`` that only what jumps there is another one."""
+    return t + _ASIDE * (inside - t)

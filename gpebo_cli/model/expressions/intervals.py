@@ -65,7 +65,9 @@ def _image(ufunc: np.ufunc, a: Any, b: Any = 0.0) -> tuple[Array, Array]:
         inside = (high >= first) & (low <= last)
         image = ufunc(np.clip(low, first, last)), ufunc(np.clip(high, first, last))
         return np.where(inside, image[0], np.nan), np.where(inside, image[1], np.nan)
-    image = _OTHERS[name](ufunc, low, high, least, most, a is b)
+    if a is b and name == "multiply":
+        return _even(np.square, low, high)
+    image = _OTHERS[name](low, high, least, most)
     return image[0], image[1]
 
 
@@ -75,13 +77,7 @@ def _product(low: Any, high: Any, least: Any, most: Any) -> tuple[Array, Array]:
     return np.minimum.reduce(ends), np.maximum.reduce(ends)
 
 
-def _multiply(_: np.ufunc, low: Any, high: Any, least: Any, most: Any, same: bool) -> Any:
-    if same:
-        return _even(np.square, low, high)
-    return _product(low, high, least, most)
-
-
-def _divide(_: np.ufunc, low: Any, high: Any, least: Any, most: Any, __: bool) -> Any:
+def _quotient(low: Any, high: Any, least: Any, most: Any) -> tuple[Array, Array]:
     through_zero = (least <= 0) & (most >= 0)
     image = _product(low, high, 1.0 / np.asarray(most), 1.0 / np.asarray(least))
     return np.where(through_zero, -np.inf, image[0]), np.where(through_zero, np.inf, image[1])
@@ -93,59 +89,56 @@ def _even(function: Callable[[Any], Any], low: Any, high: Any) -> tuple[Array, A
     return function(nearest), function(np.maximum(np.abs(low), np.abs(high)))
 
 
-def _power(_: np.ufunc, low: Any, high: Any, least: Any, __: Any, ___: bool) -> Any:
-    r = float(least)  # exponents are constant
+def _power(low: Any, high: Any, exponent: Any, _: Any) -> Any:
+    r = float(exponent)  # exponents are constant
     if r.is_integer() and r > 0:
         if r % 2 == 0:
             return _even(lambda x: np.power(x, r), low, high)
         return np.power(low, r), np.power(high, r)
     if r > 0:
         return np.where(high < 0, np.nan, np.power(np.maximum(low, 0.0), r)), np.power(high, r)
-    defined = low > 0
     image = np.power(high, r), np.power(low, r)
-    return np.where(defined, image[0], -np.inf), np.where(defined, image[1], np.inf)
+    return np.where(low > 0, image[0], -np.inf), np.where(low > 0, image[1], np.inf)
+
+
+def _reached(low: Any, high: Any, at: float, period: float) -> Any:
+    """Whether cells hold ``at`` + k ``period``; what rounding might move into them counts, too."""
+    slack = 4e-16 * np.maximum(np.abs(low), np.abs(high)) + 1e-15
+    first, last = (low - at - slack) / period, (high - at + slack) / period
+    return (np.ceil(first) <= np.floor(last)) | ~np.isfinite(last - first)
 
 
 def _wave(function: np.ufunc, low: Any, high: Any, to: float) -> Any:
-    """Bounds of sin(x + to); a crest that rounding might have moved into the cell counts, too."""
-    slack = 4e-16 * np.maximum(np.abs(low), np.abs(high)) + 1e-15
-
-    def crest(at: float) -> Any:
-        turns = 2 * np.pi
-        first, last = (low + to - at - slack) / turns, (high + to - at + slack) / turns
-        return (np.ceil(first) <= np.floor(last)) | ~np.isfinite(last - first)
-
+    """Bounds of sin(x + to)."""
     ends = function(low), function(high)
-    return (
-        np.where(crest(-_HALF_PI), -1.0, np.minimum(*ends)),
-        np.where(crest(_HALF_PI), 1.0, np.maximum(*ends)),
+    return tuple(
+        np.where(_reached(low, high, side * _HALF_PI - to, 4.0 * _HALF_PI), side, end)
+        for side, end in ((-1.0, np.minimum(*ends)), (1.0, np.maximum(*ends)))
     )
 
 
-def _tan(_: np.ufunc, low: Any, high: Any, __: Any, ___: Any, ____: bool) -> Any:
-    slack = 4e-16 * np.maximum(np.abs(low), np.abs(high)) + 1e-15
-    first, last = (low - _HALF_PI - slack) / np.pi, (high - _HALF_PI + slack) / np.pi
-    pole = (np.floor(first) != np.floor(last)) | ~np.isfinite(last - first)
+def _tan(low: Any, high: Any, *_: Any) -> Any:
+    pole = _reached(low, high, _HALF_PI, np.pi)
     return np.where(pole, -np.inf, np.tan(low)), np.where(pole, np.inf, np.tan(high))
 
 
-_Rule = Callable[..., Any]
-_OTHERS: dict[str, _Rule] = {
-    "add": lambda _, low, high, least, most, __: (low + least, high + most),
-    "subtract": lambda _, low, high, least, most, __: (low - most, high - least),
-    "multiply": _multiply,
-    "divide": _divide,
-    "negative": lambda _, low, high, *__: (-high, -low),
+# Bounds of functions of what is between low and high, and least and most.
+_OTHERS: dict[str, Callable[..., Any]] = {
+    "add": lambda low, high, least, most: (low + least, high + most),
+    "subtract": lambda low, high, least, most: (low - most, high - least),
+    "multiply": _product,
+    "divide": _quotient,
+    "negative": lambda low, high, *_: (-high, -low),
     "power": _power,
-    "absolute": lambda ufunc, low, high, *_: _even(ufunc, low, high),
-    "cosh": lambda ufunc, low, high, *_: _even(ufunc, low, high),
-    "sin": lambda ufunc, low, high, *_: _wave(ufunc, low, high, 0.0),
-    "cos": lambda ufunc, low, high, *_: _wave(ufunc, low, high, _HALF_PI),
+    "absolute": lambda low, high, *_: _even(np.absolute, low, high),
+    "cosh": lambda low, high, *_: _even(np.cosh, low, high),
+    "sin": lambda low, high, *_: _wave(np.sin, low, high, 0.0),
+    "cos": lambda low, high, *_: _wave(np.cos, low, high, _HALF_PI),
     "tan": _tan,
-    "arccos": lambda ufunc, low, high, *_: (
-        ufunc(np.clip(high, -1.0, 1.0)), ufunc(np.clip(low, -1.0, 1.0)),
+    "arccos": lambda low, high, *_: (
+        np.arccos(np.clip(high, -1.0, 1.0)), np.arccos(np.clip(low, -1.0, 1.0)),
     ),
-    "greater_equal": lambda _, low, high, least, *__: (1.0 * (low >= least), 1.0 * (high >= least)),
+    "greater_equal": lambda low, high, least, _: (1.0 * (low >= least), 1.0 * (high >= least)),
 }  # fmt: skip
 
 
