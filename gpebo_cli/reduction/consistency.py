@@ -89,6 +89,7 @@ def jumps(
         return np.asarray(part[k % len(part)])
 
     def jump(k: int, before: Array) -> Jump:
+        """The jump k from the state (n,) before it (ModelError: as above)."""
         t, A2 = float(times[k]), at(form.A2, k)
         whole = np.zeros((levels * n + structure.a, levels, n))
         blocks = whole[: levels * n].reshape(levels, n, levels, n)

@@ -176,19 +176,23 @@ def switched(name: str, decided: Coefficient, arguments: list[Jet], order: int) 
     return add(multiply([weight], a, order), multiply([1.0 - weight], b, order), order)
 
 
-def sine_and_cosine(a: Jet, order: int, hyperbolic: bool = False) -> tuple[Jet, Jet]:
-    """(sin, cos) or (sinh, cosh) of a together: each one's derivative is the other's value."""
+_WAVES = {"sin": np.sin, "cos": np.cos, "sinh": np.sinh, "cosh": np.cosh}
+
+
+def wave(name: str, a: Jet, order: int) -> Jet:
+    """One of ``_WAVES`` of a, by sine and cosine together: each one's derivative is the other."""
+    if len(a) == 1 or order == 0:
+        return [_WAVES[name](a[0])]
+    hyperbolic = name.endswith("h")
     s: Jet = [np.sinh(a[0]) if hyperbolic else np.sin(a[0])]
     c: Jet = [np.cosh(a[0]) if hyperbolic else np.cos(a[0])]
-    if len(a) == 1:
-        return s, c
     w = weighted(a, order)
     for k in range(1, order + 1):
         s_k = convolve(w, c, k, first=1) / k
         c_k = convolve(w, s, k, first=1) / k
         s.append(s_k)
         c.append(c_k if hyperbolic else -c_k)
-    return s, c
+    return s if name.startswith("s") else c
 
 
 def tangent(a: Jet, order: int, hyperbolic: bool = False) -> Jet:
@@ -212,6 +216,7 @@ UNARY: dict[str, Callable[[Jet, int], Jet]] = {
     "exp": exp,
     "erf": erf,
     **{name: partial(primitive, name) for name in _PRIMITIVES},
+    **{name: partial(wave, name) for name in _WAVES},
     "tan": tangent,
     "tanh": partial(tangent, hyperbolic=True),
 }

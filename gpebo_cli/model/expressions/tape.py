@@ -31,15 +31,6 @@ _MOST_COMPILED = 1000
 _SWITCHES = ("abs", "sign", "min", "max")
 UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
-# Function, its place in the pair of jets computed together, and which pair.
-_PAIRS = {
-    "sin": (np.sin, 0, False),
-    "cos": (np.cos, 1, False),
-    "sinh": (np.sinh, 0, True),
-    "cosh": (np.cosh, 1, True),
-}
-
-
 # Order, whether jumps are decided at other times, how many coefficients of how many signals.
 _Key = tuple[int, bool, tuple[int, int] | None]
 
@@ -210,7 +201,6 @@ class Tape:
             last = max(switch.argument for switch in self.switches)
             deciding = self.run(inside, 0, inside, signals, last + 1)
         places: list[Jet] = []
-        pairs: dict[tuple[int, bool], tuple[int, tuple[Jet, Jet]]] = {}
         for (operation, arguments, value), extra in zip(
             self.instructions[:stop], self.extra[:stop], strict=True
         ):
@@ -219,17 +209,6 @@ class Tape:
             if operation in jets.BINARY:
                 left, right = arguments
                 jet = jets.BINARY[operation](places[left], places[right], wanted)
-            elif operation in _PAIRS:
-                function, which, hyperbolic = _PAIRS[operation]
-                argument = places[arguments[0]]
-                if wanted == 0:
-                    jet = [function(argument[0])]
-                else:
-                    known, pair = pairs.get((arguments[0], hyperbolic), (-1, ([], [])))
-                    if known < wanted:
-                        pair = jets.sine_and_cosine(argument, wanted, hyperbolic)
-                        pairs[arguments[0], hyperbolic] = wanted, pair
-                    jet = pair[which]
             elif operation in jets.UNARY:
                 jet = jets.UNARY[operation](places[arguments[0]], wanted)
             elif operation == "power":
