@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from kernel_paths import by_both
+from scipy.integrate import quad
 from scipy.special import gammaln
 from test_kernels_jets import tape_of, texts
 
@@ -144,15 +147,36 @@ def test_one_narrow_pulse_anywhere_is_integrated(place, width):
     )
 
 
-@pytest.mark.parametrize("power", ["", "**2", "**3"])
-def test_a_pole_that_no_point_of_a_first_mesh_hits_is_refused(power):
-    """Of x' = x/(t − a) all solutions are zero at a, and nothing says which one goes on."""
-    with pytest.raises(GpeboError, match=r" t = 3\.3\b"):
-        run({
-            "name": "pole", "states": ["a", "b"], "inputs": {"u": "sin(t)"},
-            "E": [[1, 0], [0, 0]], "A": [[f"1/(t - 3.3){power}", 1], [1, 1]], "B": [[0], [1]],
-            "initial_state": [0, 0],
-        }, observer="none", time={"horizon": 10})
+@pytest.mark.parametrize("pole", [
+    "1/(t - 3.3)", "1e-9/(exp(t) - exp(3.3))", "(t - 3.3)**(-2)", "tan(pi*t/6.6)",
+    "1/sin(200*(t - 3.3))",
+])
+@pytest.mark.parametrize("place", [("A", 1, 0), ("B", 0, 0), ("C", 0, 0), ("phi", 0)])
+def test_a_pole_is_refused_wherever_it_stands(pole, place):
+    """Nothing grows with it in a chain, where no error of a state would tell."""
+    plant = {
+        "name": "chain", "states": ["a", "b"], "inputs": {"u": 1}, "outputs": ["y"],
+        "E": [[1, 0], [0, 1]], "A": [[-1, 0], [0, -1]], "B": [[1], [0]], "C": [[0, 1]],
+        "phi": [0, 0], "initial_state": [1, 0],
+    }
+    key, row, *column = place
+    plant[key] = copy.deepcopy(plant[key])
+    if column:
+        plant[key][row][column[0]] = pole
+    else:
+        plant[key][row] = pole
+    with pytest.raises(GpeboError, match=r"grows beyond all numbers near t = (3\.3;|0.0)"):
+        run(plant, observer="none", time={"horizon": 5.03})
+
+
+@pytest.mark.parametrize(("text", "truth"), [
+    ("1/(1 + (t - 3.3)**(-2))", lambda t: (t - 3.3) ** 2 / (1 + (t - 3.3) ** 2)),
+    ("sin(t - 3.3)/(t - 3.3)", lambda t: np.sinc((t - 3.3) / np.pi)),
+    ("1/((t - 3.3)**2 + 1e-8)", lambda t: 1 / ((t - 3.3) ** 2 + 1e-8)),
+])
+def test_what_has_no_bound_in_a_cell_may_be_finite(text, truth):
+    exact = quad(truth, 0.0, 5.03, points=[3.2999, 3.3, 3.3001], limit=500, epsabs=1e-11)[0]
+    assert integrated(text, horizon=5.03) == pytest.approx(exact, rel=1e-8)
 
 
 def slit(width):

@@ -19,12 +19,15 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.expressions.intervals import Interval
 from gpebo_cli.model.expressions.program import Program
+from gpebo_cli.model.expressions.syntax import shorten
 from gpebo_cli.model.expressions.tape import Tape
 
 ORDER = 8  # of the Taylor polynomials that functions are compared with
 RESOLVED = 1e-6  # of its largest value, by which a function may differ from such a polynomial
 COARSER = 3
 _DEEPEST = 45  # halvings of a cell
+_LOOKED = 10  # halvings after which what has no bound has to have a value at least
+_NEAR, _STEEP = 1e-9, 0.9  # of a cell; an exponent: what grows like 1/distance has no integral
 _CELLS = 64  # to begin with, where roots are looked for
 _NARROWEST = 1e-13  # of the span; cells are not cut further
 _MOST_CELLS = 1 << 15
@@ -95,9 +98,9 @@ def resolved(bounds: Bounds, edges: Array, most: int = 0) -> tuple[Array, bool]:
 
     the bounds of f_K over the cell say by how much f can differ from such a polynomial. What is
     looked at a dozen times between these edges cannot hide a pulse. What has no finite bound, as a
-    quotient while its divisor might vanish, is cut until it has one, and at a pole to rounding. The
-    edges asked for (K + 1,), jumps and kinks among them, stay. ``most`` cells are enough; 0: as
-    many as _MOST_CELLS and _MOST_VALUES let.
+    quotient while its divisor might vanish, is cut until it has one, or to rounding. The edges
+    asked for (K + 1,), jumps and kinks among them, stay. ``most`` cells are enough; 0: as many as
+    _MOST_CELLS and _MOST_VALUES let (ConfigError: a function of time has a pole, or no value).
     """
     low, high = edges[:-1], edges[1:]
     depth = np.zeros(len(low), dtype=np.intp)  # how often each has been halved
@@ -113,12 +116,39 @@ def resolved(bounds: Bounds, edges: Array, most: int = 0) -> tuple[Array, bool]:
         new = np.concatenate([low[poor], middle]), np.concatenate([middle, high[poor]])
         deeper = np.tile(depth[poor] + 1, 2)
         fresh = (*new, deeper, *_rest(bounds, *new))
+        if bounds.signals is None:
+            lost = ~np.isfinite(fresh[-1]).all(axis=1) & (deeper == _LOOKED)
+            bounds.tape.taylor(np.sort(0.5 * (new[0] + new[1])[lost]), 0)
         low, high, depth, rest, size = (
             np.concatenate([old[~poor], more])
             for old, more in zip((low, high, depth, rest, size), fresh, strict=True)
         )
+    if bounds.signals is None:
+        _refuse_poles(bounds.tape, 0.5 * (low + high), edges, ~np.isfinite(size))
     order = np.argsort(low)
     return np.append(_coarser(low[order], depth[order], edges), edges[-1]), not poor.any()
+
+
+def _refuse_poles(tape: Tape, t: Array, edges: Array, unbounded: BoolArray) -> None:
+    """Refuse outputs with a pole in cells around t (N,) in which they are ``unbounded``."""
+    cells = unbounded.any(axis=1)
+    if not cells.any():
+        return
+    t, unbounded = t[cells], unbounded[cells]
+    length = np.diff(edges)[np.searchsorted(edges[1:-1], t)]
+    away = np.maximum(_NEAR * length, 1e3 * np.spacing(np.abs(t)))
+    places = t[:, None] + away[:, None] * np.array([-1e-2, -1.0, 1.0, 1e-2])
+    inside = np.clip(places, edges[0], edges[-1])
+    size = np.abs(tape.taylor(inside.ravel(), 0)[0]).reshape(len(t), 4, -1)
+    near, far = size[:, ::3].max(axis=1), size[:, 1:3].max(axis=1)
+    pole = np.argwhere(unbounded & (near > far * 100.0**_STEEP))
+    if len(pole):
+        k, j = pole[np.argmin(t[pole[:, 0]])]
+        label = tape.labels[j]
+        raise ConfigError(
+            f"{label.where} = {shorten(label.text)} grows beyond all numbers near t = {t[k]:.6g}; "
+            "choose a horizon without that time"
+        )
 
 
 def resolved_along(

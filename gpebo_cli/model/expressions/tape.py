@@ -177,6 +177,7 @@ class Tape:
         new = {place: k for k, place in enumerate(k for k in range(last) if needed[k])}
         kept = [self.instructions[place] for place in new]
         decided = {i.arguments[-1] for i in kept if i.operation in _SWITCHES}
+        named = {label.place: label for label in reversed(self.labels)}
         return Tape(
             tuple(i._replace(arguments=tuple(new[a] for a in i.arguments)) for i in kept),
             tuple(self.extra[place] for place in new),
@@ -185,7 +186,11 @@ class Tape:
                 s._replace(argument=new[s.argument])
                 for s in self.switches if s.argument in decided
             ),
-            tuple(Label(new[place], "…", "an argument", ()) for place in places),
+            tuple(
+                named.get(place, Label(place, "…", "an argument", ()))._replace(
+                    place=new[place], uses=()
+                ) for place in places
+            ),
         )
 
     def run(
