@@ -19,15 +19,14 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError, check_memory
 from gpebo_cli.estimators._scalar import SINGULAR, low_pass
+from gpebo_cli.kernels import laws
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState
 
 _PICARD_ROUNDS = 200
-_IN_CACHE = 1 << 15  # numbers of matrices that are solved with at once
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
@@ -76,28 +75,14 @@ class InformationAt:
     def solution(self, alpha: float, f0: float, start: Array) -> Array:
         """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z), shape (M, p, c).
 
-        The spectrum, which many gains share, is not needed for it. It is solved in units in which
-        F⁻¹ has ones on its diagonal; directions in which F⁻¹ is rounding stay where they start.
+        The spectrum, which many gains share, is not needed for it, and units do not matter.
         """
-        p, found = len(start), []
-        some = max(1, _IN_CACHE // max(p * p, 1))
-        for first in range(0, max(len(self.values), 1), some):
-            values, memory = (x[first : first + some] for x in (self.values, self.memory))
-            gram, right = values[..., :p], alpha * values[..., p:]
-            if start.any():
-                right -= alpha * gram @ start[:, None]
-            diagonal = alpha * np.einsum("mii->mi", gram) + (memory * f0)[:, None]
-            unit = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))[..., None]
-            left = gram * (alpha * unit)
-            left *= transpose(unit)
-            np.einsum("mii->mi", left)[:] = diagonal * unit[..., 0] ** 2
-            right *= unit
-            try:
-                moved = np.linalg.solve(left, right)
-            except np.linalg.LinAlgError:
-                moved = np.linalg.pinv(left, p * EPS, hermitian=True) @ right
-            found.append(start[:, None] + unit * moved)
-        return np.concatenate(found)
+        values, p = self.values, len(start)
+        if start.any():
+            values = values.copy()
+            values[..., p:] -= values[..., :p] @ start[:, None]
+        _, found, _ = laws.mixed(values, self.memory * (f0 / alpha))
+        return np.asarray(found + start[:, None])
 
     def quotient(self) -> tuple[Array, Array]:
         """G_z⁻¹ h_z (M, p, c), and to how many digits, λ_min/λ_max (M,).

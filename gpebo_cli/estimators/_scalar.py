@@ -344,7 +344,7 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
 
     whole, points = extended.values, extended.values.shape[:2]
     # 𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
-    delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]))
+    delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]), None)
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
     digits = np.divide(1.0, condition, out=np.zeros(len(condition)), where=usable)
     return scalar_path(

@@ -214,15 +214,6 @@ static inline void affine(double *out, const double *a, const double *x, const d
         combine(out + i * columns, b + i * columns, a + i * n, n, x, columns, columns);
 }
 
-/* Whether all numbers are finite. */
-static inline int all_finite(const double *values, npy_intp count)
-{
-    int bad = 0;
-    for (npy_intp i = 0; i < count; i++)
-        bad |= !(fabs(values[i]) <= DBL_MAX);
-    return !bad;
-}
-
 /* Maps, particular solutions, start -> values, and how many elements in front are finite. */
 EVERY_WIDTH static Outcome chain(Call *call)
 {
@@ -233,7 +224,10 @@ EVERY_WIDTH static Outcome chain(Call *call)
         memcpy(out, state, block * sizeof(double));
         affine(out + block, call->in[0] + k * call->step[0], out, call->in[1] + k * s * block,
                s * n, n, c);
-        whole += whole == (double)k && all_finite(out, (s + 1) * block);
+        double none = 0.0; /* but where a number is not finite */
+        for (npy_intp i = 0; i < (s + 1) * block; i++)
+            none += 0.0 * out[i];
+        whole += whole == (double)k && none == 0.0;
         state = out + s * block;
     }
     call->out[1][0] = whole;
@@ -328,8 +322,6 @@ typedef double Columns[AT_ONCE], Nodes[MOST_STAGES]; /* zeros after the last sta
 /* Not unrolled before they are vectorised: else sums are kept in memory, at twice the time. */
 #define EACH_COLUMN _Pragma("omp simd") for (int b = 0; b < AT_ONCE; b++)
 #define EACH_OF_WIDTH _Pragma("omp simd") for (int b = 0; b < width; b++)
-#define POWERS 4 /* of the time at once, where there is one column: its terms stand backwards */
-#define EACH_POWER _Pragma("omp simd") for (int b = 0; b < POWERS; b++)
 #define MAXIMUM(a, b) ((a) > (b) ? (a) : (b)) /* or b where a is no number */
 
 /* X' = A X + f in a part of an element, d rows and some of the columns. */
@@ -369,15 +361,12 @@ INLINE void next_term(const Part *q, npy_intp k, npy_intp known, const int width
     const double *last = q->terms + k * later, factor = q->h / (double)(k + 1);
     for (npy_intp i = 0; i < d; i++) {
         Columns sum = {0.0}, more = {0.0}; /* one alone would wait for each product */
-        double side[POWERS] = {0.0};
         double *next = q->terms + (k + 1) * later + i * q->below;
         for (npy_intp b = 0; k < q->orders && b < q->forced; b++)
             sum[b] = q->f[(k * d + i) * q->stride + b];
         for (npy_intp e = q->row[i]; e < q->row[i + 1]; e++) {
             const double *x = last + q->column[e] * q->below, *A = q->A + e * q->degrees;
             npy_intp j = 0;
-            for (; width == 1 && j + POWERS <= known; j += POWERS, x += POWERS)
-                EACH_POWER side[b] += A[j + b] * x[b];
             for (; j + 2 <= known; j += 2, x -= 2 * later) {
                 const double one = A[j], other = A[j + 1], *y = x - later;
                 EACH_OF_WIDTH sum[b] += one * x[b];
@@ -386,12 +375,7 @@ INLINE void next_term(const Part *q, npy_intp k, npy_intp known, const int width
             if (j < known)
                 EACH_OF_WIDTH sum[b] += A[j] * x[b];
         }
-        if (width == 1) {
-            side[0] = (side[0] + side[1]) + (side[2] + side[3]);
-            next[0] = factor * (sum[0] + more[0] + side[0]);
-        } else {
-            EACH_OF_WIDTH next[b] = factor * (sum[b] + more[b]);
-        }
+        EACH_OF_WIDTH next[b] = factor * (sum[b] + more[b]);
         q->change[i] = q->weight[i] * largest_size(next, width);
         q->size[i] = MAXIMUM(q->change[i], q->size[i]);
     }
@@ -432,26 +416,21 @@ EVERY_WIDTH static void summed(const Part *q, npy_intp count, const Nodes times,
                                npy_intp all, double *out, npy_intp apart, npy_intp next)
 {
     Nodes power[MOST_ORDERS];
+    const npy_intp rows = q->width == 1 ? AT_ONCE : 1; /* in a vector */
     for (npy_intp k = 0; k < count; k++)
         EACH_NODE power[k][n] = k ? power[k - 1][n] * times[n] : 1.0;
-    for (npy_intp i = 0; i < q->d; i++) {
-        double *x = q->terms + i * q->below;
-        Nodes one = {0.0};
-        for (npy_intp k = 0; q->width == 1 && k < count; k++)
-            EACH_NODE one[n] += power[k][n] * x[k * q->later];
-        for (npy_intp j = 0; q->width == 1 && j < some; j++)
-            out[j * apart + i * next] = one[j];
-        if (q->width == 1)
-            x[0] = one[all - 1];
-        for (npy_intp j = 0; q->width > 1 && j < all; j += 4) {
+    for (npy_intp i = 0; i < q->d; i += rows) {
+        const npy_intp left = rows > 1 ? q->d - i : q->columns;
+        for (npy_intp j = 0; j < all; j += 4) {
             Columns sum[4] = {{0.0}};
+            double *x = q->terms + i * q->below;
             for (npy_intp k = 0; k < count; k++)
                 for (int m = 0; m < 4; m++)
                     EACH_COLUMN sum[m][b] += power[k][j + m] * x[k * q->later + b];
             for (int m = 0; m < 4 && j + m < some; m++)
-                put(out + (j + m) * apart + i * next, sum[m], q->columns);
+                put(out + (j + m) * apart + i * next, sum[m], left);
             if (j + 4 >= all)
-                put(x, sum[all - 1 - j], q->columns);
+                put(x, sum[all - 1 - j], left);
         }
     }
 }
@@ -504,24 +483,22 @@ static Outcome series(Call *call)
             return refused("a column", column[e]);
     const npy_intp width = all > 1 ? AT_ONCE : 1, length = width * MOST_ORDERS * d;
     Part q = {.d = d, .stride = SIZE(f), .degrees = SIZE(g), .orders = SIZE(u), .row = row};
-    q.width = width, q.below = width * MOST_ORDERS, q.later = all > 1 ? AT_ONCE : -1;
+    q.width = width, q.below = all > 1 ? AT_ONCE * MOST_ORDERS : 1, q.later = all > 1 ? AT_ONCE : d;
     q.column = column, q.weight = call->in[10], q.tol = call->number[11];
     q.share = call->number[12], q.size = scratch(call, length + 3 * d + 2 * AT_ONCE);
     if (q.size == NULL)
         return ERROR;
     double *so_far = q.size + d;
     q.change = so_far + d;
-    double *all_terms =
-        q.change + d; /* in whole lines of the cache; vectors reach beyond the last */
-    all_terms += (64 - (uintptr_t)all_terms % 64) % 64 / sizeof(double);
-    q.terms = all_terms + (all > 1 ? 0 : MOST_ORDERS - 1);
+    q.terms = q.change + d; /* in whole lines of the cache; vectors reach beyond the last */
+    q.terms += (64 - (uintptr_t)q.terms % 64) % 64 / sizeof(double);
     for (npy_intp k = 0; k < K; k++)
         call->out[1][k] = call->number[11];
     for (npy_intp first = 0; first < all; first += AT_ONCE) {
         const npy_intp c = all - first < AT_ONCE ? all - first : AT_ONCE, left = SIZE(f) - first;
         q.columns = c, q.forced = left < 0 ? 0 : left < c ? left : c;
         memset(so_far, 0, d * sizeof(double));
-        memset(all_terms, 0, length * sizeof(double));
+        memset(q.terms, 0, length * sizeof(double));
         for (npy_intp i = 0; i < d; i++)
             memcpy(q.terms + i * q.below, call->in[9] + i * all + first, c * sizeof(double));
         for (npy_intp k = 0, part = 0; k < K; part += parts[k++]) {

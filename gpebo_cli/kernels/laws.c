@@ -23,7 +23,32 @@ static double determinant(const Lane *A, npy_intp p, int l, double sign)
     return exponent ? ldexp(sign, exponent) : sign;
 }
 
-/* [Ω | 𝒴] -> Δ = det Ω, η̄ = Ω⁻¹𝒴, ‖Ω‖‖Ω⁻¹‖; η̄ is not finite where Δ = 0. */
+#define SMALL_SHARE 1e-13 /* of an entry: a pivot of which no more is left is rounding */
+
+/* (Ω + r)⁻¹𝒴, not finite where rounding decides, in the place of 𝒴 in [Ω | 𝒴] (p, w). */
+EVERY_WIDTH static void regularised(Lane *A, const double *r, npy_intp p, npy_intp w)
+{
+    for (npy_intp k = 0; k < p; k++)
+        EACH A[k * w + k][l] += r[l], A[(p + k) * w][l] = SMALL_SHARE * A[k * w + k][l];
+    for (npy_intp k = 0; k < p; k++) {
+        double *pivot = A[k * w + k], *small = A[(p + k) * w];
+        EACH pivot[l] = pivot[l] > small[l] ? 1.0 / pivot[l] : NAN;
+        for (npy_intp i = k + 1; i < p; i++) {
+            Lane factor, *restrict to = A + i * w, *restrict from = A + k * w;
+            EACH factor[l] = from[i][l] * pivot[l];
+            for (npy_intp j = i; j < w; j++)
+                EACH to[j][l] -= factor[l] * from[j][l];
+        }
+    }
+    for (npy_intp k = p - 1; k >= 0; k--) {
+        Lane *x = A + k * w + p;
+        lanes_multiply(x, w, A + k * w + k + 1, w, x + w, w, 1, p - k - 1, w - p, -1.0);
+        for (npy_intp j = 0; j < w - p; j++)
+            EACH x[j][l] *= A[k * w + k][l];
+    }
+}
+
+/* [Ω | 𝒴] -> Δ = det Ω, η̄ = Ω⁻¹𝒴, ‖Ω‖‖Ω⁻¹‖; η̄ is not finite where Δ = 0. With r η̄ alone. */
 static Outcome mixed(Call *call)
 {
     const npy_intp N = SIZE(N), p = SIZE(p), c = SIZE(c), w = SIZE(w);
@@ -35,6 +60,14 @@ static Outcome mixed(Call *call)
         const npy_intp used = N - first < LANES ? N - first : LANES;
         Lane sign, size, inverse;
         lanes_load(values, call->in[0], p * w, p * w, first, used);
+        if (call->in[1] != NULL) {
+            lanes_load(&size, call->in[1], 1, 1, first, used);
+            for (npy_intp l = first; l < first + used; l++)
+                call->out[0][l] = call->out[2][l] = NAN;
+            regularised(values, size, p, w);
+            lanes_store(call->out[1], values, p, w, p, c, first, used);
+            continue;
+        }
         lanes_clear(both, p * w);
         for (npy_intp i = 0; i < p; i++) {
             memcpy(omega + i * p, values + i * w, p * sizeof(Lane));
@@ -48,8 +81,7 @@ static Outcome mixed(Call *call)
             memcpy(values + i * p, both + i * w, p * sizeof(Lane));
         lanes_norm(inverse, values, p * p);
         for (int l = 0; l < used; l++) {
-            const double delta = determinant(omega, p, l, sign[l]);
-            call->out[0][first + l] = delta;
+            call->out[0][first + l] = determinant(omega, p, l, sign[l]);
             call->out[2][first + l] = size[l] * inverse[l];
         }
     }
@@ -195,11 +227,7 @@ EVERY_WIDTH static void errors_of_cases(const Call *call, const double *eta, npy
     const npy_intp M = SIZE(M), p = SIZE(p), n = SIZE(n);
     for (npy_intp from = 0; from < M; from += TOGETHER) {
         const npy_intp now = M - from < TOGETHER ? M - from : TOGETHER;
-        for (npy_intp l = 0; l < LANES; l++) {
-            const double *one = eta + ((l < used ? l : used - 1) * M + from) * p;
-            for (npy_intp i = 0; i < now * p; i++)
-                lanes[i][l] = one[i];
-        }
+        lanes_load(lanes, eta + from * p, M * p, now * p, 0, used);
         Lane in_eta[TOGETHER], in_x[TOGETHER];
         for (npy_intp i = 0; i < now; i++) {
             const npy_intp m = from + i;
@@ -253,7 +281,7 @@ static Outcome squared_errors(Call *call)
 }
 
 const Kernel law_kernels[] = {
-    {"mixed", "Npw c=w-p", "N Npc N", mixed},
+    {"mixed", "Npw |N c=w-p", "N Npc N", mixed},
     {"stepped_law", "S Sp Sp Sp @M M M g?p gw", "gMp", stepped_law},
     {"squared_errors", "gMp M?p p M?n M?np M?n n |gc # c=p+n", "gM gM gc g2", squared_errors},
     {NULL, NULL, NULL, NULL},

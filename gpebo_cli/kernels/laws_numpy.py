@@ -6,13 +6,19 @@ import numpy as np
 
 from gpebo_cli.kernels.arrays import Array, IntArray
 
+_EPS, _IN_CACHE = float(np.finfo(float).eps), 1 << 16  # numbers that are solved with at once
 
-def mixed(extended: Array) -> tuple[Array, Array, Array]:
+
+def mixed(extended: Array, added: Array | None) -> tuple[Array, Array, Array]:
     """Δ = det Ω (N,), Ω⁻¹𝒴 (N, p, c) and ‖Ω‖‖Ω⁻¹‖ (N,) of [Ω | 𝒴] (N, p, p + c).
 
-    Where Δ = 0 the second one is not finite.
+    Where Δ = 0 the second one is not finite. With r (N,) it is that of :func:`regularised`, and
+    there are no others.
     """
     p = extended.shape[1]
+    if added is not None:
+        nothing = np.full(len(extended), np.nan)
+        return nothing, regularised(extended, added), nothing
     omega = extended[:, :, :p]
     delta = np.linalg.det(omega)
     solved = np.full((*extended.shape[:2], extended.shape[2]), np.nan)
@@ -24,6 +30,29 @@ def mixed(extended: Array) -> tuple[Array, Array, Array]:
         inverse = np.linalg.norm(solved[:, :, :p], axis=(1, 2))
         condition = np.linalg.norm(omega, axis=(1, 2)) * inverse
     return delta, solved[:, :, p:], condition
+
+
+def regularised(extended: Array, added: Array) -> Array:
+    """(Ω + r)⁻¹𝒴 (N, p, c) of [Ω | 𝒴] (N, p, p + c), Ω symmetric and not negative, and r (N,) ≥ 0.
+
+    It is solved in units in which the matrix has ones on its diagonal; directions in which it is
+    rounding come to nothing.
+    """
+    p, found = extended.shape[1], extended[..., extended.shape[1] :].copy()
+    diagonal = np.einsum("nii->ni", extended[..., :p]) + added[:, None]
+    unit = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))[..., None]
+    some = max(1, _IN_CACHE // max(p * p, 1))
+    for first in range(0, len(found), some):
+        part = slice(first, first + some)
+        left = extended[part, :, :p] * unit[part]
+        left *= np.swapaxes(unit[part], 1, 2)
+        np.einsum("nii->ni", left)[:] = diagonal[part] * unit[part, :, 0] ** 2
+        right = found[part] * unit[part]
+        try:
+            found[part] = np.linalg.solve(left, right) * unit[part]
+        except np.linalg.LinAlgError:
+            found[part] = np.linalg.pinv(left, p * _EPS, hermitian=True) @ right * unit[part]
+    return found
 
 
 def stepped_law(

@@ -69,21 +69,21 @@ def in_frame(
     Lambda, on_basis = from_left(A), _across(algebraic, domain)
     # [A_0 | D_0 | of u and y] = [Λ B | E⁺F | E⁺B, 0] − Λ H Q1ᵀ [𝒜 B | G | g_signals]
     times = max(map(len, (E, A, B, F, C)))
-    through = joined(on_basis, G, g_signals, axis=2)
     back = _across(Lambda, kernel) @ X1
     touched = back.any(axis=(0, 2))  # of many states few are moved by those that are eliminated
-    parts = _across(Lambda, domain), from_left(F), from_left(B), np.zeros((1, d, r))
-    whole = joined(*parts, axis=2)
-    if touched.any() and len(back) > len(whole):
-        whole = np.broadcast_to(whole, (len(back), *whole.shape[1:])).copy()
-    if touched.any():
-        whole[:, touched] -= back[:, touched] @ (np.swapaxes(Q1, 1, 2) @ through)
-    whole = np.broadcast_to(whole, (times, *whole.shape[1:]))
-    of_dynamics = slice(1 if len(E) == len(A) == len(C) == 1 else times)
-    return (
-        sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity,
-        whole[of_dynamics, :, :d], whole[:, :, d : d + q], whole[:, :, d + q :],
-    )
+    found = []
+    for direct, through in (
+        (_across(Lambda, domain), on_basis), (from_left(F), G),
+        (joined(from_left(B), np.zeros((1, d, r)), axis=2), g_signals),
+    ):
+        whole = np.broadcast_to(direct, (times, *direct.shape[1:]))
+        if touched.any():
+            whole = whole.copy()
+            whole[:, touched] -= back[:, touched] @ (np.swapaxes(Q1, 1, 2) @ through)
+        found.append(whole)
+    if len(E) == len(A) == len(C) == 1:
+        found[0] = found[0][:1]
+    return sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, *found
 
 
 def _axes(columns: Array) -> IntArray | slice | None:

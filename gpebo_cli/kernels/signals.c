@@ -82,11 +82,9 @@ static Outcome interpolation(Call *call)
     for (npy_intp i = 0; i < SIZE(N); i++) {
         npy_intp low = 0, high = K - 1;
         while (low < high) {
-            const npy_intp middle = (low + high) / 2;
-            if (edges[middle + 1] > call->in[4][i])
-                high = middle;
-            else
-                low = middle + 1;
+            const npy_intp middle = (low + high) / 2, left = edges[middle + 1] > call->in[4][i];
+            high = left ? middle : high;
+            low = left ? low : middle + 1;
         }
         const double place = (call->in[3][i] - edges[low]) / (edges[low + 1] - edges[low]);
         double *weights = call->out[1] + i * t, sum = 0.0;
