@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import keyword
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -88,12 +89,13 @@ class _Block:
 
 
 class _Scope(NamedTuple):
-    """What names mean in a block."""
+    """What names mean in a line of a block."""
 
     nodes: Mapping[str, str]  # what its ports are called outside
     known: Mapping[str, str]  # parameters by lower-case name, with what they are in the plant
     prefix: str = ""  # of names inside, ``x1_``
     depth: int = 0  # of nesting
+    place: Place = Place("", 0)  # of the line
 
     def node(self, word: str) -> str:
         """A node as the plant has it."""
@@ -206,27 +208,20 @@ def _tokens(text: str, place: Place) -> list[str]:
 
 def _options(text: str, place: Place) -> tuple[list[str], dict[str, str]]:
     """Plain words, and ``key=value`` pairs by lower-case key."""
-    groups: list[list[str]] = [[]]  # of words between two =
-    for word in _tokens(text, place):
-        if word == "=":
-            groups.append([])
-        else:
-            groups[-1].append(word)
-    plain: list[str] = []
-    options: dict[str, str] = {}
-    key = ""
-    for k, group in enumerate(groups):
-        last = k + 1 == len(groups)
-        if len(group) < (k > 0) + (not last):
+    words, plain, options, k = [*_tokens(text, place), "", ""], list[str](), dict[str, str](), 0
+    while key := words[k]:
+        equals, value = words[k + 1 : k + 3]
+        if key == "=" or (equals == "=" and value in ("", "=")):
             raise place.error("= needs a name before it and a value behind it")
-        following = "" if last else group.pop().lower()
-        count = 0
-        if k > 0:  # on=1,3,5: more numbers belong to the key
-            more = itertools.takewhile(lambda word: number(word) is not None, group[1:])
-            values = [group[0], *more]
-            options[key], count = " ".join(values), len(values)
-        plain += group[count:]
-        key = following
+        if equals != "=":
+            plain.append(key)
+            k += 1
+            continue
+        stop = k + 3  # on=1,3,5: more numbers belong to the key
+        while number(words[stop]) is not None and words[stop + 1] != "=":
+            stop += 1
+        options[key.lower()] = " ".join(words[k + 2 : stop])
+        k = stop
     return plain, options
 
 
@@ -244,42 +239,45 @@ class _Reader:
         """Read the lines of a block, in which its own parameters are known, too."""
         known = dict(scope.known)
         scope = scope._replace(known=known)
-        lines = [(place, line, line.split()[0].lower()) for place, line in block.lines]
-        for place, line, head in lines:
+        lines = [
+            (scope._replace(place=place), line, line.split()[0].lower())
+            for place, line in block.lines
+        ]
+        for here, line, head in lines:
             if head in (".param", ".params"):
-                _, given = _options(line[len(head) :], place)
+                _, given = _options(line[len(head) :], here.place)
                 if not given:
-                    raise place.error(".param needs name=value")
+                    raise here.place.error(".param needs name=value")
                 for name, value in given.items():
-                    known[name] = self._parameter(scope.prefix + name, value, known, place)
-        for place, line, head in lines:
+                    known[name] = self._parameter(scope.prefix + name, value, here)
+        for here, line, head in lines:
             if head.startswith(".param"):
                 continue
             if head.startswith("."):
-                self._command(head, line, place, scope)
+                self._command(head, line[len(head) :], here)
                 continue
-            plain, options = _options(line, place)
+            plain, options = _options(line, here.place)
             if not plain:
-                raise place.error(
+                raise here.place.error(
                     f"{shown(line)} is no element: a name comes first, then its nodes"
                 )
             add = self._instance if head.startswith("x") else self._element
-            add(plain, options, place, scope)
+            add(plain, options, here)
 
-    def _parameter(self, name: str, value: str, scope: Mapping[str, str], place: Place) -> str:
+    def _parameter(self, name: str, value: str, scope: _Scope) -> str:
         taken = {key.lower() for key in self.parameters}.union(RESERVED, keyword.kwlist)
         while name.lower() in taken:
             name += "_"
-        self.parameters[name] = self.value(value, scope, place, name)
+        self.parameters[name] = self.value(value, scope, name)
         return name
 
-    def value(self, text: str, scope: Mapping[str, str], place: Place, what: str) -> float | str:
+    def value(self, text: str, scope: _Scope, what: str) -> float | str:
         """A number, or an expression translated into the language of plants."""
         inner = text[1:-1] if text.startswith("{") and text.endswith("}") else text
         plain = number(inner.strip())
         if plain is not None:
             return plain
-        known = {**{name: name for name in RESERVED}, **scope, "time": "t", "t": "t"}
+        known = {**{name: name for name in RESERVED}, **scope.known, "time": "t", "t": "t"}
 
         def translated(match: re.Match[str]) -> str:
             if match["number"]:
@@ -288,16 +286,16 @@ class _Reader:
                 return digits if found is None else repr(found)
             word = match["word"].lower()
             if word not in known:
-                raise place.error(
+                raise scope.place.error(
                     f"{what} uses {match['word']}, which is neither a parameter nor a function"
-                    + nearest(word, [*scope, *RESERVED])
+                    + nearest(word, [*scope.known, *RESERVED])
                 )
             return known[word]
 
         return _IN_EXPRESSION.sub(translated, inner.replace("^", "**")).strip()
 
-    def _command(self, head: str, line: str, place: Place, scope: _Scope) -> None:
-        rest = line[len(head) :]
+    def _command(self, head: str, rest: str, scope: _Scope) -> None:
+        place = scope.place
         if head == ".ic":
             _, given = _options(rest, place)
             for quantity, value in given.items():
@@ -320,9 +318,8 @@ class _Reader:
             )
         # Other commands ask for analyses, which gpebo's own settings describe.
 
-    def _instance(
-        self, plain: list[str], given: dict[str, str], place: Place, scope: _Scope
-    ) -> None:
+    def _instance(self, plain: list[str], given: dict[str, str], scope: _Scope) -> None:
+        place = scope.place
         plain = [word for word in plain if word.lower() != "params:"]
         if len(plain) < 2 or plain[-1].lower() not in self.blocks:
             what = shown(plain[-1]) if len(plain) > 1 else "nothing"
@@ -349,15 +346,13 @@ class _Reader:
         ports = dict(zip(block.ports, map(scope.node, ends), strict=True))
         inner = dict(scope.known)
         for key, default in block.defaults.items():
-            inner[key] = self._parameter(inside + key, given.get(key, default), scope.known, place)
+            inner[key] = self._parameter(inside + key, given.get(key, default), scope)
         self.expand(block, _Scope(ports, inner, inside, scope.depth + 1))
 
-    def _element(
-        self, plain: list[str], options: dict[str, str], place: Place, scope: _Scope
-    ) -> None:
-        name, kind = plain[0], plain[0][0].upper()
+    def _element(self, plain: list[str], options: dict[str, str], scope: _Scope) -> None:
+        name, kind, place = plain[0], plain[0][0].upper(), scope.place
         if kind == "K":
-            element = self._coupling(plain, scope, place)
+            element = self._coupling(plain, scope)
         elif kind not in NODES:
             raise place.error(
                 f"{shown(name)}: elements are {', '.join([*NODES, 'K', 'X'])} by their first letter"
@@ -368,7 +363,7 @@ class _Reader:
             if len(ends) < count:
                 raise place.error(f"{name} needs {count} nodes and has {len(ends)}")
             where = tuple(map(scope.node, ends))
-            element = self._valued(kind, name, where, rest, options, scope, place)
+            element = self._valued(kind, name, where, rest, options, scope)
         full = scope.prefix + name
         if not _WORD.fullmatch(full):
             raise place.error(f"{shown(name)} cannot be a name; use letters, digits and _")
@@ -380,19 +375,21 @@ class _Reader:
             raise place.error(f"there are more than {MAX_ELEMENTS} elements")
         self.elements[full.lower()] = replace(element, name=full)
 
-    def _coupling(self, plain: Sequence[str], scope: _Scope, place: Place) -> Element:
+    def _coupling(self, plain: Sequence[str], scope: _Scope) -> Element:
+        name, place = plain[0], scope.place
         if len(plain) != 4:
-            raise place.error(f"{plain[0]} needs two inductors and a coefficient, as K1 L1 L2 0.9")
-        value = self.value(plain[3], scope.known, place, plain[0])
+            raise place.error(f"{name} needs two inductors and a coefficient, as K1 L1 L2 0.9")
+        value = self.value(plain[3], scope, name)
         if isinstance(value, float) and not abs(value) <= 1.0:
-            raise place.error(f"{plain[0]}: a coupling is at most 1, got {value:g}")
+            raise place.error(f"{name}: a coupling is at most 1, got {value:g}")
         coils = tuple(scope.prefix + word.lower() for word in plain[1:3])
-        return Element("K", plain[0], (), value, place, coils)
+        return Element("K", name, (), value, place, coils)
 
     def _valued(
         self, kind: str, name: str, where: tuple[str, ...], rest: list[str],
-        options: dict[str, str], scope: _Scope, place: Place,
+        options: dict[str, str], scope: _Scope,
     ) -> Element:
+        place = scope.place
         controls: tuple[str, ...] = ()
         allowed = {"C": ("ic",), "L": ("ic",), "S": ("on", "off", "ron", "roff"), "T": ("n",)}
         wrong = [key for key in options if key not in allowed.get(kind, ())]
@@ -404,13 +401,13 @@ class _Reader:
             raise place.error(f"{name}: {wrong[0]}= changes the value; write the value itself")
         value: float | str
         if kind in "VI":
-            value = self._source(rest, scope.known, place, name)
+            value = self._source(rest, scope, name)
         elif kind == "S":
-            value = self._switch(options, scope.known, place, name)
+            value = self._switch(options, scope, name)
         elif kind == "T":
             if rest or "n" not in options:
                 raise place.error(f"{name} needs n=RATIO, as in T1 a 0 b 0 n=2")
-            value = self.value(options["n"], scope.known, place, name)
+            value = self.value(options["n"], scope, name)
         else:
             if kind in "FH":
                 if not rest:
@@ -419,7 +416,7 @@ class _Reader:
             if len(rest) != 1:
                 got = "none" if not rest else " ".join(rest)
                 raise place.error(f"{name} needs one value, a number or {{expression}}; got {got}")
-            value = self.value(rest[0], scope.known, place, name)
+            value = self.value(rest[0], scope, name)
         if kind in "RLCST" and isinstance(value, float) and value == 0.0:
             raise place.error(f"{name} has the value 0")
         initial = number(options["ic"]) if "ic" in options else None
@@ -427,10 +424,9 @@ class _Reader:
             raise place.error(f"{name}: ic={options['ic']} is not a number")
         return Element(kind, name, where, value, place, controls, initial)
 
-    def _switch(
-        self, options: Mapping[str, str], scope: Mapping[str, str], place: Place, name: str
-    ) -> str:
+    def _switch(self, options: Mapping[str, str], scope: _Scope, name: str) -> str:
         """The conductance of a switch that closes and opens at given instants."""
+        place = scope.place
         if "on" not in options and "off" not in options:
             raise place.error(f"{name} needs its instants, as in S1 a b on=1,3 off=2 ron=1m")
         events: list[tuple[float, int]] = []
@@ -445,13 +441,12 @@ class _Reader:
         closed = "1" if events[0][1] < 0 else "0"
         for time, sign in events:
             closed += f" {'+' if sign > 0 else '-'} step(t - {time!r})"
-        ron = self.value(options.get("ron", "1m"), scope, place, name)
-        roff = self.value(options.get("roff", "1g"), scope, place, name)
+        ron = self.value(options.get("ron", "1m"), scope, name)
+        roff = self.value(options.get("roff", "1g"), scope, name)
         return f"1/({roff}) + (1/({ron}) - 1/({roff}))*({closed})"
 
-    def _source(
-        self, rest: list[str], scope: Mapping[str, str], place: Place, name: str
-    ) -> float | str:
+    def _source(self, rest: list[str], scope: _Scope, name: str) -> float | str:
+        place = scope.place
         words = rest[1:] if rest and rest[0].lower() == "dc" else rest
         # What stands behind AC is for another analysis.
         words = list(itertools.takewhile(lambda word: word.lower() != "ac", words))
@@ -473,7 +468,7 @@ class _Reader:
                 f"{name}: {shown(text)} is no source; write a number, {{expression}}, SIN(…), "
                 "PULSE(…), PWL(…) or EXP(…)"
             )
-        return self.value(words[0], scope, place, name)
+        return self.value(words[0], scope, name)
 
 
 def _padded(numbers: Sequence[float], least: int, defaults: Sequence[float]) -> list[float]:
@@ -536,17 +531,13 @@ def _pulse(numbers: Sequence[float]) -> str:
 def _corners(times: Sequence[float], values: Sequence[float]) -> str:
     """A piecewise linear function as a sum of ramps and jumps, constant outside."""
     terms, slope = [repr(values[0])], 0.0
-    for k in range(len(times)):
-        last = k == len(times) - 1
-        if not last and times[k + 1] == times[k]:
-            jump, new = values[k + 1] - values[k], 0.0
-        else:
-            jump = 0.0
-            new = 0.0 if last else (values[k + 1] - values[k]) / (times[k + 1] - times[k])
+    points = [*zip(times, values, strict=True), (math.inf, values[-1])]
+    for (t, value), (until, end) in itertools.pairwise(points):
+        jump, new = (0.0, (end - value) / (until - t)) if until > t else (end - value, 0.0)
         if new != slope:
-            terms.append(f"{new - slope!r}*(t - {times[k]!r})*step(t - {times[k]!r})")
+            terms.append(f"{new - slope!r}*(t - {t!r})*step(t - {t!r})")
         if jump:
-            terms.append(f"{jump!r}*step(t - {times[k]!r})")
+            terms.append(f"{jump!r}*step(t - {t!r})")
         slope = new
     return " + ".join(terms)
 
