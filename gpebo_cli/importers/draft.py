@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,11 +58,15 @@ class PlantDraft:
         """Add a term to the entry of a matrix (E, A, B, F, C, D or H) in a row and a column."""
         self._terms[matrix].setdefault((row, column), []).append(term)
 
-    def add_matrix(self, matrix: str, values: object) -> None:
-        """Add all entries of a matrix that are not zero."""
-        columns = list(self._columns(matrix))
+    def add_matrix(
+        self, matrix: str, values: object, first: int = 0, columns: Sequence[str] = (),
+        sign: int = 1,
+    ) -> None:
+        """Add what is not zero of ± ``values`` in rows from the first on, and columns or all."""
+        columns = columns or list(self._columns(matrix))
         for i, j, value in _nonzero(values):
-            self.add(matrix, i, columns[j], value)
+            text = isinstance(value, str) and sign < 0
+            self.add(matrix, first + i, columns[j], f"-({value})" if text else sign * value)
 
     def negate(self, rows: Collection[int]) -> None:
         """Multiply equations by −1."""

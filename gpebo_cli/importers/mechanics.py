@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import Entry, PlantDraft
 from gpebo_cli.schema import per_name, plain, read
@@ -93,26 +95,24 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
         })
 
     for position, velocity in zip(positions, velocities, strict=True):
-        row = draft.equation(f"{position}' = {velocity}")
-        draft.add("E", row, position, 1.0)
-        draft.add("A", row, velocity, 1.0)
-    terms = (
-        ("E", M, velocities, 1), ("A", D, velocities, -1), ("A", K, positions, -1),
-        ("B", B, list(given.inputs), 1), ("F", F, list(given.unknowns), 1),
-        ("A", [[line[i] for line in G] for i in range(k)], forces, 1),
-    )
-    for i in range(k):
-        row = draft.equation(f"balance of forces along {positions[i]}")
-        for matrix, rows, columns, sign in terms:
-            for entry, column in zip(rows[i], columns, strict=True):
-                _put(draft, matrix, row, column, entry, sign)
+        draft.equation(f"{position}' = {velocity}")
+    for position in positions:
+        draft.equation(f"balance of forces along {position}")
     for j in range(c):  # 0 = G q − r; an r that is not zero is an input
         row = draft.equation(f"constraint {j + 1}: G q = r")
-        for entry, column in zip(G[j], positions, strict=True):
-            _put(draft, "A", row, column, entry, 1)
         if given.r and given.r[j] != 0:
             draft.inputs[f"r{j + 1}"] = (given.r[j], "")
             draft.add("B", row, f"r{j + 1}", -1.0)
+    one = np.eye(k)
+    draft.add_matrix("E", one, columns=positions)
+    draft.add_matrix("A", one, columns=velocities)
+    draft.add_matrix("E", M, k, velocities)
+    draft.add_matrix("A", D, k, velocities, sign=-1)
+    draft.add_matrix("A", K, k, positions, sign=-1)
+    draft.add_matrix("A", [*zip(*G, strict=True)], k, forces)
+    draft.add_matrix("A", G, 2 * k, positions)
+    draft.add_matrix("B", B, k)
+    draft.add_matrix("F", F, k)
     draft.measure(given.measure, f"{where}: ")
     return draft
 
@@ -163,18 +163,9 @@ def linearise(
     }
 
 
-def _put(draft: PlantDraft, matrix: str, row: int, column: str, entry: Entry, sign: int) -> None:
-    if isinstance(entry, str):
-        draft.add(matrix, row, column, entry if sign > 0 else f"-({entry})")
-    elif entry != 0:
-        draft.add(matrix, row, column, sign * entry)
-
-
 def _sized(matrix: Matrix, rows: int, columns: int, where: str) -> Matrix:
-    """A matrix of the size that is asked for; zeros where there is none."""
-    if not matrix:
-        return [[0.0] * columns for _ in range(rows)]
-    if len(matrix) != rows:
+    """A matrix of the size that is asked for, or none."""
+    if matrix and len(matrix) != rows:
         raise ConfigError(f"{where} has {len(matrix)} rows; expected {rows}")
     for i, row in enumerate(matrix):
         if len(row) != columns:
