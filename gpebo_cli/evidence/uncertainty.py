@@ -439,12 +439,10 @@ class SampledDeviations:
         for g, case in enumerate(cases):
             size = k + signals + case.A.shape[1]
             M = np.zeros((count, size, size + signals))
-            M[:, :k, : k + signals] = observer.step[..., : k + signals]
-            M[:, :k, size:] = observer.step[..., k + signals :]
+            both = np.r_[: k + signals, size : size + signals]  # ζ and the errors of two samples
+            M[:, :k, both] = observer.step
             M[:, k : k + signals, size:] = np.eye(signals)
-            into = case.old @ Y_old + case.new @ Y_new
-            M[:, k + signals :, : k + signals] = into[..., : k + signals]
-            M[:, k + signals :, size:] = into[..., k + signals :]
+            M[:, k + signals :, both] = case.old @ Y_old + case.new @ Y_new
             M[:, k + signals :, k + signals : size] = case.A
             if len(self._factors) <= g:
                 self._factors.append(np.zeros((size, size)))

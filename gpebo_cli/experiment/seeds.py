@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.estimators import estimate
+from gpebo_cli.estimators import Estimates, estimate
 from gpebo_cli.experiment.noise import (
     NoiseLevels,
     SampledMesh,
@@ -72,25 +72,24 @@ def over_seeds(
     horizon = observation.regression.mesh.edges[-1:]
     seeds = range(settings.seed, settings.seed + settings.seeds)
     done = pace(len(seeds), f"noise.seeds with {len(estimator.cases)} cases")
-    if observation.respond is None:
-        found = []
-        for number, seed in enumerate(seeds, 1):
+
+    def estimated() -> Iterator[tuple[Observation, Estimates]]:
+        if observation.respond is not None:
+            for many in _added(observation, observation.respond, signals, settings, levels):
+                yield observation, estimator.estimate(many, horizon)
+            return
+        for seed in seeds:
             own = observe(measure(signals, replace(settings, seed=seed), levels))
-            eta = estimate(own.estimator or estimator, own.regression, horizon)
-            values = eta.parameters(slice(None))[:, 0, :, None]
-            truth = _truth(own, horizon, theta, signals)
-            found.append(_with_unknowns(values, own.regression, horizon)[..., 0] - truth)
-            done(number)
-        error = np.stack(found, axis=-1)
-    else:
-        added, found = _added(observation, observation.respond, signals, settings, levels), []
-        for many in added:
-            values = estimator.estimate(many, horizon).parameters(slice(None))[:, 0]
-            found.append(_with_unknowns(values, observation.regression, horizon))
-            done(sum(part.shape[-1] for part in found))
-        error = np.concatenate(found, axis=-1)
-        error -= _truth(observation, horizon, theta, signals)[:, None]
-    S = observation.regression.parametrisation
+            yield own, estimate(own.estimator or estimator, own.regression, horizon)
+
+    found = list[Array]()
+    for own, estimates in estimated():
+        values = estimates.parameters(slice(None))[:, 0]
+        each = values if values.ndim == 3 else values[..., None]  # of several seeds, or of one
+        truth = _truth(own, horizon, theta, signals)
+        found.append(_with_unknowns(each, own.regression, horizon) - truth[:, None])
+        done(sum(part.shape[-1] for part in found))
+    error, S = np.concatenate(found, axis=-1), observation.regression.parametrisation
     return NoiseStatistics(
         seeds=settings.seeds,
         t=float(horizon[0]),
