@@ -28,7 +28,7 @@ from gpebo_cli.reduction.scaling import Scaling, balance_entries
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
 _SOUND = 0.1  # of the largest entry of its row, in units of the states
 _ROUNDING, _CLEAR = 1e-13, 1e-9  # of what an entry is the difference of: zero below, sure above
-_AT_ONCE = 64  # times or entries, of which there are two while they are copied
+_AT_ONCE = 64  # times, whose entries are there twice while they are copied
 _FILL = 40  # entries per equation; with more of them, a matrix is not sparse
 
 Row = dict[int, Array]
@@ -136,22 +136,20 @@ def _size(a: Array) -> float:
 
 
 def _divided(values: Array, which: IntArray, factor: Array) -> Array:
-    """Some of the values (e, orders, N or 1) times factors (w, orders, N or 1)."""
-    new = np.moveaxis(
-        product(np.moveaxis(values[which], 0, 2), np.moveaxis(factor, 0, 2)), 2, 0
-    )
-    count = max(values.shape[2], new.shape[2])
-    out = np.array(np.broadcast_to(values, (*values.shape[:2], count)))
-    out[which] = new
+    """Some of the values (orders, N or 1, e) times factors (orders, N or 1, w)."""
+    new = product(values[:, :, which], factor)
+    count = max(values.shape[1], new.shape[1])
+    out = np.array(np.broadcast_to(values, (len(values), count, values.shape[2])))
+    out[:, :, which] = new
     return out
 
 
-def _by_time(values: Array, which: IntArray, count: int) -> Array:
-    """Some of the values (e, orders, N or 1) themselves at ``count`` times, (count, w)."""
-    out, every = np.empty((count, len(which))), values.shape[2] == 1
+def _at_times(values: Array, count: int, which: IntArray) -> Array:
+    """Some of the values (orders, N or 1, e) themselves at ``count`` times, (count, w)."""
+    out, every = np.empty((count, len(which))), values.shape[1] == 1
     for first in range(0, count, _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        out[some] = values[which, 0, slice(1) if every else some].T
+        out[some] = values[0, slice(None) if every else some].take(which, axis=1)
     return out
 
 
@@ -160,14 +158,10 @@ class _Equations:
 
     def __init__(self, values: Array, places: Places, known: Array, units: Array) -> None:
         n = len(units)
-        order = np.lexsort(places[::-1])
-        self.values = np.empty((len(order), *values.shape[:2]))
-        for first in range(0, len(order), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
-            self.values[some] = np.moveaxis(values[:, :, order[some]], 2, 0)
-        self.place = [place[order] for place in places]  # rows, and columns
+        self.values, self.order = values, np.lexsort(places[::-1])
+        self.place = [place[self.order] for place in places]  # rows, and columns
         self.first = np.searchsorted(self.place[0], np.arange(n + 1))
-        self.given = known  # (n, orders, N or 1)
+        self.given = known  # (orders, N or 1, n)
         self.units = units
         self.rows: dict[int, Row] = {}  # those that were touched, and
         self.known: dict[int, Array] = {}
@@ -181,8 +175,9 @@ class _Equations:
         """Row i, to be changed."""
         if i not in self.rows:
             part = slice(self.first[i], self.first[i + 1])
-            self.rows[i] = dict(zip(self.place[1][part].tolist(), self.values[part], strict=True))
-            self.known[i] = self.given[i]
+            values = np.moveaxis(self.values[:, :, self.order[part]], 2, 0).copy()
+            self.rows[i] = dict(zip(self.place[1][part].tolist(), values, strict=True))
+            self.known[i] = self.given[:, :, i].copy()
         return self.rows[i]
 
     def where(self, k: int) -> set[int]:
@@ -193,15 +188,15 @@ class _Equations:
         return self._where[k]
 
     def divide(self, rows: IntArray, pivots: Array) -> None:
-        """Divide untouched rows (r,) by pivots (r, orders, N or 1)."""
+        """Divide untouched rows (r,) by pivots (orders, N or 1, r)."""
         count = np.diff(self.first)
         place = np.zeros(len(count), dtype=np.intp)
         place[rows] = np.arange(len(rows))
         divided = np.zeros(len(count), dtype=bool)
         divided[rows] = True
-        factor = np.moveaxis(_reciprocal(np.moveaxis(pivots, 0, 2)), 2, 0)
-        which = np.flatnonzero(divided[self.place[0]])
-        self.values = _divided(self.values, which, factor[place[self.place[0][which]]])
+        factor, which = _reciprocal(pivots), np.flatnonzero(divided[self.place[0]])
+        of_row = place[self.place[0][which]]
+        self.values = _divided(self.values, self.order[which], factor[:, :, of_row])
         self.given = _divided(self.given, rows, factor)
 
     def assembled(self, chosen: IntArray, states: IntArray) -> tuple[IntArray, IntArray, Array]:
@@ -218,13 +213,13 @@ class _Equations:
         ]
         i = np.concatenate([position[self.place[0][plain]], [t[0] for t in touched]])
         j = np.concatenate([column[self.place[1][plain]], column[[t[1] for t in touched]]])
-        count = max([self.values.shape[2], *(len(t[2]) for t in touched)])
+        count = max([self.values.shape[1], *(len(t[2]) for t in touched)])
         order = np.argsort(i, kind="stable")
         place = np.empty(len(i), dtype=np.intp)  # of each entry in the end
         place[order] = np.arange(len(i))
         of_plain = np.zeros(len(i), dtype=np.intp)
-        of_plain[place[: plain.sum()]] = np.flatnonzero(plain)
-        entries = _by_time(self.values, of_plain, count)
+        of_plain[place[: plain.sum()]] = self.order[plain]
+        entries = _at_times(self.values, count, of_plain)
         for k, (_, _, value) in zip(place[plain.sum() :].tolist(), touched, strict=True):
             entries[:, k] = value
         rows = np.searchsorted(i[order], np.arange(len(chosen) + 1))
@@ -233,8 +228,8 @@ class _Equations:
     def forcing(self, chosen: IntArray) -> Array:
         """What is known in the rows ``chosen`` (d,), (N or 1, d)."""
         touched = [(p, self.known[i][0]) for p, i in enumerate(chosen.tolist()) if i in self.known]
-        count = max([self.given.shape[2], *(len(value) for _, value in touched)])
-        f = _by_time(self.given, chosen, count)
+        count = max([self.given.shape[1], *(len(value) for _, value in touched)])
+        f = _at_times(self.given, count, chosen)
         for p, value in touched:
             f[:, p] = value
         return f
@@ -299,9 +294,8 @@ def scaling_of(found: Entries, n: int) -> Scaling:
 def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
     """Eliminate, with the model at N times and f (orders, N or 1, n) known (or UndecidedError)."""
     n, units = f.shape[2], scaling.columns
-    known = np.ascontiguousarray(np.moveaxis(f, 2, 0))
-    A = _Equations(found.values.A, found.places["A"], known, units)
-    E = _Equations(found.values.E, found.places["E"], np.zeros((n, 1, 1)), units)
+    A = _Equations(found.values.A, found.places["A"], f, units)
+    E = _Equations(found.values.E, found.places["E"], np.zeros((1, 1, n)), units)
     equation_of = _leading(E, A)
     shifts = _shifted(E, A, equation_of)
     count = len(shifts)
@@ -325,10 +319,11 @@ def _leading(E: _Equations, A: _Equations) -> dict[int, int]:
     n, (rows, columns) = len(E.units), E.place
     single = np.bincount(rows, minlength=n)[rows] == 1
     single &= np.bincount(columns, minlength=n)[columns] == 1
-    size = np.abs(E.values[:, 0])
-    single &= (size.min(axis=1) >= _STEADY * size.max(axis=1)) & (size.max(axis=1) > 0.0)
-    if not ((E.values[single, 0] == 1.0).all() and (E.values[single, 1:] == 0.0).all()):
-        A.divide(rows[single], E.values[single])
+    size = np.abs(E.values[0][:, E.order])
+    single &= (size.min(axis=0) >= _STEADY * size.max(axis=0)) & (size.max(axis=0) > 0.0)
+    pivots = E.values[:, :, E.order[single]]
+    if not ((pivots[0] == 1.0).all() and (pivots[1:] == 0.0).all()):
+        A.divide(rows[single], pivots)
     equation_of = dict(zip(columns[single].tolist(), rows[single].tolist(), strict=True))
     left: list[int] = sorted(set(rows[~single].tolist()))
     while left:
