@@ -20,6 +20,7 @@ from gpebo_cli.evidence.groups import Groups, grouped
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.model.expressions import among
 from gpebo_cli.numerics.linalg import transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -93,7 +94,7 @@ def propagated(
     if starts is not None:
         anew[np.searchsorted(mesh.edges, starts)] = True
     anew[0] = L is None  # else an error of the last row goes on
-    fresh[0] &= anew[0] or _among(mesh.edges[:1], groups.starts, 1e-3 * mesh.steps[0])[0]
+    fresh[0] &= anew[0] or among(mesh.edges[:1], groups.starts, 1e-3 * mesh.steps[0])[0]
     # The errors that count in an element.
     beside = groups.first[group, None] + np.arange(1 + groups.memory.shape[1])
     beside = beside.clip(max=len(groups.shares) - 1)
@@ -263,22 +264,15 @@ def _mesh(edges: Array, groups: Groups) -> tuple[Mesh, BoolArray, IntArray]:
     """
     instants = groups.starts
     near = 1e-9 * float(np.diff(edges).min())
-    inner = ~_among(edges, groups.others, near)
+    inner = ~among(edges, groups.others, near)
     inner[[0, -1]] = True
-    own = instants[~_among(instants, edges, near)]
+    own = instants[~among(instants, edges, near)]
     own = own[(own > edges[0]) & (own < edges[-1])]
     mesh = Mesh(np.union1d(edges[inner], own), radau_rule(_STAGES))
     parts = int(np.clip(np.ceil(_ELEMENTS / mesh.size), 1, _MOST_PARTS))
     mesh, _ = mesh.split(np.full(mesh.size, parts, dtype=np.intp))
     group = np.searchsorted(instants - near, mesh.edges[:-1], side="right").clip(1) - 1
     return mesh, np.diff(group, prepend=-1) > 0, group
-
-
-def _among(t: Array, times: Array, near: float) -> BoolArray:
-    """Which of t (N,) are as ``near`` as that to one of the ascending times."""
-    padded = np.concatenate([[-np.inf], times, [np.inf]])
-    k = np.searchsorted(padded, t).clip(1)
-    return np.asarray(np.minimum(t - padded[k - 1], padded[k] - t) <= near)
 
 
 def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:

@@ -47,7 +47,7 @@ def finished(
     """
     if std is None or requirement.holds or not len(columns):
         return std, why
-    eta = _about(root, columns)
+    eta = _least_squares_about(root, columns)
     far = (np.abs(final - eta) > _BEYOND * std[:, -1, : len(eta)]).any(axis=1)
     if not far.any():
         return std, why
@@ -72,7 +72,7 @@ def moved_by_noise(
     return out
 
 
-def _about(root: Array, columns: IntArray) -> Array:
+def _least_squares_about(root: Array, columns: IntArray) -> Array:
     """η (p,) of least squares about some of the parameters, the others being zero."""
     eta = np.zeros(root.shape[1] - 1)
     eta[columns] = least_squares(root[:, [*columns, -1]])
@@ -98,7 +98,7 @@ def of_estimates(
     final, p = final[np.isfinite(final).all(axis=1)], final.shape[1]
     if not len(final) or not len(columns):
         return {}, ()
-    eta = _about(root, columns)
+    eta = _least_squares_about(root, columns)
     least = np.linalg.norm(root @ np.append(-eta, 1.0))
     more = np.linalg.norm((final - eta) @ root[:, :-1].T, axis=1)
     best = int(np.argmin(more))

@@ -27,6 +27,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import SignalNoise
@@ -136,10 +137,7 @@ def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
     wanted = start + np.arange(count * parts) * (sample_time / parts)
     wanted = wanted[wanted < stop - _SAME * sample_time]
     # Where both kinds of edges (nearly) meet, the mesh's own stays: a jump stands there.
-    right = np.minimum(np.searchsorted(mesh.edges, wanted), mesh.size)
-    left = np.maximum(right - 1, 0)
-    near = np.minimum(np.abs(mesh.edges[right] - wanted), np.abs(mesh.edges[left] - wanted))
-    edges = np.union1d(mesh.edges, wanted[near > _SAME * sample_time])
+    edges = with_others(mesh.edges, wanted, _SAME * sample_time)
     sample = np.floor((edges[:-1] - start) / sample_time + _SAME).astype(np.intp)
     return SampledMesh(Mesh(edges, mesh.rule), sample, sample_time)
 

@@ -147,10 +147,7 @@ def _level(
 ) -> float:
     """σ of a recording; with resets the mean square of what each segment says."""
     segments = regression.segments
-    squares = [
-        noise_level(errors, own, rows, variances, starts) ** 2
-        for own in segments
-    ]
+    squares = [noise_level(errors, own, rows, variances, starts) ** 2 for own in segments]
     lengths = np.array([own.mesh.edges[-1] - own.mesh.edges[0] for own in segments])
     told = np.isfinite(squares)
     weights = lengths * told

@@ -16,6 +16,7 @@ intermediate value that overflows is refused even where the end result would be 
 from gpebo_cli.model.expressions.bounds import (
     Bounds,
     Cells,
+    among,
     aside,
     breakpoints,
     halved,
@@ -29,7 +30,7 @@ from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shor
 from gpebo_cli.model.expressions.tape import Assembly, Tape, record, taylor
 
 __all__ = [
-    "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "aside", "breakpoints",
-    "divisors_of", "halved", "parse", "record", "resolved", "resolved_along", "shorten",
-    "signal", "switched", "taylor", "with_others",
+    "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "among", "aside",
+    "breakpoints", "divisors_of", "halved", "parse", "record", "resolved", "resolved_along",
+    "shorten", "signal", "switched", "taylor", "with_others",
 ]

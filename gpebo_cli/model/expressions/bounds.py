@@ -220,10 +220,14 @@ def with_others(known: Array, others: Array, near: float | None = None) -> Array
     None: by more than rounding of the span between the first and the last.
     """
     near = _SAME * (known[-1] - known[0]) if near is None else near
-    place = np.searchsorted(known, others)
-    before, after = known[np.maximum(place - 1, 0)], known[np.minimum(place, len(known) - 1)]
-    new = np.minimum(np.abs(others - before), np.abs(after - others)) > near
-    return np.union1d(known, others[new])
+    return np.union1d(known, others[~among(others, known, near)])
+
+
+def among(t: Array, times: Array, near: float) -> BoolArray:
+    """Which of t (N,) are as ``near`` as that to one of the ascending times."""
+    padded = np.concatenate([[-np.inf], times, [np.inf]])
+    k = np.searchsorted(padded, t).clip(1)
+    return np.asarray(np.minimum(t - padded[k - 1], padded[k] - t) <= near)
 
 
 def roots(tape: Tape, knots: Array, start: float, stop: float) -> Array:

@@ -23,6 +23,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh
@@ -176,8 +177,7 @@ def _with_edges(mesh: Mesh, times: Array) -> tuple[Mesh, Array]:
     if not len(times):
         return mesh, times
     near = 1e-9 * float(mesh.edges[-1] - mesh.edges[0])
-    edges = [t for t in times if np.abs(mesh.edges - t).min() > near]
-    finer = Mesh(np.unique(np.concatenate([mesh.edges, edges])), mesh.rule)
+    finer = Mesh(with_others(mesh.edges, times, near), mesh.rule)
     k = np.unique([int(np.abs(finer.edges - t).argmin()) for t in times])
     k = k[(k > 0) & (k < finer.size)].astype(np.intp)
     return finer, finer.edges[k]
