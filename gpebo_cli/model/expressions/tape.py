@@ -25,9 +25,6 @@ from gpebo_cli.model.expressions.syntax import Expression, shorten
 
 MAX_INSTRUCTIONS = 200_000
 MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in parts
-# Recording takes as long as evaluating four times without the kernel: where that is much, it may
-# never be gained again.
-_MOST_COMPILED = 1000
 _SWITCHES = ("abs", "sign", "min", "max")
 UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
@@ -124,13 +121,11 @@ class Tape:
     def program(
         self, order: int, apart: bool, signals: tuple[int, int] | None = None
     ) -> Program | None:
-        """What :meth:`taylor` does, for the compiled kernel; None where that is not worth it.
+        """What :meth:`taylor` does, for the compiled kernel; None where it is refused at any time.
 
         Jumps are decided at other times if ``apart``. With ``signals``, so many coefficients of so
         many are given.
         """
-        if len(self.instructions) > _MOST_COMPILED:
-            return None
         recorder = Recorder(signals or (0, 0))
         known = None if signals is None else recorder.signals
         try:
@@ -139,7 +134,7 @@ class Tape:
                     recorder.t, order, recorder.inside if apart else recorder.t, known
                 )
         except FloatingPointError:
-            return None  # to be refused at any time
+            return None
         return finished(recorder, places, self.outputs, order)
 
     @cached_property
