@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.excitation import assess
 from gpebo_cli.evidence.groups import grouped
 from gpebo_cli.experiment.fit import _varies_slowly
+from gpebo_cli.findings import Requirement
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
@@ -23,6 +24,8 @@ from gpebo_cli.observers.reduced import extension
 from gpebo_cli.observers.reduced import system as reduced
 from gpebo_cli.recordings.hold import held, recording_mesh
 from gpebo_cli.regression import linear
+from gpebo_cli.regression.estimator import Lasting, Unmixed
+from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.settings import ExcitationSettings, SolverSettings
 from tests.plants import shipped
 from tests.regressions import ETA, regression, three
@@ -242,7 +245,8 @@ def test_an_output_that_is_used_up_for_a_state_is_no_residual():
     {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3}, {"name": "gradient"},
     {"name": "ls_drem"}, {"name": "drem", "gamma": [1e2, 1e4]}, {"name": "mre"}, {"name": "lion"},
     {"name": "fct", "gamma": [1e2, 1e4]}, {"name": "fct", "extension": "least_squares"},
-    {"name": "power", "gamma": 10.0},
+    {"name": "power", "gamma": 10.0}, {"name": "exciting", "kappa": 1e3},
+    {"name": "instrumental", "gamma": [1e2, 1e4]}, {"name": "annihilator", "perturbed": ["p1"]},
 ], ids=str)
 def test_estimators_and_evidence_go_on_from_window_to_window(settings, monkeypatch):
     """Nothing tells where a long regression was cut: estimates, deviations, excitation, misfit."""
@@ -268,6 +272,45 @@ def test_estimators_and_evidence_go_on_from_window_to_window(settings, monkeypat
         found.append([np.array(x, dtype=float) for x in numbers if x is not None])
     for whole, cut in zip(*found, strict=True):
         np.testing.assert_allclose(cut, whole, rtol=1e-9, atol=1e-11 * np.nanmax(np.abs(whole)))
+
+
+def test_an_estimator_of_ones_own_goes_on_from_window_to_window(monkeypatch):
+    """What it needs to say so is one method, and that its estimates know what was before them."""
+
+    @dataclass(frozen=True)
+    class Sum(Unmixed, Lasting):
+        sums: Trajectory
+        t: np.ndarray
+
+        @property
+        def reached(self):
+            return (ExtensionState(self.sums.final, 0.0),)
+
+        @property
+        def requirement(self):
+            return Requirement("none", True, {"sum": float(self.sums.final.sum())}, "")
+
+        def parameters(self, cases, start=None):
+            return self.sums(self.t)[None, :, -1][cases]
+
+    class Adding:
+        cases = ({},)
+
+        def estimate(self, regression, t):
+            return self.go_on(regression, t, ())
+
+        def go_on(self, regression, t, known):
+            sums = regression.gram.values + (known[0].values if known else 0.0)
+            return Sum(Trajectory(regression.mesh, sums), t)
+
+    found = []
+    for window in (1 << 12, 17):
+        monkeypatch.setattr(linear, "_WINDOW", window)
+        made = estimators.estimate(Adding(), regression(three, ETA), TIMES)
+        assert isinstance(made, Sum) == (window > 17)
+        found.append([made.parameters(slice(None)), made.requirement.evidence["sum"]])
+    for whole, cut in zip(*found, strict=True):
+        np.testing.assert_allclose(cut, whole, rtol=1e-12, atol=1e-12)
 
 
 def test_a_row_more_takes_few_more_bytes(monkeypatch):

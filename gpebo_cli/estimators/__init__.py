@@ -6,7 +6,14 @@ All that an author needs is imported from here (docs/howto/estimator.md); the mo
 with an underscore may change.
 """
 
-from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, axis, combinations, gain
+from gpebo_cli.estimators._base import (
+    GainEstimator,
+    ResumableEstimator,
+    WindowedEstimator,
+    axis,
+    combinations,
+    gain,
+)
 from gpebo_cli.estimators._information import Information, information
 from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reached
 from gpebo_cli.estimators._recursive import InformationRoot, KreisselmeierFilter, ScalarLaw
@@ -30,6 +37,8 @@ from gpebo_cli.regression.estimator import (
     Resumable,
     ResumableEstimates,
     SampledEstimates,
+    Windowed,
+    WindowEstimates,
 )
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
@@ -42,7 +51,8 @@ __all__ = [
     "InformationRoot", "KreisselmeierFilter", "LinearRegression", "MixedEstimates", "Moving",
     "Recursion", "Recursive", "Requirement", "Reset", "Resumable", "ResumableEstimates",
     "ResumableEstimator", "SampledEstimates", "SampledRegression", "ScalarLaw", "Trajectory",
-    "VectorEstimates", "VectorLaw", "able", "axis", "build", "combinations", "errors", "estimate",
-    "gain", "information", "kreisselmeier", "lion", "low_pass", "mix", "names", "number",
-    "per_name", "persistent", "raised", "reached", "settings_of", "tuned", "tuned_for",
+    "VectorEstimates", "VectorLaw", "WindowEstimates", "Windowed", "WindowedEstimator", "able",
+    "axis", "build", "combinations", "errors", "estimate", "gain", "information", "kreisselmeier",
+    "lion", "low_pass", "mix", "names", "number", "per_name", "persistent", "raised", "reached",
+    "settings_of", "tuned", "tuned_for",
 ]

@@ -22,7 +22,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.errors import ErrorSystem
-from gpebo_cli.regression.estimator import Estimates, ResumableEstimates
+from gpebo_cli.regression.estimator import Estimates, WindowEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import Known
 from gpebo_cli.schema import LARGEST, Accepted, number, per_name
@@ -157,20 +157,28 @@ class GainEstimator(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResumableEstimator(GainEstimator):
-    """A :class:`GainEstimator` that can go on after a reset (observer.remedy: reset)."""
+class WindowedEstimator(GainEstimator):
+    """A :class:`GainEstimator` that takes a long regression window by window."""
 
-    def estimate(self, regression: LinearRegression, t: Array) -> ResumableEstimates:
+    def estimate(self, regression: LinearRegression, t: Array) -> WindowEstimates:
         """Prepare the estimates at the times t (M,), ascending; nothing is known before."""
-        return self.resume(regression, t, ())
-
-    @property
-    def extends(self) -> ResumableEstimator:
-        """The estimator whose extension is known at the end of a part; one that mixes nothing."""
-        return self
+        return self.go_on(regression, t, ())
 
     @abstractmethod
-    def resume(self, regression: LinearRegression, t: Array, known: Known) -> ResumableEstimates:
+    def go_on(self, regression: LinearRegression, t: Array, known: Known) -> WindowEstimates:
+        """Prepare the estimates at the times t (M,), with what is known at the start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResumableEstimator(WindowedEstimator):
+    """One that can go on after a reset, too (observer.remedy: reset)."""
+
+    def go_on(self, regression: LinearRegression, t: Array, known: Known) -> WindowEstimates:
+        """As after a reset that changes nothing, at the times t (M,)."""
+        return self.resume(regression, t, known)
+
+    @abstractmethod
+    def resume(self, regression: LinearRegression, t: Array, known: Known) -> WindowEstimates:
         """Prepare the estimates at the times t (M,), with extensions known at the start."""
 
 

@@ -22,7 +22,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, largest, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
-from gpebo_cli.regression.estimator import SampledEstimates
+from gpebo_cli.regression.estimator import Lasting, SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known
 from gpebo_cli.regression.samples import SampledRegression
@@ -183,7 +183,7 @@ class RecursiveMixed:
 
 
 @dataclass(frozen=True, eq=False)
-class MixedEstimates:
+class MixedEstimates(Lasting):
     """One mixed regression per group; case i belongs to group i // g and has gain i % g."""
 
     groups: tuple[ScalarPath, ...]

@@ -9,11 +9,8 @@ from itertools import chain, islice
 
 import numpy as np
 
-from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator
-from gpebo_cli.estimators._mixed import MixedEstimates
+from gpebo_cli.estimators._base import GainEstimator
 from gpebo_cli.estimators._registry import Several, able
-from gpebo_cli.estimators._vector import VectorEstimates
-from gpebo_cli.estimators.least_squares import LeastSquaresEstimates
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.errors import ErrorsAt, one_after_another
@@ -25,6 +22,8 @@ from gpebo_cli.regression.estimator import (
     Moving,
     Resumable,
     ResumableEstimates,
+    Windowed,
+    WindowEstimates,
 )
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known, Reset
@@ -114,51 +113,41 @@ def in_windows(
     What an estimator holds is that of one window; from one to the next it goes on as after a reset
     that changes nothing. Δ is found at the times ``shown`` (k,).
     """
-    if not isinstance(estimator, ResumableEstimator):
+    if not (regression.long and isinstance(estimator, Windowed)):
         return None
-    if not regression.long or len(estimator.cases) * t.size * regression.p > _MOST:
+    if len(estimator.cases) * t.size * regression.p > _MOST:
         return None
     etas: list[Array] = []
     deltas: list[Array | None] = []
 
-    def parts() -> Iterator[ResumableEstimates]:
+    def parts() -> Iterator[WindowEstimates]:
         known: Known = ()
         start = None
         windows = zip(windowed(regression, t), windowed(regression, shown), strict=True)
         for (own, window), (looked, _) in windows:
             end = window.mesh.edges[-1]  # there may be no other time
-            part = estimator.resume(window, np.append(own, end), known)
+            part = estimator.go_on(window, np.append(own, end), known)
             eta, delta = part.parameters(slice(None), start), part.delta(np.append(looked, end))
             etas.append(eta[:, :-1])
             deltas.append(None if delta is None else delta[:, :-1])
-            known = part.reached
-            # The prior of least squares is about where they began.
-            start = None if isinstance(part, LeastSquaresEstimates) else eta[:, -1]
+            known, start = part.reached, eta[:, -1]
             yield part
 
     running = parts()
-    part = next(running)
-    if isinstance(part, VectorEstimates):
-        more = (each.information for each in running if isinstance(each, VectorEstimates))
-        requirement = part.over(chain([part.information], more), regression.mesh.span)
-    elif isinstance(part, LeastSquaresEstimates | MixedEstimates):
-        for part in running:  # noqa: B007  the last one
-            pass
-        requirement = part.requirement
-    else:  # it says what it needs of all data at once
-        return None
+    first = next(running)
+    requirement = first.over(chain([first], running), regression.mesh.span)
     mixed = None if deltas[0] is None else np.concatenate([d for d in deltas if d is not None], 1)
     return Gone(np.concatenate(etas, axis=1), shown, mixed, requirement)
 
 
 def errors(estimator: Affine, regression: LinearRegression) -> Sequence[ErrorsAt]:
     """``estimator.errors`` without resets; of a long regression what one window needs is held."""
-    if not (regression.long and isinstance(estimator, ResumableEstimator)):
+    if not (regression.long and isinstance(estimator, Windowed)):
         return estimator.errors(regression)
     known: list[Known] = [()]
     for window in regression.windows():
         end = window.mesh.edges[-1:]
-        known.append(estimator.extends.resume(window, end, known[-1]).reached)
+        known.append(estimator.go_on(window, end, known[-1]).reached)
     starts = np.array([window.mesh.edges[0] for window in regression.windows()])
 
     @lru_cache(maxsize=1)

@@ -17,6 +17,7 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Trajectory, joined
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.estimator import WindowEstimates
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
 from gpebo_cli.regression.resets import ExtensionState
 
@@ -30,7 +31,7 @@ _ROUNDING = 1e-13  # smaller steps between elements are no jumps
 class VectorLaw:
     """The signals M (k, p), N (k, p) and b (k,) or (k, c) of a law on one mesh."""
 
-    M: Trajectory
+    M: Trajectory | None  # None: the identity
     N: Trajectory
     b: Trajectory
     floor: float = 0.0  # size below which η̂ is rounding
@@ -46,12 +47,13 @@ class VectorLaw:
         Eliminating it puts γ MᵀN into the matrix, whose rounding errors then drive the slow
         directions: at γ = 1e14 they would be lost. In this form the limit γ → ∞ is an
         ordinary differential-algebraic equation. Where b jumps (a sample, a step of the input), ν
-        does, too, and starts anew; η̂ does not jump.
+        does, too, and starts anew; η̂ does not jump. Where M is the identity, ν is not needed.
         """
-        signals = self.M.values, self.N.values, with_realisations(self.M.values, self.b.values)
+        b = with_realisations(self.N.values, self.b.values)
+        signals = [self.N.values, b] if self.M is None else [self.M.values, self.N.values, b]
         first, eta, found = 0, start, list[Trajectory]()
         sizes: float | Array = self.floor  # so far: later, η̂ and ν may have decayed
-        for window in self.M.mesh.windows():
+        for window in self.N.mesh.windows():
             part = slice(first, first + window.size)
             packed = np.concatenate([values[part] for values in signals], axis=-1)
             solution = self._over(Trajectory(window, packed), gains, eta, sizes)
@@ -64,29 +66,32 @@ class VectorLaw:
         self, packed: Trajectory, gains: Array, start: Array, sizes: float | Array
     ) -> Trajectory:
         """(η̂, ν) for [M | N | b] over a window, from η̂ (p,) or (p, c); rounding is below sizes."""
-        p, k = len(start), self.b.values.shape[2]
-        c = packed.values.shape[-1] - 2 * p
+        p, residual = len(start), self.M is not None
+        k, first = (self.b.values.shape[2], p) if residual else (0, 0)
+        c = packed.values.shape[-1] - first - p
         E = np.zeros((1, p + k, p + k))
         E[0, :p, :p] = np.eye(p)
 
         def coefficients(t: Array, inside: Array) -> LinearEquation:
-            signals = packed(t, inside)
-            A = np.zeros((len(t), p + k, p + k))
-            A[:, :p, p:] = gains[:, None] * np.swapaxes(signals[:, :, :p], 1, 2)
-            A[:, p:, :p] = -signals[:, :, p : 2 * p]
-            A[:, p:, p:] = -np.eye(k)
-            f = np.zeros((len(t), p + k, c))
-            f[:, p:] = signals[:, :, 2 * p :]
+            M, N, b = np.split(packed(t, inside), [first, first + p], axis=2)
+            A, f = np.zeros((len(t), p + k, p + k)), np.zeros((len(t), p + k, c))
             if self.dynamics is not None:
                 A[:, :p, :p] = self.dynamics.A(t, inside)
                 f[:, :p] = self.dynamics.b(t, inside)[:, :, None]
-            return LinearEquation(E, A, f)
+            if residual:
+                A[:, :p, p:] = gains[:, None] * np.swapaxes(M, 1, 2)
+                A[:, p:, :p], A[:, p:, p:], f[:, p:] = -N, -np.eye(k), b
+            else:
+                A -= gains[:, None] * N
+                f += gains[:, None] * b
+            return LinearEquation(E if residual else None, A, f)
 
-        starts = _with_residual(packed.values[0, 0], np.broadcast_to(start.reshape(p, -1), (p, c)))
+        wide = np.broadcast_to(start.reshape(p, -1), (p, c))
+        starts = _with_residual(packed.values[0, 0], wide) if residual else wide
         problem = LinearProblem(coefficients, starts, name="estimator", floor=sizes)
         return solve(
             problem, packed.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
-            restarts=_residual_restarts(packed, p),
+            restarts=_residual_restarts(packed, p) if residual else {},
         ).trajectory
 
 
@@ -126,13 +131,12 @@ class VectorEstimates:
     @property
     def requirement(self) -> Requirement:
         """Persistent excitation."""
-        return self.told or self.over()
+        return self.told or self.over([self], self.information.mesh.span)
 
-    def over(
-        self, parts: Iterable[Trajectory] | None = None, span: tuple[float, float] | None = None
-    ) -> Requirement:
-        """Persistent excitation by this information (p, p), or by its parts in turn over a span."""
-        return persistent(self.information, float(self.gains.min()), parts, span)
+    def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:
+        """Persistent excitation by the information of all ``parts`` of a span."""
+        each = (part.information for part in parts if isinstance(part, VectorEstimates))
+        return persistent(self.information, float(self.gains.min()), each, span)
 
     def delta(self, t: Array) -> Array | None:
         """Δ at the times t (M,), shape (1, M); None where nothing is mixed."""

@@ -23,7 +23,7 @@ from functools import partial
 
 import numpy as np
 
-from gpebo_cli.estimators._base import GainEstimator, gain
+from gpebo_cli.estimators._base import WindowedEstimator, gain
 from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
 from gpebo_cli.estimators._recursive import Mixed, Steps
 from gpebo_cli.estimators._scalar import ScalarPath, filled, scalar_path
@@ -34,6 +34,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import Known
 from gpebo_cli.regression.samples import Filter, SampledRegression
 
 _TOLERANCE, _MAX_ELEMENTS = 1e-12, 200_000
@@ -41,7 +42,7 @@ _KNOWN = 1e-13  # of Φ_21, from which on e_2/Φ_21 is more than rounding
 
 
 @dataclass(frozen=True, kw_only=True)
-class Exciting(GainEstimator):
+class Exciting(WindowedEstimator):
     """Kreisselmeier filters, mixing, the new regressor, and η̂_i' = γ Φ_21 (e_2 − Φ_21 η̂_i).
 
     Attributes:
@@ -55,24 +56,24 @@ class Exciting(GainEstimator):
     kappa: float = field(default=1e10, metadata={"positive": True})
     rates: object = field(default=None, metadata={"key": "lambda"})
 
-    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
+    def go_on(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Extend, mix, rotate, and keep what the closed form needs at the times t (M,)."""
-        inner = self.part(Drem).resume(regression, t, ())
+        inner = self.part(Drem).resume(regression, t, known)
         (path,) = inner.groups
-        columns, turning = 1 + path.quotient.shape[-1], self._turning(path)
+        columns, left = 1 + path.quotient.shape[-1], self._left(path, known)
 
         def rotation(t: Array, inside: Array) -> LinearEquation:
             delta, Y, _ = path.signals(t, inside)
             A = np.zeros((len(t), 2, 2))
-            turn = turning(t, inside) * delta  # u2
+            turn = self.kappa * left(t, inside) * delta  # u2
             A[:, 1, 0] = turn * delta
             A[:, 0, 1] = -A[:, 1, 0]
             f = np.zeros((len(t), 2, columns))
             f[:, 1, 1:] = turn[:, None] * Y
             return LinearEquation(None, A, f)
 
-        start = np.zeros((2, columns))
-        start[0, 0] = 1.0  # of Φ; e − Φ (η, 0) and z start at 0
+        # The first column is of Φ; e − Φ (η, 0) and z start at 0.
+        start = known[0].turned if known else np.outer([1.0, 0.0], np.eye(columns)[0])
         found = solve(
             LinearProblem(rotation, start, name="new regressor"), path.mesh,
             tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
@@ -91,31 +92,34 @@ class Exciting(GainEstimator):
         law = scalar_path(
             found.mesh, signals, new, digits(new), quotient, np.asarray(t), path.floor
         )
-        return replace(inner, groups=(law,), condition="IE")
+        (end,) = inner.at_end()
+        end = replace(end, turned=found.final)
+        return replace(inner, groups=(law,), condition="IE", at_end=lambda: (end,))
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
         """The estimator at samples."""
         return RecursiveMixed(self, parameters, Rotation(self, parameters).update, "IE")
 
-    def _turning(self, path: ScalarPath) -> Callable[[Array, Array], Array]:
-        """φ'/Δ² = κ (π/2) e^{−κ∫Δ²} at times (N,)."""
-        kappa, energy = self.kappa, Trajectory(path.mesh, path.energy)
-        return lambda t, inside: 0.5 * np.pi * kappa * np.exp(-kappa * energy(t, inside))
+    def _left(self, path: ScalarPath, known: Known) -> Callable[[Array, Array], Array]:
+        """π/2 − φ = (π/2) e^{−κ∫Δ²} at times (N,)."""
+        Phi = known[0].turned[:, 0] if known else np.eye(2)[0]
+        start, energy = np.arctan2(*Phi), Trajectory(path.mesh, path.energy)
+        return lambda t, inside: start * np.exp(-self.kappa * energy(t, inside))
 
-    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+    def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
         """δ𝒴 as of ``drem``, δe' = φ'[[0, −1], [1, 0]] δe + φ'/Δ (0, adj(Ω) δ𝒴), of every case.
 
         Then δη̂' = γΦ_21 (δe_2 − Φ_21 δη̂).
         """
         p, end, linear = regression.p, regression.mesh.edges[-1:], self.part(Drem)
-        rates, mixed = linear.behind(regression)
-        turning = self._turning(linear.resume(regression, end, ()).groups[0])
-        (law,) = self.estimate(regression, end).groups
+        rates, mixed = linear.behind(regression, known)
+        left = self._left(linear.resume(regression, end, known).groups[0], known)
         first, second = np.arange(p, 2 * p), np.arange(2 * p, 3 * p)
 
         def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
             seen, delta, adjugate = mixed(t, inside)
-            turn = (turning(t, inside) * delta)[:, None]
+            rest = left(t, inside)
+            turn = (self.kappa * rest * delta)[:, None]
             filters = np.zeros((len(t), 3 * p, 3 * p))
             filters[:, :p, :p] = np.diag(rates)
             filters[:, first, second] = turn * delta[:, None]
@@ -123,7 +127,7 @@ class Exciting(GainEstimator):
             filters[:, second, :p] = -turn[..., None] * adjugate
             into = np.pad(seen, ((0, 0), (0, 2 * p), (0, 0)))
             e_2 = np.eye(3 * p)[None, 2 * p :]
-            return scalar_errors(filters, into, law.signals(t, inside)[0], e_2, gain)
+            return scalar_errors(filters, into, np.cos(rest), e_2, gain)
 
         return tuple(partial(at, gain) for gain in self.gains("gamma", regression.parameters))
 

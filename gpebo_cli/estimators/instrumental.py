@@ -19,7 +19,7 @@ from functools import partial
 
 import numpy as np
 
-from gpebo_cli.estimators._base import GainEstimator, gain
+from gpebo_cli.estimators._base import WindowedEstimator, gain
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     RecursiveMixed,
@@ -33,41 +33,46 @@ from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
+from gpebo_cli.regression.resets import ExtensionState, Known
 from gpebo_cli.regression.samples import Filter, Past, SampledRegression, delayed
 
 
 def lagged(regression: LinearRegression, delay: float, t: Array, inside: Array) -> Array:
     """[ψ(t) ; ψ(t − d)]ᵀ (N, 2p, rows) at times t (N,), d in seconds, zero before the start."""
-    start = regression.mesh.edges[0]
-    before = regression.psi(np.maximum(t - delay, start), inside - delay)
+    whole = regression.whole or regression
+    start = whole.mesh.edges[0]
+    before = whole.psi(np.maximum(t - delay, start), inside - delay)
     before[inside - delay < start] = 0.0
     return np.swapaxes(np.concatenate([regression.psi(t, inside), before], axis=-1), -1, -2)
 
 
-def averaged(regression: LinearRegression, delay: float, settle: float) -> Trajectory:
+def averaged(
+    regression: LinearRegression, delay: float, settle: float, before: Array | float = 0.0
+) -> Trajectory:
     """Means of [ψ(t) ; ψ(t − d)]ᵀ [ψ | Y], shape (2p, p + c): Z' = (product − Z)/(T₀ + t), Z = 0.
 
     What a disturbance of Y has in common with a factor stays in the mean of that row; the rest
     vanishes as the mean is taken over longer and longer times. The mesh has edges where the delayed
-    ψ has; d and T₀ are in seconds.
+    ψ has; d and T₀ are in seconds. Of a window t counts from the start of the first one, and Z from
+    what it was ``before``.
     """
-    edges = regression.mesh.edges
-    later = edges[edges + delay < edges[-1]] + delay
+    edges, every = regression.mesh.edges, (regression.whole or regression).mesh.edges
+    later = every[slice(*np.searchsorted(every + delay, edges[[0, -1]]))] + delay
     after = np.searchsorted(edges, later)
     apart = np.minimum(edges[after] - later, later - edges[after - 1])
-    cuts = np.union1d(edges, later[apart > 1e-12 * (edges[-1] - edges[0])])
+    cuts = np.union1d(edges, later[apart > 1e-12 * (every[-1] - every[0])])
     mesh = Mesh(cuts, regression.mesh.rule)
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
     psi, Y = regression.psi(t, inside), regression.Y(t, inside)
     both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
     product = lagged(regression, delay, t, inside) @ both
-    whole = mesh.trajectory(product).integral()
-    span = (settle + mesh.points - edges[0])[..., None, None]
-    return Trajectory(mesh, whole.values / span)
+    sums = mesh.trajectory(product).integral().values
+    span = (settle + mesh.points - every[0])[..., None, None]
+    return Trajectory(mesh, (sums + before * span[0, 0]) / span)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Instrumental(GainEstimator):
+class Instrumental(WindowedEstimator):
     """Means of products with a delayed ψ, mixing, and η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i).
 
     Attributes:
@@ -80,9 +85,10 @@ class Instrumental(GainEstimator):
     delay: float = field(default=0.5, metadata={"positive": True})
     settle: float = field(default=1.0, metadata={"positive": True})
 
-    def means(self, regression: LinearRegression) -> Trajectory:
+    def means(self, regression: LinearRegression, known: Known) -> Trajectory:
         """Means of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c)."""
-        return averaged(regression, self.delay, self.settle)
+        before = known[0].values if known else 0.0
+        return averaged(regression, self.delay, self.settle, before)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
         """The estimator at samples."""
@@ -92,18 +98,21 @@ class Instrumental(GainEstimator):
         """What makes p equations of the 2p means (N, 2p, p + c), (N or 1, p, 2p)."""
         return np.eye(2 * len(names))[None, len(names) :]
 
-    def estimate(self, regression: LinearRegression, t: Array) -> MixedEstimates:
+    def go_on(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Extend, mix, and keep what the closed form needs at the times t (M,)."""
-        names, means = regression.parameters, self.means(regression)
+        names, means = regression.parameters, self.means(regression, known)
         rows = means.values.reshape(-1, *means.values.shape[2:])
         square = (self.left(rows, names) @ rows).reshape(*means.values.shape[:2], len(names), -1)
         path = mix(Trajectory(means.mesh, square), np.asarray(t), regression.floor)
-        return mixed_estimates(self, regression, (path,))
+        return mixed_estimates(
+            self, regression, (path,), lambda: (ExtensionState(means.final, 0.0),), known=known
+        )
 
-    def errors(self, regression: LinearRegression) -> tuple[ErrorsAt, ...]:
+    def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
         """δ𝒴' = (ζδY − δ𝒴)/(T₀ + t) of all means, δη̂' = γΔ(adj(Ω) δ𝒴 − Δ δη̂), of every case."""
         names, p = regression.parameters, regression.p
-        means, began = self.means(regression), regression.mesh.edges[0]
+        means = self.means(regression, known)
+        began = (regression.whole or regression).mesh.edges[0]
 
         def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
             rows = means(t, inside)

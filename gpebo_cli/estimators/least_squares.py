@@ -25,7 +25,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
-from gpebo_cli.regression.estimator import Found, SampledEstimates, Unmixed
+from gpebo_cli.regression.estimator import Found, Lasting, SampledEstimates, Unmixed
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known
 from gpebo_cli.regression.samples import SampledRegression, integrating
@@ -149,6 +149,7 @@ class LeastSquares(ResumableEstimator):
         return LeastSquaresEstimates(
             self.cases, [at[id(info)] for info in infos], self.start(regression.parameters),
             tuple(info.reached for info in infos), regression.realisations,
+            regression.whole is not None,
         )
 
 
@@ -171,7 +172,7 @@ def solved(extended: Array) -> Found:
 
 
 @dataclass(frozen=True, eq=False)
-class LeastSquaresEstimates(Unmixed):
+class LeastSquaresEstimates(Unmixed, Lasting):
     """The regularised solution of every case."""
 
     cases: tuple[Mapping[str, float], ...]
@@ -179,6 +180,7 @@ class LeastSquaresEstimates(Unmixed):
     start: Array  # (p,)
     reached: tuple[ExtensionState, ...]  # of each case
     realisations: tuple[int, ...] = ()
+    window: bool = False  # of a long regression, whose prior is about the start of the first one
 
     @property
     def requirement(self) -> Requirement:
@@ -201,7 +203,7 @@ class LeastSquaresEstimates(Unmixed):
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
         chosen, known = self.cases[cases], self.known[cases]
         starts = np.broadcast_to(
-            self.start if start is None else start, (len(chosen), len(self.start))
+            self.start if start is None or self.window else start, (len(chosen), len(self.start))
         )
         few = len(self.cases) <= _FEW and len(self.start) > _SMALL
         eta = []

@@ -59,11 +59,6 @@ class LsDrem(ResumableEstimator):
         """The part that extends the regressor."""
         return self.part(LeastSquares)
 
-    @property
-    def extends(self) -> LeastSquares:
-        """The same part."""
-        return self.least_squares
-
     def axes(self) -> dict[str, Sequence[float]]:
         """α, f₀, β and γ, checked as the least-squares part checks them."""
         self.least_squares.axes()

@@ -92,9 +92,8 @@ class MemoryExtension(ResumableEstimator):
         self, regression: LinearRegression, extended: Trajectory, t: Array
     ) -> VectorEstimates:
         mesh, values, p = extended.mesh, extended.values, regression.p
-        identity = Trajectory(mesh, np.broadcast_to(np.eye(p), values[..., :p].shape))
         omega, rhs = Trajectory(mesh, values[..., :p]), Trajectory(mesh, values[..., p:])
-        law = VectorLaw(identity, omega, rhs, regression.floor)
+        law = VectorLaw(None, omega, rhs, regression.floor)
         return vector_estimates(self, regression, law, omega, t)
 
 

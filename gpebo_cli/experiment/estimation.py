@@ -80,14 +80,14 @@ def continuous(
     observer: Observer, estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
     """Observer and estimator as differential equations (SolverError)."""
-    t, goes_on = source.t, isinstance(estimator, estimators.ResumableEstimator)
+    t, goes_on = source.t, isinstance(estimator, estimators.Windowed)
 
     def observe(signals: Source | Signals) -> Observation:
         known = signals if isinstance(signals, Source) else source
         asked = None
-        if _blind(known) and known.samples is not None and not source.pieces and goes_on:
-            inside = (known.samples > t[0]) & (known.samples < t[-1])
-            asked = np.union1d(t, known.samples[inside])
+        if _blind(known) and known.samples is not None and goes_on:
+            inside = (known.samples > known.t[0]) & (known.samples < known.t[-1])
+            asked = np.union1d(known.t, known.samples[inside])
         seen = Measurements(
             signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.rows),
             known.derivatives, known.t if known.recording else None, asked,

@@ -16,7 +16,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
+from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory, joined
 from gpebo_cli.observers import AffineStateMap, Observation
 from gpebo_cli.regression.errors import ErrorSystem, one_after_another
 from gpebo_cli.regression.linear import LinearRegression
@@ -142,7 +142,7 @@ def joined_observation(
         state_map=AffineStateMap(
             _joined([each.offset for each in affine], shifts),
             _joined([
-                Trajectory(each.gain.mesh, wide(each.gain.values, k))
+                replace(each.gain, values=wide(each.gain.values, k))
                 for k, each in enumerate(affine)
             ], shifts),
             affine[0].units,
@@ -172,8 +172,21 @@ def _filled(values: Array, rows: int) -> Array:
 
 
 def _joined(signals: Sequence[Trajectory], shifts: Sequence[float]) -> Trajectory:
-    """One after the other, all by the rule with the most stages, in which each is exact."""
+    """One after the other, all by the rule with the most stages, in which each is exact.
+
+    Of samples the last of each gives way to the next one's first.
+    """
     rule = max((each.mesh.rule for each in signals), key=lambda each: each.stages)
+    samples = [each for each in signals if isinstance(each, Samples)]
+    if len(samples) == len(signals):
+        pieces = [
+            (each.mesh.edges[:last] + by, each.t[:last] + by, each.values[0, :last])
+            for each, by, last in zip(
+                samples, shifts, [-1] * (len(signals) - 1) + [None], strict=True
+            )
+        ]
+        edges, t, values = map(np.concatenate, zip(*pieces, strict=True))
+        return Mesh(edges, rule).sampled(t, values)
     same = (
         each if each.mesh.rule.stages == rule.stages else Mesh(each.mesh.edges, rule).along(each)
         for each in signals

@@ -1,13 +1,14 @@
 """What an estimator is to the rest: settings that make estimates from a regression.
 
 ``Estimator`` and ``Estimates`` are the least there must be. What more an estimator can do it shows
-by a method: :class:`Resumable` can continue after a reset, :class:`Moving` follows parameters that
-move, :class:`Recursive` works at samples.
+by a method: :class:`Windowed` takes a long regression in parts, :class:`Resumable` can continue
+after a reset, :class:`Moving` follows parameters that move, :class:`Recursive` works at samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -87,12 +88,40 @@ class ResumableEstimates(Estimates, Protocol):
         ...
 
 
+class WindowEstimates(ResumableEstimates, Protocol):
+    """Estimates in one window of a long regression."""
+
+    def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:
+        """What is needed and was got in all of the ``parts`` of a span, this the first of them."""
+        ...
+
+
+class Lasting:
+    """Estimates that know what was got before them."""
+
+    def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:  # noqa: ARG002
+        """What the last of the ``parts`` says."""
+        return deque(parts, maxlen=1)[0].requirement
+
+
 @runtime_checkable
 class Weighing(Protocol):
     """Estimates that are the least of a sum of squares, and that say how it weighs errors."""
 
     def weights(self, case: int) -> Array:
         """M (M, p, p) of (η − η̂)ᵀ M (η − η̂), by which the sum grows beside η̂, at the times."""
+        ...
+
+
+@runtime_checkable
+class Windowed(Estimator, Protocol):
+    """An estimator that takes a long regression window by window."""
+
+    def go_on(self, regression: LinearRegression, t: Array, known: Known) -> WindowEstimates:
+        """As ``Estimator.estimate`` at the times t (M,) of a window, about the same parameters.
+
+        From what was ``reached`` in the window before; none: it is the first one.
+        """
         ...
 
 
@@ -135,7 +164,7 @@ class Affine(Protocol):
     def errors(self, regression: LinearRegression) -> Sequence[ErrorsAt]:
         """For each case how errors of Y become errors of η̂, in continuous time, without resets.
 
-        One that can go on after a reset takes what was ``known`` before as a second argument.
+        One that is ``Windowed`` takes what was ``known`` before as a second argument.
         """
         ...
 

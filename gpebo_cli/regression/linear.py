@@ -45,6 +45,7 @@ class LinearRegression:
     parametrisation: Parametrisation | None = None  # η = S(θ)
     # Where Y is the projection of what was measured, |factor [−η; 1]|² is ∫‖Y − ψη‖² of that.
     factor: Array | None = None  # (k, p + 1)
+    whole: LinearRegression | None = None  # a long one, of which this is a window
 
     @classmethod
     def from_functions(
@@ -195,7 +196,8 @@ class LinearRegression:
             yield self
             return
         for first in range(0, self.mesh.size, self._window):
-            yield self._part(first, min(first + self._window, self.mesh.size), self.floor)
+            last = min(first + self._window, self.mesh.size)
+            yield replace(self._part(first, last, self.floor), whole=self)
 
     @property
     def long(self) -> bool:

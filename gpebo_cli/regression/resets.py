@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,6 +39,7 @@ class ExtensionState:
     memory: float = 1.0  # z of least squares with forgetting
     surplus: float = SURPLUS  # how many times ``level`` a reset may make of Ω
     energy: float = 0.0  # ∫Δ² of a law behind it since it began
+    turned: Array = field(default_factory=lambda: np.zeros((2, 0)))  # (2, 1 + p) [Φ | e]
 
     def after(self, reset: Reset) -> ExtensionState:
         """The same knowledge of η₊ = T η + τ.
