@@ -232,8 +232,8 @@ class Trajectory:
 
     @property
     def final(self) -> Array:
-        """Value at the end of the mesh."""
-        return np.asarray(self.values[-1, -1])
+        """Value at the end of the mesh, which does not hold the others."""
+        return np.array(self.values[-1, -1])
 
     def derivative(self) -> Trajectory:
         """That of each element's polynomial, in 1/s."""

@@ -113,7 +113,7 @@ class LinearRegression:
             part = window.gram
             if window is not self:  # what it holds is its own
                 np.add(part.values, known, out=part.values)
-                known = part.final.copy()
+                known = part.final
             yield part
 
     @cached_property
