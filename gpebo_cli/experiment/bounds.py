@@ -139,8 +139,11 @@ class BoundedEstimates:
 
     def _move(self, eta: Array, metric: Array) -> tuple[ActiveBound, ...]:
         """Move η̂ (M, p) of one case in place, and say which bounds are active at the end."""
-        grid = np.union1d(self.state_map.offset.mesh.points.ravel(), self.t)
-        normals, levels = self._of_states(grid)
+        grid = self.t
+        normals, levels = np.zeros((0, len(grid), eta.shape[1])), np.zeros((0, len(grid)))
+        if self.states:
+            grid = np.union1d(self.state_map.offset.mesh.points.ravel(), grid)
+            normals, levels = self._of_states(grid)
         moving = np.linalg.norm(normals, axis=2)
         most = moving.max(axis=1, initial=0.0)
         size = np.abs(levels).max(axis=1, initial=0.0) + most * np.abs(eta).max(initial=0.0)

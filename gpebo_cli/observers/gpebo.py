@@ -87,7 +87,8 @@ class Gpebo:
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
     ) -> Observation:
         """The regression and the state map, with the remedy."""
-        keeps = isinstance(self.remedy, Plain | OutputInjection) and not self.bounds
+        keeps = isinstance(self.remedy, Plain | OutputInjection)
+        keeps &= not (self.bounds or {}).get("states")  # looked at between samples, too
         if not keeps or signals.mesh.size < _LONG or system.n > SMALL or solver.name == "ivp":
             signals = replace(signals, asked=None)
         few = thinned(system, signals, solver) if keeps else None
