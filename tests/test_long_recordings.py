@@ -334,5 +334,5 @@ def test_a_row_more_takes_few_more_bytes(monkeypatch):
         tracemalloc.stop()
         found.append([seen.regression.psi.values.nbytes, held, most - held])
     psi, held, added = np.subtract(found[2], found[1])
-    assert 1.0 <= held / psi < 1.7
+    assert 1.0 <= held / psi < 2.0  # 3 with the state map at all points
     assert added / psi < 0.3
