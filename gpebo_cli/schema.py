@@ -306,7 +306,7 @@ def _describe(kind: Any) -> str:
         return " or ".join(str(a) if str(a)[:1].isalnum() else shown(a) for a in arguments)
     if origin is list:
         return f"a list (each {_describe(arguments[0])})"
-    if origin is not None and issubclass(origin, Mapping):
+    if origin is not None:
         return f"a mapping of names (each {_describe(arguments[1])})"
     words = {
         float: "a finite number",

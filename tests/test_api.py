@@ -372,7 +372,7 @@ def test_an_estimator_of_another_package(tmp_path):
     """What `pip install` leaves of a package with an entry point, and a file with its settings."""
     entries = {"ridge": "Ridge", "broken": "Gone", "odd": "RIDGE"}
     install(tmp_path, "theirs", "gpebo.estimators", **entries)
-    (tmp_path / "theirs.py").write_text(RIDGE + "\n\nRIDGE = 3\n")
+    (tmp_path / "theirs.py").write_text(RIDGE + "\n\nclass RIDGE:\n    pass\n")
     (tmp_path / "estimator").mkdir()
     for name in ("ridge", "broken", "odd"):
         (tmp_path / "estimator" / f"{name}.yaml").write_text(f"name: {name}\n")

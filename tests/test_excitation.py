@@ -12,11 +12,10 @@ from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec
 from scipy.optimize import brentq
 
-from gpebo_cli.evidence.excitation import assess, persistent
+from gpebo_cli.evidence.excitation import assess, persistent, sampled_window_level
 from gpebo_cli.evidence.metrics import measure_squares, settling_time, time_rms
-from gpebo_cli.settings import (
-    ExcitationSettings,
-)
+from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.settings import ExcitationSettings
 
 T = np.linspace(0, 10, 201)
 CLEAN = regression(three, ETA)
@@ -52,6 +51,17 @@ def test_eigenvalues_and_window_against_quadrature():
     for k in (50, 111, 200):
         expected = np.linalg.eigvalsh(gram(three, T[k] - 2.5, T[k]))[0]
         assert found.pe_level[k] == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_a_window_of_samples_of_a_circle(hold):
+    """ψ = [cos t, sin t]: the integral over a window w has the eigenvalues (w ± sin w)/2."""
+    t, w = np.linspace(-1.0, 5.0, 601), 1.5
+    rows = np.stack([np.cos(t), np.sin(t), t], axis=1)[:, None]
+    sampled = SampledRegression(t, np.diff(t, prepend=-1.0), np.vstack([rows[:1], rows]), hold)
+    level = sampled_window_level(sampled, w)
+    assert np.isnan(level[t < -1.0 + w - 1e-6]).all()
+    np.testing.assert_allclose(level[t > -1.0 + w - 1e-6], 0.5 * (w - np.sin(w)), rtol=1e-3)
 
 
 def test_t_c_is_the_first_time_the_level_is_reached():

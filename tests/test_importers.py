@@ -87,8 +87,9 @@ NETLISTS = {  # name: (netlist, what is measured, index)
         "R2 c 0 1\nC2 c 0 1 ic=0\nH1 d 0 Vs 1.5\nR3 d e 1\nC3 e 0 1 ic=0\n"), "v(c),v(e)", 1,
     ),
     "subcircuits": (
-        ("sub\n.param rr=2\n.subckt filt in out r=1 c=1\nR1 in out {r*rr}\nC1 out 0 {c} ic=0\n"
-        ".ends\nV1 in 0 SIN(0 1 0.3)\nX1 in m filt r=0.5\nX2 m o filt c=0.3\n"), "v(o)", 1,
+        ("sub\n.param rr=2\n.subckt filt in out r=1 c=1\nR1 in out {r*rr}\nC1 out 0 {c}\n"
+        ".ic v(out)=0.4\n.ends\nV1 in 0 SIN(0 1 0.3)\nX1 in m filt r=0.5\n"
+        "X2 m o filt c=0.3\n"), "v(o)", 1,
     ),
     "bridge": (
         ("bridge\nI1 0 a SIN(0 1 0.25)\nR1 a b 1\nR2 a c 2\nC1 b 0 1 ic=0\nC2 c 0 500m ic=0\n"

@@ -52,7 +52,10 @@ def sampled_deviations(
     variances = _variances(noise, levels)
     if source is None:
         return SampledDeviations(variances, None, relative=levels.silent)
-    instants = _rows(source, noise).t
+    rows = _rows(source, noise)
+    instants = rows.t
+    if not rows.lines:  # nothing is held from the end on
+        instants = instants[: np.searchsorted(instants, source.inputs.mesh.edges[-1])]
     near = 1e-6 * float(np.diff(instants).min(initial=np.inf))
 
     def number(t: Array) -> Array:

@@ -167,7 +167,7 @@ class Canonical:
         return Observation(
             regression=LinearRegression(
                 Trajectory(mesh, Y), Trajectory(mesh, psi), (*system.unknowns, *names),
-                np.abs(psi).max(axis=(0, 1, 2), initial=0.0),
+                np.abs(psi).max(axis=(0, 1, 2)),
             ),
             state_map=CanonicalStateMap(
                 xi_a=Trajectory(mesh, xi),

@@ -144,8 +144,7 @@ class Gpebo:
             unknown=self.unknown_initial, in_part=isinstance(self.remedy, Plain),
         )
         reduced = replace(reduced, note=note) if note else reduced
-        found = self.remedy.observe(reduced)
-        return replace(found, bounds=self.bounds) if self.bounds else found
+        return replace(self.remedy.observe(reduced), bounds=self.bounds)
 
     def sampling(self) -> Sampling | None:
         """The samples that ``sample_time`` asks for."""
