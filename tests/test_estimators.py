@@ -13,7 +13,7 @@ from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
 
 import gpebo_cli
-from gpebo_cli import estimators
+from gpebo_cli import estimators, observers
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import LinearRegression, Trajectory
@@ -611,6 +611,8 @@ def test_a_gain_per_parameter_by_name():
         np.testing.assert_allclose(
             answer[0, :, i], run("drem", NOISY, gamma=gamma)[0, :, i], atol=1e-12
         )
+    for name in ("exciting", "fct", "gradient", "instrumental", "ls_drem", "mre", "power"):
+        assert len(estimators.build({"name": name, "gamma": gains}).cases) == 1
 
 
 @pytest.mark.parametrize(
@@ -815,11 +817,15 @@ def test_so_they_are_of_several_recordings(tmp_path):
     assert "least squares over the same data" in "".join(details.warnings)
 
 
-@pytest.mark.parametrize("path", sorted((CONF / "estimator").glob("*.yaml")), ids=lambda p: p.stem)
-def test_defaults_from_python_are_those_of_the_files(path):
+@pytest.mark.parametrize(("group", "path"), [
+    (group, path) for group in (estimators, observers)
+    for path in sorted((CONF / group.__name__.split(".")[-1][:-1]).glob("*.yaml"))
+], ids=lambda p: getattr(p, "stem", ""))
+def test_defaults_from_python_are_those_of_the_files(group, path):
     content = parse(path.read_text(encoding="utf-8"), str(path))
-    del content["title"]
-    assert estimators.build(content) == estimators.build({"name": content["name"]})
+    for key in ("title", "reference", "estimator"):
+        content.pop(key, None)
+    assert group.build(content) == group.build({"name": content["name"]})
 
 
 def test_what_fct_hands_on_is_declared_as_where_it_goes():

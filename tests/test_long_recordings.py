@@ -245,7 +245,7 @@ def test_estimators_and_evidence_go_on_from_window_to_window(settings, monkeypat
     """Nothing tells where a long regression was cut: estimates, deviations, excitation, misfit."""
     signal, t = regression(three, ETA, disturbance=lambda t: 0.1 * np.sin(9.0 * t)), TIMES
     t = t[(t < 3.0) | (t > 6.0)]  # some windows have none
-    estimator, looked = estimators.build(settings), ExcitationSettings()
+    estimator, looked = estimators.build(settings), ExcitationSettings(rho=1.0)
     found = []
     for window in (1 << 12, 17):
         monkeypatch.setattr(linear, "_WINDOW", window)

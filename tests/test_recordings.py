@@ -684,6 +684,9 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     found = guess(str(path), shipped("circuit"))
     assert found.lacking == ["V", "y"]
     assert any("no column was found for V" in doubt for doubt in found.doubts)
+    path.write_bytes(b"t,V,y\n0,1,\xff\n")
+    with refused("lab.csv, line 2: not UTF-8 text"):
+        guess(str(path), shipped("circuit"))
 
 
 def test_numbers_that_stand_for_gaps_are_said(tmp_path):

@@ -291,6 +291,18 @@ def test_windows_of_excitation_run_through_resets():
     np.testing.assert_allclose(cut.gram.final[:, :3], final, atol=1e-11)
 
 
+def test_the_bound_of_what_has_decayed_is_in_units_of_the_data():
+    """T shrinks a direction, and ψ and Y are in units of one and of 1e-6."""
+    plain = make_regression(three, ETA)
+    resets = (Reset(float(plain.mesh.edges[30]), np.diag([1.0, 2.0, 1e-9]), np.zeros(3), 0.0),)
+    grams = []
+    for unit in (1.0, 1e6):
+        Y, psi = (Trajectory(plain.mesh, x.values / unit) for x in (plain.Y, plain.psi))
+        cut = type(plain)(Y, psi, plain.parameters, plain.scale / unit, resets)
+        grams.append(cut.gram.final * unit**2)
+    np.testing.assert_allclose(*grams, rtol=1e-9)
+
+
 def test_an_unknown_whose_value_nobody_knows_spoils_no_other():
     """The errors of the extension behind resets do not need θ, as long as it is constant."""
     two = {**MIXED, "unknowns": {"a": 0.7, "b": 0.2}, "F": [[1, 0], [0, 1], [0, 0]]}

@@ -381,7 +381,13 @@ def test_a_recording_at_samples_is_told(tmp_path):
     measured = made.filter(regex="measured").rename(columns=lambda c: c.removesuffix("_measured"))
     measured.to_csv(tmp_path / "rows.csv")
     observer = {"sample_time": 0.1, "hold": "linear"}
-    result = run("descriptor", data=str(tmp_path / "rows.csv"), observer=observer)
+    result, whole = (
+        run("descriptor", data=str(tmp_path / "rows.csv"), observer=given)
+        for given in (observer, "gpebo")
+    )
+    fit, other = result.details.fit, whole.details.fit
+    assert fit.size == pytest.approx(other.size, rel=0.05)
+    assert fit.residual[0] == pytest.approx(other.residual[0], rel=0.5)  # lines make noise smaller
     line = next(line for line in run_lines(result.details) if line.strip().startswith("theta1"))
     value, std = (float(cell) for cell in line.split()[1:3])
     assert abs(value - 1.5) < 6 * std < 0.5

@@ -21,7 +21,6 @@ from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
 from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra._internal.utils import get_args_parser
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -140,8 +139,6 @@ def session(arguments: Arguments) -> Iterator[Hydra]:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # without it Hydra prints its errors and exits with 1
     logging.raiseExceptions = False  # a reader may close the pipe
     hydra = Hydra("gpebo", Loader(arguments.config_dir))
-    GlobalHydra.instance().clear()
-    GlobalHydra.instance().initialize(hydra)
     try:
         yield hydra
     except LIBRARY_ERRORS as error:
@@ -150,7 +147,6 @@ def session(arguments: Arguments) -> Iterator[Hydra]:
         raise ConfigError("a file chooses itself, by way of its defaults list") from error
     finally:
         os.environ["HYDRA_FULL_ERROR"] = before
-        GlobalHydra.instance().clear()
 
 
 def _words(arguments: Arguments) -> list[str]:
