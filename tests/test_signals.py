@@ -125,6 +125,8 @@ def test_functions_from_python_are_evaluated_along_signals_too(order):
 def test_functions_may_not_depend_on_what_the_format_excludes():
     with pytest.raises(ConfigError, match="C takes 3 arguments, but may depend on t, u only"):
         system_from_functions("p", [[1.0]], [[-1.0]], initial_state=[1], C=lambda t, u, y: t*u*y)
+    with pytest.raises(ConfigError, match="A takes 4 arguments, but may depend on t, u, y only"):
+        system_from_functions("p", [[1.0]], lambda t, u, y, x: t * x, initial_state=[1])
 
 
 @pytest.mark.parametrize("name", ["collocation", "ivp"])
