@@ -221,6 +221,22 @@ def test_a_stiff_varying_plant_that_elimination_would_fill_is_left_to_dense_coll
     assert large.large_simulation(system, TIME, SolverSettings()) is None
 
 
+@pytest.mark.parametrize("rate", [1, 4, 20])
+def test_what_decays_and_comes_back_is_resolved_or_refused(rate):
+    """x' = rate (t − 10) x falls to e^(−50 rate), and is 1 again; e^−1000 is nothing in float64."""
+    system = load_plant({
+        "name": "back", "states": ["a", "b"], "outputs": ["y"], "E": [[1, 0], [0, 1]],
+        "A": [[f"{rate}*(t - 10)", 0], [0, f"{rate}*(t - 10)"]], "C": [[1, 0]],
+        "initial_state": [1, 2],
+    })
+    found = large.large_simulation(system, TimeSettings(horizon=20.0), SolverSettings())
+    assert (found.lost is None) == (rate < 20)
+    if rate < 20:
+        np.testing.assert_allclose(found.signals.states.final, [1.0, 2.0], rtol=1e-11)
+    else:
+        assert found.lost == pytest.approx(10.0 + np.sqrt(70.8), abs=0.1)
+
+
 def test_coefficients_that_swing_are_resolved_before_anything_is_solved(monkeypatch):
     """Elements are solved on one mesh, and as well as they are by other elements."""
     solved, march = [], series._marched

@@ -438,7 +438,7 @@ EVERY_WIDTH static void summed(const Part *q, npy_intp count, const Nodes times,
 /* All parts of element k from the left end in the terms: X at the nodes, and the right end in its
    place; 0 if a series does not converge. */
 static int through_element(const Call *call, Part *q, npy_intp k, npy_intp part, npy_intp first,
-                           double *so_far, double *out)
+                           double *out)
 {
     const npy_intp s = SIZE(s), d = q->d, all = SIZE(c), parts = call->index[2][k];
     const double *nodes = call->in[0];
@@ -451,7 +451,7 @@ static int through_element(const Call *call, Part *q, npy_intp k, npy_intp part,
         q->f = call->in[7] + first + part++ * call->step[7];
         const double *left = q->terms;
         for (npy_intp r = 0; r < d; r++, left += q->below)
-            q->size[r] = so_far[r] = larger(q->weight[r] * largest_size(left, q->width), so_far[r]);
+            q->size[r] = q->weight[r] * largest_size(left, q->width);
         const npy_intp count = expanded(q);
         converged &= count > 0;
         for (; node + some < s && (i + 1 == parts || nodes[node + some] * parts <= i + 1); some++)
@@ -485,11 +485,10 @@ static Outcome series(Call *call)
     Part q = {.d = d, .stride = SIZE(f), .degrees = SIZE(g), .orders = SIZE(u), .row = row};
     q.width = width, q.below = all > 1 ? AT_ONCE * MOST_ORDERS : 1, q.later = all > 1 ? AT_ONCE : d;
     q.column = column, q.weight = call->in[10], q.tol = call->number[11];
-    q.share = call->number[12], q.size = scratch(call, length + 3 * d + 2 * AT_ONCE);
+    q.share = call->number[12], q.size = scratch(call, length + 2 * d + 2 * AT_ONCE);
     if (q.size == NULL)
         return ERROR;
-    double *so_far = q.size + d;
-    q.change = so_far + d;
+    q.change = q.size + d;
     q.terms = q.change + d; /* in whole lines of the cache; vectors reach beyond the last */
     q.terms += (64 - (uintptr_t)q.terms % 64) % 64 / sizeof(double);
     for (npy_intp k = 0; k < K; k++)
@@ -497,7 +496,6 @@ static Outcome series(Call *call)
     for (npy_intp first = 0; first < all; first += AT_ONCE) {
         const npy_intp c = all - first < AT_ONCE ? all - first : AT_ONCE, left = SIZE(f) - first;
         q.columns = c, q.forced = left < 0 ? 0 : left < c ? left : c;
-        memset(so_far, 0, d * sizeof(double));
         memset(q.terms, 0, length * sizeof(double));
         for (npy_intp i = 0; i < d; i++)
             memcpy(q.terms + i * q.below, call->in[9] + i * all + first, c * sizeof(double));
@@ -505,7 +503,7 @@ static Outcome series(Call *call)
             double *out = call->out[0] + k * (s + 1) * d * all + first;
             for (npy_intp i = 0; i < d; i++)
                 put(out + i * all, q.terms + i * q.below, c);
-            if (!through_element(call, &q, k, part, first, so_far, out + d * all))
+            if (!through_element(call, &q, k, part, first, out + d * all))
                 call->out[1][k] = INFINITY;
             for (npy_intp i = 0; i < d && call->in[8] != NULL; i++)
                 for (npy_intp b = 0; b < c; b++)

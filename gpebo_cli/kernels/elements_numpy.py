@@ -172,9 +172,9 @@ def series(
     """Values at all points of X' = A X + f by series in time, one element after the other.
 
     ``(k + 1) X_{k+1} = h (Σ A_j X_{k−j} + f_k)`` until nothing that can follow is larger than
-    ``tol``, relative to the largest a row has been so far, or to a ``share`` of the largest of all
-    rows, times their weights (d,). Nodes of the rule (s,) are in (0, 1], h are lengths (K,), and
-    each element has so many equal ``parts`` (K,), P in all, each with a series: in powers of its
+    ``tol``, relative to the largest a row has been in the part, or to a ``share`` of the largest of
+    all rows, times their weights (d,). Nodes of the rule (s,) are in (0, 1], h are lengths (K,); an
+    element has so many equal ``parts`` (K,), P in all, each with a series: in powers of its
     time, which ends at 1, the entries of A have coefficients (P or 1, e, g), from each power on at
     most ``decay`` (P or 1, g) relative to the entry, and the first columns of X f (P or 1, u, d,
     f). Each row of A begins somewhere (d + 1,) in the columns ``indices`` (e,). ``kicks`` (K, d, c)
@@ -186,14 +186,14 @@ def series(
     (d, columns), all_rows = start.shape, np.repeat(np.arange(len(rows) - 1), np.diff(rows))
     values, changes = np.empty((len(h), len(nodes) + 1, d, columns)), np.full(len(h), tol)
     matrices, forcing = np.zeros((A.shape[2], d, d)), np.zeros((_ORDERS, d, columns))
-    size, state, part = np.zeros(d), start, 0
+    state, part = start, 0
     for k, count in enumerate(parts.tolist()):
         values[k, 0] = state
         for i in range(count):
             matrices[:, all_rows, indices] = A[part % len(A)].T
             forcing[: f.shape[1], :, : f.shape[3]] = f[part % len(f)]
-            size = np.maximum(size, weights * np.abs(state).max(axis=1, initial=0.0))
-            terms, largest, sizes, left = [state], size, [1.0], np.inf
+            largest = weights * np.abs(state).max(axis=1, initial=0.0)
+            terms, sizes, left = [state], [1.0], np.inf
             while len(terms) < _ORDERS and np.isfinite(sizes[0]) and not left <= tol:
                 pairs = zip(matrices, reversed(terms), strict=False)
                 right = sum((a @ x for a, x in pairs), forcing[len(terms) - 1])

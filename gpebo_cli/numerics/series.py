@@ -397,8 +397,11 @@ def _errors(march: March, problem: LinearProblem, mesh: Mesh, found: _Found) -> 
     size, last = np.maximum(sizes, _TINY), found.looked.last
     tail = predicted_tail(last, rule, size.reshape(K, -1)).reshape(sizes.shape)
     # As in numerics.errors; and what series leave out.
-    added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * sizes
+    units = np.ones((n, 1)) if problem.units is None else problem.units
+    beside = np.maximum(sizes, SHARE * units * (sizes / units).max(axis=1, keepdims=True))
+    added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * beside
     added += EPS * (END * found.made_of + found.moved)
+    added += np.where(sizes.max(axis=0) > 0.0, _TINY, 0.0)  # what decays to nothing is lost
     start = EPS * np.abs(values[0, 0])
     noise = np.zeros((n, columns))
     if points > 4:
