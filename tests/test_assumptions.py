@@ -142,3 +142,13 @@ def test_an_observer_that_its_own_errors_spoil_says_so(error, count):
 
     assert len(warnings(Spoilt())) == count
     assert all("2.0e+00 of their size" in line for line in warnings(Spoilt()))
+
+
+def test_an_impulse_ends_the_check_by_its_name():
+    """v = x' and x = u, which jumps."""
+    system = lti(
+        A=[[0, 1], [1, 0]], inputs={"u": "step(t - 1)"}, B=[[0], [-1]], initial_state=[0, 0]
+    )
+    names = found(system)
+    assert not names["No impulses"].holds
+    assert list(names)[-1] == "No impulses"

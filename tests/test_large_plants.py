@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from scipy.linalg import eigh, null_space
+from scipy.linalg import eigh, expm, null_space
 from scipy.sparse import csr_matrix
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -18,7 +18,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.findings import OnDemand
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.mesh import SHARE, initial_mesh
+from gpebo_cli.numerics.mesh import SHARE, Mesh, initial_mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced import extension
@@ -219,6 +219,15 @@ def test_a_stiff_varying_plant_that_elimination_would_fill_is_left_to_dense_coll
 
     system = plant(full, varying=True, cells=12)
     assert large.large_simulation(system, TIME, SolverSettings()) is None
+
+
+def test_kicks_are_added_at_right_ends():
+    rng, mesh = np.random.default_rng(0), Mesh(np.linspace(0.0, 1.0, 4), radau_rule(4))
+    A, kicks, start = (rng.normal(size=shape) for shape in ((3, 3), (3, 3, 2), (3, 2)))
+    matrix = series.Sparse(np.array([0, 3, 6, 9]), np.tile(np.arange(3), 3), A.reshape(1, 9))
+    values, _ = series._Solved(matrix)(mesh, matrix, np.zeros((1, 3, 0)), kicks, start, 1e-9)
+    np.testing.assert_allclose(values[1:, 0], (values[:, -1] + kicks)[:-1], rtol=1e-12)
+    np.testing.assert_allclose(values[0, -1], expm(A / 3.0) @ start, rtol=1e-6)
 
 
 @pytest.mark.parametrize("rate", [1, 4, 20])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from plants import reference, shipped
 from processes import refused
 from scipy.integrate import solve_ivp
+from scipy.optimize import OptimizeResult
 from scipy.special import beta
 
 from gpebo_cli import GpeboError, run
@@ -514,3 +515,11 @@ def test_growth_is_refused_with_its_time_and_its_reason(rate, solver, why):
     system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state={"x": 1})
     with pytest.raises(GpeboError, match=why):
         simulate(system, TimeSettings(horizon=20.0), SolverSettings(name=solver))
+
+
+def test_what_solve_ivp_says_where_it_gives_up_is_passed_on(monkeypatch):
+    gone = OptimizeResult(success=False, t=np.array([0.25]), message="no step is short enough")
+    monkeypatch.setattr("scipy.integrate.solve_ivp", lambda *_, **__: gone)
+    system = plant(states=["x"], E=[[1]], A=[[-1]], initial_state={"x": 1})
+    with refused("failed after t = 0.25: no step is short enough", by=GpeboError):
+        simulate(system, TimeSettings(horizon=1.0), SolverSettings(name="ivp"))

@@ -189,7 +189,7 @@ class VectorRecursion:
             self._eta = self._eta + (L[:, k] @ rest[..., None])[..., 0]
             self._left = shrunk[:, k] @ self._left
             out[:, k] = self._eta
-            left[k] = np.linalg.norm(self._left * scale, 2, axis=(1, 2)).max(initial=0.0)
+            left[k] = np.linalg.norm(self._left * scale, 2, axis=(1, 2)).max()
         self._most = float(left[-1])
         return out, shrunk, left <= _LEFT
 

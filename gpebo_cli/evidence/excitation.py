@@ -92,7 +92,7 @@ class Excitation:
         """From when on all parameters are well determined."""
         if not self.parameters or not (self.final.share >= WELL).all():
             return None
-        return since(self.t, self.known.share.min(axis=1, initial=1.0)[:, None] >= WELL)[0]
+        return since(self.t, self.known.share.min(axis=1)[:, None] >= WELL)[0]
 
 
 def assess(

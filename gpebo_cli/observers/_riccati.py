@@ -156,7 +156,7 @@ def run_filter(
     unit = _units(m.A, deviation, horizon)
     P0, start = P0 / np.outer(unit, unit), start / unit[:, None]
     least = float((floor / unit).max(initial=0.0))
-    W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0, initial=0.0)
+    W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0)
     # A common factor of all covariances changes nothing. It is chosen so that W is of order 1:
     # entries of 1e7 would be taken as pivots, and mix the equations. A W that moves P by nothing
     # is rounding, and is not made larger.
