@@ -34,7 +34,7 @@ from gpebo_cli.schema import per_name
 from gpebo_cli.settings import SolverSettings
 
 _HELD = 3  # arrays of every kind that are alive at once; measured
-_KEPT, _BESIDE = 1.15, 45  # the same of windows, and numbers that deviations hold for a sample
+_KEPT, _BESIDE = 1.15, 30  # the same of windows, and numbers that deviations hold for a sample
 _LARGE = 32  # parameters, from which on gains are not sampled for one case
 
 ByName = float | Sequence[float] | Mapping[str, float]
