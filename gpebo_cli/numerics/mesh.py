@@ -261,7 +261,8 @@ class Trajectory:
         ``local``: from the left end of each element.
         """
         mesh, flat = self.mesh, _flat(self.values)
-        out = np.zeros(flat.shape)
+        out = np.empty(flat.shape)
+        out[:, 0] = 0.0
         weights = mesh.steps[:, None, None] * mesh.rule.integration
         np.matmul(weights, flat[:, 1:], out=out[:, 1:])
         if not local:
