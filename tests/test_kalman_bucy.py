@@ -291,11 +291,14 @@ def test_command_line(tmp_path):
     assert "kalman_bucy" in gpebo("list", "observers", cwd=tmp_path).stdout
 
 
-def test_nothing_to_filter_is_one_line():
-    plant = {
-        "name": "algebraic", "states": ["x"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
-        "E": [[0]], "A": [[-1]], "B": [[1]], "C": [[1]], "initial_state": [0],
-    }
+@pytest.mark.parametrize("entries", [
+    {"states": ["x"], "E": [[0]], "A": [[-1]], "B": [[1]], "C": [[1]], "initial_state": [0]},
+    # x = u and z = u': constraints leave nothing free, though E is not zero.
+    {"states": ["x", "z"], "E": [[1, 0], [0, 0]], "A": [[0, 1], [1, 0]], "B": [[0], [-1]],
+     "C": [[1, 0]], "initial_state": [0, 1]},
+])
+def test_nothing_to_filter_is_one_line(entries):
+    plant = {"name": "p", "inputs": {"u": "sin(t)"}, "outputs": ["y"], **entries}
     with pytest.raises(ConfigError, match="nothing for observer=kalman_bucy to filter"):
         api_run(plant, observer="kalman_bucy", time={"horizon": 1})
     assert api_run(plant, observer="gpebo", time={"horizon": 1}).details.metrics is not None

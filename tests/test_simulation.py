@@ -169,7 +169,7 @@ def test_index_above_the_limit_is_refused():
     )
     solved = simulate(chain, TimeSettings(horizon=1.0), SOLVER)
     assert solved.structure.index == 6
-    with pytest.raises(ModelError, match="index is above 4"):
+    with pytest.raises(ModelError, match=r"solver\.max_strangeness_index = 3; .* raise that to 5"):
         simulate(chain, TimeSettings(horizon=1.0), SolverSettings(max_strangeness_index=3))
 
 

@@ -101,6 +101,17 @@ def test_evidence_is_the_same_in_any_units(name, decades):
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
 
 
+@pytest.mark.parametrize("name", ["boost", "circuit", "published/ascher_petzold", 5])
+def test_output_injection_is_the_same_in_any_units(name):
+    """Deviations that are small in their unit are not rounding."""
+    one, other, units = both(
+        name, True, estimator={"name": "least_squares", "f0": 1e-200},
+        observer={"name": "gpebo", "remedy": "output_injection"},
+    )
+    a, b = one.estimation.states[0, -1], other.estimation.states[0, -1] / units.states
+    assert a == pytest.approx(b, rel=1e-7, abs=1e-7 * np.abs(a).max())
+
+
 @pytest.mark.parametrize("seed", [102, 123])
 def test_what_no_sample_tells_is_unknown_in_any_units(seed):
     """Kernels of E turn: ψ of a parameter that acts on nothing measured is rounding of z."""

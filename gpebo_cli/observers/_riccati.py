@@ -140,20 +140,21 @@ class Filtered:
 def run_filter(
     model: Callable[[Array, Array], tuple[StateSpace, tuple[Array, ...]]], start: Array, P0: Array,
     mesh: Mesh, *, tol: float, max_elements: int, monitor: Monitor | None = None,
-    name: str = "Kalman-Bucy filter", floor: Array | float = 0.0,
+    name: str = "Kalman-Bucy filter", floor: Array | float = 0.0, sizes: Array | float = 1.0,
 ) -> Filtered:
     """Solve Riccati equation and filter on ``mesh``, refined until P and ζ̂ are resolved.
 
     From ζ̂ = ``start`` (n, g) with the covariance ``P0`` (n, n). The model at times (N,) comes with
     whatever ``monitor`` needs, which gives further signals to resolve from that and ζ̂. ``tol`` is
     relative to each signal's own size, to that of each element for P, which so is as accurate where
-    it has become small. Below sizes ``floor`` (n,) ζ̂ is not resolved for its own sake
+    it has become small. Below ``floor`` (n,) ζ̂ is not resolved for its own sake, and it is
+    comparable in ``sizes`` (n,)
     (SolverError: the tolerance cannot be reached, or P is not positive semidefinite).
     """
     m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     deviation = np.sqrt(np.diag(P0))
-    unit = _units(m.A, deviation, horizon)
+    unit = _units(m.A, deviation, horizon, sizes)
     P0, start = P0 / np.outer(unit, unit), start / unit[:, None]
     least = float((floor / unit).max(initial=0.0))
     W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0)
@@ -254,15 +255,15 @@ def _error(
     return error
 
 
-def _units(A: Array, deviation: Array, horizon: float) -> Array:
+def _units(A: Array, deviation: Array, horizon: float, sizes: Array | float) -> Array:
     """Units (n,) of ζ: deviations at the start, or what those of constants soon make of them.
 
     Powers of two: nothing is rounded. What is constant, a row of zeros in A, moves the others for
     as long as these remember. By ``_GROWTH`` X₁ may be out of balance.
     """
-    largest = deviation.max(initial=0.0)
+    largest = sizes * ((deviation / sizes).max(initial=0.0) or 1.0)
     rounding = np.sqrt(np.finfo(float).eps) * largest  # of a variance beside the largest one
-    unit = np.where(deviation > rounding, deviation, largest or 1.0)
+    unit = np.where(deviation > rounding, deviation, largest)
     pushes = np.abs(A).max(axis=0, initial=0.0) * unit / unit[:, None]
     moving = pushes.any(axis=1)
     rate = max(float(pushes[np.ix_(moving, moving)].max(initial=0.0)), 1.0 / horizon)

@@ -254,20 +254,22 @@ class KalmanBucy:
             return filter_model(known.matrices(t, inside), known.measured(t, inside), known.form)
 
         names = (*system.unknowns, *(f"w_{label}" for label in known.labels))
-        if not names:
+        if not (system.unknowns or known.begin.names):
             raise ConfigError(
-                f"plant {system.name} has neither unknowns nor differential states: there is "
-                "nothing for observer=kalman_bucy to filter; observer=gpebo takes it"
+                f"plant {system.name} has neither unknowns nor states that its constraints leave "
+                "free: there is nothing for observer=kalman_bucy to filter; observer=gpebo takes it"
             )
-        w0 = split.dual @ known.xi_a
-        start = np.concatenate([np.zeros(q), w0])
+        start = np.concatenate([np.zeros(q), split.dual @ known.xi_a])
         variances = per_name(self.P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
         P0 = _initial_covariance(variances, known)
         process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
-        points, inside = mesh.points.ravel(), mesh.inside.ravel()
-        known_of = reduced(points, inside)
+        inside = mesh.inside.ravel()
+        known_of = reduced(mesh.points.ravel(), inside)
         # What is known at the start counts as what is least known.
-        varies = np.where(variances > 0.0, variances, variances.max(initial=0.0) or 1.0)
+        sizes = np.concatenate([known.form.units.unknowns, known.units])
+        varies = np.where(variances > 0.0, variances, sizes**2 * (
+            (variances / sizes**2).max(initial=0.0) or 1.0
+        ))
         model_noise = NoiseModel(
             noise.variances * noise.sample_time, process,
             self.regularisation**2 * noise.sample_time * varies,
@@ -299,7 +301,7 @@ class KalmanBucy:
         name = f"Kalman-Bucy filter of plant {system.name}"
         filtered = run_filter(
             model, start[:, None], P0, mesh, tol=solver.tol, max_elements=solver.max_elements,
-            monitor=monitor, name=name, floor=floor,
+            monitor=monitor, name=name, floor=floor, sizes=sizes,
         )
         offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
 

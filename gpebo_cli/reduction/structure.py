@@ -37,6 +37,7 @@ _DIP_ROUNDS = 14
 _FALL = 1e-2  # towards an end of the horizon, singular values may fall to this share
 _DIP_POINTS = 17
 _MOST_DIPS = 6  # of each kind
+_LOOKED_AHEAD = 400  # rows of a derivative array beyond the limit of differentiations
 
 
 class Pivots(NamedTuple):
@@ -181,10 +182,30 @@ def _analysed(
     staged = _in_stages(system, t, max_mu, rank_tol)
     if staged is not None:
         return staged
+    _refuse_limit(system, t[len(t) // 2 :][:1], scaling, max_mu, rank_tol)
     raise ModelError(
-        f"{who(system)} is not uniquely solvable, or its index is above {max_mu + 1}: with "
-        f"{max_mu} differentiations {reason}; is an equation missing, or there twice?"
+        f"{who(system)} is not uniquely solvable, or its index is above {max_mu + 1} (solver."
+        f"max_strangeness_index = {max_mu}): with {max_mu} differentiations {reason}; is an "
+        "equation missing, or there twice?"
     )
+
+
+def _refuse_limit(
+    system: DescriptorSystem, t: Array, scaling: Scaling, max_mu: int, rank_tol: float
+) -> None:
+    """Refuse by the name of the limit if at a time t (1,) a higher one would do."""
+    constraints = -1
+    for mu in range(max_mu + 1, min(system.n + 1, 20, _LOOKED_AHEAD // system.n) + 1):
+        c = system.coefficients.taylor(t, mu)
+        levels = _judged(t, c, mu, scaling, rank_tol, invariant=True)
+        if levels.reference is None:
+            continue
+        if levels.a == constraints:  # two in a row: rounding does not find the same ones
+            raise ModelError(
+                f"the index of {who(system)} is above {max_mu + 1}, for solver."
+                f"max_strangeness_index = {max_mu}; it seems to be {mu}: raise that to {mu - 1}"
+            )
+        constraints = levels.a
 
 
 def _in_stages(

@@ -127,7 +127,7 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     S0 = kappa * V @ V.T
     S = run_filter(
         model, np.zeros((n, 0)), S0, mesh, tol=_TOLERANCE, max_elements=reduced.solver.max_elements,
-        name=f"output injection for plant {reduced.system.name}",
+        name=f"output injection for plant {reduced.system.name}", sizes=reduced.units,
     )
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
