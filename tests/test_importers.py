@@ -286,6 +286,8 @@ def test_what_continues_and_what_is_a_comment():
     ("V1 a 0 PWL(1 1 0 2)", "times that do not fall"),
     ("V1 a 0 PULSE(0 1 0 1n 1n 2u 1u 3)", "longer than their period"),
     ("V1 a 0 PULSE(0 1 0 1n 1n 1u 2u 2000)", "at most 1000 are read"),
+    ("R1 out 0 1\n.ic v(aut)=1", ".ic v(aut) is neither the voltage of a node"),
+    ("R1 a 0 1\nC1 a 0 1\n.ic i(C1)=1", ".ic i(c1) is neither"),
     ("V1 a 0 1 2", "is no source"), ("R1 a 0 1\n" * 20001, "lines; at most"),
     ("\n".join(f"R{k} a 0 1" for k in range(5001)), "more than 5000 elements"),
 ])

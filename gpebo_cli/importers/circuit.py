@@ -199,6 +199,7 @@ class _Builder:
         }
 
     def build(self) -> PlantDraft:
+        """The draft without outputs (ConfigError: .ic names no state)."""
         draft = self.draft
         for key, value in self.netlist.parameters.items():
             draft.parameters[self._claim(key, key)] = value
@@ -217,6 +218,13 @@ class _Builder:
                 start = e.initial if e.kind == "L" else None
                 given = self.netlist.initial.get(f"i({e.name.lower()})", 0.0)
                 draft.states[label] = (given if start is None else start, "A")
+        known = [f"v({node})" for node in self._node] + [f"i({name})" for name in self._current]
+        for quantity in self.netlist.initial:
+            if quantity not in known:
+                raise ConfigError(
+                    f"{self.file}: .ic {quantity} is neither the voltage of a node nor a current "
+                    "that is a state" + nearest(quantity, known)
+                )
         for e in self.netlist.elements:
             getattr(self, f"_stamp_{e.kind}")(e)
         draft.negate(self._turned)  # an algebraic equation begins with a minus, as balances do
