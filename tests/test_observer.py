@@ -268,3 +268,16 @@ def test_an_output_that_sees_nothing_is_not_exciting_though_the_kernel_of_E_turn
     assert not result.regression.psi.any()
     assert not result.excitation.is_ie
     assert "not determined by the data: a, b, e0_a" in result.verdict
+
+
+@pytest.mark.parametrize("g", [1 / 9000, 0.3, 1 / 7])
+def test_what_no_output_sees_is_not_excited_by_rounding(g):
+    """A capacitor between two nodes that nothing else depends on: 𝒜 B cancels, to 1e-17."""
+    found = experiment({
+        "name": "p", "states": ["p", "a", "b"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[1, 0, 0], [0, 1, -1], [0, -1, 1]], "B": [[1], [0], [0]], "C": [[1, 0, 0]],
+        "A": [["-1 - 0.2*sin(t)", 0, 0], [1, -g, 0], [0, 0, -g]], "initial_state": [1, 1, 0],
+    }, time={"horizon": 5, "samples": 11}).details
+    assert not found.excitation.is_ie
+    unknown = {name for name, since in found.estimable.items() if since is None}
+    assert unknown == {"a", "b", "e0_2"}

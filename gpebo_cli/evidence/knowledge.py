@@ -171,10 +171,12 @@ class Knowledge:
         z = V[:, clear] @ (seen / root)
         row = gain / self.sizes[-1]
         unseen = np.linalg.norm(row @ V[:, ~clear], axis=1) * _HIDDEN * np.linalg.norm(z)
-        error = unseen + _NOISE * (
-            np.linalg.norm(row @ V[:, clear] / root, axis=1) * np.linalg.norm(seen)
-            + np.abs(row) @ np.abs(z)
-        )
+        # Rounding is relative to all of Y, or to what each column of ψ meets of it, if less.
+        told = V[:, clear]
+        of_all = np.linalg.norm(row @ told / root, axis=1) * np.linalg.norm(seen)
+        met = np.abs((told * spectrum[clear]) @ told.T) @ np.abs(z)
+        of_each = np.abs(row @ (told / spectrum[clear]) @ told.T) @ met
+        error = unseen + _NOISE * (np.minimum(of_all, of_each) + np.abs(row) @ np.abs(z))
         return np.asarray(error), z / self.sizes[-1]
 
 

@@ -159,10 +159,11 @@ def observer_matrices(
     else:
         scale = (np.ones(system.r) if output_scale is None else output_scale) / units.outputs
     plain = model.hidden is None and {"D", "H"} <= system.coefficients.zero
+    # Products with axes have no rounding that would have to be found.
     known = like.split.frame if frame is None and like is not None else frame
     frame = axes_frame(largest_over_time(model.E)) if like is None and frame is None else known
     found = None
-    if plain and frame is not None and frame.remaining is None:
+    if plain and frame is not None and frame.remaining is None and frame.axes:
         found = _in_frame(model, units.equations, scale, frame, rank_tol)
     if found is not None:
         return found
@@ -223,7 +224,7 @@ def _by_steps(
     algebraic, of_inputs, G = (
         joined(*part, last, axis=1) for part, last in zip(exact, (C, D, H), strict=True)
     )
-    on_basis = algebraic @ basis
+    on_basis = without_rounding(algebraic @ basis, np.abs(algebraic) @ np.abs(basis))
     of_y = np.zeros((1, algebraic.shape[1], r))
     of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
     g_signals = joined(of_inputs, of_y, axis=2)

@@ -77,6 +77,11 @@ class Frame:
         """P, (n, n)."""
         return np.asarray(self.domain @ self.dual)
 
+    @cached_property
+    def axes(self) -> bool:
+        """Whether domain and kernel are coordinate axes."""
+        return bool(np.count_nonzero(self.domain) == self.domain.shape[1])
+
 
 def axes_frame(entries: Array) -> Frame | None:
     """Coordinate axes where E, of entries up to (n, n), has columns and rows that are exactly zero.
