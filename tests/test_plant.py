@@ -290,6 +290,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "outputs is a mapping": (lambda: mine(outputs={"y": 1}), "outputs must be a list"),
     "input is a boolean": (lambda: mine(inputs={"V": True, "I": 0}), "inputs.V is the boolean"),
     "input name is a boolean": (lambda: mine(inputs={False: 1, "I": 0}), "boolean false as a name"),
+    "half of a call, which a comma ended": (
+        lambda: mine(parameters={"k": "max(t", "1)": None}), "quote what has a comma"),
     "parameters is text": (lambda: mine(parameters="R"), "parameters must map names"),
     "parameter is reserved": (lambda: mine(parameters={"exp": 1}), "exp, which is reserved"),
     "parameter is a keyword": (lambda: mine(parameters={"lambda": 1}), "write lambda_"),

@@ -224,9 +224,11 @@ def _name(plant: str, key: str, value: object) -> str:
             f"({_YAML_BOOLEAN})"
         )
     if not (isinstance(value, str) and value.isascii() and value.isidentifier()):
+        half = isinstance(value, str) and value.endswith(")")  # of max(y, 1)
         raise ConfigError(
             f"{plant}: {key} has the name {brief(value)}; a name is made of the letters "
             "a-z, A-Z, digits and _, and starts with no digit"
+            + "; within braces, quote what has a comma" * half
         )
     if value in RESERVED:
         raise ConfigError(
