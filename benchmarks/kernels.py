@@ -32,12 +32,13 @@ def twins() -> dict[str, tuple[Any, Any, str]]:
         numpy = import_module(f"gpebo_cli.kernels.{subject}_numpy")
         bound = getattr(kernels, subject)
         for name in import_module(f"gpebo_cli.kernels.{subject}_compiled").__dict__:
-            if not name.startswith("_") and name in vars(numpy) and name not in _NOT_KERNELS:
+            function = name.islower() or name.isupper()  # no type
+            if function and name[0] != "_" and name in vars(numpy) and name not in _NOT_KERNELS:
                 found[f"{subject}.{name}"] = bound, numpy, name
     return found
 
 
-_NOT_KERNELS = {"np", "annotations", "Array", "IntArray", "BoolArray", "Callable"}
+_NOT_KERNELS = {"np", "annotations"}
 
 
 @contextmanager
