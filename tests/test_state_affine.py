@@ -275,6 +275,12 @@ def test_windows_that_shrink_towards_a_time_are_refused_early(half, slows):
         _refuse_slow(lorenz(), time, spent, 90.0)
 
 
+def test_a_pole_of_time_is_named_before_windows_shrink_towards_it():
+    plant = lorenz(A=[[-10, 10, 0], [0, "-tan(t)", "-y"], [0, "y", "-8/3"]])
+    with pytest.raises(ConfigError, match=r"A\[1\]\[1\] .* beyond all numbers near t = 1\.5708;"):
+        simulate(plant, TimeSettings(horizon=3.0), SOLVER)
+
+
 def test_division_by_an_output_that_crosses_zero_names_the_entry():
     """x = (cos t + sin t + e^−t)/2 crosses zero; another state divides by it."""
     system = plant_from_mapping({

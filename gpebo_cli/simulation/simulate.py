@@ -56,8 +56,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         if simulation.lost is not None:
             raise nothing_left(f"plant {system.name}", simulation.lost)
         return simulation
-    # Windows would try a table that is too short up to its end.
-    system.coefficients.breakpoints(time.start, time.start + time.horizon)
+    first_mesh(system, time, solver)  # windows would try a pole, or the end of a table, up to it
     last: list[Simulation] = []
 
     def solve_linear(
