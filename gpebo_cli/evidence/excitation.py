@@ -198,11 +198,10 @@ def _first_time(
     left = int(np.argmax(at_ends)) + 1  # elements up to the first at whose end it is reached
     for part in parts:
         mesh, gram, rule = part.mesh, part.values[:left], part.mesh.rule
-        points, shares = mesh.points[:left], np.tile(rule.points, len(gram))
-        ends = gram[:, -1].repeat(len(rule.points), axis=0)
+        points, element = mesh.points[:left], np.arange(len(gram)).repeat(len(rule.points))
         there, _ = reached(
             points.ravel(), gram.reshape(points.size, *gram.shape[2:]),
-            interpolation_error(ends, shares, rule.stages),
+            interpolation_error(part, element, np.tile(rule.points, len(gram))),
         )
         there = there.reshape(points.shape)
         left -= mesh.size
@@ -216,9 +215,8 @@ def _first_time(
     (start, stop), length = span, float(mesh.steps[k])
 
     def looked(at: Array) -> tuple[BoolArray, BoolArray]:
-        share = (at - mesh.edges[k]) / length
-        end = np.broadcast_to(piece.final, (len(at), *piece.final.shape))
-        return reached(at, piece(at), interpolation_error(end, share, rule.stages))
+        share, alone = (at - mesh.edges[k]) / length, np.zeros(len(at), dtype=np.intp)
+        return reached(at, piece(at), interpolation_error(piece, alone, share))
 
     if mesh.edges[k] == start:  # at once is what is reached as soon as rounding lets one know
         found, known = looked(start + length * _SOON)

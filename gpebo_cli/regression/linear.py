@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.linalg import largest, triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -147,7 +147,7 @@ class LinearRegression:
                 sampler = mesh.sampler(t[some])
                 found[some], k = sampler(part.values), sampler.element
                 share = (t[some] - mesh.edges[k]) / mesh.steps[k]
-                rounding[some] = interpolation_error(part.values[k, -1], share, mesh.rule.stages)
+                rounding[some] = interpolation_error(part, k, share)
         return found, rounding
 
     @cached_property
@@ -222,14 +222,15 @@ class LinearRegression:
         )
 
 
-def interpolation_error(end: Array, share: Array, stages: int) -> Array:
-    """Rounding (M, p) of the diagonal of G, interpolated to a share (M,) of elements.
+def interpolation_error(gram: Trajectory, element: IntArray, share: Array) -> Array:
+    """Rounding (M, p) of the diagonal of G (p, p + c), at a share (M,) of some elements (M,).
 
-    Of G (M, p, p + c) at the right ends of these: ∑|l_j(s)| ≤ 1.4 stages² s for all nodes but the
-    first, and values at nodes are good to some units in the last place of the right end's.
+    ∑|l_j(s)| ≤ 1.4 stages² s for all nodes but the first, and values at nodes are good to some
+    units in the last place of the right end's.
     """
-    energy = np.einsum("mjj->mj", end[..., : end.shape[1]])
-    return np.asarray(_ROUNDING * stages**2 * share[:, None] * np.abs(energy))
+    ends = gram.values[:, -1, :, : gram.values.shape[2]]
+    level = _ROUNDING * gram.mesh.rule.stages**2 * share
+    return np.asarray(level[:, None] * np.abs(np.einsum("kjj->kj", ends))[element])
 
 
 def least_squares(root: Array) -> Array:
