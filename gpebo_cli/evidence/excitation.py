@@ -153,16 +153,17 @@ def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float |
     told = smallest[smallest >= level]
     enough = min(WELL, 0.5 * float(told.max(initial=0.0))) if rho is None else 1.0
 
-    def reached(at: Array, matrices: Array, rounding: Array) -> tuple[BoolArray, BoolArray]:
+    def judged(smallest: Array, level: Array) -> tuple[BoolArray, BoolArray]:
         """Where ψ is exciting, and where rounding lets one know whether it is."""
-        smallest, level = seen(at, matrices, rounding)
         there = smallest >= np.maximum(enough, level)
         return there, there | (level <= enough)
 
     if not enough:
         return None
-    at_ends = smallest >= np.maximum(enough, level)
-    return _first_time(regression.gram_parts(), regression.mesh.span, at_ends, reached)
+    return _first_time(
+        regression.gram_parts(), regression.mesh.span, judged(smallest, level)[0],
+        lambda at, matrices, rounding: judged(*seen(at, matrices, rounding)),
+    )
 
 
 def estimable(

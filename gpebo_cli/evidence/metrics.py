@@ -86,7 +86,7 @@ def measure_squares(
 
 
 def _norms_settled(t: Array, squares: Sequence[Array], last: Array | None) -> Array:
-    """:func:`settling_time` (2, G) of two norms in units of sizes, from their squares (G, M) each.
+    """:func:`settling_times` (2, G) of two norms in units of sizes, from their squares (G, M) each.
 
     As in :func:`levels`, a norm that starts at rounding is to stay below 1 % of one.
     """
@@ -107,30 +107,21 @@ def levels(first: Array, size: Array) -> Array:
 
 
 def settling_times(t: Array, error: Array, level: Array) -> Array:
-    """:func:`settling_time` of each of c errors (g, M, c) against levels (g, c), shape (g, c).
+    """Times (g, c) after which errors (g, M, c) stay below their levels (g, c).
 
-    NaN where the last error or the level is not known.
+    NaN if that is never reached, or the last error or the level is not known; 0 if the error is
+    below it from the start. They count from the first of the times t (M,). Between two of them the
+    logarithm of the error is taken as linear, which is exact where it decays exponentially.
     """
-    absolute = np.abs(np.moveaxis(error, 2, 1))  # (g, c, M)
-    out = settling_time(t, absolute.reshape(-1, len(t)), level=level.ravel()).reshape(level.shape)
-    return np.where(np.isnan(absolute[..., -1] + level), np.nan, out)
-
-
-def settling_time(t: Array, error: Array, level: Array | None = None) -> Array:
-    """Time (g,) after which a nonnegative error (g, M) stays below 1 % of its initial value.
-
-    Or below a ``level`` (g,); NaN if that is never reached, 0 if the error is zero from the start.
-    It counts from the first of the times t (M,). Between two of them the logarithm of the error is
-    taken as linear, which is exact where it decays exponentially.
-    """
-    level = SETTLED * error[:, 0] if level is None else level
-    return np.asarray(_settled(t, [error], level[None])[0])
+    absolute = np.abs(np.moveaxis(error, 2, 0))  # (c, g, M)
+    out = _settled(t, absolute, level.T).T
+    return np.where(np.isnan(error[:, -1] + level), np.nan, out)
 
 
 def _settled(
-    t: Array, errors: Sequence[Array], level: Array, last: Array | None = None
+    t: Array, errors: Sequence[Array] | Array, level: Array, last: Array | None = None
 ) -> Array:
-    """:func:`settling_time` (c, g) of c errors (g, M) each below levels (c, g).
+    """:func:`settling_times` (c, g) of c sizes of errors (g, M) each below levels (c, g).
 
     ``last`` (c, g) are indices of the last times at which they are above, −1 for none; None: they
     are not known.
@@ -139,17 +130,18 @@ def _settled(
         last = np.array([
             last_above(error[:, :, None], own[:, None, None])[:, 0]
             for error, own in zip(errors, level, strict=True)
-        ])
+        ]).reshape(level.shape)
     rows, k = np.arange(level.shape[1]), np.clip(last, 0, max(len(t) - 2, 0)).astype(np.intp)
     before, after = (
-        np.array([error[rows, place] for error, place in zip(errors, at, strict=True)])
-        for at in (k, np.minimum(k + 1, len(t) - 1))
+        np.array([error[rows, at] for error, at in zip(errors, places, strict=True)])
+        .reshape(level.shape)
+        for places in (k, np.minimum(k + 1, len(t) - 1))
     )
     return settled(t, last, before, after, level)
 
 
 def settled(t: Array, last: Array, before: Array, after: Array, level: Array) -> Array:
-    """:func:`settling_time` (...) where it is known when an error is above its level last.
+    """:func:`settling_times` (...) where it is known when an error is above its level last.
 
     ``last`` is the index of that time among t (M,), −1 where there is none, ``before`` and
     ``after`` are the error there and at the next time, ``level`` is that of the error.

@@ -118,14 +118,11 @@ def evaluation(
     offset_kept, gain_kept = offset[chosen], np.swapaxes(gain[chosen], 1, 2)
 
     def errors(eta: Array, at: IntArray) -> Array:
-        """Of η̂ and x̂ (2, g, p + n) at two times for each quantity of each case, indices ``at``."""
-        place = len(grid) * np.arange(len(eta))[:, None] + at  # in all cases, one after the other
-        j, m, i = np.arange(p), at[..., p:], np.arange(at.shape[2] - p)
-        of_eta = eta.ravel().take(place[..., :p] * p + j) - truth[at[..., :p], j]
-        flat = eta.reshape(eta.shape[0] * eta.shape[1], p)  # spelled out: p may be 0
-        gains = gain.reshape(len(gain) * len(i), p).take(m * len(i) + i, axis=0)
-        seen = np.einsum("tgip,tgip->tgi", gains, flat.take(place[..., p:], axis=0))
-        return np.concatenate([of_eta, offset[m, i] + seen - x[m, i]], axis=2)
+        """Of η̂ and x̂ (g, p + n) at a time for each quantity of each case, indices ``at``."""
+        case, k, m = np.arange(len(eta))[:, None], at[:, :p], at[:, p:]
+        j, i = np.arange(p), np.arange(x.shape[1])
+        seen = offset[m, i] + np.einsum("gip,gip->gi", gain[m, i], eta[case, m])
+        return np.concatenate([eta[case, k, j] - truth[k, j], seen - x[m, i]], axis=1)
 
     def errors_at(eta: Array, k: int) -> list[Array]:
         """Of η̂ (g, p) and x̂ (g, n) at one time."""
@@ -146,8 +143,8 @@ def evaluation(
         numbers = measure_squares(grid, squares, of_eta, of_x, judged, of_norms)
         if level is not None:
             k = np.clip(last, 0, max(len(grid) - 2, 0)).astype(np.intp)
-            before, after = np.abs(errors(eta, np.array([k, np.minimum(k + 1, len(grid) - 1)])))
-            times = settled(grid, last, before, after, level)
+            before, after = errors(eta, k), errors(eta, np.minimum(k + 1, len(grid) - 1))
+            times = settled(grid, last, np.abs(before), np.abs(after), level)
             times[np.isnan(np.hstack([of_eta, of_x]))] = np.nan
             times[:, :p][:, ~judged] = np.nan
             numbers = np.concatenate([numbers, times.T])

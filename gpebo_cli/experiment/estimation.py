@@ -259,12 +259,11 @@ def at_samples(
             return online, joined(made)
 
         online, made = estimated(None)
-        by, columns = online, made.known.independent
+        columns = made.known.independent
         if 0 < len(columns) < len(online.parameters) and not online.fits:
             # As many numbers in its settings as parameters: all are estimated.
             with suppress(ConfigError):
-                by, few = estimated(columns)
-                made = made.with_some(few, columns)
+                online, made = estimated(columns)
         truth = online.truth(made.extension)(t, source.theta(t), source.states)
         x = source.states(t)
         parameters = made.parameters * accuracy.told(made.known.parameters[-1])
@@ -274,21 +273,19 @@ def at_samples(
             t, parameters - truth, states - x, sizes, accuracy.judged_of(source, truth.shape[1])
         ), online.parameters, system)
     chosen = kept_samples(1, len(t), settings.time.samples)
-    kept = chosen[kept_samples(len(by.cases), len(chosen), settings.output.max_rows)]
-    still = doubts.still(parameters, by.requirement, online.natural_sizes)
+    kept = chosen[kept_samples(len(online.cases), len(chosen), settings.output.max_rows)]
+    still = doubts.still(parameters, online.requirement, online.natural_sizes)
     told = np.concatenate([parameters, states], axis=2)[:, kept]
     std, gains, why = made.at(kept, ~np.isnan(told), still)
     if settings.uncertainty and parameters.size and std is None:
-        why = why or none_at_samples(len(by.cases))
+        why = why or none_at_samples(len(online.cases))
     estimation = EstimationResult(
-        cases=by.cases, t=t[kept], names=online.parameters, parameters=parameters[:, kept],
+        cases=online.cases, t=t[kept], names=online.parameters, parameters=parameters[:, kept],
         true_parameters=truth[kept], states=states[:, kept],
         delta=None if made.delta is None else made.delta[:, kept],
-        checks={}, requirement=by.requirement, still=still,
+        checks={}, requirement=online.requirement, still=still,
         doubts=online.doubts(
-            made.parameters[:, -1],
-            np.append(sizes[0], np.where(np.isnan(sizes[1]), online.largest, sizes[1])),
-            columns, by.requirement,
+            np.append(sizes[0], np.where(np.isnan(sizes[1]), online.largest, sizes[1])), columns
         ),
     ).with_deviations(std)
     with stage("excitation"):
@@ -307,7 +304,7 @@ def at_samples(
         ),
         excitation, estimation,
         accuracy.standing(estimation, metrics, gains, system) if noisy else metrics,
-        by.fit() if source.recording else None,
+        online.fit() if source.recording else None,
         times, [name for name, since in times.items() if since is None],
         note=online.note + (_no_deviations(why) if noisy else _held(samples, metrics)),
     )

@@ -64,22 +64,6 @@ class OnlineEstimates:
         gain = np.broadcast_to(gain, (len(std), *gain.shape[-3:]))
         return None if why and not told.any() else std, gain, why
 
-    def with_some(self, few: OnlineEstimates, columns: IntArray) -> OnlineEstimates:
-        """The same with the estimates of some of the parameters (k,), the others being zero."""
-        wide = np.zeros_like(self.parameters)
-        wide[..., columns] = few.parameters
-        std, gain = few.std, few.gain
-        if std is not None and gain is not None:
-            k, p = len(columns), wide.shape[2]
-            std = np.zeros((*std.shape[:2], p + std.shape[2] - k))
-            std[..., [*columns, *range(p, std.shape[2])]] = few.std
-            gain = np.zeros((*gain.shape[:-1], p))
-            gain[..., columns] = few.gain
-        return replace(
-            self, parameters=wide, states=few.states, delta=few.delta, std=std, level=few.level,
-            gain=gain, by_noise=few.by_noise,
-        )
-
 
 def joined(parts: Sequence[OnlineEstimates]) -> OnlineEstimates:
     """What consecutive samples gave, as if they had come at once."""
@@ -124,12 +108,12 @@ class Online:
         if estimator is None:
             estimator = estimators.build(settings.estimator)
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases
-        self._columns, names = columns, self._observer.parameters
-        self.parameters = names if columns is None else tuple(names[j] for j in columns)
+        self.parameters = self._observer.parameters
+        self._columns = np.arange(len(self.parameters)) if columns is None else columns
         self._recursion = estimators.able(
             estimator, estimators.Recursive,
             "observer.sample_time and streams need an estimator that works at samples",
-        ).recursive(self.parameters)
+        ).recursive(tuple(self.parameters[j] for j in self._columns))
         self._gram = InformationRoot(len(self.parameters), np.zeros(1))
         self._tol = max(settings.solver.tol, TOLERANCE)
         self._rho = settings.excitation.rho
@@ -151,13 +135,16 @@ class Online:
         """Take the samples u (K, m) and y (K, r) at the times t (K,), after all earlier ones."""
         self._state, block = self._observer.advance(self._state, t, u, y)
         self.fits = block.fit is not None
-        if self._columns is not None:
-            block = block.about(self._columns)
-        made = self._recursion.update(block.regression)
-        roots, _ = self._gram.update(block.regression)
-        self.root, self.count = roots[-1, 0], self.count + len(t)
-        p = len(self.parameters)
-        S = roots[:, 0, :p, :p]
+        columns, p = self._columns, len(self.parameters)
+        rows = block.regression.rows[..., [*columns, p]]
+        some = replace(block.regression, rows=rows)
+        made = self._recursion.update(some)
+        eta = np.zeros((*made.parameters.shape[:2], p))
+        eta[..., columns] = made.parameters
+        whole, _ = self._gram.update(block.regression)
+        roots = whole[:, 0]
+        self.root, self.count = roots[-1], self.count + len(t)
+        S = roots[:, :p, :p]
         sigma: Array = np.linalg.svd(S, compute_uv=False).astype(np.float64)
         known = knowledge_of_roots(S, block.scale, t - self.start, self._tol)
         smallest = sigma.min(axis=1, initial=np.inf) ** 2
@@ -169,29 +156,33 @@ class Online:
             if self._t_c[k] is None and holds.any():
                 self._t_c[k] = float(t[np.argmax(holds)])
         gain = block.gain
-        states = block.offset + np.einsum("knp,gkp->gkn", gain, made.parameters)
+        states = block.offset + np.einsum("knp,gkp->gkn", gain, eta)
         if block.fit is not None:
-            states, gain = block.fit(made.parameters, transpose(S) @ S)
+            states, gain = block.fit(eta, transpose(S) @ S)
         std, level, by_noise = None, None, None
         if self._deviations is not None and block.errors is not None and made.errors is not None:
-            std, level = self._deviations.update(
-                block.errors, made.errors(), block.regression, gain, roots[:, 0]
+            own = roots
+            if len(columns) < p:
+                own = np.asarray(np.linalg.qr(roots[..., [*columns, p]], mode="r"))
+            found, level = self._deviations.update(
+                block.errors, made.errors(), some, gain[..., columns], own
             )
             by_noise = doubted.moved_by_noise(
-                std * level[:, None], made.parameters, roots[:, 0], made.met
+                found * level[:, None], made.parameters, own, made.met
             )
+            std = np.zeros((*eta.shape[:2], p + gain.shape[-2]))
+            std[..., [*columns, *range(p, std.shape[2])]] = found
         eigenvalues = sigma[:, ::-1] ** 2
         seen = known.states(gain if gain.ndim == 3 else gain[0], block.units)
         self._last = block.offset[-1], block.gain[-1], block.fit
         if block.fit is None:
-            root = roots[-1, 0]
-            h = root[:, :p].T @ root[:, p]
+            h = self.root[:, :p].T @ self.root[:, p]
             seen &= known.resolved(h, block.offset, gain, self.growth)
-        self._final, self._seen = made.parameters[:, -1].copy(), seen[-1].copy()
+        self._final, self._seen = eta[:, -1].copy(), seen[-1].copy()
         self.largest = np.fmax(self.largest, np.abs(states).max(axis=(0, 1)))
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]
         return OnlineEstimates(
-            block.regression, made.parameters, states, made.delta, eigenvalues, known, seen,
+            block.regression, eta, states, made.delta, eigenvalues, known, seen,
             block.extension, std, level, None if std is None else gain, by_noise,
         )
 
@@ -267,20 +258,18 @@ class Online:
         ))
 
     def doubts(
-        self, final: Array | None = None, sizes: Array | None = None,
-        columns: IntArray | None = None, requirement: Requirement | None = None,
+        self, sizes: Array | None = None, columns: IntArray | None = None
     ) -> tuple[Mapping[str, float], tuple[str, ...]]:
-        """How far ``final`` estimates (G, p) may be off, and warnings of that; None: the newest.
+        """How far the newest estimates may be off beside ``sizes`` (p + n,), and warnings of that.
 
-        They are about some ``columns`` (k,), with the ``requirement`` that those have.
+        They are compared with least squares about some ``columns`` (k,).
         """
         _, known, _ = self._newest
         return doubted.of_estimates(
-            self.root, self._final if final is None else final, self.last_states, self.last_states,
+            self.root, self._final, self.last_states, self.last_states,
             [*self.parameters, *self._system.states],
             np.append(self.natural_sizes, self.largest) if sizes is None else sizes,
-            known, self._seen, known.independent if columns is None else columns,
-            requirement or self.requirement,
+            known, self._seen, known.independent if columns is None else columns, self.requirement,
         )
 
     def fit(self) -> Fit:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -18,7 +18,6 @@ from gpebo_cli.model.descriptor import (
     Array,
     BoolArray,
     DescriptorSystem,
-    IntArray,
     differential_order,
 )
 from gpebo_cli.model.expressions import aside
@@ -298,15 +297,6 @@ class SampledBlock:
     errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset
     units: Array | None = None  # (n,) as of ``AffineStateMap``
     fit: Fit | None = None  # where the state is not affine in η: instead of offset and gain
-
-    def about(self, columns: IntArray) -> SampledBlock:
-        """The same about some of the parameters (k,), the others being zero."""
-        whole = self.regression
-        rows = whole.rows[..., [*columns, whole.p]]
-        return replace(
-            self, regression=replace(whole, rows=rows), gain=self.gain[..., columns],
-            scale=self.scale[:, columns],
-        )
 
 
 class Observer(Protocol):
