@@ -115,6 +115,9 @@ def solve(
     if errors.lost == mesh.size and errors.estimate > _AMPLIFIED * tol:
         other = _rounded_otherwise(problem, mesh, values, restarts or {})
         errors = errors._replace(largest=np.maximum(errors.largest, other))
+    if problem.missed is not None:
+        shown = CHANCE * problem.missed(mesh, values)
+        errors = errors._replace(largest=np.maximum(errors.largest, shown))
     if left > _COARSE:
         errors = errors._replace(largest=np.maximum(errors.largest, left * errors.own))
     return LinearSolution(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import Mesh
 
 
 class Constraints(NamedTuple):
@@ -52,6 +53,9 @@ class LinearProblem:
     floor: float | Array = 0.0
     # (n, n + 1) by how much relative rounding of the components, and of 1, reaches each component
     amplification: Array | None = None
+    # By how much values (K, s + 1, n, columns) on a mesh miss the constraints, (n, columns): the
+    # rounding that they are seen to have; None: nothing is looked at.
+    missed: Callable[[Mesh, Array], Array] | None = None
     # An equivalent value at every edge to continue with, in place of the limit from the left (n,
     # columns): a basis whose columns grow is changed. What errors do is then not known.
     renewal: Callable[[Array], Array] | None = None

@@ -103,6 +103,23 @@ def strangeness_free_form(
     )
 
 
+def shown_rounding(
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array, x: Array
+) -> Array:
+    """By how much states x (N, n, 1) at times t (N,) miss the constraints, at most, (n, 1).
+
+    How rounding of one stage shows in the next depends on how fast the states move, and no bound
+    tells it closely. It is seen instead: the equations, multiplied by factors, keep their
+    solutions, and what they say of these ones is different rounding.
+    """
+    c = system.coefficients.taylor(t, structure.mu, inside)
+    factors = np.random.default_rng(0).uniform(1.0, 1.1, (len(t), system.n, 1))
+    E, A, f = c.E * factors, c.A * factors, forcing(c)[..., None] * factors
+    found, units = reduced(system, structure, E, A, f, t, 1), structure.scaling.columns[:, None]
+    missed = found.inverse[:, :, structure.d :] @ (found.A2 @ (x / units) + found.f2)
+    return np.asarray((units * np.abs(missed)).max(axis=0))
+
+
 class Reduced(NamedTuple):
     """0 = Â2 x + f2 in scaled rows and states, and what completes it, at N times."""
 

@@ -19,7 +19,12 @@ from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.refinement import RoundingError
 from gpebo_cli.reduction.consistency import Jump, consistent_state, jumps
-from gpebo_cli.reduction.strangeness_free import StrangenessFree, direct_part, strangeness_free_form
+from gpebo_cli.reduction.strangeness_free import (
+    StrangenessFree,
+    direct_part,
+    shown_rounding,
+    strangeness_free_form,
+)
 from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
@@ -152,11 +157,16 @@ def _solved(
     floor = SHARE * np.abs(system.initial_state)
     if first.basis is not None:
         floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
+    def missed(mesh: Mesh, values: Array) -> Array:
+        some = slice(None, None, -(-mesh.size // _LOOKED_AT))
+        at = mesh.points[some, -1], mesh.inside[some, -1]
+        return shown_rounding(system, structure, *at, values[some, -1])
+
     units = structure.scaling.columns[:, None]
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
         _amplification(first, structure.scaling.columns, float(mesh.steps.max())),
-        units=units,
+        units=units, missed=missed if structure.stages else None,
     )
     if independent:
         problem = replace(problem, coefficients=explicit)
