@@ -21,32 +21,30 @@ f_a and f_b are B u; only the known functions c1, c2 are differentiated.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.integrate import trapezoid
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import (
-    InitialError,
     Measurements,
     Observation,
     Reconstruction,
     StateMap,
-    initial_extension,
-    log_norm,
     output_scale,
 )
-from gpebo_cli.regression.linear import LinearRegression, outer_products
+from gpebo_cli.observers.reduced.system import reduced_system
+from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.schema import unknown
 from gpebo_cli.settings import SolverSettings
-from gpebo_cli.simulation import ivp
 
 _ZERO = 1e-12  # entries below this share of their matrix are zero
 _SMALL = 1e-9  # nothing is divided by entries below this share
@@ -57,8 +55,7 @@ _FINER = 4  # the observer for z_b runs on elements this many times shorter: ẑ
 class Blocks:
     """The canonical form's blocks at N times, with first derivatives where they are needed."""
 
-    A_a: Array  # (N, n_a, n_a)
-    F_a: Array  # (N, n_a, q)
+    n_a: int
     B: Array  # (N, n, m)
     N: Array  # (N, n_b, n_b)
     C: Array  # (N, r, n)
@@ -94,7 +91,7 @@ def canonical_blocks(system: DescriptorSystem, t: Array, inside: Array) -> Block
             f"plant {system.name}: observer=canonical takes unknown parameters in the equations "
             "of z_a only"
         )
-    return Blocks(A[:, :n_a, :n_a], F[:, :n_a], c.B[0], E[:, n_a:, n_a:], c.C[0], c.C[1])
+    return Blocks(n_a, c.B[0], E[:, n_a:, n_a:], c.C[0], c.C[1])
 
 
 @dataclass(frozen=True)
@@ -120,76 +117,69 @@ class Canonical:
     ) -> Observation:
         """The regression of Proposition 3, and z_b by Proposition 4 where it applies."""
         _refuse_beyond(system)
-        inputs, outputs, mesh = signals.inputs, signals.outputs, signals.mesh
+        mesh = signals.mesh
         blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())
-        scale = output_scale(self.weights, system)
-        n_a, q = blocks.A_a.shape[1], system.q
-        suitable = _outputs_without_zb(system, blocks, n_a)
-        names = tuple(f"e0_{state}" for state in system.states[:n_a])
-        xi_a0 = initial_extension(self.xi_a0, system, names)
-        start = np.concatenate([xi_a0[:, None], np.zeros((n_a, q)), np.eye(n_a)], axis=1)
+        n_a, weights = blocks.n_a, output_scale(self.weights, system) ** 2
+        suitable = _outputs_without_zb(system, blocks)
+        of_za = replace(
+            system, states=system.states[:n_a], initial_state=system.initial_state[:n_a],
+            outputs=tuple(system.outputs[k] for k in suitable),
+            coefficients=_Differential(system, n_a, suitable),
+        )
+        own = Trajectory(mesh, signals.outputs.values[:, :, suitable])
+        found = Plain().observe(reduced_system(
+            of_za, replace(signals, outputs=own, asked=None), solver, form="given",
+            xi_a0=self.xi_a0, weights=weights[suitable].tolist(),
+        ))
+        # The general observer has 0 = C ξ_a − y + …, and the paper's y = …: signs are the paper's.
+        regression = found.regression
+        Y, psi = (Trajectory(x.mesh, -x.values) for x in (regression.Y, regression.psi))
+        zb = _unknown_input_observer(self, system, regression.mesh, signals, n_a)
 
-        def coefficients(t: Array, inside: Array) -> LinearEquation:
-            b = canonical_blocks(system, t, inside)
-            f_a = np.einsum("nij,nj->ni", b.B[:, :n_a], inputs(t, inside))
-            rest = np.zeros((len(t), n_a, n_a))
-            f = np.concatenate([f_a[:, :, None], b.F_a, rest], axis=2)
-            seen = (b.C[:, suitable, :n_a], outputs(t, inside)[:, suitable])
-            return LinearEquation(None, b.A_a, f, seen)
+        def truth(t: Array, theta: Array, states: Trajectory) -> Array:
+            return found.truth(t, theta, Trajectory(states.mesh, states.values[..., :n_a]))
 
-        def regress(values: Array, C: Array, y: Array) -> tuple[Array, Array]:
-            """Y and ψ of Proposition 3 at the points of the mesh."""
-            seen = C @ values  # C_k [ξ_a, ξ_b, Φ_a]
-            psi = seen[..., 1:]
-            psi[..., q:] *= -1.0
-            weight = scale[suitable]  # √w of each output
-            return weight * (y - seen[..., 0]), weight[:, None] * psi
-
-        def monitor(values: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-            Y, psi = regress(values, *extras)
-            products = outer_products(psi, Y)
-            shape = values.shape[:2]
-            # Y may vanish identically (if ξ_a is perfect), so its size is that of its terms.
-            size = 1e-3 * float(np.abs(outputs.values[:, :, suitable]).max(initial=0.0))
-            level = float(np.abs(psi).max(initial=0.0))
-            kinds = [(Y, size), (psi, 0.0), (products[..., :-1], 0.0)]
-            kinds.append((products[..., -1], level * size))
-            return [(signal.reshape(*shape, -1), floor) for signal, floor in kinds]
-
-        problem = LinearProblem(coefficients, start, monitor, f"observer of plant {system.name}")
-        integrate = ivp.solve if solver.name == "ivp" else solve
-        solution = integrate(problem, mesh, tol=solver.tol, max_elements=solver.max_elements)
-        mesh, values = solution.trajectory.mesh, solution.trajectory.values
-        Y, psi = regress(values, *solution.extras)
-        first_states = np.eye(n_a, system.n)
-        xi, xi_b, Phi = values[..., 0], values[..., 1 : 1 + q], values[..., 1 + q :]
-        zb = _unknown_input_observer(self, system, mesh, signals, n_a)
-        return Observation(
-            regression=LinearRegression(
-                Trajectory(mesh, Y), Trajectory(mesh, psi), (*system.unknowns, *names),
-                np.abs(psi).max(axis=(0, 1, 2)),
-            ),
-            state_map=CanonicalStateMap(
-                xi_a=Trajectory(mesh, xi),
-                gain=Trajectory(mesh, np.concatenate([xi_b, -Phi], axis=-1)),
-                zb=zb, n_b=system.n - n_a,
-            ),
-            truth=InitialError(first_states, xi_a0, first_states, solution.trajectory),
-            error_estimate=solution.error_estimate,
+        return replace(
+            found, regression=replace(regression, Y=Y, psi=psi),
+            state_map=CanonicalStateMap(found.state_map, zb=zb, n_a=n_a, n_b=system.n - n_a),
+            truth=truth,
             assumptions=(
                 Assumption(
                     "Assumption 3", "at least one output does not see z_b", True,
-                    {"outputs": ", ".join(system.outputs[k] for k in suitable)},
+                    {"outputs": ", ".join(of_za.outputs)},
                 ),
                 *(zb.assumptions if zb is not None else ()),
             ),
-            growth=float(np.abs(Phi).max(initial=0.0)),
             unseen=system.states[n_a if zb is None else system.n - (zb.third is None) :],
-            growth_rate=log_norm(Phi[-1, -1]) / float(mesh.edges[-1] - mesh.edges[0]),
+            errors=None, respond=None, note="",
         )
 
 
 OBSERVER = Canonical
+
+
+@dataclass(frozen=True, eq=False)
+class _Differential:
+    """The equations of z_a, with some of the outputs, which see nothing else."""
+
+    system: DescriptorSystem
+    n_a: int
+    outputs: list[int]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.system.coefficients, name)
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None  # noqa: ARG002  none counts
+    ) -> Coefficients:
+        """Evaluate them at the times t (N,) (ModelError: the plant is not in canonical form)."""
+        canonical_blocks(self.system, t, t if inside is None else inside)
+        c, own = self.system.coefficients.taylor(t, order, inside), slice(self.n_a)
+        return c._replace(
+            E=c.E[:, :, own, own], A=c.A[:, :, own, own], B=c.B[:, :, own], F=c.F[:, :, own],
+            C=c.C[:, :, self.outputs, own], phi=c.phi[:, :, own], D=c.D[:, :, self.outputs],
+            H=c.H[:, :, self.outputs],
+        )
 
 
 def _refuse_beyond(system: DescriptorSystem) -> None:
@@ -204,7 +194,8 @@ def _refuse_beyond(system: DescriptorSystem) -> None:
         )
 
 
-def _outputs_without_zb(system: DescriptorSystem, blocks: Blocks, n_a: int) -> list[int]:
+def _outputs_without_zb(system: DescriptorSystem, blocks: Blocks) -> list[int]:
+    n_a = blocks.n_a
     in_zb = np.abs(blocks.C[:, :, n_a:]).max(axis=(0, 2), initial=0.0)
     size = np.abs(blocks.C).max(axis=(0, 2), initial=0.0)
     suitable = [k for k in range(system.r) if in_zb[k] <= _ZERO * size[k] and size[k] > 0]
@@ -394,9 +385,9 @@ def transition_decay(M: Trajectory) -> float:
 class CanonicalStateMap(StateMap):
     """ẑ_a = ξ_a + ξ_b θ̂ − Φ_a ê₀, then ẑ_w driven by it, then ẑ_b3 where an output sees it."""
 
-    xi_a: Trajectory  # (n_a,)
-    gain: Trajectory  # (n_a, p)
+    za: StateMap
     zb: UnknownInputObserver | None
+    n_a: int
     n_b: int
 
     @property
@@ -406,11 +397,10 @@ class CanonicalStateMap(StateMap):
 
     def at(self, t: Array) -> Reconstruction:
         """Sample all at the times t (M,) once; each batch of cases is one integration."""
-        sampler = self.xi_a.mesh.sampler(t)
-        xi_a, gain = sampler(self.xi_a.values), sampler(self.gain.values)
+        of_za = self.za.at(t)
 
         def reconstruct(eta: Array) -> Array:
-            za = xi_a + np.matmul(gain, eta[..., None])[..., 0]  # (g, M, n_a)
+            za = of_za(eta)  # (g, M, n_a)
             unseen = np.full((*za.shape[:2], self.n_b), np.nan)
             zb = unseen if self.zb is None else estimate_zb(self.zb, t, za)
             return np.concatenate([za, zb], axis=2)
@@ -421,7 +411,7 @@ class CanonicalStateMap(StateMap):
         """Algebraic z_b1 = −f_b1 and z_b2 = (y_w + c1 f_b1)/c2, (g, M), from x̂ (g, M, n)."""
         if self.zb is None:
             return {}
-        za = states[..., : self.xi_a.values.shape[2]]
+        za = states[..., : self.n_a]
         sampler = self.zb.mesh.sampler(t)
         y_w = sampler(self.zb.y.values) - np.sum(sampler(self.zb.C_a.values) * za, axis=2)
         known = sampler(self.zb.algebraic.values)

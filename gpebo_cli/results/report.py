@@ -56,7 +56,10 @@ def case_table(result: RunResult) -> list[str]:
     gains = list(cases[0])
     shown = dict(list(shown_metrics(rows).items())[:-1])  # the last one is for comparisons
     head = [*gains, *shown.values()]
-    body = [[*(f"{row[g]:g}" for g in gains), *(_cell(n, row) for n in shown)] for row in rows]
+    body = [
+        [*(f"{row[g]:g}" for g in gains), *(_told(n, row, "{:.2e}".format) for n in shown)]
+        for row in rows
+    ]
     lines = columns([head, *body])
     if not few:
         lines.insert(1 + half, f"… {count - 2 * half} more in cases.csv")
@@ -85,17 +88,11 @@ def case_cells(named: Sequence[tuple[str, dict[str, float]]]) -> list[list[str]]
         [
             *([name] if several else []),
             *(number_text(row[gain]) if gain in row else "" for gain in shown),
-            *(_metric(key, row.get(key, math.nan)) for key in known),
+            *(_told(key, row, number_text) for key in known),
         ]
         for name, row in named
     ]
     return [head, *rows]
-
-
-def _metric(name: str, value: float) -> str:
-    if name.startswith("seconds"):
-        return f"{value:.3f} s" if math.isfinite(value) else "never"
-    return number_text(value) if math.isfinite(value) else "unknown"
 
 
 def noise_table(noise: NoiseStatistics) -> list[str]:
@@ -155,15 +152,14 @@ def columns(
     return ["  ".join(map(aligned, row, widths)) for row in rows]
 
 
-def _cell(name: str, row: Mapping[str, float]) -> str:
-    value = row[name]
-    if math.isnan(row[known_by(name)]):
+def _told(metric: str, row: Mapping[str, float], text: Callable[[float], str]) -> str:
+    """A metric of a case for a person, with the ``text`` of numbers that are no time."""
+    value = row.get(metric, math.nan)
+    if math.isnan(row.get(known_by(metric), math.nan)):
         return "unknown"
-    if name == SETTLED:
-        return f"after {value:.3f} s"
-    if name.startswith("seconds"):
-        return f"{value:.3f} s" if math.isfinite(value) else "never"
-    return f"{value:.2e}"
+    if not metric.startswith("seconds"):
+        return text(value)
+    return f"{'after ' * (metric == SETTLED)}{value:.3f} s" if math.isfinite(value) else "never"
 
 
 def run_lines(result: RunResult, folder: str = "") -> list[str]:

@@ -334,8 +334,7 @@ def _fill(axes: Axes, panel: Panel, height: float) -> None:
     if panel.vertical is not None:
         time, label = panel.vertical
         axes.axvline(time, label=label.replace("t_c", "$t_c$"), **INSTANT.keywords)
-    power = _set_ticks(axes.yaxis, 5, log=panel.log)
-    unit = " ".join(filter(None, (power, escaped(panel.unit))))
+    unit = _set_ticks(axes.yaxis, 5, panel.unit, log=panel.log)
     _set_name(axes, panel.text or escaped(panel.name), unit, height)
 
 
@@ -355,11 +354,10 @@ def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
         dots = any(curve.style.dots for panel in panels for curve in panel.curves)
         margin = 0.02 * (high - low) if dots else 0.0  # half a dot at either end would be cut
         axes.set_xlim(low - margin, high + margin)
-    power = _set_ticks(axes.xaxis, 7, log=axis.log)
+    unit = _set_ticks(axes.xaxis, 7, axis.unit, log=axis.log)
     if axis.log and np.ceil(np.log10(low)) + 1 > np.floor(np.log10(high) + 1e-9):
         # There are less than two whole decades to label: the ends are.
         axes.set_xticks([low, high], [number_text(low), number_text(high)])
-    unit = " ".join(filter(None, (power, escaped(axis.unit))))
     axes.set_xlabel(with_unit(axis.text or escaped(axis.label), unit))
 
 
@@ -395,8 +393,8 @@ def _log_limits(panel: Panel) -> tuple[float, float]:
     return 10.0 ** (first - room), 10.0 ** (last + room)
 
 
-def _set_ticks(axis: Any, most: int, *, log: bool) -> str:
-    """At most ``most`` + 1 ticks; the power of ten that their labels leave out."""
+def _set_ticks(axis: Any, most: int, unit: str, *, log: bool) -> str:
+    """At most ``most`` + 1 ticks; the unit with the power of ten that their labels leave out."""
     from matplotlib.ticker import MaxNLocator
 
     ends = axis.get_view_interval()
@@ -407,18 +405,18 @@ def _set_ticks(axis: Any, most: int, *, log: bool) -> str:
         # A text with superscripts: setting a formula takes twenty times as long.
         axis.set_ticks([10.0**k for k in exponents], [power_of_ten(k) for k in exponents])
         axis.set_ticks([], minor=True)
-        return ""
+        return escaped(unit)
     ticks = MaxNLocator(most, steps=[1, 2, 5, 10]).tick_values(*ends)
     ticks = ticks[(ticks >= ends[0]) & (ticks <= ends[1])]
     exponent = math.floor(math.log10(np.abs(ends).max()))
     if -3 < exponent < 4:
         exponent = 0
-    unit = 10.0**exponent
-    apart = float(np.diff(ticks).min(initial=np.inf) / unit)
+    size = 10.0**exponent
+    apart = float(np.diff(ticks).min(initial=np.inf) / size)
     decimals = max(0, -math.floor(math.log10(apart) + 1e-9)) if math.isfinite(apart) else 1
-    labels = [f"{tick / unit + 0.0:.{decimals}f}".replace("-", "−") for tick in ticks]
+    labels = [f"{tick / size + 0.0:.{decimals}f}".replace("-", "−") for tick in ticks]
     axis.set_ticks(ticks, labels)
-    return power_of_ten(exponent) if exponent else ""
+    return " ".join(filter(None, (power_of_ten(exponent) if exponent else "", escaped(unit))))
 
 
 def _only_mark_ticks(axes: Axes) -> None:

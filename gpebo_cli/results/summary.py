@@ -162,20 +162,20 @@ def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
     nothing = np.full(len(result.system.states), np.nan)
     last = signals.states[-1] if len(signals.states) else nothing
     kinds = (
-        (result.system.states, estimation.states, estimation.states_std, last),
         (estimation.names, estimation.parameters, estimation.parameters_std,
          estimation.true_parameters[-1]),
+        (result.system.states, estimation.states, estimation.states_std, last),
     )
-    out = {}
+    out: dict[str, dict[str, Any]] = {}
     for names, values, deviations, truth in kinds:
         for i, name in enumerate(names):
-            out[name] = {
+            out.setdefault(name, {
                 "value": values[case, -1, i],
                 "std": None if deviations is None else deviations[case, -1, i],
                 "unit": units.get(name.removeprefix("e0_")),
                 "true": truth[i],
-            }
-    return {name: out[name] for name in (*estimation.names, *result.system.states)}
+            })
+    return out
 
 
 def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:

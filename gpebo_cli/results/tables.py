@@ -86,38 +86,35 @@ def _estimates(result: RunResult) -> Table | None:
     ``<parameter>_true`` of what varies; of what does not, ``summary.json`` has the value. Columns
     of states that the observer does not see are empty.
     """
-    estimation = result.estimation
-    if estimation is None:
+    e = result.estimation
+    if e is None:
         return None
-    names = (*estimation.names, *result.system.states)
-    header = ["case", "t", *(f"{name}_hat" for name in names)]
-    if estimation.delta is not None:
-        header.append("delta")
-    if estimation.parameters_std is not None:
-        header += [f"{name}_std" for name in names]
-    header += [*estimation.checks, *(f"{name}_true" for name, _ in _varying_truth(estimation))]
-    cases, at_once = len(estimation.cases), max(1, _CHUNK_ROWS // max(len(estimation.t), 1))
-    return Table(header, (
-        _rows_of_cases(estimation, slice(first, first + at_once))
-        for first in range(0, cases, at_once)
-    ))
+    # Names, and values of every case (G, M, c), or the same of all.
+    kinds: list[tuple[Iterable[str], Array]] = [
+        (["case"], np.arange(len(e.parameters), dtype=float)[:, None, None]),
+        (["t"], e.t[None, :, None]),
+    ]
+    states, delta = result.system.states, e.delta
+    for suffix, of_eta, of_x in (
+        ("hat", e.parameters, e.states), ("std", e.parameters_std, e.states_std)
+    ):
+        if of_eta is not None and of_x is not None:
+            kinds.append(([f"{name}_{suffix}" for name in e.names], of_eta))
+            kinds.append(([f"{name}_{suffix}" for name in states], of_x))
+        if suffix == "hat" and delta is not None:
+            kinds.append((["delta"], delta[..., None]))
+    kinds += [([name], check[..., None]) for name, check in e.checks.items()]
+    kinds += [([f"{name}_true"], truth[None, :, None]) for name, truth in _varying_truth(e)]
+    cases, at_once = len(e.cases), max(1, _CHUNK_ROWS // max(len(e.t), 1))
 
+    def rows(part: slice) -> Array:
+        wide = [np.broadcast_to(x, (cases, len(e.t), x.shape[2]))[part] for _, x in kinds]
+        return np.concatenate(wide, axis=2).reshape(-1, sum(x.shape[2] for x in wide))
 
-def _rows_of_cases(estimation: EstimationResult, cases: slice) -> Array:
-    """The rows (g M, columns) of some cases."""
-    numbers = np.arange(len(estimation.parameters))[cases]
-    columns = [estimation.parameters[cases], estimation.states[cases]]
-    if estimation.delta is not None:
-        own = len(estimation.delta) > 1
-        columns.append(estimation.delta[cases if own else slice(None)][..., None])
-    if estimation.parameters_std is not None and estimation.states_std is not None:
-        columns += [estimation.parameters_std[cases], estimation.states_std[cases]]
-    columns += [check[cases][..., None] for check in estimation.checks.values()]
-    columns += [values[:, None] for _, values in _varying_truth(estimation)]
-    columns = [numbers[:, None, None].astype(float), estimation.t[:, None], *columns]
-    shape = columns[2].shape[:2]
-    wide = [np.broadcast_to(c, (*shape, c.shape[-1])) for c in columns]
-    return np.concatenate(wide, axis=2).reshape(shape[0] * shape[1], -1)
+    return Table(
+        [name for names, _ in kinds for name in names],
+        (rows(slice(first, first + at_once)) for first in range(0, cases, at_once)),
+    )
 
 
 def check_parquet() -> None:
