@@ -140,26 +140,6 @@ def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
     return out
 
 
-def largest(extended: Array) -> float:
-    """‖Ω‖₂ of [Ω | 𝒴] (..., p, p + c), the largest of all.
-
-    Singular values are computed only of matrices whose Frobenius norm leaves room for a larger one
-    than that of the matrix with the largest Frobenius norm.
-    """
-    p = extended.shape[-2]
-    flat = extended[..., :p].reshape(-1, p, p) if extended.size else np.zeros((0, p, p))
-    size = float(np.abs(flat).max(initial=0.0))
-    if size == 0.0 or not np.isfinite(size):
-        return size
-    flat = flat / size  # squares neither overflow nor vanish
-    frobenius = np.sqrt(np.einsum("nij,nij->n", flat, flat))
-    norm = float(np.linalg.svd(flat[np.argmax(frobenius)], compute_uv=False)[0])
-    rest = flat[frobenius > norm * (1.0 + 1e-12)]
-    if len(rest) > 1:
-        norm = max(norm, float(np.linalg.svd(rest, compute_uv=False)[:, 0].max()))
-    return norm * size
-
-
 def triangular(pieces: Iterable[Array]) -> Array:
     """R (k, c) with RᵀR = ΣAᵀA of rows A (N, c) that come piece by piece."""
     found: Array | None = None
