@@ -67,10 +67,7 @@ def exact_product(left: Array, right: Array) -> Array:
 def inverse_or_none(whole: Array) -> tuple[Array, BoolArray]:
     """Inverses (N, n, n), and at which of the N there is none."""
     inverse = inverses(whole)
-    finite = np.isfinite(inverse)
-    if finite.all():
-        return inverse, np.zeros(len(inverse), dtype=bool)
-    return inverse, np.asarray(~finite.all(axis=(1, 2)))
+    return inverse, np.asarray(~np.isfinite(inverse).all(axis=(1, 2)))
 
 
 def orthonormal_complement(basis: Array) -> Array:
@@ -142,10 +139,8 @@ def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
 
 def triangular(pieces: Iterable[Array]) -> Array:
     """R (k, c) with RᵀR = ΣAᵀA of rows A (N, c) that come piece by piece."""
-    found: Array | None = None
+    found: Array = np.zeros(0)
     for rows in pieces:
-        whole = rows if found is None else np.concatenate([found, rows])
+        whole = np.concatenate([found.reshape(-1, rows.shape[1]), rows])
         found = np.asarray(np.linalg.qr(whole, mode="r"))
-    if found is None:
-        raise ValueError("there are no rows")
     return found
