@@ -7,7 +7,7 @@ import pytest
 import yaml
 from plants import CONF
 from random_systems import HORIZON, random_system
-from units import drawn, in_units
+from units import Units, drawn, in_units
 
 from gpebo_cli import estimators, run
 from gpebo_cli.evidence.excitation import WELL
@@ -27,7 +27,10 @@ EPS = float(np.finfo(float).eps)
 
 
 def both(name, decades, kept=(), seed=5, **settings):
-    """Details of a run of a plant, of one in other units but for those kept, and the units."""
+    """Details of a run of a plant, of one in other units but for those kept, and the units.
+
+    Settings that have units are functions of them.
+    """
     if isinstance(name, int):
         content, horizon = random_system(name)[0], HORIZON
     else:
@@ -39,8 +42,11 @@ def both(name, decades, kept=(), seed=5, **settings):
     units = units._replace(time=float(units.time))
 
     one, other = (
-        run(made, time={"horizon": horizon * unit, "samples": 101}, **settings).details
-        for made, unit in ((content, 1.0), (in_units(content, units), units.time))
+        run(made, time={"horizon": horizon * float(by.time), "samples": 101}, **{
+            key: value(by) if callable(value) else value for key, value in settings.items()
+        }).details
+        for made, by in ((content, Units(*map(np.ones_like, units))),
+                         (in_units(content, units), units))
     )
     return one, other, units
 
@@ -130,6 +136,23 @@ def test_remedies_are_the_same_in_any_units(remedy, name):
     a, b = (run.estimation.states[0, 50:, told] for run in (one, other))
     away = np.abs(b / units.states[told, None] - a) / size[told, None]
     assert away.max(initial=0.0) <= 1e-8
+
+
+@pytest.mark.parametrize(("name", "states"), [
+    ("window", ["x1", "x2"]), (1, ["x0", "x1"]),
+])
+def test_a_kalman_filter_is_the_same_in_any_units(name, states):
+    """Variances have units, and so has what regularises: a variance times a sample time."""
+    def observer(by):
+        size = dict(zip([*(f"w_{state}" for state in states), "k0", "k1"],
+                        [*by.states[: len(states)], *by.unknowns], strict=False))
+        return {"name": "kalman_bucy", "regularisation": 1e-3 * float(by.time) ** 0.5,
+                "P0": {each: 10.0 * float(unit) ** 2 for each, unit in size.items()}}
+
+    one, other, units = both(name, True, seed=[5, 1], observer=observer)
+    assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+    a, b = (run.estimation.states[0] for run in (one, other))
+    assert (np.abs(b / units.states - a) <= 1e-10 * np.abs(a).max(axis=0)).all()
 
 
 @pytest.mark.parametrize("seed", [102, 123])
