@@ -41,24 +41,28 @@ static inline void add_row(Lane *restrict C, const double *factor, const Lane *r
 
 EVERY_WIDTH void lanes_product(Lane *C, npy_intp c, const Lane *A, npy_intp down, npy_intp right,
                                const Lane *B, npy_intp b, npy_intp rows, npy_intp inner,
-                               npy_intp columns, double sign)
+                               npy_intp columns, How how)
 {
-    for (npy_intp i = 0; i < rows; i++)
+    for (npy_intp i = 0; i < rows; i++) {
+        if (how == SET)
+            lanes_clear(C + i * c, columns);
         for (npy_intp k = 0; k < inner; k++) {
             const double *one = A[i * down + k * right];
             Lane factor;
             if (is_zero(one))
                 continue;
-            EACH factor[l] = sign * one[l];
+            EACH factor[l] = how == SUBTRACT ? -one[l] : one[l];
             add_row(C + i * c, factor, B + k * b, columns);
         }
+    }
 }
 
 EVERY_WIDTH void lanes_from_left(Lane *C, npy_intp c, const double *M, npy_intp down,
                                  npy_intp right, const Lane *A, npy_intp rows, npy_intp inner,
                                  npy_intp columns)
 {
-    for (npy_intp i = 0; i < rows; i++)
+    for (npy_intp i = 0; i < rows; i++) {
+        lanes_clear(C + i * c, columns);
         for (npy_intp k = 0; k < inner; k++) {
             const double m = M[i * down + k * right];
             Lane factor;
@@ -67,11 +71,14 @@ EVERY_WIDTH void lanes_from_left(Lane *C, npy_intp c, const double *M, npy_intp 
             EACH factor[l] = m;
             add_row(C + i * c, factor, A + k * columns, columns);
         }
+    }
 }
 
 EVERY_WIDTH void lanes_from_right(Lane *C, npy_intp c, const Lane *A, const double *M,
                                   npy_intp rows, npy_intp inner, npy_intp columns)
 {
+    for (npy_intp i = 0; i < rows; i++)
+        lanes_clear(C + i * c, columns);
     for (npy_intp k = 0; k < inner; k++)
         for (npy_intp j = 0; j < columns; j++) {
             const double m = M[k * columns + j];

@@ -38,17 +38,20 @@ void lanes_load(Lane *to, const double *from, npy_intp step, npy_intp entries, n
 void lanes_store(double *to, const Lane *from, npy_intp rows, npy_intp width, npy_intp column,
                  npy_intp columns, npy_intp first, npy_intp used);
 
-/* C (rows, columns) += sign A B, A (rows, inner), B (inner, columns), of row lengths c, a, b; the
+/* What becomes of C: the product, or what it was with the product added or taken away. */
+typedef enum { SET, ADD, SUBTRACT } How;
+
+/* C (rows, columns) and A B, A (rows, inner), B (inner, columns), of row lengths c, a, b; the
    entries of A may be any numbers `down` and `right` apart. */
 void lanes_product(Lane *C, npy_intp c, const Lane *A, npy_intp down, npy_intp right, const Lane *B,
-                   npy_intp b, npy_intp rows, npy_intp inner, npy_intp columns, double sign);
+                   npy_intp b, npy_intp rows, npy_intp inner, npy_intp columns, How how);
 #define lanes_multiply(C, c, A, a, ...) lanes_product(C, c, A, a, 1, __VA_ARGS__)
 
-/* C += M A with M (rows, inner) the same at all times, its numbers `down` and `right` apart. */
+/* C = M A with M (rows, inner) the same at all times, its numbers `down` and `right` apart. */
 void lanes_from_left(Lane *C, npy_intp c, const double *M, npy_intp down, npy_intp right,
                      const Lane *A, npy_intp rows, npy_intp inner, npy_intp columns);
 
-/* C += A M with M (inner, columns) the same at all times. */
+/* C = A M with M (inner, columns) the same at all times. */
 void lanes_from_right(Lane *C, npy_intp c, const Lane *A, const double *M, npy_intp rows,
                       npy_intp inner, npy_intp columns);
 

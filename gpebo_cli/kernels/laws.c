@@ -42,7 +42,7 @@ EVERY_WIDTH static void regularised(Lane *A, const double *r, npy_intp p, npy_in
     }
     for (npy_intp k = p - 1; k >= 0; k--) {
         Lane *x = A + k * w + p;
-        lanes_multiply(x, w, A + k * w + k + 1, w, x + w, w, 1, p - k - 1, w - p, -1.0);
+        lanes_multiply(x, w, A + k * w + k + 1, w, x + w, w, 1, p - k - 1, w - p, SUBTRACT);
         for (npy_intp j = 0; j < w - p; j++)
             EACH x[j][l] *= A[k * w + k][l];
     }

@@ -37,13 +37,10 @@ static void invert_in_frame(Frame *f)
 {
     const npy_intp n = f->n, d = f->d, b = f->b;
     Lane size;
-    lanes_clear(f->work, n * b + f->e * n);
     lanes_from_right(f->work, b, f->E, f->kernel, n, n, b);
     lanes_from_left(f->work + n * b, n, f->equations, n, 1, f->E, f->e, n, n);
     f->outside = largest(f->outside, f->work, n * b + f->e * n);
-    lanes_clear(f->work, d * n);
     lanes_from_left(f->work, n, f->range, 1, d, f->E, d, n, n);
-    lanes_clear(f->Q, d * d);
     lanes_from_right(f->Q, d, f->work, f->domain, d, n, d);
     lanes_norm(size, f->Q, d * d);
     f->inner = largest(f->inner, &size, 1);
@@ -55,8 +52,7 @@ static void invert_in_frame(Frame *f)
         for (npy_intp k = 0; k < d; k++)
             for (npy_intp j = 0; j < d && f->range[i * d + k] != 0.0; j++)
                 EACH f->work[j * n + i][l] += f->range[i * d + k] * f->Q[k * d + j][l];
-    lanes_clear(f->pinv, d * n);
-    lanes_multiply(f->pinv, n, f->X, d, f->work, n, d, d, n, 1.0);
+    lanes_multiply(f->pinv, n, f->X, d, f->work, n, d, d, n, SET);
 }
 
 /* 𝒜 = [Π A; C], 𝒜 B, and Q1, H of (𝒜 Q)⁺ = H Q1ᵀ; the bound of its smallest singular value. */
@@ -64,16 +60,11 @@ static void eliminate_kernel(Frame *f, double *bound)
 {
     const npy_intp n = f->n, b = f->b, all = f->all;
     Lane norm, inverse;
-    lanes_clear(f->algebraic, f->e * n);
     lanes_from_left(f->algebraic, n, f->equations, n, 1, f->A, f->e, n, n);
     memcpy(f->algebraic + f->e * n, f->C, f->r * n * sizeof(Lane));
-    for (npy_intp i = 0; i < all; i++)
-        lanes_clear(f->through + i * f->width, f->d);
     lanes_from_right(f->through, f->width, f->algebraic, f->domain, all, n, f->d);
-    lanes_clear(f->Q1, all * b);
     lanes_from_right(f->Q1, b, f->algebraic, f->kernel, all, n, b);
     lanes_qr(f->Q1, f->R1, f->X1, all, b);
-    lanes_clear(f->H, n * b);
     lanes_from_left(f->H, b, f->kernel, b, 1, f->X1, n, b, b);
     lanes_norm(norm, f->algebraic, all * n);
     lanes_norm(inverse, f->X1, b * b);
@@ -96,17 +87,14 @@ static void drive(Frame *f)
 static void combine_all(Frame *f)
 {
     const npy_intp n = f->n, d = f->d, b = f->b, width = f->width;
-    lanes_clear(f->Lambda, d * n);
-    lanes_multiply(f->Lambda, n, f->pinv, n, f->A, n, d, n, n, 1.0);
-    lanes_clear(f->LH, d * b);
-    lanes_multiply(f->LH, b, f->Lambda, n, f->H, b, d, n, b, 1.0);
+    lanes_multiply(f->Lambda, n, f->pinv, n, f->A, n, d, n, n, SET);
+    lanes_multiply(f->LH, b, f->Lambda, n, f->H, b, d, n, b, SET);
     lanes_clear(f->whole, d * width);
     lanes_from_right(f->whole, width, f->Lambda, f->domain, d, n, d);
-    lanes_multiply(f->whole + d, width, f->pinv, n, f->F, f->q, d, n, f->q, 1.0);
-    lanes_multiply(f->whole + d + f->q, width, f->pinv, n, f->B, f->m, d, n, f->m, 1.0);
-    lanes_clear(f->seen, b * width);
-    lanes_product(f->seen, width, f->Q1, 1, b, f->through, width, b, f->all, width, 1.0);
-    lanes_multiply(f->whole, width, f->LH, b, f->seen, width, d, b, width, -1.0);
+    lanes_multiply(f->whole + d, width, f->pinv, n, f->F, f->q, d, n, f->q, ADD);
+    lanes_multiply(f->whole + d + f->q, width, f->pinv, n, f->B, f->m, d, n, f->m, ADD);
+    lanes_product(f->seen, width, f->Q1, 1, b, f->through, width, b, f->all, width, SET);
+    lanes_multiply(f->whole, width, f->LH, b, f->seen, width, d, b, width, SUBTRACT);
 }
 
 static int prepare(Call *call, Frame *f)
@@ -205,8 +193,7 @@ static Outcome regression_signals(Call *call)
         for (npy_intp i = 0; i < k; i++) /* w = ξ_a + ξ_b θ − Φ e₀ and ψ has −ξ_b, +Φ */
             for (npy_intp j = 1; j < 1 + q; j++)
                 EACH z[i * columns + j][l] = -z[i * columns + j][l];
-        lanes_clear(terms, rows * columns);
-        lanes_multiply(terms, columns, at[3], k, z, columns, rows, k, columns, 1.0);
+        lanes_multiply(terms, columns, at[3], k, z, columns, rows, k, columns, SET);
         for (npy_intp i = 0; i < rows; i++) {
             Lane *row = terms + i * columns;
             for (npy_intp j = 0; j < columns; j++) {
@@ -220,12 +207,10 @@ static Outcome regression_signals(Call *call)
                 most[j] = largest(most[j], &whole, 1);
             }
         }
-        lanes_clear(seen, b * columns);
-        lanes_product(seen, columns, Q1, 1, b, terms, columns, b, rows, columns, 1.0);
-        lanes_multiply(terms, columns, Q1, b, seen, columns, rows, b, columns, -1.0);
-        lanes_clear(state, n * columns);
+        lanes_product(seen, columns, Q1, 1, b, terms, columns, b, rows, columns, SET);
+        lanes_multiply(terms, columns, Q1, b, seen, columns, rows, b, columns, SUBTRACT);
         lanes_from_left(state, columns, call->in[2], k, 1, z, n, k, columns);
-        lanes_multiply(state, columns, at[7], b, seen, columns, n, b, columns, -1.0);
+        lanes_multiply(state, columns, at[7], b, seen, columns, n, b, columns, SUBTRACT);
         for (npy_intp i = 0; i < n; i++)
             for (npy_intp j = 1; j < columns; j++)
                 EACH state[i * columns + j][l] = -state[i * columns + j][l];

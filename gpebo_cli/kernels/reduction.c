@@ -12,6 +12,7 @@ typedef struct {
     Lane *M11, *M12, *M21, *M22, *X; /* X = M21 M11⁻¹ */
     Lane *N1, *N2;                   /* (rank, n), (a, n): N[rows], N2 becoming Â2 */
     Lane *whole, *inverse;           /* (n, n): [Z1ᵀE; Â2] */
+    Lane *Q;                         /* (n, d) orthonormal basis of range(E T) */
     Lane *work;                      /* (max(rank, n))² twice */
     Lane of_M, of_N, of_X, residual, sign;
 } Elimination;
@@ -26,11 +27,21 @@ static Outcome begin(Call *call, int place, const Model *m, Elimination *el)
         if (el->rows[i] < 0 || el->rows[i] >= size || el->columns[i] < 0 || el->columns[i] >= size)
             return refused("a row or a column of M", i);
     const npy_intp widest = r > n ? r : n;
-    const npy_intp sizes[] = {n * size, n * size, r * r, r * a,
-                              a * r,    a * a,    a * r, r * n,
-                              a * n,    n * n,    n * n, 2 * widest * (widest + n + 1)};
-    Lane **parts[] = {&el->e, &el->A,  &el->M11, &el->M12,   &el->M21,     &el->M22,
-                      &el->X, &el->N1, &el->N2,  &el->whole, &el->inverse, &el->work};
+    const npy_intp sizes[] = {n * size,
+                              n * size,
+                              r * r,
+                              r * a,
+                              a * r,
+                              a * a,
+                              a * r,
+                              r * n,
+                              a * n,
+                              n * n,
+                              n * n,
+                              n * (n - a),
+                              2 * widest * (widest + n + 1)};
+    Lane **parts[] = {&el->e,  &el->A,  &el->M11,   &el->M12,     &el->M21, &el->M22, &el->X,
+                      &el->N1, &el->N2, &el->whole, &el->inverse, &el->Q,   &el->work};
     return lanes_scratch(call, sizes, parts, LENGTH(sizes)) ? DONE : ERROR;
 }
 
@@ -92,11 +103,10 @@ EVERY_WIDTH static void fill(const Model *m, Elimination *el, npy_intp first, np
 static void eliminate_blocks(const Model *m, Elimination *el)
 {
     const npy_intp n = m->n, r = el->rank, a = el->a;
-    lanes_multiply(el->M22, a, el->X, r, el->M12, a, a, r, a, -1.0);
+    lanes_multiply(el->M22, a, el->X, r, el->M12, a, a, r, a, SUBTRACT);
     lanes_norm(el->residual, el->M22, a * a);
     lanes_norm(el->of_X, el->X, a * r);
-    lanes_multiply(el->N2, n, el->X, r, el->N1, n, a, r, n, -1.0);
-    lanes_clear(el->whole, el->d * n);
+    lanes_multiply(el->N2, n, el->X, r, el->N1, n, a, r, n, SUBTRACT);
     lanes_from_left(el->whole, n, el->Z1, 1, el->d, el->e, el->d, n, n);
     memcpy(el->whole + el->d * n, el->N2, a * n * sizeof(Lane));
 }
@@ -125,8 +135,7 @@ static Outcome bounds(Call *call)
         memcpy(pivots, el.M11, r * r * sizeof(Lane));
         identity(inverse, r);
         lanes_solve(pivots, inverse, r, r, el.sign);
-        lanes_clear(el.X, a * r);
-        lanes_multiply(el.X, r, el.M21, r, inverse, r, a, r, r, 1.0);
+        lanes_multiply(el.X, r, el.M21, r, inverse, r, a, r, r, SET);
         lanes_norm(of_inverse, inverse, r * r);
         eliminate_blocks(&m, &el);
         identity(el.inverse, n);
@@ -146,9 +155,7 @@ static Outcome bounds(Call *call)
         }
         /* Z1ᵀ A T, T being the first columns of the inverse. */
         Lane *AT = el.whole, *z = el.work;
-        lanes_clear(AT, n * d);
-        lanes_multiply(AT, d, el.A, n, el.inverse, n, n, n, d, 1.0);
-        lanes_clear(z, d * d);
+        lanes_multiply(AT, d, el.A, n, el.inverse, n, n, n, d, SET);
         lanes_from_left(z, d, el.Z1, 1, d, AT, d, n, d);
         lanes_store(call->out[2], z, d, d, 0, d, first, used);
     }
@@ -174,7 +181,7 @@ static void add_product(const Model *m, Forcing *f, const Series *matrix, const 
     for (npy_intp i = 0; i < m->orders; i++)
         for (npy_intp k = i; k < m->orders; k++)
             lanes_multiply(f->g + k * n, 1, f->matrix + i * n * width, width,
-                           f->vector + (k - i) * width, 1, n, width, 1, 1.0);
+                           f->vector + (k - i) * width, 1, n, width, 1, ADD);
 }
 
 /* g = (f_0, f_1, …) in scaled rows and time, at one block of times. */
@@ -207,12 +214,14 @@ static void multipliers(Elimination *el)
             memcpy(el->X + k * r + i, right + i * a + k, sizeof(Lane));
 }
 
-/* [Z1ᵀE; Â2]⁻¹, its rows times the states' scales, into inverse, judging rows by their own size;
-   `grown` is the norm of what is inverted so. whole is used up. */
+/* [QᵀE; Â2]⁻¹ = [T P], its rows times the states' scales, into inverse, QᵀE into the first rows of
+   whole. It comes from that with Z1, judging rows by their own size; `grown` is the norm of what is
+   inverted so. With Z1 the equations are E T times those with Q, and nearly lost where range(E T)
+   is nearly at a right angle to that of the reference. */
 EVERY_WIDTH static void invert(const Model *m, Elimination *el, double *grown)
 {
-    const npy_intp n = m->n;
-    Lane *scales = el->work;
+    const npy_intp n = m->n, a = el->a, d = el->d;
+    Lane *scales = el->work, *T = el->work, *R = T + n * d, *X = R + d * d, *E1 = el->whole;
     identity(el->inverse, n);
     for (npy_intp i = 0; i < n; i++) {
         Lane *row = el->whole + i * n;
@@ -227,7 +236,19 @@ EVERY_WIDTH static void invert(const Model *m, Elimination *el, double *grown)
     lanes_solve(el->whole, el->inverse, n, n, el->sign);
     lanes_norm(grown, el->inverse, n * n);
     for (npy_intp i = 0; i < n * n; i++)
-        EACH el->inverse[i][l] *= scales[i % n][l] * m->columns[i / n];
+        EACH el->inverse[i][l] *= scales[i % n][l];
+    lanes_multiply(el->Q, d, el->e, n, el->inverse, n, n, n, d, SET);
+    lanes_qr(el->Q, R, X, n, d);
+    lanes_multiply(T, d, el->inverse, n, X, d, n, d, d, SET);
+    lanes_product(E1, n, el->Q, 1, d, el->e, n, d, n, n, SET);
+    lanes_multiply(R, a, E1, n, el->inverse + d, n, d, n, a, SET);
+    lanes_multiply(el->inverse + d, n, T, d, R, a, n, d, a, SUBTRACT);
+    for (npy_intp i = 0; i < n * n; i++) {
+        double *to = el->inverse[i];
+        const double *from = i % n < d ? T[i / n * d + i % n] : to;
+        const double unit = m->columns[i / n] / (i % n < d ? m->time : 1.0);
+        EACH to[l] = from[l] * unit;
+    }
 }
 
 /* x (rows, columns) to some times of out, times factors of the columns. */
@@ -235,7 +256,7 @@ static void hand_over(double *out, Lane *x, npy_intp rows, npy_intp columns, npy
                       npy_intp used, const double *factors, double all)
 {
     for (npy_intp i = 0; i < rows * columns; i++)
-        EACH x[i][l] *= factors ? all / factors[i % columns] : all;
+        EACH x[i][l] *= all / factors[i % columns];
     lanes_store(out, x, rows, columns, 0, columns, first, used);
 }
 
@@ -252,37 +273,25 @@ static int equations(const Model *m, Elimination *el, Forcing *f, npy_intp first
         fill(m, el, first, used);
         multipliers(el);
         eliminate_blocks(m, el);
-    }
-    for (npy_intp l = 0; l < used; l++)
-        if (!(el->residual[l] <= residual * el->of_M[l] && el->of_X[l] <= growth))
-            return 0;
-    lanes_clear(some, d * n);
-    lanes_from_left(some, 1, el->Z1, 1, d, f->g, d, n, 1);
-    hand_over(out[2], some, 1, d, first, used, NULL, 1.0);
-    for (npy_intp i = 0; i < a; i++)
-        memcpy(some + i, f->g + el->rows[r + i], sizeof(Lane));
-    for (npy_intp k = 0; k < r; k++)
-        memcpy(el->M12 + k, f->g + el->rows[k], sizeof(Lane));
-    lanes_multiply(some, 1, el->X, r, el->M12, 1, a, r, 1, -1.0);
-    lanes_store(out[4], some, 1, a, 0, a, first, used);
-    memcpy(f2, some, a * sizeof(Lane));
-    if (fresh) {
-        lanes_clear(some, d * n);
-        lanes_from_left(some, n, el->Z1, 1, d, el->A, d, n, n);
-        hand_over(out[1], some, d, n, first, these, m->columns, 1.0);
-        memcpy(some, el->whole, d * n * sizeof(Lane));
-        hand_over(out[0], some, d, n, first, these, m->columns, m->time);
-        hand_over(out[3], el->N2, a, n, first, these, m->columns, 1.0);
         invert(m, el, grown);
         for (npy_intp l = 0; l < used; l++)
-            if (!(grown[l] <= growth))
+            if (!(el->residual[l] <= residual * el->of_M[l] && el->of_X[l] <= growth &&
+                  grown[l] <= growth))
                 return 0;
-        for (npy_intp i = 0; i < n; i++)
-            memcpy(some + i * d, el->inverse + i * n, d * sizeof(Lane));
-        hand_over(out[5], some, n, d, first, these, NULL, 1.0 / m->time);
+        hand_over(out[0], el->whole, d, n, first, these, m->columns, m->time);
+        lanes_product(some, n, el->Q, 1, d, el->A, n, d, n, n, SET);
+        hand_over(out[1], some, d, n, first, these, m->columns, 1.0);
+        hand_over(out[3], el->N2, a, n, first, these, m->columns, 1.0);
+        lanes_store(out[5], el->inverse, n, n, 0, d, first, these);
     }
+    lanes_product(some, 1, el->Q, 1, d, f->g, 1, d, n, 1, SET);
+    lanes_store(out[2], some, 1, d, 0, d, first, used);
+    for (npy_intp k = 0; k < m->size; k++)
+        memcpy(k < r ? el->M12 + k : f2 + (k - r), f->g + el->rows[k], sizeof(Lane));
+    lanes_multiply(f2, 1, el->X, r, el->M12, 1, a, r, 1, SUBTRACT);
+    lanes_store(out[4], f2, 1, a, 0, a, first, used);
     lanes_clear(some, n);
-    lanes_multiply(some, 1, el->inverse + d, n, f2, 1, n, a, 1, -1.0);
+    lanes_multiply(some, 1, el->inverse + d, n, f2, 1, n, a, 1, SUBTRACT);
     lanes_store(out[6], some, 1, n, 0, n, first, used);
     return 1;
 }
@@ -311,23 +320,21 @@ static void amplify(const Model *m, Elimination *el, Forcing *f, npy_intp first,
     memcpy(pivots, el->M11, r * r * sizeof(Lane));
     for (npy_intp i = 0; i < r * r; i++)
         EACH pivots[i][l] = 2.0 * fabs(pivots[i][l]);
-    lanes_multiply(through, width, pivots, r, higher, width, r, r, width, 1.0);
+    lanes_multiply(through, width, pivots, r, higher, width, r, r, width, ADD);
     multipliers(el);
     eliminate_blocks(m, el);
     for (npy_intp i = 0; i < a * r; i++)
         EACH el->X[i][l] = fabs(el->X[i][l]);
     for (npy_intp i = 0; i < a * width; i++)
         EACH terms[i][l] = fabs(terms[i][l]);
-    lanes_multiply(terms, width, el->X, r, through, width, a, r, width, 1.0);
+    lanes_multiply(terms, width, el->X, r, through, width, a, r, width, ADD);
     invert(m, el, grown);
     for (npy_intp i = 0; i < n * n; i++)
         EACH el->inverse[i][l] = fabs(el->inverse[i][l]);
-    Lane *reached = through;
-    lanes_clear(reached, n * width);
-    lanes_multiply(reached, width, el->inverse + d, n, terms, width, n, a, width, 1.0);
+    lanes_multiply(through, width, el->inverse + d, n, terms, width, n, a, width, SET);
     for (npy_intp i = 0; i < n * width; i++)
         for (int l = 0; l < LANES; l++)
-            most[i] = larger(most[i], reached[i][l]);
+            most[i] = larger(most[i], through[i][l]);
 }
 
 /* The model, B, F, u, θ, pivots, at every how many times the amplification is looked at, growth,

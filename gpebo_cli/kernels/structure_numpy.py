@@ -238,21 +238,26 @@ def eliminated(*_: Any) -> tuple[Array, ...] | None:
 
 
 def in_own_states(
-    E: Array, A: Array, f: Array, Z1: Array, A2: Array, f2: Array, size: Array, inverse: Array,
-    rows: Array, columns: Array, time: float, every: int,
+    E: Array, A: Array, f: Array, A2: Array, f2: Array, size: Array, inverse: Array,
+    rows: Array, columns: Array, every: int,
 ) -> tuple[Array, ...]:
-    """What :func:`eliminated` returns, from Z1 (N, n, d) and Â2 (N, a, n) in scaled form.
+    """What :func:`eliminated` returns, from Â2 (N, a, n) in scaled form and [Z1ᵀE; Â2]⁻¹ = [T P].
 
     Only rows stay scaled, and row scalings do not matter. E, A and f are those of the model.
     """
-    W1 = np.swapaxes(Z1, 1, 2) * rows
+    d = E.shape[1] - A2.shape[1]
+    # With Z1 of one time the equations would be nearly lost where range(E T) is nearly at a right
+    # angle to it, and beside them what polynomials leave out of the constraints' derivatives.
     inverse = columns[:, None] * inverse
-    d = Z1.shape[2]
-    some = slice(0, None, every) if len(inverse) > 1 else slice(None)
-    amplification = (np.abs(inverse[some, :, d:]) @ size).max(axis=0)
-    amplification[:, :-1] /= columns
+    Q, R = np.linalg.qr(rows[:, None] * E @ inverse[:, :, :d])
+    signs = np.copysign(1.0, np.diagonal(R, axis1=1, axis2=2))
+    Q, R = Q * signs[:, None], R * signs[:, :, None]
+    T, W1 = inverse[:, :, :d] @ inverses(R), np.swapaxes(Q, 1, 2) * rows
     E1, A2 = W1 @ E, A2 / columns
-    T, of_f2 = inverse[:, :, :d] / time, inverse[:, :, d:]  # the scaled E is E/τ
+    of_f2 = inverse[:, :, d:] - T @ (E1 @ inverse[:, :, d:])
+    some = slice(0, None, every) if len(inverse) > 1 else slice(None)
+    amplification = (np.abs(of_f2[some]) @ size).max(axis=0)
+    amplification[:, :-1] /= columns
     offset = -(of_f2 @ f2)
     # Of components beside which others are large the inverse leaves rounding of these.
     offset -= T @ (E1 @ offset) + of_f2 @ (A2 @ offset + f2)

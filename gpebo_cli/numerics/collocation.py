@@ -19,7 +19,7 @@ so T need not be smooth in time.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
@@ -28,7 +28,7 @@ import numpy as np
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements, elements_numpy
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.errors import CHANCE, EPS, estimated_errors, least_sizes, nothing_left
+from gpebo_cli.numerics.errors import CHANCE, estimated_errors, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import (
     Looked,
@@ -38,14 +38,13 @@ from gpebo_cli.numerics.mesh import (
     unresolved,
     unresolved_kinds,
 )
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
 
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
-_AMPLIFIED = 1e3  # times the tolerance: errors beyond that are looked at once more
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
 _MODEST = 1e100  # values up to here may be multiplied with each other
 # The C library gives freed memory back to the system, page by page, and takes as much again a
@@ -112,9 +111,6 @@ def solve(
     errors = estimated_errors(
         problem, mesh, homogeneous[:, -1], particular[:, -1], noise, values
     )
-    if errors.lost == mesh.size and errors.estimate > _AMPLIFIED * tol:
-        other = _rounded_otherwise(problem, mesh, values, restarts or {})
-        errors = errors._replace(largest=np.maximum(errors.largest, other))
     if problem.missed is not None:
         shown = CHANCE * problem.missed(mesh, values)
         errors = errors._replace(largest=np.maximum(errors.largest, shown))
@@ -125,26 +121,6 @@ def solve(
         None if errors.lost == mesh.size else float(mesh.edges[errors.lost + 1]), tuple(extras),
         errors.last, None if problem.units is None else errors.vague(tol),
     )
-
-
-def _rounded_otherwise(
-    problem: LinearProblem, mesh: Mesh, values: Array,
-    restarts: Mapping[float, Callable[[Array], Array]],
-) -> Array:
-    """Errors (n, columns) seen by solving again with coefficients at times a rounding away.
-
-    What rounding does to the elimination of constraints no bound tells closely, and where the
-    equation amplifies errors that is what counts.
-    """
-    away = EPS * float(mesh.edges[-1] - mesh.edges[0])
-
-    def coefficients(t: Array, inside: Array) -> LinearEquation:
-        return problem.coefficients(t + away, inside)
-
-    maps = _element_maps(replace(problem, coefficients=coefficients), mesh, None)
-    other, _ = _chain(maps, problem, mesh, restarts)
-    found = CHANCE * np.abs(other - values).max(axis=(0, 1))
-    return np.where(np.isfinite(found), found, np.inf)
 
 
 def _not_finite(
@@ -254,9 +230,12 @@ def _element_maps(
     whole: list[Array] = []  # filled piece by piece: all pieces beside the whole are twice as much
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
-        c = known
-        if c is None or len(h) > chunk:
+        if known is None:
             c = problem.coefficients(t[part].ravel(), inside[part].ravel())
+        elif len(h) <= chunk:
+            c = known
+        else:
+            c = _at_points(known, slice(i * (s + 1), (i + chunk) * (s + 1)))
         maps = _solve_elements(problem, mesh.rule, h[part], t[part], c)
         if len(h) <= chunk:
             return maps
@@ -275,6 +254,18 @@ def _is_constant(c: LinearEquation) -> bool:
     """Whether everything but the forcing is constant in time."""
     basis = None if c.constraints is None else c.constraints.basis
     return all(matrix is None or len(matrix) == 1 for matrix in (c.E, c.A, basis))
+
+
+def _at_points(c: LinearEquation, part: slice) -> LinearEquation:
+    """The coefficients at some of their times."""
+
+    def some(values: Array) -> Array:
+        return values if len(values) == 1 else values[part]
+
+    return LinearEquation(
+        None if c.E is None else some(c.E), some(c.A), some(c.f), tuple(map(some, c.extras)),
+        None if c.constraints is None else Constraints(*map(some, c.constraints)),
+    )
 
 
 def at_points(values: Array, k: int, s: int) -> Array:
@@ -401,6 +392,8 @@ def _chain(
     for first, last in pairwise(cuts):
         if first:
             state = restarts[edges[first]](state)
+            if renew is not None:
+                state = renew(state)
         part = slice(first, last)
         own = homogeneous if len(homogeneous) == 1 else homogeneous[part]
         values, finite = elements.chain(own, particular[part], state, renew)

@@ -233,7 +233,7 @@ def hidden_constraints(
     g = np.concatenate(
         [np.broadcast_to(part, (mu + 1, len(t), n, part.shape[3])) for part in parts], axis=3
     )
-    _, A2, f2, *_ = reduced(system, structure, E, A, g, t, len(t))
+    A2, f2, *_ = reduced(system, structure, E, A, g, t, len(t))
     terms = np.abs(g * weights[:, None, :, None]).max(axis=(0, 2))[:, None, :]
     A2 = A2 * (units / s.columns)
     # Rows of equal size first: they are of any size, and the factors below are then of order one.

@@ -93,7 +93,7 @@ def strangeness_free_form(
         f = forcing(c)
         found = in_own_states(
             E[0], A[0], f[0], *reduced(system, structure, E, A, f[..., None], t, every),
-            *model[:3], every,
+            *model[:2], every,
         )
     E1, A1, f1, A2, f2, basis, offset, amplification = found
     none = not structure.a
@@ -123,11 +123,10 @@ def shown_rounding(
 class Reduced(NamedTuple):
     """0 = Â2 x + f2 in scaled rows and states, and what completes it, at N times."""
 
-    Z1: Array  # (N or 1, n, d) orthonormal basis of range(E T2), T2 of the kernel of Â2
     A2: Array  # (N or 1, a, n)
     f2: Array  # (N, a, c)
     size: Array  # (·, a, n + c) of the terms of [Â2 f2], at every so many of the times
-    inverse: Array  # (N or 1, n, n) of [Z1ᵀE; Â2]
+    inverse: Array  # (N or 1, n, n) of [Z1ᵀE; Â2], with any Z1 (n, d) with which there is one
 
 
 def reduced(
@@ -152,7 +151,7 @@ def reduced(
         whole = np.concatenate([transpose(found.Z1) @ e[0], found.A2], axis=1)
         inverse, poor = inverse_or_none(whole)
         _refuse_undetermined(system, poor, t)
-        return Reduced(found.Z1, found.A2, found.f2, found.size, inverse)
+        return Reduced(found.A2, found.f2, found.size, inverse)
     M, N = derivative_array(e, a, mu)
     # [Â2 | f2] = Z2ᵀ [N | g] with g = (f_0, …, f_μ)
     g = np.moveaxis(g, 0, 1).reshape(len(t), -1, g.shape[3])
@@ -160,9 +159,8 @@ def reduced(
         e[0], M, N, g, known.rows, known.columns, known.rank, known.Z1, every, MAX_GROWTH, RESIDUAL
     )
     if not poor.any():
-        return Reduced(known.Z1[None], A2, f2, size, inverse)
-    Z1 = np.repeat(known.Z1[None], len(M), axis=0)
-    Z1[poor], Z2 = _by_singular_vectors(
+        return Reduced(A2, f2, size, inverse)
+    Z1, Z2 = _by_singular_vectors(
         system, structure, e[0][poor], M[poor], N[poor], t[: len(M)][poor]
     )
     # What the elimination made grow there is not used, and amplifies nothing.
@@ -173,10 +171,10 @@ def reduced(
     again = np.arange(len(t))[some][everywhere[some]]
     which = again if len(M) > 1 else np.zeros_like(again)
     size[everywhere[some]] = np.abs(transpose(Z2))[np.cumsum(poor)[which] - 1] @ terms[again]
-    whole = np.concatenate([transpose(Z1[poor]) @ e[0][poor], A2[poor]], axis=1)
+    whole = np.concatenate([transpose(Z1) @ e[0][poor], A2[poor]], axis=1)
     inverse[poor], poor[poor] = inverse_or_none(whole)
     _refuse_undetermined(system, poor, t)
-    return Reduced(Z1, A2, f2, size, inverse)
+    return Reduced(A2, f2, size, inverse)
 
 
 def _refuse_undetermined(system: DescriptorSystem, poor: BoolArray, t: Array) -> None:
