@@ -523,6 +523,27 @@ def test_abs_and_sign() -> None:
     np.testing.assert_allclose(derivatives("abs(t**2 - 4)", t, 2)[:, 0], [4, 0, -2])
 
 
+@pytest.mark.parametrize(("outer", "inner", "turn"), [
+    ("asin", "sin", 0.5), ("acos", "sin", 0.5), ("asin", "cos", 0.0), ("acos", "cos", 0.0),
+    ("atan", "tan", 0.5),
+])
+def test_inverse_functions_of_waves_are_triangles_and_saws(
+    outer: str, inner: str, turn: float
+) -> None:
+    """asin(a) has no derivative where a = ±1, which waves reach at every turn."""
+    text, t = f"{outer}({inner}(3*t - 0.4))", np.linspace(0.0, 7.0, 401)
+    turns = breakpoints(record([read(text)]), 0.0, 7.0)
+    at = np.pi * (np.arange(-1, 8) + turn)
+    wanted = (at + 0.4)[(at > -0.4) & (at < 20.6)] / 3.0
+    np.testing.assert_allclose(turns, wanted, rtol=1e-12)
+    value, slope = derivatives(text, t, 1)
+    wave = getattr(np, inner)(3.0 * t - 0.4)
+    np.testing.assert_allclose(value, getattr(np, "arc" + outer[1:])(wave), atol=3e-8)
+    side = 1 if outer == "atan" else (-1.0) ** np.searchsorted(turns, t)
+    np.testing.assert_allclose(slope, slope[0] * side, rtol=1e-14)
+    assert abs(slope[0]) == pytest.approx(3.0)
+
+
 @pytest.mark.parametrize(
     ("text", "before", "after"),
     [

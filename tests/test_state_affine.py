@@ -456,6 +456,21 @@ def test_an_output_may_pass_a_jump_and_come_back_at_once(argument, inside):
     assert found.state_errors[1] < 1e-8
 
 
+@pytest.mark.parametrize("inner", [1.143, 1.3, 1.5])
+def test_where_an_iterate_passed_a_kink_is_no_edge_for_the_next(inner):
+    """Chua's circuit: elements of 2e-16 s were left, and the Kalman-Bucy filter halves elements."""
+    system = plant_from_mapping({
+        "name": "chua", "states": ["v1", "v2", "i"], "outputs": ["y"],
+        "parameters": {"f": f"-0.714*y + 0.5*(0.714 - {inner})*(abs(y + 1) - abs(y - 1))"},
+        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "A": [[-15.6, 15.6, 0], [1, -1, 1], [0, -28, 0]],
+        "phi": ["-15.6*f", 0, 0], "C": [[1, 0, 0]], "initial_state": [0.7, 0, 0],
+    })
+    found = simulate(system, TimeSettings(horizon=6.0), SolverSettings(tol=1e-9))
+    steps = found.signals.states.mesh.steps
+    assert len(Linearised(system, found.signals.states).switched) > 2
+    assert steps.min() > 1e-6 * steps.max()
+
+
 def test_an_unknown_friction_is_estimated_from_a_speed_that_changes_its_sign():
     plant = {
         "name": "friction", "states": ["p", "v"], "inputs": {"u": "2*sin(t)"},

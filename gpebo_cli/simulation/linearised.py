@@ -28,6 +28,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 # and by rounding over it, which costs Newton's method nothing that could be seen.
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
+_SAME = 1e-2  # of the longer element beside it: an edge so near to another one is that one
 _NO_MORE = 1e-15  # of a right side: what an output moves it by is rounding up to that
 
 
@@ -96,8 +97,9 @@ class Linearised:
         found, bounded = self.system.coefficients.of_time.resolved(edges)
         if not bounded or len(self.guess.mesh.edges) == 2:
             return found, bounded
-        own = self.guess.mesh.edges
-        return with_others(found, own[1:-1], 1e-9 * np.diff(own).min()), bounded
+        # Where the iterate before passed a jump that this one passes a rounding later is no edge.
+        own, steps = self.guess.mesh.edges, self.guess.mesh.steps
+        return with_others(found, own[1:-1], _SAME * np.maximum(steps[1:], steps[:-1])), bounded
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None

@@ -188,6 +188,7 @@ FUNCTIONS: dict[str, Callable[[float], float]] = {
     )},
     "abs": abs, "sign": lambda x: float((x > 0) - (x < 0)),
 }
+_OTHER_WAVE = {"sin": "cos", "cos": "sin"}
 
 
 def function(name: str, a: Node) -> Node:
@@ -196,6 +197,14 @@ def function(name: str, a: Node) -> Node:
         return _fold(FUNCTIONS[name], a.value)
     if name == "sqrt":
         return power(a, number(0.5))
+    if name in ("asin", "acos") and a.operation in _OTHER_WAVE:
+        # The root of 1 - a² is known: no derivative is 0/0 where the wave turns around.
+        root = function("abs", function(_OTHER_WAVE[a.operation], a.arguments[0]))
+        arc = multiply(number(2.0), function("atan", divide(a, add(ONE, root))))
+        return arc if name == "asin" else subtract(number(0.5 * math.pi), arc)
+    if name == "atan" and a.operation == "tan":
+        sine, cosine = (function(wave, a.arguments[0]) for wave in ("sin", "cos"))
+        return multiply(function("asin", sine), function("sign", cosine))
     return _node(name, a, smooth={"sign": 0.0, "abs": 1.0}.get(name, math.inf))
 
 
