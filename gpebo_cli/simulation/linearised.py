@@ -28,7 +28,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 # and by rounding over it, which costs Newton's method nothing that could be seen.
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
-_SAME = 1e-2  # of the longer element beside it: an edge so near to another one is that one
+_SAME = 1e-14  # of a time: edges so near to one another are one
 _NO_MORE = 1e-15  # of a right side: what an output moves it by is rounding up to that
 
 
@@ -98,8 +98,9 @@ class Linearised:
         if not bounded or len(self.guess.mesh.edges) == 2:
             return found, bounded
         # Where the iterate before passed a jump that this one passes a rounding later is no edge.
-        own, steps = self.guess.mesh.edges, self.guess.mesh.steps
-        return with_others(found, own[1:-1], _SAME * np.maximum(steps[1:], steps[:-1])), bounded
+        own = self.guess.mesh.edges
+        near = max(1e-9 * np.diff(own).min(), _SAME * np.abs(own).max())
+        return with_others(found, own[1:-1], near), bounded
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
@@ -108,7 +109,7 @@ class Linearised:
         source = self.system.coefficients
         known, x, along = self._along(t, order, inside, signals)
         c = source.taylor(t, order, inside, along)
-        y = along[0, :, self.system.m :].copy()
+        y, there = along[0, :, self.system.m :].copy(), self._there(t, inside)
         size = np.abs(y)
         shift = _SHIFT * np.maximum(size, np.maximum(_NOT_ZERO * size.max(axis=0), 1e-300))
 
@@ -116,7 +117,7 @@ class Linearised:
             """A x̄ + B u + F θ̄ + φ (order + 1, N, n), and which side of a jump y is on (N, ·)."""
             m = source.taylor(t, order, inside, along)
             of_known = _product(m.B, known.u) + _product(m.F, known.theta)
-            return m.phi + _product(m.A, x) + of_known, self._sides(t, along)
+            return m.phi + _product(m.A, x) + of_known, self._sides(there, along)
 
         here, side = right_side() if self._switching else (np.zeros(()), np.zeros((len(t), 0)))
         G = np.empty((*x.shape, self.system.r))
@@ -154,10 +155,17 @@ class Linearised:
         if self.theta is not None:
             known = known._replace(theta=np.zeros((order + 1, len(t), self.system.q)))
             known.theta[0] = self.theta
-        there = aside(t, inside) if inside is not None and self._switching else t
+        there = self._there(t, inside)
         x = self.guess.taylor(there, order, inside)
         y = _product(known.C, x) + _product(known.D, known.u) + _product(known.H, known.theta)
-        return known, x, np.concatenate([known.u, y], axis=2)
+        u = known.u
+        if there is not t and self.system.m:
+            u = source.of_time.taylor(there, order, inside, signals).u
+        return known, x, np.concatenate([u, y], axis=2)
+
+    def _there(self, t: Array, inside: Array | None) -> Array:
+        """Where the guess is looked at for the times t (N,)."""
+        return t if inside is None or self._switching is None else aside(t, inside)
 
 
 def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bool]:

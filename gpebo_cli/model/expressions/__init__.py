@@ -17,7 +17,6 @@ from gpebo_cli.model.expressions.bounds import (
     Bounds,
     Cells,
     among,
-    aside,
     breakpoints,
     halved,
     resolved,
@@ -27,7 +26,7 @@ from gpebo_cli.model.expressions.bounds import (
 )
 from gpebo_cli.model.expressions.nodes import divisors_of
 from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten, signal
-from gpebo_cli.model.expressions.tape import Assembly, Tape, record, taylor
+from gpebo_cli.model.expressions.tape import Assembly, Tape, aside, record, taylor
 
 __all__ = [
     "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "among", "aside",

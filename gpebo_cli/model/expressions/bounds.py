@@ -41,7 +41,6 @@ _SAME = 1e-12  # of the span: found instants closer than this to another are tha
 _ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
 _MOST_SWITCHED = 1 << 16
 _BISECTIONS = 100  # more than enough to leave two neighbouring floats
-_ASIDE = 1e-7  # of a way that is itself 1e-3 of an element: a signal hardly moves there
 
 
 # From the ends of cells of time, (N,) and (N,), to Taylor coefficients of each signal anywhere in
@@ -214,7 +213,7 @@ def breakpoints(tape: Tape, start: float, stop: float) -> Array:
     return with_others(np.array([start, *exact, stop]), found)[1:-1]
 
 
-def with_others(known: Array, others: Array, near: Array | float | None = None) -> Array:
+def with_others(known: Array, others: Array, near: float | None = None) -> Array:
     """Times ``known`` (A,), sorted, and those ``others`` (B,) that are not so ``near`` to one.
 
     None: by more than rounding of the span between the first and the last.
@@ -223,8 +222,8 @@ def with_others(known: Array, others: Array, near: Array | float | None = None) 
     return np.union1d(known, others[~among(others, known, near)])
 
 
-def among(t: Array, times: Array, near: Array | float) -> BoolArray:
-    """Which of t (N,) are as ``near`` (N,) to one of the ascending times."""
+def among(t: Array, times: Array, near: float) -> BoolArray:
+    """Which of t (N,) are as ``near`` as that to one of the ascending times."""
     padded = np.concatenate([[-np.inf], times, [np.inf]])
     k = np.searchsorted(padded, t).clip(1)
     return np.asarray(np.minimum(t - padded[k - 1], padded[k] - t) <= near)
@@ -361,8 +360,3 @@ def halved(sign: Callable[[Array], Array], before: Array, low: Array, high: Arra
         left = sign(half) == before
         low, high = np.where(left, half, low), np.where(left, high, half)
     return high
-
-
-def aside(t: Array, inside: Array) -> Array:
-    """Times (N,) so little from t towards ``inside`` that only what jumps there is another one."""
-    return t + _ASIDE * (inside - t)

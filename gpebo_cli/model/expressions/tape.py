@@ -26,6 +26,7 @@ from gpebo_cli.model.expressions.syntax import Expression, shorten
 MAX_INSTRUCTIONS = 200_000
 MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in parts
 _SWITCHES = ("abs", "sign", "min", "max")
+_ASIDE = 1e-7  # of a way that is itself 1e-3 of an element: a signal hardly moves there
 UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
 # Order, whether jumps are decided at other times, how many coefficients of how many signals.
@@ -76,8 +77,8 @@ class Tape:
 
         At times t (N,), in seconds, where step, abs and sign are decided at ``inside`` (N,), by
         default t. ``signals`` are Taylor coefficients of the signals at t, (J + 1, N, number of
-        signals), those beyond J being zero; what depends on a signal is decided at t. None: inputs
-        are the functions of time that the tape has for them, and outputs are unknown.
+        signals), those beyond J being zero; what depends on one is decided :func:`aside`. None:
+        inputs are the functions of time that the tape has for them, and outputs are unknown.
         """
         return self._in_a_row.taylor(np.asarray(t, dtype=np.float64), order, inside, signals)[0]
 
@@ -151,6 +152,11 @@ class Tape:
                 known.add(place)
         return frozenset(known)
 
+    @cached_property
+    def _followers(self) -> frozenset[int]:
+        told = {int(i.value) for i in self.instructions if i.operation == "signal"}
+        return self.following(told).intersection(switch.argument for switch in self.switches)
+
     def following(self, numbers: Container[int]) -> frozenset[int]:
         """Places in which a signal of these numbers is."""
         found: set[int] = set()
@@ -189,17 +195,26 @@ class Tape:
         )
 
     def run(
-        self, t: Any, order: int, inside: Any, signals: Any = None, stop: int | None = None
+        self, t: Any, order: int, inside: Any, signals: Any = None, stop: int | None = None,
+        deciding: list[Jet] | None = None,
     ) -> list[Jet]:
         """Jets of all places before ``stop``, those that jump decided at ``inside``.
 
         The times and signals are arrays (N,), symbols for them that record what is done, or cells
-        of time. A signal that is None is what the tape has for it.
+        of time. A signal that is None is what the tape has for it. ``deciding`` are jets at
+        ``inside``, if known. What follows a signal is decided where that is told, by all of its
+        argument.
         """
-        deciding: list[Jet] | None = None
+        followers: frozenset[int] = frozenset()
+        beside: list[Jet] | None = None
         if self.switches and inside is not t:
-            last = max(switch.argument for switch in self.switches)
-            deciding = self.run(inside, 0, inside, signals, last + 1)
+            if signals is not None and isinstance(t, type(inside)):  # no cells
+                followers = self._followers
+            if deciding is None:
+                last = max(switch.argument for switch in self.switches) + 1
+                deciding = self.run(inside, 0, inside, signals, last)
+                if followers:
+                    beside = self.run(aside(t, inside), 0, inside, signals, last, deciding)
         places: list[Jet] = []
         for (operation, arguments, value), extra in zip(
             self.instructions[:stop], self.extra[:stop], strict=True
@@ -223,7 +238,8 @@ class Tape:
                 told = None if signals is None else signals[int(value)]
                 jet = places[arguments[0]] if told is None else told
             else:
-                decided = (places if deciding is None else deciding)[arguments[-1]][0]
+                known = beside if arguments[-1] in followers else deciding
+                decided = (places if known is None else known)[arguments[-1]][0]
                 jet = jets.switched(operation, decided, [places[a] for a in arguments], wanted)
             places.append(jet)
         return places
@@ -385,6 +401,11 @@ def _labels(
         Label(place_of[id(e.node)], e.text, e.where, used)
         for e, used in zip(listed, uses, strict=True)
     )
+
+
+def aside(t: Any, inside: Any) -> Any:
+    """Times (N,) so little from t towards ``inside`` that only what jumps there is another one."""
+    return t + _ASIDE * (inside - t)
 
 
 def taylor(
