@@ -9,12 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
-from gpebo_cli.estimators._recursive import (
-    KreisselmeierFilter,
-    Mixed,
-    ScalarLaw,
-    mix_sampled,
-)
+from gpebo_cli.estimators._recursive import KreisselmeierFilter, Mixed, ScalarLaw, mix_sampled
 from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do

@@ -139,9 +139,8 @@ def _per_unit(
     seen: Measurements, estimable: Mapping[str, float | None],
 ) -> dict[str, float]:
     """Deviations of what is estimable, by name; none where the observer cannot tell."""
-    state_map, regression = observation.state_map, observation.regression
-    plain = not regression.resets and regression.dynamics is None and observation.names is None
-    if observation.errors is None or not plain or not isinstance(state_map, AffineStateMap):
+    state_map, regression = observation.of_constants, observation.regression
+    if observation.errors is None or state_map is None:
         return {}
     (start, stop), rows = seen.span, None if seen.noise is None else seen.noise.rows
     rows = rows or Rows(np.arange(start, stop, settings.noise.sample_time))

@@ -36,8 +36,7 @@ def still(parameters: Array, requirement: Requirement, natural: Array) -> BoolAr
 
 
 def finished(
-    std: Array | None, why: str, root: Array, final: Array, requirement: Requirement,
-    columns: IntArray,
+    std: Array, root: Array, final: Array, requirement: Requirement, columns: IntArray
 ) -> tuple[Array | None, str]:
     """Deviations (G, M, p + n) of what noise alone may have brought where it is, and why not all.
 
@@ -45,12 +44,12 @@ def finished(
     are far from least squares over the same data. None, if there are no others. The root and the
     columns are as of :func:`of_estimates`.
     """
-    if std is None or requirement.holds or not len(columns):
-        return std, why
+    if requirement.holds or not len(columns):
+        return std, ""
     eta = _least_squares_about(root, columns)
     far = (np.abs(final - eta) > _BEYOND * std[:, -1, : len(eta)]).any(axis=1)
     if not far.any():
-        return std, why
+        return std, ""
     std[far] = np.nan
     return None if far.all() else std, UNFINISHED
 

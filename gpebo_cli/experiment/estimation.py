@@ -42,7 +42,7 @@ from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
-from gpebo_cli.observers._base import AffineStateMap, Differentiable, Filtering
+from gpebo_cli.observers._base import Differentiable, Filtering
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals
@@ -186,9 +186,7 @@ def _with_deviations(
     regression, final = observation.regression, estimation.explaining
     if regression.resets or final is None or not _one_fit(observation):
         return estimation.with_deviations(std), ""
-    told, why = doubts.finished(
-        std, "", regression.root, final, estimation.requirement, columns
-    )
+    told, why = doubts.finished(std, regression.root, final, estimation.requirement, columns)
     return estimation.with_deviations(told), why
 
 
@@ -355,22 +353,17 @@ def _estimate(
     determined = np.ones(p, dtype=bool)
     about_own = observation.names is None and observation.estimator is None
 
-    def made(by: estimators.Estimator) -> tuple[estimators.Estimates, IntArray]:
-        if about_own:
-            return _estimates(by, observation, grid, kept, known.independent)
-        return estimators.estimate(by, regression, grid, kept), np.arange(p)
-
     if about_own:
         determined = known.parameters[-1]
     else:
         seen = np.ones(n, dtype=bool)
-    estimates, columns = made(estimator)
-    requirement = estimates.requirement
+    about = observation, grid, kept, known.independent
+    estimates, columns = _estimates(estimator, *about)
     if observation.estimator is None:
-        raised = estimators.raised(estimator, requirement)
+        raised = estimators.raised(estimator, estimates.requirement)
         if raised is not estimator:
-            estimator, (estimates, columns) = raised, made(raised)
-            requirement = estimates.requirement
+            estimator, (estimates, columns) = raised, _estimates(raised, *about)
+    requirement = estimates.requirement
     if observation.bounds:
         estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
     told = accuracy.told(determined), accuracy.told(seen)
@@ -449,9 +442,7 @@ def _estimates(
 def _about(observation: Observation, columns: IntArray) -> tuple[LinearRegression, IntArray]:
     """The regression about some of the parameters, the others being zero, and about which."""
     whole = observation.regression
-    plain = not whole.resets and whole.dynamics is None and observation.names is None
-    plain &= isinstance(observation.state_map, AffineStateMap)
-    if len(columns) in (0, whole.p) or not plain:
+    if len(columns) in (0, whole.p) or observation.of_constants is None:
         return whole, np.arange(whole.p)
     return replace(
         whole, psi=Trajectory(whole.mesh, whole.psi.values[..., columns]),

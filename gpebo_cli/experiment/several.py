@@ -69,14 +69,8 @@ def joined_observation(
 
     ConfigError: an observer or a remedy whose parameters are others.
     """
-    maps = [each.state_map for each in observations]
-    plain = all(
-        each.estimator is None and each.names is None and not each.regression.resets
-        and each.regression.dynamics is None
-        for each in observations
-    )
-    affine = [each for each in maps if isinstance(each, AffineStateMap)]
-    if len(affine) < len(maps) or not plain:
+    affine = [own for own in (each.of_constants for each in observations) if own is not None]
+    if len(affine) < len(observations):
         raise ConfigError(
             "data.file: several files need an observer whose parameters are θ and the initial "
             "error; accepted are observer=gpebo with the remedies none and output_injection"

@@ -14,12 +14,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, check_memory
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import (
-    Array,
-    BoolArray,
-    DescriptorSystem,
-    differential_order,
-)
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, differential_order
 from gpebo_cli.model.expressions import aside
 from gpebo_cli.model.text import switching
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
@@ -279,6 +274,13 @@ class Observation:
     def parameters(self) -> tuple[str, ...]:
         """Names of what is estimated, (p,)."""
         return self.regression.parameters if self.names is None else self.names
+
+    @property
+    def of_constants(self) -> AffineStateMap | None:
+        """The state map, where it is affine in constant parameters of one regression; else None."""
+        regression, constant = self.regression, self.estimator is None and self.names is None
+        constant &= not regression.resets and regression.dynamics is None
+        return self.state_map if constant and isinstance(self.state_map, AffineStateMap) else None
 
 
 # (η̂ (g, K, p), G (K, p, p)) -> x̂ (g, K, n) and ∂x̂/∂η̂ (g, K, n, p)

@@ -119,8 +119,8 @@ class Canonical:
         _refuse_beyond(system)
         mesh = signals.mesh
         blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())
-        n_a, weights = blocks.n_a, output_scale(self.weights, system) ** 2
-        suitable = _outputs_without_zb(system, blocks)
+        n_a, suitable = blocks.n_a, _outputs_without_zb(system, blocks)
+        scale = output_scale(self.weights, system)[suitable]
         of_za = replace(
             system, states=system.states[:n_a], initial_state=system.initial_state[:n_a],
             outputs=tuple(system.outputs[k] for k in suitable),
@@ -129,18 +129,19 @@ class Canonical:
         own = Trajectory(mesh, signals.outputs.values[:, :, suitable])
         found = Plain().observe(reduced_system(
             of_za, replace(signals, outputs=own, asked=None), solver, form="given",
-            xi_a0=self.xi_a0, weights=weights[suitable].tolist(),
+            xi_a0=self.xi_a0, weights=(scale**2).tolist(),
         ))
         # The general observer has 0 = C ξ_a − y + …, and the paper's y = …: signs are the paper's.
-        regression = found.regression
-        Y, psi = (Trajectory(x.mesh, -x.values) for x in (regression.Y, regression.psi))
+        # Weights are relative to those of all outputs, not of these alone.
+        regression, size = found.regression, scale.max()
+        Y, psi = (Trajectory(x.mesh, -size * x.values) for x in (regression.Y, regression.psi))
         zb = _unknown_input_observer(self, system, regression.mesh, signals, n_a)
 
         def truth(t: Array, theta: Array, states: Trajectory) -> Array:
             return found.truth(t, theta, Trajectory(states.mesh, states.values[..., :n_a]))
 
         return replace(
-            found, regression=replace(regression, Y=Y, psi=psi),
+            found, regression=replace(regression, Y=Y, psi=psi, scale=size * regression.scale),
             state_map=CanonicalStateMap(found.state_map, zb=zb, n_a=n_a, n_b=system.n - n_a),
             truth=truth,
             assumptions=(

@@ -16,15 +16,8 @@ from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._base import (
-    largest_entry,
-    log_norm,
-)
-from gpebo_cli.observers.reduced.matrices import (
-    AlgebraicEquations,
-    ObserverMatrices,
-    weakest,
-)
+from gpebo_cli.observers._base import largest_entry, log_norm
+from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, ObserverMatrices, weakest
 from gpebo_cli.observers.reduced.regression import (
     OVER_TIME,
     Assembled,
