@@ -90,6 +90,8 @@ HEAVY = ("numpy", "hydra", "omegaconf", "yaml", "argparse", "pathlib", "re", "da
 @pytest.mark.parametrize(("words", "heavy"), [
     *((["-S", "--", *words], HEAVY)  # without site-packages, whose own .pth files import things
       for words in (["--help"], ["run", "--help"], ["list"], ["--version"])),
+    (["-S", "--", "__complete", "run", "plant="],
+     ["numpy", "hydra", "omegaconf", "yaml", "pandas"]),
     (["--", "run", "--cfg", "job"], ["numpy"]),
     (["--", "run", *FAST], ["pandas", "sympy", "matplotlib"]),
 ])

@@ -112,12 +112,6 @@ def test_selected_expressions_to_order_six(text: str) -> None:
     np.testing.assert_allclose(got, want, rtol=1e-10, atol=1e-12 * np.abs(want).max())
 
 
-def test_integer_powers_are_differentiable_at_zeros_of_the_base() -> None:
-    np.testing.assert_array_equal(derivatives("t**3", 0.0, 4)[:, 0], [0, 0, 0, 6, 0])
-    np.testing.assert_array_equal(derivatives("(t - 1)**2", 1.0, 2)[:, 0], [0, 0, 2])
-    np.testing.assert_array_equal(derivatives("t**1", 0.0, 2)[:, 0], [0, 1, 0])
-
-
 def test_coefficients_are_normalised_and_time_stands_before_the_expression() -> None:
     t = np.array([0.0, 1.0, 2.0])
     values = taylor([read("exp(t)"), read("7"), read("t")], t, 3)
@@ -490,37 +484,33 @@ def test_the_innermost_name_is_blamed() -> None:
     assert str(caught.value) == f"plant mine: {says}"
 
 
-def test_a_name_that_is_folded_away_is_never_evaluated() -> None:
-    assert derivatives("a**0 + t", [0.0], 1, a="1/t")[:, 0].tolist() == [1, 1]
-
-
 def test_a_value_that_is_not_finite_inside_an_interval() -> None:
     with pytest.raises(ConfigError, match="no finite value at t = 2"):
         taylor([read("sign(1/(t - 2))")], np.array([1.0]), 0, inside=np.array([2.0]))
 
 
-def test_underflow_is_zero() -> None:
-    np.testing.assert_array_equal(derivatives("exp(-1000*t**2)", [0.0, 3.0], 1), [[1, 0], [0, 0]])
-
-
 # Jumps and kinks
 
 
-def test_step_is_one_from_its_instant_on() -> None:
-    t = [1.0, 1.5, 2.0]
-    np.testing.assert_array_equal(derivatives("step(t - 1.5)", t, 1), [[0, 1, 1], [0, 0, 0]])
-    np.testing.assert_array_equal(derivatives("step(1.5 - t)", t, 0), [[1, 0, 0]])
-    np.testing.assert_array_equal(derivatives("step(2*t - 3)", t, 0), [[0, 1, 1]])
-    np.testing.assert_array_equal(derivatives("step((t - a)/2)", t, 0, a="3/2"), [[0, 1, 1]])
-    np.testing.assert_array_equal(derivatives("t*step(t - 1.5)", t, 1), [[0, 1.5, 2], [0, 1, 1]])
-
-
-def test_abs_and_sign() -> None:
-    t = [0.0, 1.0, 3.0]
-    np.testing.assert_array_equal(derivatives("abs(t - 1)", t, 1), [[1, 0, 2], [-1, 0, 1]])
-    np.testing.assert_array_equal(derivatives("sign(t - 1)", t, 1), [[-1, 0, 1], [0, 0, 0]])
-    np.testing.assert_array_equal(derivatives("d(abs(t - 1))", t, 0), [[-1, 0, 1]])
-    np.testing.assert_allclose(derivatives("abs(t**2 - 4)", t, 2)[:, 0], [4, 0, -2])
+@pytest.mark.parametrize(("text", "t", "want"), [  # of which the rows are orders
+    ("step(t - 1.5)", [1, 1.5, 2], [[0, 1, 1], [0, 0, 0]]),
+    ("step(1.5 - t)", [1, 1.5, 2], [[1, 0, 0]]),
+    ("step(2*t - 3)", [1, 1.5, 2], [[0, 1, 1]]),
+    ("step((t - a)/2)", [1, 1.5, 2], [[0, 1, 1]]),
+    ("t*step(t - 1.5)", [1, 1.5, 2], [[0, 1.5, 2], [0, 1, 1]]),
+    ("abs(t - 1)", [0, 1, 3], [[1, 0, 2], [-1, 0, 1]]),
+    ("sign(t - 1)", [0, 1, 3], [[-1, 0, 1], [0, 0, 0]]),
+    ("d(abs(t - 1))", [0, 1, 3], [[-1, 0, 1]]),
+    ("abs(t**2 - 4)", [0], [[4], [0], [-2]]),
+    ("t**3", [0], [[0], [0], [0], [6], [0]]),
+    ("(t - 1)**2", [1], [[0], [0], [2]]),
+    ("t**1", [0], [[0], [1], [0]]),
+    ("b**0 + t", [0], [[1], [1]]),  # a name that is folded away is never evaluated
+    ("exp(-1000*t**2)", [0, 3], [[1, 0], [0, 0]]),  # underflow is zero
+])
+def test_values_and_derivatives_are_exact(text: str, t: list[float], want: list[Any]) -> None:
+    found = derivatives(text, [float(time) for time in t], len(want) - 1, a="3/2", b="1/t")
+    np.testing.assert_array_equal(found, want)
 
 
 @pytest.mark.parametrize(("outer", "inner", "turn"), [
@@ -572,48 +562,33 @@ def test_inside_decides_only_what_jumps() -> None:
     np.testing.assert_array_equal(taylor(smooth, t, 2, inside=t + 9), taylor(smooth, t, 2))
 
 
-def test_breakpoints_that_are_exact() -> None:
-    texts = ["step(t - 0.1)", "step(7 - t)*sin(t)", "abs(3*t - 1)", "sign(2 - t)", "step(t - 7)"]
-    got = breakpoints(record([read(text) for text in texts]), 0.0, 10.0)
-    assert got.tolist() == [0.1, 1 / 3, 2.0, 7.0]
+INSIDE = "step(t) + step(t - 1) + step(t - 2) + step(t + 1) + abs(t - 5)"
 
 
-def test_breakpoints_lie_strictly_inside() -> None:
-    expressions = [read("step(t) + step(t - 1) + step(t - 2) + step(t + 1) + abs(t - 5)")]
-    assert breakpoints(record(expressions), 0.0, 2.0).tolist() == [1.0]
-    assert breakpoints(record(expressions), 1.0, 1.0).tolist() == []
-    assert breakpoints(record([read("abs(sin(pi*t))")]), 0.0, 1.0).tolist() == []
-    assert breakpoints(record([read("sin(t)"), read("2")]), 0.0, 10.0).shape == (0,)
-    assert breakpoints(record([]), 0.0, 10.0).shape == (0,)
-
-
-def test_breakpoints_that_are_found() -> None:
-    got = breakpoints(record([read("abs(sin(t)) + sign(2*sin(t))*exp(t)")]), 0.5, 10.0)
-    np.testing.assert_allclose(got, np.pi * np.arange(1, 4), rtol=1e-15)
-    found = breakpoints(record([read("abs(t**3 - 2)")]), 0.0, 3.0)
-    np.testing.assert_allclose(found, [2 ** (1 / 3)], rtol=1e-15)
-
-
-def test_breakpoints_on_the_grid_of_the_search() -> None:
-    assert breakpoints(record([read("sign((t - 5)*(t + 1))")]), 0.0, 10.0).tolist() == [5.0]
-    assert breakpoints(record([read("abs((t - 5)**2)")]), 0.0, 10.0).tolist() == []
-    assert breakpoints(record([read("abs(t**2*0)")]), 0.0, 10.0).tolist() == []
-
-
-def test_breakpoints_of_arguments_that_jump_themselves() -> None:
+@pytest.mark.parametrize(("texts", "span", "want", "rtol"), [
+    (["step(t - 0.1)", "step(7 - t)*sin(t)", "abs(3*t - 1)", "sign(2 - t)", "step(t - 7)"],
+     (0, 10), [0.1, 1 / 3, 2.0, 7.0], 0.0),
+    # They lie strictly inside.
+    ([INSIDE], (0, 2), [1.0], 0.0), ([INSIDE], (1, 1), [], 0.0),
+    (["abs(sin(pi*t))"], (0, 1), [], 0.0), (["sin(t)", "2"], (0, 10), [], 0.0),
+    ([], (0, 10), [], 0.0),
+    # They are found, on the grid of the search, too.
+    (["abs(sin(t)) + sign(2*sin(t))*exp(t)"], (0.5, 10), np.pi * np.arange(1, 4), 1e-15),
+    (["abs(t**3 - 2)"], (0, 3), [2 ** (1 / 3)], 1e-15),
+    (["sign((t - 5)*(t + 1))"], (0, 10), [5.0], 0.0),
+    (["abs((t - 5)**2)"], (0, 10), [], 0.0), (["abs(t**2*0)"], (0, 10), [], 0.0),
     # At 4 the argument of abs jumps over zero: one breakpoint, exactly there, not two.
-    got = breakpoints(record([read("abs(step(t - 4) - 0.5 + 0*t**2)")]), 0.0, 10.0)
-    assert got.tolist() == [4.0]
-    got = breakpoints(record([read("abs(abs(t - 4) - 1)")]), 0.0, 10.0)
-    np.testing.assert_allclose(got, [3.0, 4.0, 5.0], rtol=1e-15)
-    got = breakpoints(record([read("abs(sin(t) + 5*step(t - 4))")]), 0.0, 10.0)
-    np.testing.assert_allclose(got, [np.pi, 4.0], rtol=1e-15)
-
-
-def test_breakpoints_just_before_a_jump() -> None:
-    text = "abs(t**2 - 3.9991**2 + 100*step(t - 3.9995))"  # both within one cell of the grid
-    got = breakpoints(record([read(text)]), 0, 10)
-    np.testing.assert_allclose(got, [3.9991, 3.9995], rtol=1e-14)
+    (["abs(step(t - 4) - 0.5 + 0*t**2)"], (0, 10), [4.0], 0.0),
+    (["abs(abs(t - 4) - 1)"], (0, 10), [3.0, 4.0, 5.0], 1e-15),
+    (["abs(sin(t) + 5*step(t - 4))"], (0, 10), [np.pi, 4.0], 1e-15),
+    # Both are within one cell of the grid.
+    (["abs(t**2 - 3.9991**2 + 100*step(t - 3.9995))"], (0, 10), [3.9991, 3.9995], 1e-14),
+])
+def test_breakpoints(
+    texts: list[str], span: tuple[float, float], want: list[float], rtol: float
+) -> None:
+    found = breakpoints(record([read(text) for text in texts]), *map(float, span))
+    np.testing.assert_allclose(found, want, rtol=rtol, atol=0.0)
 
 
 def test_breakpoints_of_an_argument_without_a_value() -> None:

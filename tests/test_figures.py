@@ -262,23 +262,22 @@ def test_without_mixing_there_is_no_delta() -> None:
     assert "delta" not in dict(draw(make_result(samples=51, mixing=False)))
 
 
-def test_cases_are_labelled_by_the_gain_that_varies() -> None:
-    figures = dict(draw(make_result(samples=51), ["parameter_error"]))
-    legend = figures["parameter_error"].axes[0].get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["γ = 10¹⁰", "γ = 10⁸"]
+EIGENVALUES = [rf"$\lambda_{{{k}}}$" for k in (1, 2, 3)]
 
 
-def test_of_many_cases_four_are_drawn_and_counted() -> None:
-    [(_, figure)] = draw(
-        make_result(gammas=tuple(np.logspace(6, 12, 25)), samples=51), ["state_error_a"]
-    )
-    axes = figure.axes[0]
-    legend = axes.get_legend()
+@pytest.mark.parametrize(("name", "gammas", "title", "entries"), [
+    ("parameter_error", (1e10, 1e8), "", ["γ = 10¹⁰", "γ = 10⁸"]),
+    ("state_error_a", tuple(np.logspace(6, 12, 25)), "4 of 25 cases:",
+     ["γ = 10⁶", "γ = 10⁸", "γ = 10¹⁰", "γ = 10¹²"]),
+    ("gram", (1e10, 1e8), "", [*EIGENVALUES, r"$\rho$ = 10⁻⁷", "$t_c$ = 0.24 s"]),
+])
+def test_legends(name: str, gammas: tuple[float, ...], title: str, entries: list[str]) -> None:
+    """Cases by the gain that varies, four of many, and the level and the time of excitation."""
+    [(_, figure)] = draw(make_result(gammas=gammas, samples=51), [name])
+    legend = figure.axes[0].get_legend()
     assert legend is not None
-    assert legend.get_title().get_text() == "4 of 25 cases:"
-    labels = [text.get_text() for text in legend.get_texts()]
-    assert labels == ["γ = 10⁶", "γ = 10⁸", "γ = 10¹⁰", "γ = 10¹²"]
+    assert legend.get_title().get_text() == title
+    assert [text.get_text() for text in legend.get_texts()] == entries
 
 
 def test_small_errors_are_visible_and_zeros_are_not_drawn() -> None:
@@ -312,15 +311,6 @@ def test_thinned_estimates_are_compared_at_their_own_times() -> None:
     [(_, figure)] = draw(make_result(thin=7), ["state_error_b"])
     final = np.asarray(figure.axes[0].get_lines()[0].get_ydata())[-1]
     assert final < 1e-13
-
-
-def test_excitation_level_and_its_time_are_marked() -> None:
-    [(_, figure)] = draw(make_result(samples=51), ["gram"])
-    legend = figure.axes[0].get_legend()
-    assert legend is not None
-    labels = [text.get_text() for text in legend.get_texts()]
-    eigenvalues = [rf"$\lambda_{{{k}}}$" for k in (1, 2, 3)]
-    assert labels == [*eigenvalues, r"$\rho$ = 10⁻⁷", "$t_c$ = 0.24 s"]
 
 
 def test_a_name_too_long_for_its_axis_stands_on_several_lines_with_its_unit() -> None:
@@ -375,22 +365,21 @@ def test_figures_are_as_wide_as_asked_for(width: float, inches: float) -> None:
         assert figure.get_figwidth() == pytest.approx(inches)
 
 
-@pytest.mark.parametrize(
-    ("name", "math"),
-    [
-        ("x1", "$x_{1}$"),
-        ("theta", r"$\theta$"),
-        ("theta1", r"$\theta_{1}$"),
-        ("il", "$i_L$"),
-        ("e0_il", "$e_{0,i_L}$"),
-        ("ir2", r"$\mathrm{ir}_{2}$"),
-        ("xi_a0", r"$\xi_{a_{0}}$"),
-        ("leak", r"$\mathrm{leak}$"),
-        ("flow_of_the_inlet", "flow_of_the_inlet"),
-    ],
-)
-def test_names_are_written_as_people_write_them(name: str, math: str) -> None:
-    assert symbols.typeset(name, {"il": "i_L"}) == math
+IN_MATHEMATICS = {
+    "x1": "$x_{1}$", "theta": r"$\theta$", "theta1": r"$\theta_{1}$", "il": "$i_L$",
+    "e0_il": "$e_{0,i_L}$", "ir2": r"$\mathrm{ir}_{2}$", "xi_a0": r"$\xi_{a_{0}}$",
+    "leak": r"$\mathrm{leak}$", "flow_of_the_inlet": "flow_of_the_inlet",
+}
+NUMBERS = {1e10: "10¹⁰", -1e-7: "−10⁻⁷", 2.5e-7: "2.5·10⁻⁷", 0.5: "0.5", 0.0: "0",
+           9999.0: "9999", -3.25: "−3.25"}
+GAINS = {"gamma": "γ", "gamma_2": "γ₂", "f0": "f₀", "lambda_1": "λ₁", "window": "window"}
+
+
+def test_names_and_numbers_are_written_as_people_write_them() -> None:
+    assert {x: symbols.typeset(x, {"il": "i_L"}) for x in IN_MATHEMATICS} == IN_MATHEMATICS
+    assert {x: symbols.number_text(x) for x in NUMBERS} == NUMBERS
+    assert {x: symbols.symbol(x) for x in GAINS} == GAINS
+    assert symbols.with_unit("load", "N*m") == "load (N·m)"
 
 
 def test_at_most_eight_panels_and_it_says_so() -> None:
@@ -438,10 +427,7 @@ def test_lines_differ_without_their_colours() -> None:
     assert len({(line.color, line.dashes) for line in lines}) == 49
 
 
-@given(
-    st.floats(-1e6, 1e6, allow_subnormal=False),
-    st.floats(1e-3, 1e6, allow_subnormal=False),
-)
+@given(st.floats(-1e6, 1e6, allow_subnormal=False), st.floats(1e-3, 1e6, allow_subnormal=False))
 def test_linear_ticks_are_few_inside_and_distinct(low: float, span: float) -> None:
     t = np.array([0.0, 1.0])
     panel = style.Panel("y", (style.Curve(t, np.array([low, low + span]), "", style.line(0)),))
@@ -459,34 +445,6 @@ def test_log_ticks_are_few(low: int, span: int) -> None:
     panel = style.Panel("y", (style.Curve(np.arange(2.0), ends, "", style.line(0)),), log=True)
     [axes] = style.compose([panel]).axes
     assert 1 <= len(axes.get_yticks()) <= 6
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (1e10, "10¹⁰"),
-        (-1e-7, "−10⁻⁷"),
-        (2.5e-7, "2.5·10⁻⁷"),
-        (0.5, "0.5"),
-        (0.0, "0"),
-        (9999.0, "9999"),
-        (-3.25, "−3.25"),
-    ],
-)
-def test_number_text(value: float, text: str) -> None:
-    assert symbols.number_text(value) == text
-
-
-@pytest.mark.parametrize(
-    ("gain", "text"),
-    [("gamma", "γ"), ("gamma_2", "γ₂"), ("f0", "f₀"), ("lambda_1", "λ₁"), ("window", "window")],
-)
-def test_symbol(gain: str, text: str) -> None:
-    assert symbols.symbol(gain) == text
-
-
-def test_products_of_units_have_a_dot() -> None:
-    assert symbols.with_unit("load", "N*m") == "load (N·m)"
 
 
 def test_every_figure_is_found_by_the_name_of_its_file() -> None:

@@ -32,12 +32,7 @@ from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.results.figures import describe
 from gpebo_cli.results.report import estimate_table
-from gpebo_cli.settings import (
-    NoiseSettings,
-    Settings,
-    SolverSettings,
-    TimeSettings,
-)
+from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()

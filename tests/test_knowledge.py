@@ -285,47 +285,6 @@ def test_a_wrong_plant_is_noticed(half_seen):
     assert "the residual is not white" in lines[-1]
 
 
-def in_units(plant, k, d, c):
-    """A shipped plant with its unknowns, inputs and outputs multiplied by k (q,), d (m,) and c."""
-    content = yaml.safe_load((CONF / "plant" / f"{plant}.yaml").read_text())
-    inputs, unknowns = content.get("inputs", {}), content.get("unknowns", {})
-    content["inputs"] = {n: f"{s!r}*({e})" for s, (n, e) in zip(d, inputs.items(), strict=True)}
-    content["unknowns"] = {n: s * v for s, (n, v) in zip(k, unknowns.items(), strict=True)}
-    for name, factors in (("B", d), ("F", k)):
-        if content.get(name):
-            content[name] = [
-                [f"({e})/{s!r}" for e, s in zip(row, factors, strict=True)]
-                for row in content[name]
-            ]
-    content["C"] = [[f"{c!r}*({e})" for e in row] for row in content["C"]]
-    return {key: value for key, value in content.items() if value}
-
-
-@pytest.mark.parametrize("plant", ["circuit", "descriptor", "strangeness_free"])
-def test_a_change_of_units_changes_no_evidence(plant):
-    rng = np.random.default_rng(5)
-    own = shipped(plant)
-    one = run(plant, estimator="ls_drem").details
-    for decades in (True, False):
-        def factors(count, decades=decades):
-            power = rng.integers(-6, 7, count) if decades else rng.uniform(-6, 6, count)
-            return [float(x) for x in 10.0**power]
-
-        # The descriptor plant weighs its output against an equation; in other units, otherwise.
-        c = 1.0 if plant == "descriptor" else factors(1)[0]
-        content = in_units(plant, factors(own.q), factors(own.m), c)
-        other = run(content, estimator="ls_drem").details
-        assert one.excitation.is_ie == other.excitation.is_ie
-        assert other.excitation.t_c == pytest.approx(one.excitation.t_c, rel=1e-9)
-        assert other.excitation.level == pytest.approx(one.excitation.level, rel=1e-9)
-        assert other.excitation.determined_at == one.excitation.determined_at
-        assert other.estimable == one.estimable
-        for name, part in one.excitation.weakest_direction.components.items():
-            assert other.excitation.weakest_direction.components[name] == pytest.approx(
-                part, abs=1e-9
-            )
-
-
 @pytest.mark.parametrize("plant", ["battery", "bioreactor", "boost", "descriptor", "window"])
 def test_a_run_without_any_choice_converges_where_psi_is_exciting(plant):
     """Also where parameters of very different size are hardly told apart, as in the bioreactor."""

@@ -29,12 +29,7 @@ from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, observe
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.settings import (
-    NoiseSettings,
-    Settings,
-    SolverSettings,
-    TimeSettings,
-)
+from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 TIME = TimeSettings(horizon=4.0)

@@ -231,23 +231,6 @@ def test_xi_a0_that_does_not_fit(xi_a0, message):
         run(shipped("circuit"), xi_a0=xi_a0)
 
 
-def test_units_of_an_equation_do_not_change_the_rank_of_E():
-    """The descriptor example with one equation in units of 1e-12."""
-    plain = shipped("descriptor")
-    small = shipped(
-        "descriptor",
-        E=[["1e-12", 0, 0], [0, 1, 0], [0, 0, 0]],
-        A=[["-1e-12", "1e-12*(0.5 + sin(t)/4)", "1e-12"],
-           [-0.5, "-0.5 - cos(t)/4", 0.5], [0.5, -1, "2 + sin(t)"]],
-        F=[["1e-12", 0], [0, "cos(t)"], [0.5, 0]],
-    )
-    (_, ours, truth), (_, expected, _) = run(small), run(plain)
-    assert ours.regression.parameters == expected.regression.parameters
-    np.testing.assert_allclose(ours.regression.psi(T), expected.regression.psi(T), atol=1e-10)
-    residual = ours.regression.Y(T) - ours.regression.psi(T) @ truth
-    assert np.abs(residual).max() < 1e-9
-
-
 def test_starting_value_of_the_extension_is_free():
     """Another ξ_a(0) changes e₀ and nothing else."""
     _, _, truth = run(shipped("circuit"), xi_a0=[0.0, 0.0, 0.0])

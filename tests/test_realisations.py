@@ -22,12 +22,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
-from gpebo_cli.settings import (
-    NoiseSettings,
-    Settings,
-    SolverSettings,
-    TimeSettings,
-)
+from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 ESTIMATORS = (

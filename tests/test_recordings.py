@@ -33,11 +33,7 @@ from gpebo_cli.recordings.guess import _factor, guess
 from gpebo_cli.recordings.hold import edges, held, recording_mesh
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import LineReader, read_table
-from gpebo_cli.settings import (
-    DataSettings,
-    Settings,
-    TimeSettings,
-)
+from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 WHOLE = TimeSettings(-np.inf, np.inf, 201)
 ESTIMATOR = {"name": "ls_drem"}

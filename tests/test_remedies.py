@@ -32,12 +32,7 @@ from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression.dynamics import filtered
 from gpebo_cli.regression.resets import ExtensionState, Reset
-from gpebo_cli.settings import (
-    NoiseSettings,
-    Settings,
-    SolverSettings,
-    TimeSettings,
-)
+from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "examples"

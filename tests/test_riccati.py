@@ -106,23 +106,18 @@ def relative(P: Array, expected: Array) -> float:
     return float(np.abs((P - expected) / (d[..., :, None] * d[..., None, :])).max())
 
 
-def test_time_varying_correlated_noise_against_scipy():
-    case, start, P0 = varying(), np.array([0.5, 0.0, -1.0]), np.diag([10.0, 5.0, 2.0])
-    t = np.linspace(0.0, 20.0, 41)
-    P, x = case.filtered(start, P0, 20.0).at(t)
+@pytest.mark.parametrize(("size", "start", "P0", "horizon", "of_P", "of_x"), [
+    (1e-2, [0.5, 0.0, -1.0], [10.0, 5.0, 2.0], 20.0, 1e-9, 1e-10),
+    # P(0) is 10⁷ times V: it falls within microseconds, and scipy's own error is as large.
+    (1e-6, [0.0, 0.0, 0.0], [10.0, 10.0, 10.0], 4.0, 1e-6, 1e-7),
+])
+def test_time_varying_correlated_noise_against_scipy(size, start, P0, horizon, of_P, of_x):
+    case, start, P0 = varying(size), np.array(start), np.diag(P0)
+    t = np.linspace(0.0, horizon, 2 * int(horizon) + 1)
+    P, x = case.filtered(start, P0, horizon).at(t)
     expected_P, expected_x = case.by_scipy(start, P0, t)
-    assert relative(P, expected_P) < 1e-9
-    assert np.abs(x[..., 0] - expected_x).max() < 1e-10 * np.abs(expected_x).max()
-
-
-def test_steep_start_against_scipy():
-    """P(0) is 10⁷ times V: the covariance falls within microseconds."""
-    case, start, P0 = varying(1e-6), np.zeros(3), np.diag([10.0, 10.0, 10.0])
-    t = np.linspace(0.0, 4.0, 9)
-    P, x = case.filtered(start, P0, 4.0).at(t)
-    expected_P, expected_x = case.by_scipy(start, P0, t)
-    assert relative(P[1:], expected_P[1:]) < 1e-6  # scipy's own error is as large
-    assert np.abs(x[..., 0] - expected_x).max() < 1e-7 * np.abs(expected_x).max()
+    assert relative(P[1:], expected_P[1:]) < of_P
+    assert np.abs(x[..., 0] - expected_x).max() < of_x * np.abs(expected_x).max()
 
 
 def test_limit_is_the_algebraic_riccati_solution():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -53,29 +54,16 @@ def test_only_the_inconsistent_state_of_the_circuit_moves():
     assert max(map(abs, moved.values())) < 1e-12
 
 
-def test_consistent_start_keeps_the_differential_part():
-    """0 = x1 + x2 − x3 with E = diag(1, 4, 0): only x3 may move, whatever was asked for."""
-    system = plant(
-        states=["x1", "x2", "x3"],
-        E=[[1, 0, 0], [0, 4, 0], [0, 0, 0]],
-        A=[[-1, 0, 0], [0, -1, 0], [1, 1, -1]],
-        initial_state=[1, 2, 50],
-    )
+@pytest.mark.parametrize(("E", "A", "start", "consistent"), [
+    # 0 = x1 + x2 − x3: only x3 may move, whatever was asked for.
+    ([1, 4, 0], [[-1, 0, 0], [0, -1, 0], [1, 1, -1]], [1, 2, 50], [1, 2, 3]),
+    # 0 = x1 − x2 ties two differential states: min (a)² + 4 (a − 5)² at a = 4.
+    ([1, 2, 0], [[0, 0, 1], [0, 0, -1], [1, -1, 0]], [0, 5, 0], [4, 4]),
+])
+def test_a_consistent_start_is_the_nearest_in_the_differential_part(E, A, start, consistent):
+    system = plant(states=["x1", "x2", "x3"], E=np.diag(E).tolist(), A=A, initial_state=start)
     result = simulate(system, TimeSettings(horizon=1.0), SOLVER)
-    np.testing.assert_allclose(result.initial_state, [1, 2, 3], atol=1e-13)
-
-
-def test_consistent_start_on_a_differential_constraint_is_the_E_weighted_projection():
-    """0 = x1 − x2 ties two differential states: the E-nearest point is the weighted mean."""
-    system = plant(
-        states=["x1", "x2", "x3"],
-        E=[[1, 0, 0], [0, 2, 0], [0, 0, 0]],
-        A=[[0, 0, 1], [0, 0, -1], [1, -1, 0]],
-        initial_state=[0, 5, 0],
-    )
-    result = simulate(system, TimeSettings(horizon=1.0), SOLVER)
-    # min (a)² + 4 (a − 5)² at a = 4
-    np.testing.assert_allclose(result.initial_state[:2], [4, 4], atol=1e-12)
+    np.testing.assert_allclose(result.initial_state[: len(consistent)], consistent, atol=1e-12)
 
 
 SCALES = [1.0, 1e-6, 1e6]
@@ -200,22 +188,21 @@ def test_a_step_through_a_constraint_restarts_the_algebraic_part_only():
     assert not jump.impulses.any()
 
 
+def behind(E, A, B, start, u):
+    """A plant behind an input u."""
+    states = [f"x{k + 1}" for k in range(len(start))]
+    system = plant(states=states, inputs={"u": u}, E=E, A=A, B=B, initial_state=start)
+    return simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
+
+
 def test_an_impulse_that_drives_a_differential_state_moves_it():
     """x1' = x3, x2' = 2 x3, 0 = x1 − u: a step of u moves x2 by twice as much.
 
     Keeping E x as near as possible would leave x2 where it is. Checked against smooth
     approximations of the step, whose solutions converge to this one.
     """
-
-    def after(u):
-        system = plant(
-            states=["x1", "x2", "x3"], inputs={"u": u},
-            E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]],
-            A=[[0, 0, 1], [0, "-t", 2], [1, 0, 0]], B=[[0], [0], [-1]],
-            initial_state=[0, 1, 0],
-        )
-        return simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
-
+    E, A = np.diag([1, 1, 0]).tolist(), [[0, 0, 1], [0, "-t", 2], [1, 0, 0]]
+    after = partial(behind, E, A, [[0], [0], [-1]], [0, 1, 0])
     exact = after("step(t - 1)")
     (_, before, jump), = exact.jumps
     assert jump.after - before == pytest.approx([1.0, 2.0, 0.0], abs=1e-9)
@@ -250,16 +237,9 @@ def test_a_coefficient_that_moves_while_an_impulse_passes():
     0 = x1 − u, x1' = x2, (1 + t) x2' = x3, x4' = x3, u a unit step at 1: x4 = ∫(1 + t) u'' falls
     by 1, for any rise of u from 0 to 1, however smooth.
     """
-
-    def after(u):
-        system = plant(
-            states=["x1", "x2", "x3", "x4"], inputs={"u": u},
-            E=[[0, 0, 0, 0], [1, 0, 0, 0], [0, "1 + t", 0, 0], [0, 0, 0, 1]],
-            A=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 0]],
-            B=[[-1], [0], [0], [0]], initial_state=[0, 0, 0, 0],
-        )
-        return simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
-
+    E = [[0, 0, 0, 0], [1, 0, 0, 0], [0, "1 + t", 0, 0], [0, 0, 0, 1]]
+    A = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 0]]
+    after = partial(behind, E, A, [[-1], [0], [0], [0]], [0, 0, 0, 0])
     exact = after("step(t - 1)")
     ((_, before, jump),) = exact.jumps
     assert jump.after - before == pytest.approx([1.0, 0.0, 0.0, -1.0], abs=1e-9)

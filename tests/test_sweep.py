@@ -83,20 +83,16 @@ def test_quoted_text_is_read_back_by_hydra(text):
     assert override.value() == text
 
 
-def test_a_sweep_stored_in_a_recipe(tmp_path):
-    done = gpebo("run", "experiment=gain_multirun", "--dry-run", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    *_, last = done.stdout.splitlines()
-    assert last == "10 jobs; nothing was run"
-
-
-def test_dry_run_lists_the_jobs_and_leaves_nothing(tmp_path):
-    done = gpebo(*SWEEP, "--dry-run", cwd=tmp_path)
+@pytest.mark.parametrize(("words", "keys", "count"), [
+    (SWEEP, ["estimator.gamma", "estimator"], 8),
+    (["run", "experiment=gain_multirun"], ["estimator", "estimator.gamma"], 10),  # of a recipe
+])
+def test_dry_run_lists_the_jobs_and_leaves_nothing(tmp_path, words, keys, count):
+    done = gpebo(*words, "--dry-run", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     head, *jobs, last = done.stdout.splitlines()
-    assert head.split()[:3] == ["job", "estimator.gamma", "estimator"]
-    assert len(jobs) == 8
-    assert last == "8 jobs; nothing was run"
+    assert head.split()[: 1 + len(keys)] == ["job", *keys]
+    assert (len(jobs), last) == (count, f"{count} jobs; nothing was run")
     assert not (tmp_path / "outputs").exists()
 
 
@@ -148,20 +144,17 @@ def test_fail_fast_stops_at_the_first_and_the_rest_can_be_run_later(tmp_path):
     assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "failed", "done"]
 
 
-def test_a_folder_with_a_sweep_is_not_taken_for_another(tmp_path, uninterrupted):
-    done = gpebo(*SWEEP, f"hydra.sweep.dir={uninterrupted}", cwd=tmp_path)
-    assert_refused(done, "has a sweep already; add resume=")
-
-
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("words", "key", "expected"),
     [
-        (["estimator.gamma=1e6,1e7", "estimator=drem,ls_drem", *FAST], "has 8 jobs and this one 4"),
-        ([*SWEEP[2:], "time.horizon=10"], "job 0 had time.horizon=None and has '10' now"),
+        (SWEEP[2:], "hydra.sweep.dir", "has a sweep already; add resume="),
+        (["estimator.gamma=1e6,1e7", "estimator=drem,ls_drem", *FAST], "resume",
+         "has 8 jobs and this one 4"),
+        ([*SWEEP[2:], "time.horizon=10"], "resume", "job 0 had time.horizon=None and has '10' now"),
     ],
 )
-def test_another_sweep_is_not_resumed(tmp_path, uninterrupted, words, expected):
-    done = gpebo("run", "-m", *words, f"resume={uninterrupted}", cwd=tmp_path)
+def test_a_sweep_is_not_taken_for_another(tmp_path, uninterrupted, words, key, expected):
+    done = gpebo("run", "-m", *words, f"{key}={uninterrupted}", cwd=tmp_path)
     assert_refused(done, expected)
 
 

@@ -128,19 +128,21 @@ def fed(system, estimator, t, u, y, hold="linear", noise=None, cut=0):
     ("linear", {"name": "lion", "gamma": 1e6}),
 ])
 def test_at_samples_they_are_what_each_error_by_itself_does(hold, estimator):
-    """Estimates are affine in every sample: the variances of the responses add up, to rounding."""
-    system, generator = shipped("descriptor"), np.random.default_rng(1)
-    t = np.cumsum(generator.uniform(0.2, 0.6, 10))
+    t = np.cumsum(np.random.default_rng(1).uniform(0.2, 0.6, 10))
     u, y = np.sin(t)[:, None], np.cos(2 * t)[:, None]
-    noise = NoiseSettings(name="gaussian", outputs=0.3, inputs=0.2)
+    assert_responses_add_up(shipped("descriptor"), estimator, t, u, y, hold, (0.3, 0.2))
+
+
+def assert_responses_add_up(system, estimator, t, u, y, hold, sigmas):
+    """Estimates are affine in every sample: the variances of the responses add up, to rounding."""
+    noise = NoiseSettings(name="gaussian", outputs=sigmas[0], inputs=sigmas[1])
     base, std, level = fed(system, estimator, t, u, y, hold, noise, cut=4)
     np.testing.assert_array_equal(level, 1.0)
     variance = np.zeros_like(std)
-    for j in range(len(t)):
-        one = np.zeros((len(t), 1))
-        one[j] = 1.0
-        for sigma, signals in ((0.3, (u, y + one)), (0.2, (u + one, y))):
-            variance += (sigma * (fed(system, estimator, t, *signals, hold)[0] - base)) ** 2
+    for one in np.eye(len(t))[:, :, None]:
+        for sigma, signals in zip(sigmas, ((u, y + one), (u + one, y)), strict=True):
+            if sigma:
+                variance += (sigma * (fed(system, estimator, t, *signals, hold)[0] - base)) ** 2
     np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5, atol=1e-7)
 
 
@@ -149,6 +151,14 @@ TANK = {
     "outputs": ["y"], "E": [[1]], "A": [["-1 - 0.3*u"]], "F": [["u", -1]], "C": [[1]],
     "initial_state": {"h": 0},
 }
+
+
+def noisy_rows(folder, noise, samples):
+    """A file of what was measured of the descriptor plant, with noise."""
+    made = run("descriptor", noise=noise, time={"samples": samples}).to_pandas("signals")
+    measured = made.filter(regex="measured").rename(columns=lambda c: c.removesuffix("_measured"))
+    measured.to_csv(folder / "rows.csv")
+    return str(folder / "rows.csv")
 
 
 PAUSE = np.array([0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 4.0, 4.2, 4.4, 4.6])  # most of the horizon
@@ -242,14 +252,8 @@ def test_at_samples_matrices_may_follow_an_input_without_noise():
     system = plant_from_mapping(TANK, "tank")
     t = np.linspace(0.0, 4.0, 12)
     u, y = np.sin(3 * t)[:, None] + 1.0, np.cos(t)[:, None]
-    noise, law = NoiseSettings(name="gaussian", outputs=0.3), {"name": "least_squares"}
-    base, std, _ = fed(system, law, t, u, y, "linear", noise, cut=5)
-    variance = np.zeros_like(std)
-    for j in range(len(t)):
-        one = np.zeros((len(t), 1))
-        one[j] = 0.3
-        variance += (fed(system, law, t, u, y + one, "linear")[0] - base) ** 2
-    np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5, atol=1e-7)
+    law = {"name": "least_squares"}
+    assert_responses_add_up(system, law, t, u, y, "linear", (0.3, 0.0))
     noisy = NoiseSettings(name="gaussian", outputs=0.3, inputs=0.1)
     with pytest.raises(TypeError):  # there are none
         fed(system, law, t, u, y, "linear", noisy)
@@ -261,11 +265,10 @@ def test_the_level_at_samples_has_no_bias(hold):
     system = shipped("descriptor")
     t = np.linspace(0.0, 6.0, 11)
     nothing = np.zeros((len(t), 1))
-    found = 0.0
-    for j in range(len(t)):
-        y = nothing.copy()
-        y[j] = 1.0
-        found = found + fed(system, {"name": "ls_drem"}, t, nothing, y, hold, cut=5)[2] ** 2
+    found = sum(
+        fed(system, {"name": "ls_drem"}, t, nothing, y, hold, cut=5)[2] ** 2
+        for y in np.eye(len(t))[:, :, None]
+    )
     assert np.isnan(found[:4]).all()  # four parameters explain four rows
     np.testing.assert_allclose(found[6:], 1.0, rtol=1e-6)
 
@@ -291,10 +294,7 @@ def test_they_are_in_tables_and_summary_unless_switched_off(tmp_path):
 
 def test_of_a_recording_with_levels_and_without(tmp_path):
     noise = {"name": "gaussian", "outputs": 0.02, "sample_time": 0.02}
-    made = run("descriptor", noise=noise, time={"samples": 1001}).to_pandas("signals")
-    measured = made.filter(regex="measured").rename(columns=lambda c: c.removesuffix("_measured"))
-    measured.to_csv(tmp_path / "rows.csv")
-    data = {"file": str(tmp_path / "rows.csv"), "hold": "linear"}
+    data = {"file": noisy_rows(tmp_path, noise, 1001), "hold": "linear"}
     std = [
         run("descriptor", estimator="ls_drem", data=data, noise=own).to_pandas("estimates")
         ["theta1_std"].iloc[-1]
@@ -365,25 +365,12 @@ def test_under_noise_of_unknown_effect_no_time_is_told_but_by_seeds():
         assert (away[late] <= 2.0 * deviation[names.index(name)]).all()
 
 
-def test_why_there_are_no_deviations_at_samples_is_said():
-    gains = {"name": "least_squares", "f0": [10.0**-k for k in range(33)]}
-    observer = {"name": "gpebo", "sample_time": 0.1}
-    result = run(
-        "descriptor", estimator=gains, observer=observer, noise=NOISE, time={"horizon": 2.0}
-    )
-    assert "no standard deviations: each of 33 cases would take a pass of its own" in result.verdict
-
-
 def test_a_recording_at_samples_is_told(tmp_path):
     """Its table has states whose time to settle nobody knows."""
     noise = {"name": "gaussian", "outputs": 0.02, "sample_time": 0.1}
-    made = run("descriptor", noise=noise, time={"samples": 201}).to_pandas("signals")
-    measured = made.filter(regex="measured").rename(columns=lambda c: c.removesuffix("_measured"))
-    measured.to_csv(tmp_path / "rows.csv")
-    observer = {"sample_time": 0.1, "hold": "linear"}
+    data, observer = noisy_rows(tmp_path, noise, 201), {"sample_time": 0.1, "hold": "linear"}
     result, whole = (
-        run("descriptor", data=str(tmp_path / "rows.csv"), observer=given)
-        for given in (observer, "gpebo")
+        run("descriptor", data=data, observer=given) for given in (observer, "gpebo")
     )
     fit, other = result.details.fit, whole.details.fit
     assert fit.size == pytest.approx(other.size, rel=0.05)
@@ -396,10 +383,7 @@ def test_a_recording_at_samples_is_told(tmp_path):
 def test_the_residual_is_compared_with_the_noise_that_is_given(tmp_path):
     """χ²: one where the level is right, two where it is half of it; a wrong plant is noticed."""
     noise = {"name": "gaussian", "outputs": 0.01, "sample_time": 0.05}
-    made = run("descriptor", noise=noise, time={"samples": 401}).to_pandas("signals")
-    measured = made.filter(regex="measured").rename(columns=lambda c: c.removesuffix("_measured"))
-    measured.to_csv(tmp_path / "rows.csv")
-    data, told = str(tmp_path / "rows.csv"), []
+    data, told = noisy_rows(tmp_path, noise, 401), []
     for level, plant in ((0.01, "descriptor"), (0.005, "descriptor"), (0.01, WRONG)):
         result = run(plant, data=data, noise={**noise, "outputs": level})
         told.append((result.details.fit.ratio, result.verdict))
@@ -455,12 +439,15 @@ def test_errors_with_resets_are_of_the_size_that_is_said(estimator):
     assert size.max() < 2.2
 
 
-def test_a_run_without_deviations_says_why():
-    verdict = run("descriptor", noise=NOISE, gamma="logspace(0,2,33)", time={"horizon": 2}).verdict
-    assert "no standard deviations: each of" in verdict
-    verdict = run("boost", noise=NOISE, time={"horizon": 0.5}).verdict
-    assert "no standard deviations: noise of the signals is in the matrices" in verdict
-    assert "no standard deviations" not in run("boost", time={"horizon": 0.5}).verdict
+@pytest.mark.parametrize(("plant", "more", "why"), [
+    ("descriptor", {"gamma": "logspace(0,2,33)"}, "each of 33 cases would take a pass of its own"),
+    ("descriptor", {"gamma": "logspace(0,2,33)", "observer": {"sample_time": 0.1}},
+     "each of 33 cases would take a pass of its own"),
+    ("boost", {}, "noise of the signals is in the matrices"), ("boost", {"noise": "none"}, ""),
+])
+def test_a_run_without_deviations_says_why(plant, more, why):
+    verdict = run(plant, **{"noise": NOISE, "time": {"horizon": 0.5}, **more}).verdict
+    assert (f"no standard deviations: {why}" in verdict) == bool(why)
 
 
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.01}])
